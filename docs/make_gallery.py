@@ -25,8 +25,9 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.contact import DEEP, TOUCHING
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point
-from jawusd.imaging.overlay import placed_scans
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.overlay import placed_scans
+from jawusd.media.video_writer import VideoWriter
+from jawusd.paper.figures import condyle_figure
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.media import tracked_scans
 from jawusd.pipeline.overlay import open_wall
@@ -34,7 +35,6 @@ from jawusd.pipeline.report import do_experiments
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import subject_of_build
 from jawusd.pipeline.view import ContactView, open_viewer
-from jawusd.report.figures import condyle_figure
 from jawusd.report.style import BLUE, VERMILION, figure_bytes
 from jawusd.rig import describe
 

@@ -10,12 +10,12 @@ import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jawusd.plugin_path import announce_schema
+from jawusd.base.plugin_path import announce_schema
 
 if TYPE_CHECKING:
     from os import PathLike
 
-    from jawusd.errors import JawusdError
+    from jawusd.base.errors import JawusdError
     from jawusd.evaluator import JawRig
     from jawusd.pipeline.build import build
     from jawusd.pipeline.track import track
@@ -25,7 +25,7 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "JawRig": "jawusd.evaluator",
-    "JawusdError": "jawusd.errors",
+    "JawusdError": "jawusd.base.errors",
     "build": "jawusd.pipeline.build",
     "track": "jawusd.pipeline.track",
 }

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from jawusd import guard
+from jawusd.base import guard
 
 
 def main() -> None:
-    """Run the command line in a process with limits, see `jawusd.guard`."""
+    """Run the command line in a process with limits, see `jawusd.base.guard`."""
     guard.begin()
     from jawusd.cli.main import main as run
 

@@ -27,7 +27,7 @@ PAGES = {
     ),
     "fitting": (
         "The jaw model from poses, and poses from pictures.",
-        ["jawusd.fitting", "jawusd.tracking", "jawusd.tracking.photographs"],
+        ["jawusd.fitting", "jawusd.tracking", "jawusd.photographs"],
     ),
     "geometry": ("Rotations, rigid motions, cameras and the anatomical frame.", ["jawusd.geometry"]),
     "plugins": (
@@ -50,7 +50,7 @@ TOP = """# jawusd
 | [`jawusd.JawRig`][jawusd.evaluator.JawRig] | the rig: pose, encode, margin, validate, ik |
 | [`jawusd.build`][jawusd.pipeline.build.build] | from a capture to a rig in one call |
 | [`jawusd.track`][jawusd.pipeline.track.track] | track both rows of teeth |
-| [`jawusd.JawusdError`][jawusd.errors.JawusdError] | what every error of jawusd is |
+| [`jawusd.JawusdError`][jawusd.base.errors.JawusdError] | what every error of jawusd is |
 | `jawusd.__version__` | the version, as text |
 """
 

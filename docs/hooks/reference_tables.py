@@ -6,7 +6,7 @@ from pathlib import Path
 from pxr import Sdf
 from reference_commands import escaped
 
-import jawusd.errors
+import jawusd.base.errors
 from jawusd.cli.summaries import EXIT_CODES
 from jawusd.evaluator import schema as arrays
 from jawusd.formats.capture import capture_keys
@@ -102,14 +102,14 @@ def errors_page():
     """Return the page of exceptions and exit codes."""
     kinds = {
         value
-        for value in vars(jawusd.errors).values()
-        if isinstance(value, type) and issubclass(value, jawusd.errors.JawusdError)
+        for value in vars(jawusd.base.errors).values()
+        if isinstance(value, type) and issubclass(value, jawusd.base.errors.JawusdError)
     }
     ordered = sorted(kinds, key=lambda kind: (kind.exit_code, len(kind.__mro__), kind.__name__))
     rows = [
-        f"| {kind.exit_code} | [`{kind.__name__}`][jawusd.errors.{kind.__name__}] | {kind.__doc__.splitlines()[0]} |\n"
+        f"| {kind.exit_code} | [`{kind.__name__}`][jawusd.base.errors.{kind.__name__}] | {kind.__doc__.splitlines()[0]} |\n"
         for kind in ordered
     ]
     table = "| exit code | error | |\n|---|---|---|\n" + "".join(rows)
-    directive = "::: jawusd.errors\n    options:\n      show_root_toc_entry: false\n      show_root_heading: false\n"
+    directive = "::: jawusd.base.errors\n    options:\n      show_root_toc_entry: false\n      show_root_heading: false\n"
     return f"{ERRORS}{escaped(EXIT_CODES)}\n\n{table}\n## In Python\n\n{directive}"

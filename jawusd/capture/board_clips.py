@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CalibrationError, CaptureError
+from jawusd.base.errors import CalibrationError, CaptureError
 from jawusd.formats.numbered import is_pattern, numbered_files
-from jawusd.imaging.display import to_display
-from jawusd.imaging.pictures import read_picture
-from jawusd.imaging.stored_picture import read_header, read_stored
-from jawusd.imaging.video import Video
+from jawusd.media.display import to_display
+from jawusd.media.pictures import read_picture
+from jawusd.media.stored_picture import read_header, read_stored
+from jawusd.media.video import Video
 
 
 class BoardClip:

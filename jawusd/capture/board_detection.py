@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CalibrationError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError
 from jawusd.formats.capture import Boards
-from jawusd.geometry.arrays import Array
 
 Search = Callable[[NDArray[np.uint8]], Array | None]
 

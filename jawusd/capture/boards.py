@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import CalibrationError
 from jawusd.capture.board_clips import BoardClip, sharpness
 from jawusd.capture.board_detection import corners_and_width, detector, shown_instead
-from jawusd.errors import CalibrationError
 from jawusd.formats.capture import Boards
-from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.clip import INTERLACED, INTERLACED_HINT
+from jawusd.media.clip import INTERLACED, INTERLACED_HINT
 
 MOST_VIEWS = 80  # more add minutes, not accuracy
 _LOOKED_AT = 6  # pictures searched for another board

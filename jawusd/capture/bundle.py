@@ -14,10 +14,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_matrix
 
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError
 from jawusd.capture.first_guess import FirstGuess
-from jawusd.errors import CalibrationError
 from jawusd.geometry import hat, make_transform, so3_exp, so3_left_jacobian, so3_log
-from jawusd.geometry.arrays import Array
 
 _LENS = 6  # fx, fy, cx, cy, k1, k2
 _POSE = 6  # rotation vector [rad], translation [mm]

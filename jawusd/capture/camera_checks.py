@@ -7,9 +7,9 @@ from itertools import combinations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 
 # Focal length over picture width: from a fisheye's 100 degrees to a telephoto's 3.
 _FOCAL_WIDTHS = (0.4, 20.0)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
+from jawusd.base.errors import CaptureError, SyncError
 from jawusd.capture.light import Offset
-from jawusd.errors import CaptureError, SyncError
 from jawusd.formats.capture import Capture
 from jawusd.formats.timecode import frame_of_timecode
-from jawusd.imaging.clip import Clip
-from jawusd.imaging.footage import open_clip
+from jawusd.media.clip import Clip
+from jawusd.media.footage import open_clip
 
 _DAY_S = 86400
 _RATE_TOLERANCE = 1e-3

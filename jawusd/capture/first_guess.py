@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CalibrationError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import CalibrationError
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log
-from jawusd.geometry.arrays import Array, Mask
 
 FEWEST_VIEWS = 6  # per camera; fewer leave focal length and distance exchangeable
 _SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # relative poses this close (share of the distance) agree

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import SyncError
-from jawusd.geometry.arrays import Array
-from jawusd.imaging.clip import Clip
+from jawusd.base.arrays import Array
+from jawusd.base.errors import SyncError
+from jawusd.media.clip import Clip
 
 _FIRST_WINDOW_S = 4.0  # searched at either end; doubled until a flash is found
 _SPARSE = 8  # the mean brightness is that of every 8th pixel in both directions

@@ -7,9 +7,9 @@ from itertools import combinations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera, triangulate
-from jawusd.geometry.arrays import Array
 
 #: The middle of all teeth pixels of one instant by camera [px], shape (2,).
 Middles = Mapping[str, Array]

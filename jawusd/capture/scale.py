@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CalibrationError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, triangulate
-from jawusd.geometry.arrays import Array
 
 _FEWEST_PICKS = 3  # per jaw
 _TOLERANCE = 0.03  # picks give the scale to about half a per cent

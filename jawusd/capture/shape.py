@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.capture.bundle import Bundle, camera_from
 from jawusd.capture.scale import triangulated_picks
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, se3_inverse
-from jawusd.geometry.arrays import Array
 
 _MOUTH_RADIUS_MM = 35.0  # holds both arches through an opening of 40 mm
 _DRAWS = 40

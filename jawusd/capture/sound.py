@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
-from jawusd.errors import SyncError
-from jawusd.imaging.audio import Sound
+from jawusd.base.errors import SyncError
+from jawusd.media.audio import Sound
 
 RATE_HZ = 16000
 _WHITENING = 0.75

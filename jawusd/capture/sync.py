@@ -14,17 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
+from jawusd.base.errors import SyncError
 from jawusd.capture.clocks import offsets_by_clock, refuse_other_rates
 from jawusd.capture.light import Offset, find_flashes, find_steps, match_steps, mean_brightness, on_grid
 from jawusd.capture.sound import RATE_HZ, match_sounds
-from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
 from jawusd.formats.clip_source import ClipSource
 from jawusd.formats.light_curve import LightCurve
-from jawusd.imaging.audio import Sound, read_sound
-from jawusd.imaging.clip import Clip
-from jawusd.imaging.footage import open_clip
-from jawusd.imaging.video import Video
+from jawusd.media.audio import Sound, read_sound
+from jawusd.media.clip import Clip
+from jawusd.media.footage import open_clip
+from jawusd.media.video import Video
 
 _FPS_TOLERANCE = 5e-3  # people write 24 for 23.976
 _EARLY_S = 2.0  # people stop their cameras one after the other

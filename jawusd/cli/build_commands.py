@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from jawusd.base.errors import naming_file
 from jawusd.cli.command import command_line, stopped_by_signals
 from jawusd.cli.options import (
     CaptureArg,
@@ -32,7 +33,6 @@ from jawusd.cli.options import (
     trajectory_options,
 )
 from jawusd.cli.output import emit, progress, say
-from jawusd.errors import naming_file
 from jawusd.formats.atomic import refuse_existing
 
 
@@ -236,7 +236,7 @@ def demo(
     """Render a synthetic capture with known truth: a made-up person in front of three cameras."""
     from functools import partial
 
-    from jawusd.errors import explain_missing_packages
+    from jawusd.base.errors import explain_missing_packages
 
     with explain_missing_packages("demo"):
         from jawusd.synthetic.capture_writer import DemoConfig, write_demo

@@ -22,7 +22,7 @@ def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = F
 
     Prints everything wrong or doubtful at once. Exit code 0 without errors, 5 with.
     """
-    from jawusd.errors import CaptureError
+    from jawusd.base.errors import CaptureError
     from jawusd.pipeline.check import check_capture, check_lines, check_summary
 
     with progress() as report:
@@ -80,7 +80,7 @@ def sync(
     as_json: Json = False,
 ) -> None:
     """Find the frame offsets between cameras from light flashes, else from their sound."""
-    from jawusd.errors import SyncError
+    from jawusd.base.errors import SyncError
     from jawusd.pipeline.calibrate import (
         PLOT_SUFFIXES,
         light_curves,
@@ -180,7 +180,7 @@ def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
     Raises:
         OutputError: it does.
     """
-    from jawusd.errors import OutputError
+    from jawusd.base.errors import OutputError
 
     if force or not folder.exists() or not any(folder.iterdir()):
         return
@@ -224,7 +224,7 @@ def plates(
     as_json: Json = False,
 ) -> None:
     """Write the footage without lens distortion where the rig's cameras.usda says, numbered by its time codes."""
-    from jawusd.errors import OutputError
+    from jawusd.base.errors import OutputError
     from jawusd.formats.tracks import load_tracks
     from jawusd.pipeline.calibrate import sync_cameras
     from jawusd.pipeline.capture_inputs import open_capture

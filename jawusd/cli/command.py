@@ -13,9 +13,9 @@ from typing import NoReturn
 import typer
 from typer.core import TyperCommand
 
+from jawusd.base.errors import JawusdError
 from jawusd.cli.log import RunLog
 from jawusd.cli.output import say
-from jawusd.errors import JawusdError
 
 #: Exit code of a run stopped with Ctrl+C, as shells report it.
 INTERRUPTED = 130

@@ -12,10 +12,10 @@ from jawusd.cli.output import emit
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
+    from jawusd.base.arrays import Array
     from jawusd.cli.motion import AuthoredMotion
     from jawusd.evaluator import JawRig
     from jawusd.formats.arkit_mapping import ArkitMapping
-    from jawusd.geometry.arrays import Array
 
 _CLAMPED_MM = 0.005  # what is less shows as 0.00
 
@@ -151,8 +151,8 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
     """
     import numpy as np
 
+    from jawusd.base.errors import FormatError
     from jawusd.cli.motion import AuthoredMotion
-    from jawusd.errors import FormatError
     from jawusd.formats.arkit import read_arkit, shares_of
 
     capture = read_arkit(source, fps)
@@ -166,7 +166,7 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
 
 
 def _own_mapping(rig: JawRig, path: Path) -> ArkitMapping:
-    from jawusd.errors import FormatError
+    from jawusd.base.errors import FormatError
     from jawusd.formats.arkit_mapping import load_mapping
 
     own, actor = load_mapping(path), str(rig.meta.get("actor", ""))

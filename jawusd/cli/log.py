@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from jawusd.errors import OutputError, shown
+from jawusd.base.errors import OutputError, shown
 
 _CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 

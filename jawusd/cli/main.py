@@ -12,13 +12,13 @@ from typing import Annotated
 
 import typer
 
+from jawusd.base.errors import JawusdError, OutputError, explain_missing_packages
+from jawusd.base.guard import out_of_memory
 from jawusd.cli.command import CONTEXT
 from jawusd.cli.commands import Commands
 from jawusd.cli.log import logged
 from jawusd.cli.output import complain, say
 from jawusd.cli.summaries import EXIT_CODES
-from jawusd.errors import JawusdError, OutputError, explain_missing_packages
-from jawusd.guard import out_of_memory
 
 app = typer.Typer(
     name="jawusd",

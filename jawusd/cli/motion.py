@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FormatError
+from jawusd.base.inputs import check_input
 from jawusd.cli.options import USD_SUFFIXES
 from jawusd.cli.output import emit
-from jawusd.errors import FormatError
 from jawusd.evaluator.clamping import Inside
 from jawusd.evaluator.interpolation import monotone_tangents
 from jawusd.formats.keys import FARTHEST_FRAME, FARTHEST_MM, MOST_FRAMES, Key, Keys, load_keys
 from jawusd.formats.poses import read_poses, read_poses_or_parameters
 from jawusd.formats.tracks import load_tracks
-from jawusd.geometry.arrays import Array, Mask
-from jawusd.inputs import check_input
 
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from jawusd.errors import shown
+from jawusd.base.errors import shown
 
 if TYPE_CHECKING:
     from rich.console import Console

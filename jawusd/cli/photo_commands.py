@@ -32,7 +32,7 @@ def photos(
     All photographs show one bite and come from one camera, whose focal length need not be known; some may be taken over
     a mirror. Exit code 6 if the scans do not fit the lines.
     """
-    from jawusd.errors import TrackingError
+    from jawusd.base.errors import TrackingError
     from jawusd.pipeline.photographs import align_photograph_files, photograph_lines
 
     with progress() as report:

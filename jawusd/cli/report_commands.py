@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jawusd.base.errors import naming_file
 from jawusd.cli.options import (
     Allow,
     CaptureOption,
@@ -28,7 +29,6 @@ from jawusd.cli.options import (
     trajectory_options,
 )
 from jawusd.cli.output import emit, progress, say
-from jawusd.errors import naming_file
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:

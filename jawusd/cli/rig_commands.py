@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from jawusd.base.arrays import Array
     from jawusd.evaluator import JawRig
     from jawusd.formats.finding import Finding as Changed
-    from jawusd.geometry.arrays import Array
     from jawusd.rig.read import Description
 
 Triple = tuple[float, float, float]
@@ -65,7 +65,7 @@ def info(
 
 
 def _print_schema(as_json: bool) -> None:
-    from jawusd.plugin_path import VARIABLE, schema_folder
+    from jawusd.base.plugin_path import VARIABLE, schema_folder
 
     folder = str(schema_folder() or "")
     lines = [

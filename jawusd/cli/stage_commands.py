@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from jawusd.base.errors import JawusdError
 from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, PrimName, RigArg, load_named
 from jawusd.cli.output import emit
-from jawusd.errors import JawusdError
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
+    from jawusd.base.arrays import Array
     from jawusd.evaluator import JawRig
-    from jawusd.geometry.arrays import Array
     from jawusd.rig.rebake import StageMotion
 
 

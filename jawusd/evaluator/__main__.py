@@ -6,7 +6,7 @@
     python -m jawusd.evaluator validate MODEL poses.csv
 
 Poses come as CSV with the columns frame, m00 ... m33 (row-major T_skull_mandible [mm]). Results go to stdout as CSV, or
-JSON with --json. Exit codes: 0, 1 an invalid pose was found, 2 usage, 3 and up an error (see jawusd.errors).
+JSON with --json. Exit codes: 0, 1 an invalid pose was found, 2 usage, 3 and up an error (see jawusd.base.errors).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError, JawusdError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, JawusdError
+from jawusd.base.tables import read_table
 from jawusd.evaluator.files import load
 from jawusd.evaluator.rig import JawRig
-from jawusd.geometry.arrays import Array
-from jawusd.tables import read_table
 
 _MAX_BYTES = 1 << 30
 _MATRIX_COLUMNS = [f"m{row}{column}" for row in range(4) for column in range(4)]

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.contact import PREFIXES, check_contact
 from jawusd.evaluator.schema import ANCHORED, KINDS, OPTIONAL, arrays_of
 from jawusd.evaluator.speeds import check_speeds
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect
 
 _RIGID_TOLERANCE = 1e-6

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import sections
 from jawusd.evaluator.arrays import RigArrays
 from jawusd.evaluator.batching import as_floats, as_keys, as_rows, in_chunks, pairs_in_chunks
@@ -16,7 +17,6 @@ from jawusd.evaluator.clamping import Inside, kept_inside
 from jawusd.evaluator.interpolation import interpolated
 from jawusd.evaluator.search import nearest_distance
 from jawusd.evaluator.sections import Ranges
-from jawusd.geometry.arrays import Array
 
 
 class RigAuthoring(RigArrays):

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.geometry.arrays import Array, Indices
+from jawusd.base.arrays import Array, Indices
 
 Rows = TypeVar("Rows", Array, Indices)  # rows, or the numbers of rows
 

@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.curve_formula import catmull_rom
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.formula import BoundFormula
-from jawusd.geometry.arrays import Array
 
 _ARRAYS = ("slice_d1", "slice_directions", "slice_support", "slice_softness_mm", "slice_margin_mm")
 _NEWTON_ITERATIONS = 60

@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.arrays import Array, Indices, Mask
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.ways import INSET_MM, along, lengths, short_enough
-from jawusd.geometry.arrays import Array, Indices, Mask
 
 MOST_STRETCH = 1.045  # a step inside may be this much longer than the motion's own: 5 %, with room for rounding
 

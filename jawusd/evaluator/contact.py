@@ -15,10 +15,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import pairs_in_chunks, rows_of
 from jawusd.evaluator.verdicts import Verdicts
-from jawusd.geometry.arrays import Array, Mask
 
 #: Values are stored as whole numbers of this length [mm].
 UNIT_MM = 0.01

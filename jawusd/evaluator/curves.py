@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.curve_formula import cubic
-from jawusd.geometry.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Generic, NamedTuple
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.formula import (
     ARCH_BOW_MM,
     DROP_BEND,
@@ -22,7 +23,6 @@ from jawusd.evaluator.formula import (
     GaugeNumbers,
 )
 from jawusd.evaluator.glide import GlideTable
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import N, Triple
 
 INVERSE_TOLERANCE_MM = 1e-13

@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array, Indices
 from jawusd.evaluator.solver import Residual
-from jawusd.geometry.arrays import Array, Indices
 
 # x (k, 3) -> rotations (k, 3, 3), translations (k, 3), spatial derivatives (k, 6, 3)
 Derivative = Callable[[Array], tuple[Array, Array, Array]]

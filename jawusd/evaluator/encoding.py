@@ -15,12 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Indices
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import carried, distance_residual
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.solver import minimise
-from jawusd.geometry.arrays import Array, Indices
 from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 
-from jawusd.errors import EvaluatorError, FormatError
+from jawusd.base.errors import EvaluatorError, FormatError
+from jawusd.base.npz import read_npz, upgraded_model
 from jawusd.evaluator.rig import JawRig
-from jawusd.npz import read_npz, upgraded_model
 
 FAMILY, VERSION = "jawusd-model", 2
 

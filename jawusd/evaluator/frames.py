@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.single import Motion, Vector
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_adjoint, se3_inverse
 
 

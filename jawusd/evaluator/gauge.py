@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import derivatives
 from jawusd.evaluator.derivatives import (
     ARRAYS,
@@ -22,7 +23,6 @@ from jawusd.evaluator.derivatives import (
 )
 from jawusd.evaluator.formula import GaugeNumbers
 from jawusd.evaluator.glide import GlideTable
-from jawusd.geometry.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.curve_formula import catmull_rom
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.geometry.arrays import Array
 
 _REST_MM = 1e-6
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.clamping import kept_inside
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.geometry.arrays import Array
 
 _SAMPLES = 129  # of a piece that is brought inside
 # Shares of a piece at which it is looked at to see whether it leaves the bound, dense at its ends: keys may lie on it.

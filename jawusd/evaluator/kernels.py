@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Indices
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks, usable_rows
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import distance_residual, landmark_vectors
@@ -20,7 +21,6 @@ from jawusd.evaluator.nearest import Pull, Vector, lowest_in_valley, nearest_in_
 from jawusd.evaluator.operations import triple
 from jawusd.evaluator.solver import Residual, minimise
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
-from jawusd.geometry.arrays import Array, Indices
 from jawusd.geometry.se3 import rigidity_defect, transform_points
 
 _FEW_ROWS = 3  # searched one by one sooner than together

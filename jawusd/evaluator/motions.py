@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.geometry.rodrigues import Triple, apply_series, dot, turning
 from jawusd.geometry.so3 import angle_coefficients
 

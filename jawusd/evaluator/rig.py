@@ -9,6 +9,7 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import SliceHull
@@ -22,7 +23,6 @@ from jawusd.evaluator.polygons import PolygonBound
 from jawusd.evaluator.search import BoundedSearch, IkResult
 from jawusd.evaluator.speeds import Speeds
 from jawusd.evaluator.verdicts import Limits, Verdicts, is_inside, too_fast
-from jawusd.geometry.arrays import Array, Indices, Mask
 from jawusd.geometry.se3 import transform_points
 
 BoundName = Literal["slices", "polygons"]

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.arrays import Array, Indices
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.kernels import Kernels
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.solver import pulled_inside
-from jawusd.geometry.arrays import Array, Indices
 
 # (row numbers (k,), starts (k, 3)) -> bottoms (k, 3) and squared residuals (k,)
 Search = Callable[[Indices, Array], tuple[Array, Array]]

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.geometry.arrays import Array
 
 # A range shorter than this counts as this long, which keeps normalising invertible where a section closes.
 SMALLEST_REACH_MM = 0.5

@@ -15,10 +15,10 @@ from typing import Protocol
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.derivatives import FLOATS, displacement, gradient_by_u, spline_input
 from jawusd.evaluator.formula import GaugeNumbers
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import angle_coefficients, apply_series, turning
 
 Vector = tuple[float, float, float]

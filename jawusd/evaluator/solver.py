@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator.nearest import (
     INSIDE_MM,
     ITERATIONS,
@@ -26,7 +27,6 @@ from jawusd.evaluator.nearest import (
     TOLERANCE_MM,
     TOUCHING_MM,
 )
-from jawusd.geometry.arrays import Array, Indices, Mask
 
 # (x (k, 3), row numbers (k,)) -> residuals (k, m) and their derivatives by x (k, m, 3)
 Residual = Callable[[Array, Indices], tuple[Array, Array]]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.errors import EvaluatorError
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
+from jawusd.base.errors import EvaluatorError
 
 _FEWEST_FRAMES = 30
 # Sums of the squared coefficients of first, second and fourth differences: the variance there of noise of variance 1.

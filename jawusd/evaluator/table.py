@@ -7,10 +7,10 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array, Indices
 from jawusd.evaluator.batching import as_rows, in_chunks
 from jawusd.evaluator.motions import motions_from_twists
 from jawusd.evaluator.single import motion_matrix, motion_of_twist
-from jawusd.geometry.arrays import Array, Indices
 
 _SINGLE_LIMIT_MM = 1e4
 

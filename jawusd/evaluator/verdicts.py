@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.formula import ON_BOUND_MM
-from jawusd.geometry.arrays import Array, Mask
 
 # A matrix written with 5 decimals or kept in half precision is rigid to about this; sheared or scaled ones are not.
 RIGID_TOLERANCE = 1e-3

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.geometry.arrays import Array, Mask
 
 INSET_MM = 0.01  # what is drawn inside ends this far below the surface, so that lines between samples stay inside
 

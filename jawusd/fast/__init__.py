@@ -1,6 +1,6 @@
 """The rig's functions compiled with numba: the same results to 1e-10, several times faster."""
 
-from jawusd.errors import MissingDependencyError
+from jawusd.base.errors import MissingDependencyError
 
 try:
     import numba  # noqa: F401

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.nearest import (
     INSIDE_MM,
     ITERATIONS,
@@ -29,7 +30,6 @@ from jawusd.fast.hull import signed_distance_curvature, signed_distance_gradient
 from jawusd.fast.motion import Scratch, motion_by_displacement, motion_derivative
 from jawusd.fast.packing import SIDES
 from jawusd.fast.rigid import Vector, device, solve
-from jawusd.geometry.arrays import Array
 
 PARAMETERS, DISPLACEMENT, POINT = 0, 1, 2  # charts: x is d, the incisal displacement u, or d compared as it is
 

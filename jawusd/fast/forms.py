@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from math import sqrt
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import derivatives
 from jawusd.evaluator.derivatives import gradient_by_u, spline_input
 from jawusd.evaluator.formula import GaugeNumbers
 from jawusd.fast.packing import ARCH, COUNT, CURVES, DROP, FADE, LINEAR, OFFSET, PATH, SCALES, SOFTNESS, SPLINE
 from jawusd.fast.rigid import FLOATS, Vector, device, interval, summing
-from jawusd.geometry.arrays import Array
 
 
 @device

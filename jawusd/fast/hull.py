@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from math import exp, log
 
+from jawusd.base.arrays import Array
 from jawusd.fast.packing import HULL, MARGIN, ROUNDING, SIDES
 from jawusd.fast.rigid import Vector, device, interval
-from jawusd.geometry.arrays import Array
 
 _NEGLIGIBLE = 45.0  # exp(-45) = 3e-20: shares below it change nothing
 

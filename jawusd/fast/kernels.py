@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.batching import usable_rows
 from jawusd.evaluator.kernels import RigParts
 from jawusd.evaluator.verdicts import Limits, Verdicts
 from jawusd.fast import rows
 from jawusd.fast.descent import PARAMETERS, POINT
 from jawusd.fast.packing import packed_bound, packed_model
-from jawusd.geometry.arrays import Array
 
 
 class CompiledKernels:

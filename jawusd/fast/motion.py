@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.fast.forms import displacement, spline, spline_derivative, summed_curves
 from jawusd.fast.packing import ADDITIVE_KIND, CLOSED, COUNT, FROM_ANATOMICAL, INCISOR, KIND
 from jawusd.fast.rigid import Vector, coefficient_slopes, device, inverse_coefficient, move, product, rotate
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import angle_coefficients, apply_series, cross, dot
 
 

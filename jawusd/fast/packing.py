@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.glide import GlideTable
 from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED, KINDS
-from jawusd.geometry.arrays import Array
 
 # the model, every kind
 KIND = 0  # place of the kind in `schema.KINDS`

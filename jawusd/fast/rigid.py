@@ -10,10 +10,10 @@ from typing import cast
 import numba
 from numba.extending import register_jitable
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import derivatives
 from jawusd.evaluator.derivatives import Elementary
 from jawusd.geometry import rodrigues
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import angle_coefficients, apply_series, dot, turning
 
 Vector = tuple[float, float, float]

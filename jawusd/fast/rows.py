@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.batching import LARGEST
 from jawusd.fast.compiling import compiled
 from jawusd.fast.descent import Problem, descend_inside, edge_scratch, normal_scratch
@@ -19,7 +20,6 @@ from jawusd.fast.motion import logarithm, logarithm_derivative, pose, scratch
 from jawusd.fast.packing import ADJOINT
 from jawusd.fast.rigid import device
 from jawusd.fast.searches import NOT_FINITE, encoding_scratch, hull_scratch, judge, outside
-from jawusd.geometry.arrays import Array
 
 
 @device

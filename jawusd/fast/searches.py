@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.batching import LARGEST
 from jawusd.evaluator.formula import ON_BOUND_MM
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Reason
@@ -26,7 +27,6 @@ from jawusd.fast.packing import (
     VECTORS,
 )
 from jawusd.fast.rigid import device
-from jawusd.geometry.arrays import Array
 
 NOT_FINITE, _NOT_RIGID = Reason.NOT_FINITE.value, Reason.NOT_RIGID.value
 _OFF_MODEL, _OUTSIDE_BOUNDS = Reason.OFF_MODEL.value, Reason.OUTSIDE_BOUNDS.value

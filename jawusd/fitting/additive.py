@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import BSpline
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting.curves import MEASURED, Curve, in_millimetres
@@ -18,7 +19,6 @@ from jawusd.fitting.form import FittedForm
 from jawusd.fitting.gauge_fit import fit_gauge, fit_path
 from jawusd.fitting.spline import choose_smoothing, ridge_solve, within
 from jawusd.geometry import se3_log
-from jawusd.geometry.arrays import Array, Mask
 
 _PIECES = (8, 6, 6)  # polynomial pieces of the three curves
 _ROUNDS = 8

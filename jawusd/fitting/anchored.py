@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.models import AnchoredModel
 from jawusd.fitting.condylar import CondylarGuidance
@@ -21,7 +22,6 @@ from jawusd.fitting.form import FittedForm
 from jawusd.fitting.gauge_fit import fit_gauge, fit_path
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve, within
 from jawusd.geometry import make_transform, so3_log
-from jawusd.geometry.arrays import Array, Mask
 
 CENTRES = 80
 _ROUNDS = 4

@@ -20,8 +20,8 @@ from scipy.spatial import Delaunay, QhullError
 from shapely import MultiPoint, Polygon, polygons, union_all
 from shapely.geometry.polygon import orient
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.geometry.arrays import Array
 
 #: Names and columns of d of the planes of the alpha shapes.
 PLANES = {"polygon_d1d2": [0, 1], "polygon_d1d3": [0, 2]}

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.fitting.data import displacement
 from jawusd.geometry import so3_exp, so3_log
-from jawusd.geometry.arrays import Array, Mask
 
 _SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # make the polynomials' arguments of order one
 _DEGREE = 4

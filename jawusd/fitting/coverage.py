@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.gauge_fit import SMALLEST_OPENING_MM, fit_path
-from jawusd.geometry.arrays import Array, Mask
 
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
 

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jawusd.errors import FittingError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FittingError
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.fitting.coverage import PARAMETERS
 from jawusd.geometry import se3_exp, se3_left_jacobian
-from jawusd.geometry.arrays import Array, Mask
 
 #: A curve of some parameter t (n,): twists (n, 6) and their derivatives by t (n, 6); the twist is zero at t = 0.
 Curve = Callable[[Array], tuple[Array, Array]]

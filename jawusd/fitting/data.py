@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jawusd.errors import FittingError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FittingError
 from jawusd.evaluator.frames import motions_of_poses, poses_of_motions
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, transform_points
-from jawusd.geometry.arrays import Array, Mask
 
 #: Tracks, or frame numbers (F,) and poses T_skull_mandible (F, 4, 4) with NaN where there is none.
 Source = Tracks | tuple[ArrayLike, ArrayLike]

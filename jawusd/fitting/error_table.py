@@ -9,11 +9,11 @@ from scipy.optimize import linprog
 from scipy.sparse import eye_array, hstack
 from scipy.spatial import cKDTree
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.models import JawModelForm
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.form import FittedForm
 from jawusd.geometry import LANDMARKS, transform_point
-from jawusd.geometry.arrays import Array, Mask
 
 Refit = Callable[[TrainingData], FittedForm]
 #: Mean, median, p95, max [mm] and number of frames of each column.

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.errors import FittingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.formats.arkit import FaceCapture, shares_of
 from jawusd.formats.arkit_mapping import ArkitMapping, moved_terms
 from jawusd.geometry import transform_points
-from jawusd.geometry.arrays import Array
 
 _REST_SHARE = 0.1  # of the frames: those nearest to the closed bite show the neutral weights
 _DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # tried for each weight

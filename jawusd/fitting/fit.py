@@ -10,7 +10,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from jawusd.errors import EvaluatorError, FittingError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import EvaluatorError, FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting.additive import fit_additive
 from jawusd.fitting.anatomy_gate import AnatomyWarning, check_anatomy
@@ -24,10 +25,9 @@ from jawusd.fitting.form import FittedForm
 from jawusd.fitting.pca import fit_pca
 from jawusd.fitting.screening import screened
 from jawusd.formats.model import JawModel
-from jawusd.geometry.arrays import Array, Mask
 
 if TYPE_CHECKING:
-    from jawusd.fitting.nlpca import Nlpca
+    from jawusd.paper.nlpca import Nlpca
 
 #: Called with the steps done and the steps in all.
 Progress = Callable[[int, int], None]
@@ -160,7 +160,7 @@ def fit_form(
         return fit_additive(data, shown, config.trim_mad)
     if config.method == "pca":
         return fit_pca(data, shown)
-    from jawusd.fitting.paper import fit_paper
+    from jawusd.paper.model import fit_paper
 
     return fit_paper(data, shown, config.literal, config.starts, config.seed, nets)
 

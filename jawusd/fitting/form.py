@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from jawusd.base.arrays import Mask
 from jawusd.evaluator.models import JawModelForm
-from jawusd.geometry.arrays import Mask
 
 
 @dataclass(frozen=True, eq=False)

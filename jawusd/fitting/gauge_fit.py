@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.gauge import Gauge
-from jawusd.geometry.arrays import Array, Mask
 
 SOFTNESS_MM = 2.0  # rounding of the arch across d2 = 0, for smooth motion of the slider there
 FADE_MM = 14.0  # opening at which tooth guidance has faded to 1/e

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
+from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.glide import GlideTable
@@ -20,9 +21,8 @@ from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
 from jawusd.fitting.coverage import PARAMETERS
 from jawusd.fitting.gauge_fit import SMALLEST_MINOR, smallest_minor
 from jawusd.formats.model import JawModel
-from jawusd.geometry.arrays import Array, Indices, Mask
 from jawusd.geometry.se3 import make_transform
-from jawusd.imaging.contact import Teeth
+from jawusd.meshes.contact import Teeth
 
 _STEP_MM = 0.5  # between knots: cusps and fossae are a few times as wide
 _BEYOND_MM = 1.5  # outside the captured parameters, still measured

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.distances import carried, landmark_vectors
 from jawusd.evaluator.encoding import nearest_in_chart
 from jawusd.evaluator.models import JawModelForm
 from jawusd.geometry import hat, make_transform
-from jawusd.geometry.arrays import Array
 
 _TOGETHER = 32  # poses whose displacements are computed at once
 _EVERY = 32  # of the extreme points, one is looked at for a lower bound

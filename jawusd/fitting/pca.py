@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from jawusd.errors import FittingError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FittingError
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting.curves import MEASURED, straight, translation
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.form import FittedForm
 from jawusd.fitting.metric import velocity_of
 from jawusd.geometry import se3_log
-from jawusd.geometry.arrays import Array, Mask
 
 _LARGEST_CONDITION = 1e3
 

@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.fitting.data import Selection, TrainingData
 from jawusd.geometry import so3_log
-from jawusd.geometry.arrays import Array, Indices, Mask
 
 _FEWEST = 60  # poses needed to identify outliers
 _TRIALS, _SAMPLE = 300, 15  # random samples; each somewhat above the ten unknowns per component

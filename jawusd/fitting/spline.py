@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from jawusd.geometry.arrays import Array, Indices, Mask
+from jawusd.base.arrays import Array, Indices, Mask
 
 _RANK = 1e-9  # singular values below this share of the largest count as zero
 _TIE_DIGITS = 9

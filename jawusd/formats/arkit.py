@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FormatError
-from jawusd.geometry.arrays import Array
-from jawusd.tables import TextTable, check_width, read_table
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
+from jawusd.base.tables import TextTable, check_width, read_table
 
 JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
 _TIME, _COUNT = "timecode", "blendshapecount"

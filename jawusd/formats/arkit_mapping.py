@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from jawusd.base.arrays import Array
+from jawusd.base.tables import read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_model
-from jawusd.geometry.arrays import Array
-from jawusd.tables import read_text
 
 _MAX_BYTES = 1 << 20
 _WITHIN = "numbers within +-10000"

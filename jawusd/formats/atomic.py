@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jawusd.errors import OutputError, shown
+from jawusd.base.errors import OutputError, shown
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -9,14 +9,14 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from jawusd.errors import FormatError, JawusdError, UnitsError
+from jawusd.base.errors import FormatError, JawusdError, UnitsError
+from jawusd.base.npz import check_format
 from jawusd.formats.capture_errors import problems_of
 from jawusd.formats.capture_keys import Key, KeyEntry, entries
 from jawusd.formats.capture_parts import Boards, CameraSource, Scans, Strict
 from jawusd.formats.capture_paths import resolve_paths, similar_names
 from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
-from jawusd.npz import check_format
 
 FAMILY, VERSION = "jawusd-capture", 1
 _MOST_PICKS = 200  # on a row of teeth; the triples of them, of which some are tried, grow with the third power

@@ -10,10 +10,10 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from jawusd.errors import FormatError, OutputError
+from jawusd.base.errors import FormatError, OutputError
+from jawusd.base.inputs import check_input
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.capture import Bootstrap
-from jawusd.inputs import check_input
 
 _TABLE = "bootstrap"
 
@@ -30,7 +30,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
     check_input(path)
     try:
         data = path.read_bytes()
-        encoding = json.detect_encoding(data)  # as `jawusd.tables.read_text` does, and keeps
+        encoding = json.detect_encoding(data)  # as `jawusd.base.tables.read_text` does, and keeps
         text = data.decode(encoding)
         found = tomllib.loads(text).get(_TABLE)
         there = None if found is None else Bootstrap.model_validate(found)

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel
 
-from jawusd.errors import CaptureError, JawusdError
+from jawusd.base.errors import CaptureError, JawusdError
 from jawusd.formats.capture_errors import Location, place
 from jawusd.formats.file_kinds import wrong_kind
 from jawusd.formats.numbered import is_pattern

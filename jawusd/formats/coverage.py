@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry.arrays import Array
 
 _APART_S = 0.5  # neighbours show the same trouble
 

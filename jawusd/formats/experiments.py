@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.atomic import write_csv_atomic
-from jawusd.geometry.arrays import Array
 
 TABLE_COLUMNS = ("experiment", "model", "quantity", "count", "mean_mm", "median_mm", "p95_mm", "max_mm")
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator
 
-from jawusd.errors import shown
+from jawusd.base.errors import shown
 
 Severity = Literal["error", "warning", "note"]
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import continuous_wxyz
 
 _MM = 1e-3  # in metres

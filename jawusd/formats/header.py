@@ -8,7 +8,7 @@ from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 
 T = TypeVar("T")
 #: Frames that a camera is off by.

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import wxyz_from_matrix
 
 _COLUMNS = "shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,qz,clamped_mm"

@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from jawusd.base.arrays import Array
+from jawusd.base.tables import read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_model
-from jawusd.geometry.arrays import Array
-from jawusd.tables import read_text
 
 #: Keys are written out frame by frame: an hour at 60 per second fits.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9

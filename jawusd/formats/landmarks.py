@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError, UnitsError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, UnitsError
+from jawusd.base.npz import check_format
 from jawusd.formats.text import parse_json, read_text
 from jawusd.geometry import LANDMARKS, rigidity_defect
-from jawusd.geometry.arrays import Array
-from jawusd.npz import check_format
 
 FAMILY, VERSION = "jawusd-landmarks", 1
 _RIGID_TOLERANCE = 1e-6

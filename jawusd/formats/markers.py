@@ -1,6 +1,6 @@
 """Tables of marker positions, as optical systems write them.
 
-Tables, one row of x, y, z of every marker per frame, frames numbered from 0, of any locale (see `jawusd.tables`):
+Tables, one row of x, y, z of every marker per frame, frames numbered from 0, of any locale (see `jawusd.base.tables`):
 
 * numbers alone, as Northern Digital's `opto2ascii` writes them;
 * a probe of ArtiSynth (Modelling Guide, "Numeric probes", text format): `start stop scale`, then `interpolation size
@@ -22,10 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError, UnitsError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, UnitsError
+from jawusd.base.tables import read_text, split_rows, to_numbers
 from jawusd.formats.numbered import is_pattern, numbered_files
-from jawusd.geometry.arrays import Array
-from jawusd.tables import read_text, split_rows, to_numbers
 
 READ = (
     "Read are C3D, TSV of Qualisys Track Manager (3D), TRC, CSV of Vicon Nexus (Trajectories), probes of ArtiSynth, "

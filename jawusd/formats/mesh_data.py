@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CaptureError
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError
 
 Indices = NDArray[np.int64]
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import CaptureError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError
 from jawusd.formats.mesh_data import (
     COPY_AGAIN,
     Indices,
@@ -23,7 +24,6 @@ from jawusd.formats.mesh_data import (
     cut_polygons,
     read_mesh_bytes,
 )
-from jawusd.geometry.arrays import Array
 
 _MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)

@@ -14,7 +14,8 @@ from struct import Struct
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CaptureError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError
 from jawusd.formats.mesh_data import (
     Indices,
     MeshData,
@@ -24,7 +25,6 @@ from jawusd.formats.mesh_data import (
     cut_polygons,
     read_mesh_bytes,
 )
-from jawusd.geometry.arrays import Array
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
 _TYPES |= {"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import CaptureError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError
 from jawusd.formats.mesh_data import COPY_AGAIN, MOST_TRIANGLES, MeshData, check_count, cut_off, read_mesh_bytes
-from jawusd.geometry.arrays import Array
 
 _HEADER = 84
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

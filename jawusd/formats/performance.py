@@ -9,8 +9,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.geometry.arrays import Array, Mask
 
 HEADER = ("frame", "time_s", "d1", "d2", "d3", "sigma1", "sigma2", "sigma3", "margin_mm", "verdict", "state")
 

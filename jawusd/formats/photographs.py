@@ -6,9 +6,9 @@ import json
 import os
 from dataclasses import dataclass
 
+from jawusd.base.arrays import Array
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
-from jawusd.geometry.arrays import Array
 
 FORMAT = "jawusd-photos/1"
 

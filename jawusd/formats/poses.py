@@ -1,4 +1,4 @@
-"""Poses and parameters as tables: CSV of any locale (see `jawusd.tables`) with a header, or JSON alike.
+"""Poses and parameters as tables: CSV of any locale (see `jawusd.base.tables`) with a header, or JSON alike.
 
 Poses:      frame, m00, m01, ... m33   (row-major T_skull_mandible [mm])
         or  frame, tx, ty, tz, qw, qx, qy, qz   (scalar-first quaternion)
@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FormatError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
+from jawusd.base.tables import TextTable, read_table, read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_json
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
-from jawusd.geometry.arrays import Array
-from jawusd.tables import TextTable, read_table, read_text
 
 MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError
-from jawusd.geometry.arrays import Array
-from jawusd.tables import read_text
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
+from jawusd.base.tables import read_text
 
 _MAX_BYTES = 1 << 24
 _RIG_COUNT = "number of markers"

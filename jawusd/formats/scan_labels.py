@@ -18,10 +18,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
+from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.mesh import BASE, Mesh
-from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
 
 FAMILY, VERSION = "jawusd-scan-labels", 1
 SUFFIX = ".labels.npz"

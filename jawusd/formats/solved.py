@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FormatError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FormatError
+from jawusd.base.npz import NamedArrays, take
 from jawusd.formats.performance import SolveState
-from jawusd.geometry.arrays import Array, Mask
-from jawusd.npz import NamedArrays, take
 
 _PREFIX = "solved_"
 

@@ -11,9 +11,9 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
+from jawusd.base.tables import read_text
 from jawusd.formats.capture_keys import table_model
-from jawusd.tables import read_text
 
 Model = TypeVar("Model", bound=BaseModel)
 

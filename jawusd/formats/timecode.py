@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 
-from jawusd.errors import CaptureError
+from jawusd.base.errors import CaptureError
 
 _CODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.,])(\d{2,3})")
 _PER_DAY_HOURS = 24

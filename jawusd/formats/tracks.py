@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
-from jawusd.errors import FormatError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FormatError
+from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.header import TracksHeader, check_header
 from jawusd.formats.solved import SolvedJaw, take_solved
 from jawusd.geometry import LANDMARKS, rigidity_defect
-from jawusd.geometry.arrays import Array, Mask
-from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
 
 FAMILY, VERSION = "jawusd-tracks", 1
 

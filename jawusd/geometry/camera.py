@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_points
 
 _ALLOWED_COEFFICIENTS = (0, 4, 5, 8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.geometry.so3 import so3_exp
 
 _SAMPLES = 400

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 
 _PARALLEL = 1e-12  # determinant below which a ray runs along a triangle
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.geometry.se3 import make_transform, transform_points
 
 _FLATTEST = 1e-6  # of points in a line: their second extent over the first

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.geometry.so3 import hat, so3_exp, so3_left_jacobian, so3_left_jacobian_inverse, so3_log
 
 # Below this angle [rad] the coupling block uses its series; the closed form loses digits like a^-5 there.

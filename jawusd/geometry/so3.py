@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import rodrigues
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, angle_quotients, angle_series, turning
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 
 
 def welded(points: Array) -> tuple[Array, NDArray[np.int64]]:

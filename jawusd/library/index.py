@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError, JawusdError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, JawusdError
+from jawusd.base.npz import check_format
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.geometry import LANDMARKS, landmark_frame, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.library.transport import Donor, condylar_distance_mm, condyle_incisor_mm
-from jawusd.npz import check_format
 
 FAMILY, VERSION = "jawusd-library", 1
 INDEX_FILE = "library.json"

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.errors import FittingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FittingError
 from jawusd.geometry import LANDMARKS, rigid_fit, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.library.transport import Donor, displacements, landmark_distance_mm
 
 # Landmark distances [mm] at which a person's weight falls to exp(-1/2); inf: equal weights.

@@ -14,7 +14,7 @@ from collections import deque
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.base.arrays import Array, Mask
 
 STILL_MM = 1e-6  # a smaller step of the original has no direction
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.geometry import landmark_frame, rigid_fit, transform_points
-from jawusd.geometry.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import RigError, explain_missing_packages
+from jawusd.base.errors import RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
@@ -60,8 +60,8 @@ def bake_subject(
         RigError, OutputError: the rig cannot be written.
     """
     from jawusd.fitting.speeds import with_speeds
-    from jawusd.imaging.decimation import bone_proxy_of, proxy_of
-    from jawusd.imaging.mesh_cleaning import manifold
+    from jawusd.meshes.decimation import bone_proxy_of, proxy_of
+    from jawusd.meshes.mesh_cleaning import manifold
     from jawusd.rig.bake import bake_rig
     from jawusd.rig.layout import prim_name_of
 

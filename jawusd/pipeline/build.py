@@ -9,7 +9,7 @@ from pathlib import Path
 
 from typing_extensions import TypedDict
 
-from jawusd.errors import explain_missing_packages, naming_file
+from jawusd.base.errors import explain_missing_packages, naming_file
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import load_model, save_model

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, NotRequired, cast
 
 from typing_extensions import TypedDict
 
-from jawusd.errors import SyncError, TrackingError, explain_missing_packages, naming_file
+from jawusd.base.errors import SyncError, TrackingError, explain_missing_packages, naming_file
+from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.calibration import save_calibration
 from jawusd.formats.capture import Capture
 from jawusd.formats.clip_source import ClipSource
 from jawusd.formats.header import Frames

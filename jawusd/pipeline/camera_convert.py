@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import OutputError
-from jawusd.formats.calibration import save_calibration
-from jawusd.formats.camera_files import lacks_sizes, load_cameras_file
-from jawusd.formats.camera_write import save_colmap
+from jawusd.base.errors import OutputError
+from jawusd.cameras.calibration import save_calibration
+from jawusd.cameras.colmap_write import save_colmap
+from jawusd.cameras.files import lacks_sizes, load_cameras_file
 from jawusd.geometry import Camera
 
 Size = tuple[int, int]
@@ -56,7 +56,7 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
     """Read cameras and write them in mm: .toml for aniposelib, .usda for OpenUSD, a folder for COLMAP.
 
     Args:
-        source: see `formats.camera_files.load_cameras_file`; or a stage.
+        source: see `cameras.files.load_cameras_file`; or a stage.
         out: what to write.
         unit_mm: length of the source's unit.
         size: (width, height) [px] of the pictures, for formats that do not say.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from jawusd.errors import CalibrationError, explain_missing_packages
-from jawusd.formats.camera_parts import plain_name
+from jawusd.base.errors import CalibrationError, explain_missing_packages
+from jawusd.cameras.parts import plain_name
 from jawusd.formats.capture import CameraSource, Capture
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
@@ -76,14 +76,14 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
 
 
 def _recorded_sizes(capture: Capture) -> dict[str, Size]:
-    from jawusd.imaging.footage import open_clip
+    from jawusd.media.footage import open_clip
 
     return {camera.name: open_clip(camera.clip).size_px for camera in capture.cameras if camera.clip is not None}
 
 
 def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) -> Camera:
-    from jawusd.imaging.footage import open_clip
-    from jawusd.imaging.masks import mask_size_px
+    from jawusd.media.footage import open_clip
+    from jawusd.media.masks import mask_size_px
 
     aspect = 1.0
     if source.clip is not None:

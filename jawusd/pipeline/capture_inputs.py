@@ -6,8 +6,8 @@ import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from jawusd.errors import CaptureError
-from jawusd.formats.camera_files import calibration_files
+from jawusd.base.errors import CaptureError
+from jawusd.cameras.files import calibration_files
 from jawusd.formats.capture import Capture, load_capture
 from jawusd.formats.numbered import is_pattern, numbered_files
 from jawusd.formats.scan_labels import labels_path

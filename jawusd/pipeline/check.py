@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TypedDict
 
-from jawusd.errors import CaptureError, JawusdError
+from jawusd.base.errors import CaptureError, JawusdError
 from jawusd.formats.capture import Capture, read_capture
 from jawusd.formats.finding import Finding, Severity
 from jawusd.pipeline.check_parts import Parts, found_error

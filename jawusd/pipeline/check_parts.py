@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal
 
-from jawusd.errors import JawusdError
+from jawusd.base.errors import JawusdError
 from jawusd.formats.capture import CameraSource, Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
@@ -17,8 +17,8 @@ from jawusd.formats.numbered import is_pattern
 from jawusd.geometry import Camera
 
 if TYPE_CHECKING:
-    from jawusd.imaging.clip import Clip
-    from jawusd.imaging.mask_samples import MaskSamples
+    from jawusd.media.clip import Clip
+    from jawusd.media.mask_samples import MaskSamples
     from jawusd.tracking.contour.scan import Scan
 
 Size = tuple[int, int]

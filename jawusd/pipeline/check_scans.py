@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jawusd.errors import JawusdError
+from jawusd.base.errors import JawusdError
 from jawusd.formats.finding import Finding
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.check_parts import Parts, found_error
@@ -21,7 +21,7 @@ _CONDYLES_MM = (75.0, 140.0)  # distance of the condyle centres: adults have abo
 
 def scans(parts: Parts) -> Iterator[Finding]:
     """Read every mesh, label the scans and prepare them."""
-    from jawusd.imaging.meshio import load_mesh
+    from jawusd.meshes.meshio import load_mesh
     from jawusd.tracking.contour.scan import ARCH_NAMES, prepare_scan
 
     given = parts.given.scans

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import CaptureError, JawusdError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError, JawusdError
 from jawusd.formats.finding import Finding, Severity
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
 from jawusd.pipeline.check_parts import Parts, found_error
 
@@ -24,8 +24,8 @@ _CROWN_POINTS = 6000
 
 def clips(parts: Parts) -> Iterator[Finding]:
     """Open every clip and decode three pictures of it."""
-    from jawusd.imaging.clip_checks import decoded_findings, rate_findings
-    from jawusd.imaging.footage import open_clip
+    from jawusd.media.clip_checks import decoded_findings, rate_findings
+    from jawusd.media.footage import open_clip
 
     for camera in parts.given.cameras:
         if camera.clip is None or not parts.usable(camera.clip.path):
@@ -89,8 +89,8 @@ def _rescaled(parts: Parts) -> Iterator[Finding]:
 
 def boards(parts: Parts) -> Iterator[Finding]:
     """Open the board clips, where a calibration must be made from them."""
-    from jawusd.imaging.clip_checks import decoded_findings
-    from jawusd.imaging.footage import open_clip
+    from jawusd.media.clip_checks import decoded_findings
+    from jawusd.media.footage import open_clip
 
     capture = parts.given
     if capture.boards is None or capture.calibration is not None:
@@ -119,9 +119,9 @@ def boards(parts: Parts) -> Iterator[Finding]:
 
 def masks(parts: Parts) -> Iterator[Finding]:
     """Look at some masks of every camera."""
-    from jawusd.imaging.mask_samples import sample_masks
-    from jawusd.imaging.mask_survey import survey_masks
-    from jawusd.imaging.masks import mask_size_px
+    from jawusd.media.mask_samples import sample_masks
+    from jawusd.media.mask_survey import survey_masks
+    from jawusd.media.masks import mask_size_px
 
     capture = parts.given
     sources = [camera for camera in capture.cameras if camera.masks is not None]

@@ -9,24 +9,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from typing_extensions import TypedDict
 
-from jawusd.errors import RigError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM, ContactField
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.report import ContactPicture
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.meshes import BONES
 from jawusd.pipeline.scan_labels import TEETH
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import Subject
 
 if TYPE_CHECKING:
-    from jawusd.imaging.contact import Teeth
-    from jawusd.imaging.joints import Joints
+    from jawusd.meshes.contact import Teeth
+    from jawusd.meshes.joints import Joints
 
 _QUALITY = 88  # of the pictures, JPEG
-_FARTHEST_MM = 1.5  # distances that are measured, see `imaging.collision`
+_FARTHEST_MM = 1.5  # distances that are measured, see `meshes.collision`
 
 
 class ContactSummary(TypedDict, total=False):
@@ -74,8 +74,8 @@ def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture,
     Raises:
         RigError: The scans do not show them.
     """
-    from jawusd.imaging.contact_map import ContactMap
-    from jawusd.imaging.overlay import encode_jpeg
+    from jawusd.media.overlay import encode_jpeg
+    from jawusd.meshes.contact_map import ContactMap
 
     rig = JawRig(model.arrays, model.meta)
     drawn, closed = ContactMap(teeth_of(rig, subject.meshes)), rig.ranges(0.0)
@@ -102,7 +102,7 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
     Raises:
         RigError: The rig has no clearances, or the meshes do not show how the teeth meet.
     """
-    from jawusd.imaging.contact import NoContact, find_teeth
+    from jawusd.meshes.contact import NoContact, find_teeth
 
     missing = [name for name in TEETH.values() if name not in meshes]
     if rig.contact is None or missing:
@@ -120,7 +120,7 @@ def meeting_teeth(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest:
     Args:
         meshes: Scans and bones, registered as the poses are.
     """
-    from jawusd.imaging.contact import NoContact, find_teeth
+    from jawusd.meshes.contact import NoContact, find_teeth
 
     if any(name not in meshes for name in TEETH.values()):
         return "there are no scans of both rows of teeth"
@@ -134,8 +134,8 @@ def meeting_joints(
     meshes: Mapping[str, Mesh], T_anatomical_skull: Array, landmarks: Array, T_rest: Array
 ) -> Joints | str:
     """Return condyles and skull among meshes as solids, or why there are none; see `meeting_teeth`."""
-    from jawusd.imaging.contact import NoContact
-    from jawusd.imaging.joints import find_joints
+    from jawusd.meshes.contact import NoContact
+    from jawusd.meshes.joints import find_joints
 
     if any(name not in meshes for name in BONES):
         return "there are no meshes of both skull and mandible"
@@ -157,7 +157,7 @@ def with_teeth(
         regauge: Count d1 from where the teeth touch, and end the bound there.
     """
     from jawusd.fitting.glide import follow_teeth
-    from jawusd.imaging.contact import sample_field
+    from jawusd.meshes.contact import sample_field
 
     if isinstance(teeth, str):
         return _known(model, "contact", {"missing": teeth})
@@ -178,8 +178,8 @@ def with_joints(model: JawModel, joints: Joints | str, progress: Progress = no_p
     Args:
         joints: Those of the person, see `meeting_joints`.
     """
-    from jawusd.imaging.contact import sample_field
-    from jawusd.imaging.joints import STEP_MM
+    from jawusd.meshes.contact import sample_field
+    from jawusd.meshes.joints import STEP_MM
 
     if isinstance(joints, str):
         model = _known(model, "joints", {"missing": joints})

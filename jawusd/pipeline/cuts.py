@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import Camera, transform_points
-from jawusd.geometry.arrays import Array
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from jawusd import __version__
-from jawusd.guard import SETTING, machine_memory, memory_limit
+from jawusd.base.guard import SETTING, machine_memory, memory_limit
 
 _NEEDED_TO_BUILD = ("build",)
 _NEEDED_CODECS = ("h264", "ffv1", "png")
@@ -115,7 +115,7 @@ def _cores() -> int:
 def _graphics() -> str:
     if find_spec("moderngl") is None:
         return "not looked for: moderngl is not installed (extra: demo); only `demo` and `--backend gl` need it"
-    from jawusd.imaging.gl import describe_graphics
+    from jawusd.paper.gl import describe_graphics
 
     return describe_graphics()
 
@@ -123,7 +123,7 @@ def _graphics() -> str:
 def _codecs() -> dict[str, bool]:
     if find_spec("av") is None:
         return {}
-    from jawusd.imaging.codecs import decodable
+    from jawusd.media.codecs import decodable
 
     return decodable()
 

@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
-from jawusd.errors import FormatError, explain_missing_packages
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, explain_missing_packages
 from jawusd.formats.model import JawModel
 from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.contact import (
     ContactSummary,
     contact_words,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import Camera, relative_pose, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.cuts import Cutter
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject

@@ -12,12 +12,12 @@ from typing import cast
 
 import numpy as np
 
-from jawusd.errors import EvaluatorError, FormatError, OutputError, explain_missing_packages
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import EvaluatorError, FormatError, OutputError, explain_missing_packages
 from jawusd.evaluator import JawRig, load
 from jawusd.evaluator.sections import SMALLEST_REACH_MM
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.model import JawModel, load_model, save_model
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.library.index import MODEL_FILE, Entry, Library, load_donors, scan_library
 from jawusd.library.personal import PersonalMotion, leave_one_out, personal_motion
 from jawusd.library.timing import follow

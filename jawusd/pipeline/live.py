@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import jawusd
-from jawusd.errors import CaptureError, explain_missing_packages, naming_file
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
-from jawusd.geometry.arrays import Array
-from jawusd.imaging import live_clock
+from jawusd.media import live_clock
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
@@ -30,7 +30,7 @@ from jawusd.pipeline.solve_pictures import PreparedTeeth, VideoOptions, VideoSho
 from jawusd.pipeline.state import no_progress
 
 if TYPE_CHECKING:
-    from jawusd.imaging.live_source import LiveSource
+    from jawusd.media.live_source import LiveSource
     from jawusd.segmentation.footage import Pictures
     from jawusd.tracking.performance.attempts import FrameFit
     from jawusd.tracking.performance.coordinates import Pose
@@ -167,7 +167,7 @@ class _Follower:
     def __init__(
         self, capture: Capture, jaw: JawRig, sources: Mapping[str, str], fixed_head: bool, pool: Executor
     ) -> None:
-        from jawusd.imaging.live_source import LiveSource
+        from jawusd.media.live_source import LiveSource
         from jawusd.tracking.region.live import LiveTake
 
         self._capture, where = _with_sources(capture, sources)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError, explain_missing_packages
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, explain_missing_packages
+from jawusd.base.inputs import check_input
 from jawusd.formats.markers import MarkerTable, length_unit, mark_hidden, read_markers
 from jawusd.formats.rigid_bodies import RigidBody, read_body
 from jawusd.geometry import rigid_fits, se3_inverse
-from jawusd.geometry.arrays import Array
-from jawusd.inputs import check_input
 
 BODIES = ("head", "jaw")
 LENGTH_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}

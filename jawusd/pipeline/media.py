@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CaptureError, FormatError, explain_missing_packages
+from jawusd.base.errors import CaptureError, FormatError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.coverage import uncovered_percent, worst_frames
 from jawusd.formats.mesh import Mesh
@@ -22,8 +22,8 @@ from jawusd.pipeline.meshes import load_meshes, registered_meshes
 from jawusd.pipeline.state import Progress, make_folder
 
 if TYPE_CHECKING:
-    from jawusd.imaging.backdrop import Backdrop
-    from jawusd.imaging.clip import Clip
+    from jawusd.media.backdrop import Backdrop
+    from jawusd.media.clip import Clip
 
 _UNCOVERED, _UNCERTAIN = 3, 2  # frames shown for either reason; one typical frame is added, to compare with
 _MOST_CAMERAS = 4
@@ -39,7 +39,7 @@ def open_videos(capture: Capture) -> dict[str, Clip]:
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.
     """
-    from jawusd.imaging.footage import open_clip
+    from jawusd.media.footage import open_clip
 
     sources = {source.name: source.clip for source in capture.cameras if source.clip}
     if not sources:
@@ -76,7 +76,7 @@ def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Ba
     Raises:
         CaptureError: no camera has video or masks, or one cannot be decoded.
     """
-    from jawusd.imaging.backdrop import Backdrop
+    from jawusd.media.backdrop import Backdrop
 
     sources = [source for source in capture.cameras if source.video or source.masks]
     if not sources:
@@ -139,7 +139,7 @@ def draw_frames(
     Raises:
         CaptureError: a picture cannot be decoded.
     """
-    from jawusd.imaging.overlay import encode_jpeg, tracking_sheet
+    from jawusd.media.overlay import encode_jpeg, tracking_sheet
 
     shown = [cameras[name] for name in backdrops][:_MOST_CAMERAS]
     found = []
@@ -188,8 +188,8 @@ def write_plates(
         CaptureError, CalibrationError: see `open_footage`.
         OutputError: the files cannot be written.
     """
-    from jawusd.imaging.picture_sequence import PictureSequence
-    from jawusd.imaging.plates import PlateWriter
+    from jawusd.media.picture_sequence import PictureSequence
+    from jawusd.media.plates import PlateWriter
     from jawusd.rig.cameras import LIGHT_PLATE, PLATE
 
     cameras, videos = open_footage(capture)
@@ -242,6 +242,6 @@ def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
 
 
 def _small(mesh: Mesh) -> Mesh:
-    from jawusd.imaging.decimation import decimated
+    from jawusd.meshes.decimation import decimated
 
     return Mesh(*decimated(mesh.vertices, mesh.faces, min(_MOST_FACES, len(mesh.faces))))

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import explain_missing_packages
+from jawusd.base.arrays import Array
+from jawusd.base.errors import explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.scan_labels import TEETH, LabelledScan, label_teeth
 
 BONES = ("mandible", "skull")
@@ -51,7 +51,7 @@ def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
 @explain_missing_packages()
 def read_files(files: Mapping[str, Path]) -> dict[str, Mesh]:
     """Read mesh files by the names of `MESHES` as they are, without labels; raises CaptureError as `load_meshes`."""
-    from jawusd.imaging.meshio import load_mesh
+    from jawusd.meshes.meshio import load_mesh
 
     return {name: load_mesh(path, kind="bone" if name in BONES else "scan") for name, path in files.items()}
 

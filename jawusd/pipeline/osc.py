@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jawusd.errors import OutputError, explain_missing_packages
+from jawusd.base.errors import OutputError, explain_missing_packages
 
 if TYPE_CHECKING:
     from jawusd.pipeline.live import LiveFrame

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import explain_missing_packages
+from jawusd.base.errors import explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
@@ -20,8 +20,8 @@ from jawusd.pipeline.media import check_same_cameras, open_backdrops, open_foota
 from jawusd.pipeline.state import Progress, make_folder
 
 if TYPE_CHECKING:
-    from jawusd.imaging.backdrop import Backdrop
-    from jawusd.imaging.side_by_side import CameraWall
+    from jawusd.media.backdrop import Backdrop
+    from jawusd.media.side_by_side import CameraWall
 
 SHEET = "contact_sheet.png"
 #: Suffix of an overlay that is one video of all cameras.
@@ -68,8 +68,8 @@ def write_overlay(
 def _write_cameras(
     capture: Capture, offsets: Mapping[str, int], tracks: Tracks, folder: Path, progress: Progress
 ) -> None:
-    from jawusd.imaging.overlay import save_png, tracking_sheet
-    from jawusd.imaging.video_writer import VideoWriter
+    from jawusd.media.overlay import save_png, tracking_sheet
+    from jawusd.media.video_writer import VideoWriter
 
     cameras, videos = open_footage(capture, tracks)
     scans = tracked_scans(capture, tracks)
@@ -93,7 +93,7 @@ def _write_cameras(
 
 def _drawn(tracks: Tracks, backdrop: Backdrop, camera: Camera, scans: tuple[Mesh, Mesh]) -> Iterator[NDArray[np.uint8]]:
     """Yield the picture of every tracked frame, (h, w, 3) RGB."""
-    from jawusd.imaging.overlay import EMPTY_GRAY, draw_overlay, placed_scans
+    from jawusd.media.overlay import EMPTY_GRAY, draw_overlay, placed_scans
 
     for row, frame in enumerate(tracks.frames.tolist()):
         image = backdrop.picture(frame)
@@ -106,9 +106,9 @@ def _drawn(tracks: Tracks, backdrop: Backdrop, camera: Camera, scans: tuple[Mesh
 def _write_side_by_side(
     capture: Capture, offsets: Mapping[str, int], tracks: Tracks, path: Path, progress: Progress
 ) -> None:
-    from jawusd.imaging.overlay import placed_scans
-    from jawusd.imaging.status_bar import StatusBar
-    from jawusd.imaging.video_writer import VideoWriter
+    from jawusd.media.overlay import placed_scans
+    from jawusd.media.status_bar import StatusBar
+    from jawusd.media.video_writer import VideoWriter
 
     scans = tracked_scans(capture, tracks)
     wall = open_wall(capture, offsets, tracks, scans, TILE_PX)
@@ -135,7 +135,7 @@ def open_wall(
     Raises:
         CaptureError, CalibrationError: no camera has video or masks, or one cannot be read.
     """
-    from jawusd.imaging.side_by_side import CameraWall
+    from jawusd.media.side_by_side import CameraWall
 
     backdrops = open_backdrops(capture, offsets)
     cameras = {camera.name: camera for camera in tracked_cameras(load_cameras(capture), tracks)}

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CaptureError, explain_missing_packages
+from jawusd.base.errors import CaptureError, explain_missing_packages
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.photographs import AlignedPhotos, save_photographs
-from jawusd.imaging.meshio import load_mesh
-from jawusd.imaging.overlay import save_png
-from jawusd.imaging.pictures import read_gray
+from jawusd.media.overlay import save_png
+from jawusd.media.pictures import read_gray
+from jawusd.meshes.meshio import load_mesh
+from jawusd.photographs import Drawing, PhotoAlignment, align_photographs, read_lines, seen_outlines
 from jawusd.pipeline.state import Progress, no_progress
-from jawusd.tracking.photographs import Drawing, PhotoAlignment, align_photographs, read_lines, seen_outlines
 
 RESULT = "photos.json"
 _COLOURS = np.array([[60, 220, 60], [60, 160, 255]], np.uint8)  # upper, lower; red, green, blue

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import CameraSource, Capture
 from jawusd.pipeline.segment_record import with_masks
 from jawusd.pipeline.state import Progress

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from jawusd.errors import explain_missing_packages
+from jawusd.base.errors import explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.pipeline import build
 from jawusd.pipeline.build import BuildOptions
@@ -58,7 +58,7 @@ def _stages(capture: Capture) -> list[Stage[Mapping[str, object]]]:
 
 def _pictures(capture: Capture) -> int:
     """Return the number of pictures of all cameras that are processed."""
-    from jawusd.imaging.footage import open_clip
+    from jawusd.media.footage import open_clip
 
     counts = [open_clip(camera.clip).count for camera in capture.cameras if camera.clip is not None]
     frames = capture.frames[1] - capture.frames[0] if capture.frames else max(counts, default=300)

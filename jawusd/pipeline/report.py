@@ -12,7 +12,7 @@ from typing import NotRequired, TypeVar
 
 from typing_extensions import TypedDict
 
-from jawusd.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
+from jawusd.base.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.experiments import Experiments, save_table
 from jawusd.formats.finding import Finding, FoundJson
@@ -333,7 +333,7 @@ def do_experiments(
     """
     from jawusd.fitting import FittingConfig
     from jawusd.fitting.data import SubjectAnatomy
-    from jawusd.fitting.experiments import run_experiments
+    from jawusd.paper.experiments import run_experiments
 
     points = subject.measured_points()
     anatomy = SubjectAnatomy.of(subject.T_anatomical_skull, subject.landmarks, points, subject.T_rest)
@@ -355,7 +355,7 @@ def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
     Raises:
         OutputError: a file cannot be written.
     """
-    from jawusd.report import figures
+    from jawusd.paper import figures
 
     files = figures.draw_experiments(found, folder)
     save_table(folder / TABLE_FILE, found.table())
@@ -365,7 +365,7 @@ def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
 @explain_missing_packages()
 def experiment_files(folder: Path) -> list[Path]:
     """Return the files that `draw_experiments` writes into a folder."""
-    from jawusd.report.figures import FIGURES
+    from jawusd.paper.figures import FIGURES
 
     return [folder / f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")] + [folder / TABLE_FILE]
 

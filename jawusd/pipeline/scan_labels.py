@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import GUM, Mesh, painted_labels
 from jawusd.formats.scan_labels import ScanLabels, labels_path, load_scan_labels
-from jawusd.geometry.arrays import Array
 
 if TYPE_CHECKING:
-    from jawusd.imaging.scan_labels import Labelling
+    from jawusd.meshes.scan_labels import Labelling
 
 TEETH = {"upper": "upper_teeth", "lower": "lower_teeth"}
 
@@ -85,7 +85,7 @@ def _labelled(arch: str, mesh: Mesh, path: Path, file: Path | None, other: Array
 
 
 def _by_shape(arch: str, mesh: Mesh, path: Path, other: Array | None) -> LabelledScan:
-    from jawusd.imaging.scan_labels import label_scan
+    from jawusd.meshes.scan_labels import label_scan
 
     shape = label_scan(mesh, other)
     found = ScanLabels(shape.labels, "automatic", shape.weak_share)

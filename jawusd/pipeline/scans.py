@@ -10,7 +10,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import explain_missing_packages
+from jawusd.base.errors import explain_missing_packages
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.capture import Capture, Scans
 from jawusd.formats.mesh import Mesh, painted_labels, tooth_labels
@@ -139,7 +139,7 @@ def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: N
 
 def _stored(scan: LabelledScan, folder: Path | None) -> ScanSummary:
     """Write the labels that the shape gave, and sum up."""
-    from jawusd.imaging.scan_surface import ScanSurface
+    from jawusd.meshes.scan_surface import ScanSurface
 
     file = labels_path(scan.path, folder)
     if scan.origin == "shape" and scan.labels is not None:
@@ -162,8 +162,8 @@ def _stored(scan: LabelledScan, folder: Path | None) -> ScanSummary:
 
 
 def _draw(scans: Sequence[LabelledScan], summaries: Sequence[ScanSummary], capture: Capture, picture: Path) -> None:
-    from jawusd.imaging.label_picture import label_sheet
-    from jawusd.imaging.overlay import save_png
+    from jawusd.media.label_picture import label_sheet
+    from jawusd.media.overlay import save_png
 
     given = capture.anatomy.T_anatomical_skull
     crowns = [scan.mesh.vertices[tooth_labels(scan.mesh) > 0] for scan in scans]

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jawusd.errors import CaptureError, explain_missing_packages
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.capture_inputs import input_hashes
 from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.media import open_footage

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jawusd.errors import JawusdError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import JawusdError
+from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import relative_pose, se3_inverse, transform_points
-from jawusd.geometry.arrays import Array
-from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.pipeline.meshes import registration_of
 from jawusd.pipeline.segment_record import auto_masks_folder
 

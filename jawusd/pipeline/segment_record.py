@@ -15,13 +15,13 @@ from typing import NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FormatError, OutputError, explain_missing_packages
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, OutputError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.capture_parts import Masks
 from jawusd.formats.text import read_text
 from jawusd.formats.tracks import LOST
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.state import hash_value
 
 RECORD, SUMMARY, SHEET, LEARNED = "segment.jsonl", "segment.json", "look_at_these.png", "learned.json"

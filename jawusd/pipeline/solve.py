@@ -10,7 +10,7 @@ from typing import NotRequired, TypedDict, cast
 import numpy as np
 
 import jawusd
-from jawusd.errors import OutputError, RigError, explain_missing_packages, naming_file
+from jawusd.base.errors import OutputError, RigError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.capture import Capture

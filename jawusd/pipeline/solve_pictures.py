@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Bootstrap, CameraSource, Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.cuts import Cutter
 from jawusd.pipeline.media import open_videos
 from jawusd.pipeline.picture_search import LEAST_FIT, Begin, PictureSearch, outside, unseen_picks

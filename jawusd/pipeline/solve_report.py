@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError, OutputError, explain_missing_packages, naming_file
+from jawusd.base.errors import FormatError, OutputError, explain_missing_packages, naming_file
 from jawusd.formats.capture import Capture
 from jawusd.formats.coverage import worst_frames
 from jawusd.formats.performance import SolveState

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jawusd.errors import CaptureError, JawusdError, explain_missing_packages
+from jawusd.base.errors import CaptureError, JawusdError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture_template import BoardSketch, CameraSketch, CaptureSketch, capture_text
 from jawusd.pipeline.camera_convert import SameSize, read_calibration
@@ -19,7 +19,7 @@ from jawusd.pipeline.folder_files import FoundFiles, camera_names, find_files, p
 from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:
-    from jawusd.imaging.clip import Clip
+    from jawusd.media.clip import Clip
 
 _PICTURES = 5  # of a board clip that are looked at
 _USUAL_RATES = tuple(Fraction(n, d) for d in (1, 1001) for n in (24 * d, 25 * d, 30 * d, 50 * d, 60 * d, 120 * d)) + (
@@ -162,7 +162,7 @@ def _cameras(
 
 
 def _opened(folder: Path, clips: Sequence[PurePath], out: CaptureStart) -> dict[PurePath, Clip]:
-    from jawusd.imaging.footage import open_clip
+    from jawusd.media.footage import open_clip
 
     found: dict[PurePath, Clip] = {}
     for clip in clips:

@@ -17,12 +17,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Generic, TypeVar
 
-from jawusd.errors import FormatError, OutputError
+from jawusd.base.errors import FormatError, OutputError
+from jawusd.base.inputs import check_input, check_path
+from jawusd.base.npz import check_format
 from jawusd.formats.atomic import ELSEWHERE, clear_unfinished, destination, write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.text import parse_json, read_text
-from jawusd.inputs import check_input, check_path
-from jawusd.npz import check_format
 
 FAMILY, VERSION = "jawusd-build", 1
 BUILD_FILE = "build.json"

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.errors import CaptureError, explain_missing_packages
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.formats.model import load_model
 from jawusd.geometry import LANDMARKS, anatomical_frame, find_landmarks, landmark_frame, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.meshes import load_meshes, read_meshes, registered_meshes, registration_of
 
 

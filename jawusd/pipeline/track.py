@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NotRequired
 import numpy as np
 from typing_extensions import TypedDict
 
-from jawusd.errors import TrackingError, explain_missing_packages, naming_file
+from jawusd.base.errors import TrackingError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.coverage import used_coverage
@@ -138,8 +138,8 @@ def first_pass(
     Args:
         offsets: frame offset by camera.
     """
+    from jawusd.paper.take import track_capture_paper
     from jawusd.tracking import track_capture
-    from jawusd.tracking.paper.take import track_capture_paper
     from jawusd.tracking.region.strained import widen_strained
 
     with naming_file(capture.folder / "capture.toml"):

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-from jawusd.errors import CaptureError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError
 from jawusd.formats.capture import Bootstrap, CameraSource, Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.media import open_footage
 from jawusd.pipeline.picture_search import Begin, PictureSearch, outside, unseen_picks

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FormatError, OutputError, RigError, explain_missing_packages
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FormatError, OutputError, RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.pipeline.bake import DEFAULT_FPS
 from jawusd.pipeline.contact import teeth_of
 
 if TYPE_CHECKING:
-    from jawusd.imaging.contact_map import ContactMap
+    from jawusd.meshes.contact_map import ContactMap
     from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import Viewer
     from jawusd.viewer.viewed import Look, ViewedActor
@@ -91,7 +91,7 @@ class ContactView:
 
     @cached_property
     def _map(self) -> ContactMap:
-        from jawusd.imaging.contact_map import ContactMap
+        from jawusd.meshes.contact_map import ContactMap
         from jawusd.rig.geo import read_geometry
 
         return ContactMap(teeth_of(self._rig, read_geometry(self._path, self._prim)))

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import explain_missing_packages, naming_file
+from jawusd.base.arrays import Array
+from jawusd.base.errors import explain_missing_packages, naming_file
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.capture_edit import write_bootstrap
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras, tracked_cameras
 from jawusd.pipeline.capture_inputs import open_capture
@@ -30,9 +30,9 @@ from jawusd.pipeline.state import BuildState, Progress
 from jawusd.pipeline.subject import subject_of_capture
 
 if TYPE_CHECKING:
-    from jawusd.imaging.backdrop import Backdrop
-    from jawusd.imaging.overlay import PlacedScan
-    from jawusd.imaging.side_by_side import CameraWall
+    from jawusd.media.backdrop import Backdrop
+    from jawusd.media.overlay import PlacedScan
+    from jawusd.media.side_by_side import CameraWall
     from jawusd.viewer.server import CaptureViewer
     from jawusd.viewer.viewed import Look, ViewedCapture
 
@@ -83,7 +83,7 @@ def viewed_capture(
         CaptureError: there is no footage, or a file cannot be decoded.
         SyncError: the cameras cannot be aligned in time.
     """
-    from jawusd.imaging.side_by_side import CameraWall
+    from jawusd.media.side_by_side import CameraWall
     from jawusd.viewer.viewed import ViewedCapture
 
     path = Path(path)
@@ -192,7 +192,7 @@ class _Footage:
 
     def picture(self, name: str, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
         """Return a camera's picture at a frame of the reference camera, with the teeth drawn over it."""
-        from jawusd.imaging.overlay import EMPTY_GRAY, draw_overlay
+        from jawusd.media.overlay import EMPTY_GRAY, draw_overlay
 
         image = self.backdrops[name].picture(frame)
         if image is None:
@@ -214,7 +214,7 @@ class _Footage:
         return self.wall.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0), partly=partly)
 
     def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:
-        from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, arch_colours
+        from jawusd.media.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, arch_colours
 
         if poses is None or look == "footage":
             return []
@@ -224,7 +224,7 @@ class _Footage:
 
     def teeth_region(self, name: str, frame: int) -> tuple[float, float, float, float] | None:
         """Return left, top, right and bottom [px] of the masks of a camera at a frame, None without any."""
-        from jawusd.imaging.masks import open_masks
+        from jawusd.media.masks import open_masks
 
         source = next(camera for camera in self.capture.cameras if camera.name == name)
         if source.masks is None:

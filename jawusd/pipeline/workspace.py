@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from jawusd import __version__
-from jawusd.errors import CaptureError, JawusdError, OutputError
+from jawusd.base.errors import CaptureError, JawusdError, OutputError
 from jawusd.formats.capture import Capture
 from jawusd.pipeline.capture_inputs import InputWatch
 from jawusd.pipeline.memory import give_back_memory

@@ -9,8 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from jawusd.errors import FormatError, MissingDependencyError
-from jawusd.inputs import check_input
+from jawusd.base.errors import FormatError, MissingDependencyError
+from jawusd.base.inputs import check_input
 
 #: Files that Blender reads for jawusd.
 SUFFIXES = (".fbx", ".glb", ".gltf")

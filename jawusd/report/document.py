@@ -14,20 +14,20 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
-from jawusd.errors import shown
+from jawusd.base.errors import shown
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.contact import DEEP, TOUCHING
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
-from jawusd.report.facts import TracksFacts, model_facts, sync_facts, tracks_facts
-from jawusd.report.figures import (
+from jawusd.paper.figures import (
     condyle_figure,
     coverage_figure,
     parameter_figure,
     reconstruction_figure,
     synthesis_figure,
 )
+from jawusd.report.facts import TracksFacts, model_facts, sync_facts, tracks_facts
 from jawusd.report.ranges import human_ranges
 from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from jawusd.errors import shown
+from jawusd.base.arrays import Array
+from jawusd.base.errors import shown
 from jawusd.evaluator.frames import motions_of_poses
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import so3_log, transform_point, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.report.style import BLACK, BLUE, GREEN, SKY, new_figure, save_figure
 from jawusd.report.verdicts import GOOD, LOOK
 

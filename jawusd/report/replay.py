@@ -7,12 +7,12 @@ import base64
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.frames import motions_of_poses
 from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.report.facts import model_facts
 
 #: Names of the states of a frame in the page.

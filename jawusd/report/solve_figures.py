@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.performance import STATE_WORDS, SolveState
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.geometry.arrays import Array
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, VERMILION, new_figure
 from jawusd.report.timeline import farther, legend_beside, runs, thinned
 

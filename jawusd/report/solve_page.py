@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding

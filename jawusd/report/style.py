@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from jawusd.errors import shown
+from jawusd.base.errors import shown
 from jawusd.formats.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:

@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator import JawRig
 from jawusd.formats.coverage import used_coverage
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION, new_figure
 
 _COLUMNS = 1200  # points along the frames; longer takes show the extreme of every few frames

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from typing_extensions import TypedDict
 
+from jawusd.base.arrays import Mask
 from jawusd.evaluator import JawRig
 from jawusd.formats.coverage import used_coverage
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks
-from jawusd.geometry.arrays import Mask
 from jawusd.report.facts import model_facts, sync_facts, tracks_facts
 
 #: Grades, the best first; "open" means that there is nothing to judge.

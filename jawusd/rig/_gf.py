@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Gf, Vt
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.geometry.quaternion import continuous_wxyz, matrix_from_wxyz
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Ts
 
-from jawusd.errors import RigError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from pxr import Sdf, Usd
 
-from jawusd.errors import FormatError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, OPTIONAL, ArraySpec, arrays_of
-from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
 from jawusd.rig.layers import set_attribute
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from jawusd.errors import FormatError
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
 from jawusd.rig.bones import bones_of
 from jawusd.rig.keys import time_codes, times_between
 from jawusd.rig.layout import MOTION, SKELETON

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from pxr import Kind, Sdf, Vt
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.anatomy import LANDMARKS
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
 from jawusd.rig import _gf, layout
 from jawusd.rig.arrays import model_hash, write_arrays

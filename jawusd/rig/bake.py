@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Sdf
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.rig.animation import write_animation

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from pxr import Usd
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
-from jawusd.geometry.arrays import Array
 from jawusd.rig.animation import BETWEEN_MM
 from jawusd.rig.keys import time_codes, times_between
 from jawusd.rig.layout import PARAMETERS

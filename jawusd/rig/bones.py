@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdSkel
 
-from jawusd.errors import FormatError
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
 
 # Entries of the transforms of two meshes of one bone differ by single precision: far less, at 100 mm from the origin.
 _APART = 1e-4

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom
 
-from jawusd.errors import CalibrationError, RigError
-from jawusd.formats.camera_parts import names_of_labels
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError, RigError
+from jawusd.cameras.parts import names_of_labels
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.se3 import make_transform, se3_inverse
 from jawusd.rig import _gf

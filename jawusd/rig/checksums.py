@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pxr import Sdf
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.rig.asset_paths import file_of_layer
 
 #: Key in `customLayerData` of `actor.usda`: a dictionary of file names beside it and SHA-256 sums.

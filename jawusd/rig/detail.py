@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping
 
 from pxr import Sdf, UsdGeom
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry.arrays import Array
 from jawusd.rig.geo import MESH_PATHS, build_geometry
 from jawusd.rig.layers import stage_of
 from jawusd.rig.layout import ACTOR, BESIDE, BOTH, DETAIL, MANDIBLE, PROXY, PROXY_FILE, SCAN

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
-from jawusd.errors import RigError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import RigError
 from jawusd.formats.mesh import Mesh, crown_face_mask, without_loose
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.rig import _gf
 from jawusd.rig.arrays import value_of
 from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd import __version__
-from jawusd.errors import RigError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.formats.gltf import Material, Node, Surface, save_glb
 from jawusd.formats.mesh import Mesh, natural_colors
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.rig.animation import bake_times
 from jawusd.rig.geo import MATERIAL_LOOKS, MESH_PATHS, read_geometry, read_gum, vertex_normals
 from jawusd.rig.layout import MANDIBLE, SKULL

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pxr import Usd
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.base.arrays import Array, Mask
 
 if TYPE_CHECKING:
     from pxr import Ts  # not in OpenUSD 24.11

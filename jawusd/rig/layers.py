@@ -12,10 +12,10 @@ from typing import TypeVar
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, Vt
 
 from jawusd import __version__
-from jawusd.errors import OutputError, RigError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import OutputError, RigError
+from jawusd.base.inputs import check_path
 from jawusd.formats.atomic import atomic_path
-from jawusd.geometry.arrays import Array
-from jawusd.inputs import check_path
 from jawusd.rig import _gf
 from jawusd.rig.layout import ACTOR, BESIDE
 from jawusd.rig.schema import SCHEMA_NAME

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pxr import Sdf
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 
 FORMAT_VERSION = 2
 

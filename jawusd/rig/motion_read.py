@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
-from jawusd.errors import FormatError
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
 from jawusd.geometry.se3 import rigidity_defect
 from jawusd.rig.animation import LOST
 from jawusd.rig.bones import bones_of, place_in

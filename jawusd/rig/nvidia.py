@@ -10,7 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.rig.rules import Finding
 
 PROGRAM = "nvidia_usd_validate"

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from onnx.external_data_helper import convert_model_from_external_data
 from onnx.reference import ReferenceEvaluator
 
-from jawusd.errors import FormatError, JawusdError, RigError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, JawusdError, RigError
+from jawusd.base.inputs import check_input
 from jawusd.evaluator import JawRig
-from jawusd.geometry.arrays import Array
-from jawusd.inputs import check_input
 from jawusd.rig.arrays import model_hash
 from jawusd.rig.onnx_graph import float_type
 from jawusd.rig.onnx_sidecar import FORMAT

@@ -11,9 +11,9 @@ import onnx
 from numpy.typing import ArrayLike
 from onnx import TensorProto, helper, numpy_helper
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.formula import long_angle_series
 from jawusd.evaluator.operations import Symbol, triple
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import Triple, angle_quotients
 
 # |B_2k|, k = 1..8, of the series of the inverse left Jacobian

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.formula import MODELS, BoundFormula, RigidMotion
 from jawusd.evaluator.operations import Rows, triple
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import apply_series, dot
 from jawusd.geometry.se3 import se3_adjoint, se3_inverse
 from jawusd.rig.onnx_graph import Graph, Value

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError, MissingDependencyError
+from jawusd.base.errors import FormatError, MissingDependencyError
 
 try:
     import onnxruntime  # noqa: F401
 except ModuleNotFoundError as error:
     raise MissingDependencyError("ONNX files run in onnxruntime.", hint="pip install 'jawusd[build]'") from error
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.batching import usable_rows
 from jawusd.evaluator.files import load
 from jawusd.evaluator.kernels import NumpyKernels, RigParts
-from jawusd.geometry.arrays import Array
 from jawusd.rig.onnx_check import Run, load_sidecar, runner
 from jawusd.rig.read import load_rig
 

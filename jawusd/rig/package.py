@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdUtils
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.formats.atomic import atomic_path, scratch_folder
 from jawusd.rig.checksums import CHECKSUMS
 from jawusd.rig.layout import ONNX_ATTRIBUTES

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.anatomy import LANDMARKS
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 
 _CONDYLES = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]

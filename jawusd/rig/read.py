@@ -11,11 +11,11 @@ from typing import TypedDict
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from jawusd.errors import EvaluatorError, FormatError, RigError, UnitsError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import EvaluatorError, FormatError, RigError, UnitsError
+from jawusd.base.guard import out_of_memory
+from jawusd.base.inputs import check_path
 from jawusd.evaluator import JawRig
-from jawusd.geometry.arrays import Array
-from jawusd.guard import out_of_memory
-from jawusd.inputs import check_path
 from jawusd.rig.arrays import read_arrays, read_value, value_of
 from jawusd.rig.keys import key_times
 from jawusd.rig.layout import MADE_FOR, ONNX_ATTRIBUTES, PARAMETERS

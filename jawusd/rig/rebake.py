@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Sdf, Usd, UsdGeom, Vt
 
-from jawusd.errors import FormatError, RigError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, RigError
 from jawusd.evaluator import JawRig
-from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
 from jawusd.rig.animation import CARRIED, author_motion
 from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm

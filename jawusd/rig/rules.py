@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from jawusd.errors import FormatError, JawusdError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import OUTSIDE, place
-from jawusd.geometry.arrays import Array
 from jawusd.rig.assembly import faults_of_assembly
 from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm
 from jawusd.rig.bones import bones_of

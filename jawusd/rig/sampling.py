@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jawusd.errors import RigError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
 
 _PROBES_PER_AXIS = 41

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, UsdGeom
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh, natural_colors
-from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
 
 _UV = "st"  # the name readers look for

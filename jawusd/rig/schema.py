@@ -10,7 +10,7 @@ import warnings
 
 from pxr import Plug, Usd
 
-from jawusd.plugin_path import schema_folder
+from jawusd.base.plugin_path import schema_folder
 
 SCHEMA_NAME = "JawRigAPI"
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd import errors, guard
+from jawusd.base import errors, guard
 from jawusd.evaluator import JawRig
 from jawusd.formats.allowed_folders import SETTING, allowed_folders
 

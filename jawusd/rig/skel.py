@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Kind, Sdf, Usd, UsdSkel, Vt
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.geometry.anatomy import LANDMARKS
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
 from jawusd.rig import _gf
 from jawusd.rig.geo import MESH_PATHS

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from jawusd.errors import FormatError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.matching import match_points
 from jawusd.geometry.rigid import rigid_fit
 from jawusd.geometry.se3 import se3_inverse, transform_points

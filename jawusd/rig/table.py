@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jawusd.errors import RigError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.schema import ADDITIVE
 from jawusd.evaluator.table import SampledTable
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_exp, transform_points
 from jawusd.rig.sampling import grid_axes, grid_points, sample_valid, valid_box
 

@@ -9,9 +9,9 @@ from typing import NamedTuple, ParamSpec, TypeVar
 
 from pxr import Ar, Sdf, Tf, Usd
 
-from jawusd.errors import FormatError, RigError
+from jawusd.base.errors import FormatError, RigError
+from jawusd.base.guard import most_cpu, out_of_memory, take_in_hand
 from jawusd.formats.allowed_folders import is_allowed
-from jawusd.guard import most_cpu, out_of_memory, take_in_hand
 from jawusd.rig.asset_paths import (
     asset_paths,
     clip_templates,

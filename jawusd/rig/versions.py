@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from pxr import Sdf, Usd
 
-from jawusd.errors import FormatError, VersionError
+from jawusd.base.errors import FormatError, VersionError
 from jawusd.rig.arrays import read_value
 from jawusd.rig.layout import FORMAT_VERSION
 

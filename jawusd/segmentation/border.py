@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Mask
+from jawusd.base.arrays import Mask
 from jawusd.segmentation.colours import shadeless
 from jawusd.segmentation.config import SegmentationConfig
 

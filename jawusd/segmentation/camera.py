@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
-from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.pixels import ColourPicture
+from jawusd.media.pixels import ColourPicture
 from jawusd.segmentation.arches import Seeds, learn_colours
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array, Indices, Mask
+from jawusd.base.arrays import Array, Indices, Mask
 
 _BINS = 32  # per channel
 _FLOOR = 12.0  # added to every channel before ratios [8-bit steps]: noise of dark pixels has no colour

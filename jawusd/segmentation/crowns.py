@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import Camera, transform_points
-from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.raster import draw_depth_labels
+from jawusd.meshes.raster import draw_depth_labels
 
 OTHER, UPPER, LOWER = 0, 1, 2
 

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Mask
+from jawusd.base.arrays import Mask
 
 _TAU = _SIGMA = 0.35  # steps of the primal-dual iteration: their product times 8, the norm of the gradient, stays < 1
 

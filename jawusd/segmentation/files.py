@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CaptureError
+from jawusd.base.errors import CaptureError
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.imaging.mask_files import PngMasks
-from jawusd.imaging.mask_levels import RawImage
-from jawusd.imaging.pictures import read_gray
+from jawusd.media.mask_files import PngMasks
+from jawusd.media.mask_levels import RawImage
+from jawusd.media.pictures import read_gray
 
 ARCHES = ("upper", "lower")
 PATTERN = "%06d.png"

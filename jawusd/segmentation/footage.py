@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TypeAlias
 
-from jawusd.imaging.clip import Clip
-from jawusd.imaging.pixels import ColourPicture
+from jawusd.media.clip import Clip
+from jawusd.media.pixels import ColourPicture
 
 _CHUNK = 16  # instants held at once when going backwards: 50 MB per full HD camera
 

@@ -9,7 +9,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Mask
+from jawusd.base.arrays import Mask
 from jawusd.segmentation.arches import Seeds, cut_arches, part_arches
 from jawusd.segmentation.border import settle_borders
 from jawusd.segmentation.colours import ColourModel

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.pixels import ColourPicture
-from jawusd.imaging.working_view import WorkingView, remap
+from jawusd.media.pixels import ColourPicture
+from jawusd.media.working_view import WorkingView, remap
 
 _NODE_PX = 8  # spacing of undistorted positions; the lens is smooth in between
 

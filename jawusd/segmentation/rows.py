@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.base.arrays import Array, Mask
 
 _WIDTH_PX = 480  # of the picture that is worked on
 # Teeth are found by brightness less redness, CIELAB L* - 2.5 a*. Levels of it that are tried, as percentiles of the

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Mask
 from jawusd.formats.clip_source import ClipSource
-from jawusd.geometry.arrays import Mask
-from jawusd.imaging.footage import open_clip
-from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, captioned, contact_sheet, save_png
+from jawusd.media.footage import open_clip
+from jawusd.media.overlay import LOWER_COLOUR, UPPER_COLOUR, captioned, contact_sheet, save_png
 from jawusd.segmentation.files import ARCHES, KeyMasks
 
 _COLUMNS = 3

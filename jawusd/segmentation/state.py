@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array
+from jawusd.base.npz import DAMAGED
 from jawusd.formats.atomic import write_npz_atomic
-from jawusd.geometry.arrays import Array
-from jawusd.npz import DAMAGED
 from jawusd.segmentation.colours import ColourModel
 
 # Alternating: a run may be killed between saving the colours of a frame and recording it.

@@ -1,6 +1,6 @@
 """Jaw rigs inside differentiable solvers: a torch module with poses, bounds and a prior on jaw poses."""
 
-from jawusd.errors import MissingDependencyError
+from jawusd.base.errors import MissingDependencyError
 
 try:
     import torch  # noqa: F401

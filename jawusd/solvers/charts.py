@@ -12,6 +12,7 @@ from typing import Protocol, cast
 import torch
 from torch import Tensor
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import derivatives
 from jawusd.evaluator.derivatives import (
     INVERSE_ITERATIONS,
@@ -27,7 +28,6 @@ from jawusd.evaluator.formula import AnchoredNumbers
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.evaluator.operations import triple
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED
-from jawusd.geometry.arrays import Array
 from jawusd.solvers.motion import OPERATIONS, MotionModule
 from jawusd.solvers.solution import capturing, finished, inverse
 

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curve_formula import curve, curve_derivatives
@@ -26,7 +27,6 @@ from jawusd.evaluator.nearest import (
     TOLERANCE_MM,
 )
 from jawusd.evaluator.operations import triple
-from jawusd.geometry.arrays import Array
 from jawusd.solvers.motion import OPERATIONS, Formula
 from jawusd.solvers.solution import applied, capturing, finished, inverse
 

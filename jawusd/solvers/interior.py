@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curve_formula import catmull_rom, curve, curve_tables
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.solvers.hull import Hull
 from jawusd.solvers.motion import OPERATIONS, Formula
 from jawusd.solvers.solution import capturing, finished

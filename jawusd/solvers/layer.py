@@ -7,7 +7,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.contact import Meeting
 from jawusd.evaluator.distances import landmark_vectors

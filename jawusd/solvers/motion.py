@@ -11,10 +11,10 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.formula import MODELS, Numbers, RigidMotion
 from jawusd.evaluator.operations import Rows, polynomial, triple
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, Triple, angle_quotients, angle_series
 
 _TINY = 1e-30  # keeps the slope of a root at zero finite

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.synthetic.bones import build_mandible, build_skull
 from jawusd.synthetic.dental_arch import ArchShape, DentalArch, build_arch
 from jawusd.synthetic.person import Person

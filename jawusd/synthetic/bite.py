@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.synthetic.anatomy import Occlusion
 from jawusd.synthetic.dental_arch import ArchLine, ArchShape, DentalArch
 from jawusd.synthetic.dentition import Seat, build, seats

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry.arrays import Array
 from jawusd.synthetic.kinematics import Joint, eminence
 from jawusd.synthetic.surfaces import Faces, grid_faces, loft, merged, outward, superellipse
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jawusd.base.arrays import Array
+from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
-from jawusd.formats.calibration import save_calibration
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
-from jawusd.geometry.arrays import Array
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.masks import Outline, drawn_mask
 from jawusd.synthetic.person import Person

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import so3_exp
-from jawusd.geometry.arrays import Array
 from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import so3_exp
-from jawusd.geometry.arrays import Array
 from jawusd.synthetic.dental_arch import (
     COLUMN_MM,
     CONTACT_MM,

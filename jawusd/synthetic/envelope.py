@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import transform_points
-from jawusd.geometry.arrays import Array
 
 PoseFunction = Callable[[Array, Array, Array], Array]
 

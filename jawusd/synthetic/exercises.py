@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import make_transform, so3_exp
-from jawusd.geometry.arrays import Array
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import make_transform, so3_exp
-from jawusd.geometry.arrays import Array
 
 # Pitch [rad] of one e-folding of the Gaussian with which the tooth guidance fades out.
 _CONTACT_FADE_RAD = np.deg2rad(4.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.base.arrays import Array, Mask
 
 # Size of the jitter [px] and of its cells at a picture height of 1080; a constant share, the rest correlated in time.
 _WOBBLE_PX, _CELL_PX = 0.7, 36.0

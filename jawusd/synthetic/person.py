@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import transform_point
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.synthetic.envelope import Envelope
 from jawusd.synthetic.kinematics import Joint, controlled_pose
 

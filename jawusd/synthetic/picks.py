@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.rays import meet_triangles
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.surfaces import vertex_normals

@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import so3_exp
-from jawusd.geometry.arrays import Array
 
 Gums = Literal["dipping", "continuous", "crowns"]
 BITES = ("normal", "deep", "open", "edge to edge", "underbite", "large overjet", "crossbite")

@@ -12,9 +12,9 @@ import moderngl
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jawusd.errors import MissingDependencyError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import MissingDependencyError
 from jawusd.geometry import Camera, se3_inverse
-from jawusd.geometry.arrays import Array
 from jawusd.synthetic import shaders
 from jawusd.synthetic.soft_tissue import Surface
 from jawusd.synthetic.surfaces import vertex_normals

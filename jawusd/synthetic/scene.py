@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.synthetic.anatomy import PersonAnatomy
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.person import Person

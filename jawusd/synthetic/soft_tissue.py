@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.surfaces import Faces, grid_faces
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
-from jawusd.geometry.arrays import Array
 from jawusd.synthetic.soft_tissue import Surface
 from jawusd.synthetic.surfaces import grid_faces
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 
 Faces = NDArray[np.int32]
 

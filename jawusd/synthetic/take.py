@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import make_transform, so3_exp
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.synthetic.anatomy import Occlusion, lifted_bite
 from jawusd.synthetic.exercises import schedule, smooth_noise, smoothed
 from jawusd.synthetic.kinematics import smoothstep

@@ -12,7 +12,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.synthetic.surfaces import loft, superellipse
 
 #: Crown below the gum line [mm]; hidden by the gum.

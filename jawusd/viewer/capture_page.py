@@ -9,10 +9,10 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from jawusd.errors import JawusdError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import JawusdError
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import make_transform, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.capture_scene import UP, CaptureScene
 from jawusd.viewer.footage_panel import ALL, FootagePanel

@@ -8,8 +8,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import wxyz_from_matrix
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.decimate import for_view
 from jawusd.viewer.picking_layout import FOV_RAD, PickingLayout

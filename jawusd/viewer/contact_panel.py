@@ -8,11 +8,11 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from jawusd.errors import JawusdError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.contact import AUTHORED_MM
 from jawusd.formats.contact import DEEP, TOUCHING
-from jawusd.geometry.arrays import Array
 from jawusd.viewer.plots import GREEN, VERMILION
 from jawusd.viewer.widgets import guarded, small_text
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.formats.coverage import uncovered_percent, worst_frames
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
-from jawusd.geometry.arrays import Array
 from jawusd.viewer.plots import BLUE, GREY, ORANGE, VERMILION, svg_definition
 from jawusd.viewer.solve_plot import doubt, solve_words
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.formats.keys import load_keys, save_keys
 from jawusd.formats.poses import read_parameters, write_parameters
 from jawusd.viewer.motion import Clip

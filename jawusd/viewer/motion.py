@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.errors import FormatError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
 from jawusd.formats.keys import Key
-from jawusd.geometry.arrays import Array
 
 #: Keys of an animation, in the order of their frames.
 KeyTrack = tuple[Key, ...]

@@ -8,7 +8,7 @@ from typing import get_args
 
 import viser
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.viewer.motion import Clip, KeyTrack, Player, with_key, without_key
 from jawusd.viewer.plots import Plot, curve_plot, plot_seek, with_playhead
 from jawusd.viewer.session import Interpolation, Session

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, so3_exp, transform_point, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.rays import meet_triangles
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.picks import ARCHES

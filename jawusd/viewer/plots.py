@@ -11,8 +11,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
-from jawusd.geometry.arrays import Array
 from jawusd.viewer.motion import Clip, KeyTrack
 from jawusd.viewer.readouts import INCISOR, border_path, captured_d, landmark_places, rest_places
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import viser
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import LANDMARKS
-from jawusd.geometry.arrays import Array
 from jawusd.viewer.plots import GREEN, VERMILION
 from jawusd.viewer.readouts import Readout
 from jawusd.viewer.scene import PRESETS, JawScene

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.geometry import LANDMARKS
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
 
 INCISOR, CONDYLES = LANDMARKS.index("incisor"), (LANDMARKS.index("condyle_left"), LANDMARKS.index("condyle_right"))

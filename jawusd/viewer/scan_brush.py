@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Indices, Mask
 from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh
-from jawusd.geometry.arrays import Indices, Mask
 
 #: What the brush paints, by the name on its button.
 BRUSHES = {"crown": TOOTH, "gum": GUM, "base": BASE}

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 import viser
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 from jawusd.viewer.decimate import is_solid

@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 
 import viser
 
-from jawusd.errors import OutputError
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
+from jawusd.base.errors import OutputError
 from jawusd.viewer import capture_scene
 from jawusd.viewer.capture_page import CapturePage
 from jawusd.viewer.page import Page, StaticPlots, begin_page

@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.formats.keys import Keys
 from jawusd.geometry import LANDMARKS
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_point
 from jawusd.viewer.motion import Clip, KeyTrack, at_frames, with_key
 from jawusd.viewer.readouts import Readout, read_out, triple

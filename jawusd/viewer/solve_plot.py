@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator.verdicts import place as place_of
 from jawusd.formats.performance import STATE_COLOURS, STATE_WORDS, SolveState
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.geometry.arrays import Array
 from jawusd.viewer.plots import CURVE_COLORS, Plot, drawn, framed, path_through, place, with_playhead
 
 _NAMES = ("d1 opening", "d2 laterotrusion", "d3 protrusion")

@@ -7,7 +7,7 @@ from pathlib import PurePosixPath
 import viser
 from viser import _messages
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.viewer.widgets import say
 
 MOST_BYTES = 8 << 20

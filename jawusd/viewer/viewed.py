@@ -10,12 +10,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Bootstrap
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.viewer.motion import Clip
 
 #: Names of meshes: the first three stand still (skull frame), the others move (mandible frame).

@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 
 import viser
 
-from jawusd.errors import JawusdError
+from jawusd.base.errors import JawusdError
 
 log = logging.getLogger(__name__)
 

@@ -30,7 +30,7 @@ def test_imports_follow_the_layers():
     [
         ("geometry/so3.py", "import jawusd.tracking", "Layers"),
         ("tracking/__init__.py", "import jawusd.fitting", "Layers"),
-        ("errors.py", "import jawusd.geometry", "Layers"),
+        ("base/errors.py", "import jawusd.geometry", "Layers"),
         ("evaluator/rig.py", "import jawusd.formats", "The evaluator"),
         ("evaluator/rig.py", "import jawusd.fast", "Layers"),
         ("fast/rigid.py", "import jawusd.solvers", "Layers"),

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from jawusd.cameras.calibration import load_calibration, save_calibration
 from jawusd.capture.calibrate import calibrate_capture
-from jawusd.formats.calibration import load_calibration, save_calibration
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import rigid_fit, transform_point, transform_points, triangulate
-from jawusd.imaging.meshio import load_mesh
+from jawusd.meshes.meshio import load_mesh
 
 POINTS = 400
 

@@ -6,7 +6,7 @@ FOLDER has clones of some of the repositories below, each under its name, as `gi
 out. The models are stated once more here, by other readers than jawusd's: OpenCV's FileStorage and projectPoints,
 tomllib, and ElementTree with the formulas of Metashape's manual (appendix "Camera models", frame camera) and of Epic's
 "RealityCapture XMP Camera Math". Lenses of 3DEqualizer have no pose in these files and get a made-up camera; their
-points are roots of the formulas in the Lens Distortion Plugin Kit (tests/formats/test_camera_3de.py).
+points are roots of the formulas in the Lens Distortion Plugin Kit (tests/cameras/test_camera_3de.py).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "formats"))
 
 import test_camera_3de as of_3de
 
-from jawusd.errors import CalibrationError
-from jawusd.formats.camera_files import load_cameras_file
+from jawusd.base.errors import CalibrationError
+from jawusd.cameras.files import load_cameras_file
 
 SIZE = (1920, 1080)  # of pictures whose size the file does not hold
 Project = Callable[[np.ndarray], np.ndarray]

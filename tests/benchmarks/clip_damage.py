@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 
 from damaged_clips import CODECS, single_damages, write_clip
 
-from jawusd.errors import CaptureError
-from jawusd.imaging.video import Video
+from jawusd.base.errors import CaptureError
+from jawusd.media.video import Video
 
 
 def read(path: Path, threads: int) -> list[tuple[float, str]] | None:

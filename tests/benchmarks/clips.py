@@ -28,7 +28,7 @@ from clip_files import KINDS, write_prores, write_sequence
 
 from jawusd.formats.capture import Capture, load_capture
 from jawusd.geometry import relative_pose, transform_points
-from jawusd.imaging.video import Video
+from jawusd.media.video import Video
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth

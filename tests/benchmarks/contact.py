@@ -31,6 +31,7 @@ import igl
 import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
+from subjects.short_capture import ShortConfig, draw_capture
 
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import load_capture
@@ -46,7 +47,6 @@ from jawusd.rig.table import DecoderTable
 from jawusd.synthetic.anatomy import build_anatomy, lifted_bite
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.short_capture import ShortConfig, draw_capture
 
 FRAMES = 600
 NOISE = np.array([0.0004] * 3 + [0.04] * 3)  # of a tracked pose [rad, mm]

@@ -24,12 +24,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from jawusd.cameras.calibration import load_calibration, save_calibration
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.calibration import load_calibration, save_calibration
 from jawusd.formats.capture import Capture, load_capture
 from jawusd.geometry import Camera, make_transform, se3_exp, se3_inverse, se3_log, so3_exp, transform_points
-from jawusd.imaging.masks import MaskReader
-from jawusd.imaging.meshio import load_mesh
+from jawusd.media.masks import MaskReader
+from jawusd.meshes.meshio import load_mesh
 
 ROWS = ("upper", "lower")
 WRONG_SHARE, WRONG_SHIFT_PX = 0.05, 40

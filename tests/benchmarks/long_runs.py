@@ -73,7 +73,7 @@ def looped_take(folder: Path, count: int) -> Path:
     """Write a capture of so many frames from the example's: forwards, backwards, forwards, as numbered pictures."""
     import cv2
 
-    from jawusd.imaging.video import Video
+    from jawusd.media.video import Video
 
     write_short(folder, 300)
     text = (folder / "capture.toml").read_text().replace(".mkv", "/%06d.png")

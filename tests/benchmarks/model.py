@@ -23,8 +23,8 @@ from model_peers import PEERS  # noqa: E402
 from jawusd.evaluator import JawRig  # noqa: E402
 from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
 from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses  # noqa: E402
-from jawusd.fitting.paper import fit_paper  # noqa: E402
 from jawusd.geometry import make_transform, random_rotation, se3_exp, transform_points  # noqa: E402
+from jawusd.paper.model import fit_paper  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402
 from jawusd.synthetic.person import Person  # noqa: E402
 

@@ -12,11 +12,11 @@ from collections import Counter
 from dataclasses import fields, replace
 
 import numpy as np
+from subjects.short_capture import ShortConfig, draw_capture
 
 from jawusd.formats.mesh import Mesh, painted_labels
 from jawusd.geometry import anatomical_frame, se3_exp, se3_inverse, transform_points
-from jawusd.imaging.scan_labels import label_scan
-from jawusd.synthetic.short_capture import ShortConfig, draw_capture
+from jawusd.meshes.scan_labels import label_scan
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.initialization.occlusion import measure_occlusion
 from jawusd.tracking.initialization.scan_checks import occlusion_findings

@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, label
 
 from jawusd.geometry import transform_point
-from jawusd.imaging.meshio import load_mesh
-from jawusd.imaging.overlay import save_png
-from jawusd.imaging.pictures import read_gray, read_picture
+from jawusd.media.overlay import save_png
+from jawusd.media.pictures import read_gray, read_picture
+from jawusd.meshes.meshio import load_mesh
+from jawusd.photographs import align_photographs
+from jawusd.photographs.align import _line_distances, _lower_incisor, _refined, _rms
+from jawusd.photographs.contact import Contact
+from jawusd.photographs.solve import Bite
 from jawusd.pipeline.photographs import drawn_over, read_drawing
-from jawusd.tracking.photographs import align_photographs
-from jawusd.tracking.photographs.align import _line_distances, _lower_incisor, _refined, _rms
-from jawusd.tracking.photographs.contact import Contact
-from jawusd.tracking.photographs.solve import Bite
 
 COLOUR = 1  # cv2.IMREAD_COLOR
 VIEWS = ("front", "left", "right")

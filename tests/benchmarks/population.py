@@ -1,6 +1,6 @@
 """Check and track many synthetic persons: python tests/benchmarks/population.py --persons 100 [--jobs 2] [--faults].
 
-Persons, scanners, annotators and cameras over the human range (`jawusd.synthetic.short_capture`): each capture goes
+Persons, scanners, annotators and cameras over the human range (`subjects.short_capture`): each capture goes
 through `jawusd check` and `jawusd track` and is compared with its truth. Printed are
 
     refused     valid captures that were refused, with the messages
@@ -43,8 +43,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from population_faults import FAULTS, NotPossible
 from population_score import AXES, ROWS, STEADY_MM, Outcome, run
-
-from jawusd.synthetic.short_capture import ShortConfig, write_short_capture
+from subjects.short_capture import ShortConfig, write_short_capture
 
 #: Seed, fault or -1, frames, share of scans without paint, folder of the captures.
 Task = tuple[int, int, int, float, Path]

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 from cramer_rao import MEAN_W
+from subjects.annotator import REFERENCE_HEIGHT
 
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import TRACKED
 from jawusd.geometry import Camera, mandible_metric, se3_adjoint, transform_point, transform_points
-from jawusd.synthetic.annotator import REFERENCE_HEIGHT
 from jawusd.tracking import TrackingConfig
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.frame_record import FrameRecord

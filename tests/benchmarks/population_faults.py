@@ -14,13 +14,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from subjects.scanner import Scanner, encoded
 
-from jawusd.formats.calibration import load_calibration, save_calibration
+from jawusd.cameras.calibration import load_calibration, save_calibration
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, transform_points
-from jawusd.imaging.meshio import load_mesh
-from jawusd.imaging.video_writer import VideoWriter
-from jawusd.synthetic.scanner import Scanner, encoded
+from jawusd.media.video_writer import VideoWriter
+from jawusd.meshes.meshio import load_mesh
 
 ROWS = ("upper", "lower")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from population_bound import cramer_rao, crown_sigmas, efficient
 
-from jawusd.errors import JawusdError
+from jawusd.base.errors import JawusdError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import TRACKED, Tracks
 from jawusd.geometry import (

@@ -13,14 +13,14 @@ from collections import defaultdict
 
 import numpy as np
 from scipy.spatial import cKDTree
+from subjects.short_capture import ShortConfig, draw_capture
 
 from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import Mesh, tooth_labels
-from jawusd.imaging.meshio import load_mesh
-from jawusd.imaging.scan_labels import Labelling, label_scan
-from jawusd.imaging.scan_surface import ScanSurface
+from jawusd.meshes.meshio import load_mesh
+from jawusd.meshes.scan_labels import Labelling, label_scan
+from jawusd.meshes.scan_surface import ScanSurface
 from jawusd.pipeline.scan_labels import _WEAK_SHARE
-from jawusd.synthetic.short_capture import ShortConfig, draw_capture
 
 NEVER_MM = 20.0  # counted for a line that was not found
 

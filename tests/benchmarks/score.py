@@ -15,7 +15,7 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import tooth_labels
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import LANDMARKS, se3_inverse, se3_log, transform_points
-from jawusd.imaging.meshio import load_mesh
+from jawusd.meshes.meshio import load_mesh
 from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.subject import subject_of_capture
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from jawusd.formats.capture import Capture, load_capture
 from jawusd.geometry import LANDMARKS, se3_inverse, transform_point
-from jawusd.imaging.masks import MaskReader
-from jawusd.imaging.video import Video
+from jawusd.media.masks import MaskReader
+from jawusd.media.video import Video
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth

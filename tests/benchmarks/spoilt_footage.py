@@ -26,8 +26,8 @@ import av
 import cv2
 import numpy as np
 
-from jawusd.errors import JawusdError
-from jawusd.formats.calibration import load_calibration, save_calibration
+from jawusd.base.errors import JawusdError
+from jawusd.cameras.calibration import load_calibration, save_calibration
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import transform_point
 from jawusd.pipeline.meshes import load_meshes

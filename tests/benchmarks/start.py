@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Bootstrap, load_capture
 from jawusd.geometry import transform_point, transform_points
-from jawusd.imaging.raster import draw_depth_labels, project
+from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.meshes import load_meshes

@@ -14,10 +14,10 @@ from pathlib import Path
 import av
 import numpy as np
 
+from jawusd.base.errors import SyncError
 from jawusd.capture.sync import align_videos
-from jawusd.errors import SyncError
 from jawusd.formats.capture import load_capture
-from jawusd.imaging.video import Video
+from jawusd.media.video import Video
 
 SIZE = (480, 270)
 TICK = Fraction(1, 90000)

@@ -91,13 +91,13 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
     from jawusd.formats.capture import load_capture
     from jawusd.formats.mesh import tooth_labels
     from jawusd.geometry import transform_points
+    from jawusd.paper import take as paper_take
+    from jawusd.paper.solver import PaperConfig
     from jawusd.pipeline.cameras import load_cameras
     from jawusd.pipeline.meshes import load_meshes
     from jawusd.pipeline.subject import subject_of_capture
     from jawusd.tracking import track_capture
     from jawusd.tracking.contour.solver import ContourSolver
-    from jawusd.tracking.paper import take as paper_take
-    from jawusd.tracking.paper.solver import PaperConfig
 
     capture = load_capture(path)
     cameras, meshes = load_cameras(capture), load_meshes(capture)

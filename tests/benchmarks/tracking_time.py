@@ -24,11 +24,11 @@ import numpy as np  # noqa: E402
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 import small_take  # noqa: E402
 
-from jawusd.formats.calibration import load_calibration  # noqa: E402
+from jawusd.cameras.calibration import load_calibration  # noqa: E402
 from jawusd.formats.capture import Capture, load_capture  # noqa: E402
 from jawusd.formats.mesh import Mesh  # noqa: E402
 from jawusd.geometry import Camera, transform_point  # noqa: E402
-from jawusd.imaging.meshio import load_mesh  # noqa: E402
+from jawusd.meshes.meshio import load_mesh  # noqa: E402
 from jawusd.tracking import TrackingConfig, track_capture  # noqa: E402
 from jawusd.tracking.contour.scan import prepare_scan  # noqa: E402
 from jawusd.tracking.contour.solver import ContourSolver  # noqa: E402

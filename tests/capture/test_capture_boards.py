@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from boards import board, charuco, chessboard, corner_grid, opencv_pixels, photograph, poses, studio
 
+from jawusd.base.errors import CalibrationError, CaptureError
 from jawusd.capture.board_detection import edge_width_px
 from jawusd.capture.boards import find_boards
-from jawusd.errors import CalibrationError, CaptureError
 from jawusd.formats.capture import Boards
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 
 CAMERAS = studio(lens=(0.0, 0.0))[:2]
 NAMES = ("c0", "c1")

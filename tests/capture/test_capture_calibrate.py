@@ -5,11 +5,11 @@ import pytest
 from boards import CENTRE, board, capture_of, opencv_pixels, poses, sightings, studio
 from scipy.spatial.transform import Rotation
 
+from jawusd.base.errors import CalibrationError
 from jawusd.capture.boards import Sightings, board_points, board_symmetries
 from jawusd.capture.bundle import _Problem
 from jawusd.capture.calibrate import calibrate_capture, calibrate_sightings
 from jawusd.capture.first_guess import guess_cameras
-from jawusd.errors import CalibrationError
 from jawusd.geometry import se3_inverse, triangulate
 
 CAMERAS = studio()

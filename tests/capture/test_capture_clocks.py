@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from clip_files import counting_at, with_exr_header, write_prores, write_sequence
 
+from jawusd.base.errors import SyncError
 from jawusd.capture.sync import estimate_offsets
-from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
 from jawusd.formats.clip_source import ClipSource
 from jawusd.formats.timecode import frame_of_timecode
-from jawusd.imaging.footage import open_clip
-from jawusd.imaging.masks import MaskReader
+from jawusd.media.footage import open_clip
+from jawusd.media.masks import MaskReader
 
 IMAGES = np.full((8, 32, 32, 3), 90, np.uint8)
 

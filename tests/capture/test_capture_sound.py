@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve, resample_poly
 
+from jawusd.base.errors import CaptureError, SyncError
 from jawusd.capture.light import Step, match_steps, on_grid
 from jawusd.capture.sound import RATE_HZ, match_sounds
 from jawusd.capture.sync import align_videos, light_curve
-from jawusd.errors import CaptureError, SyncError
-from jawusd.imaging.audio import Sound, read_sound
-from jawusd.imaging.timeline import Timeline
-from jawusd.imaging.video import Video
+from jawusd.media.audio import Sound, read_sound
+from jawusd.media.timeline import Timeline
+from jawusd.media.video import Video
 
 FPS = 24
 TICK = Fraction(1, 90000)

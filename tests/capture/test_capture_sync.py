@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jawusd.base.errors import SyncError
 from jawusd.capture.light import Step, find_steps, match_steps
 from jawusd.capture.sync import align_videos, estimate_offsets
-from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 
 FPS = 24.0
 FLASHES = ((10.3, 16.0), (371.0, 378.4))  # dark, in frames of the reference camera
@@ -59,7 +59,7 @@ def test_offsets_of_three_cameras(tmp_path: Path, polarity: str) -> None:
 def test_only_both_ends_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = film(tmp_path / "a.mp4", exposures(400, 0))
     late = film(tmp_path / "late.mp4", exposures(400, 0, ((130.0, 140.0), (371.0, 376.4))))
-    from jawusd.imaging.video import Video
+    from jawusd.media.video import Video
 
     decoded: list[tuple[int, int]] = []
     frames = Video.frames

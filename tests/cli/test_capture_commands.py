@@ -8,10 +8,10 @@ import pytest
 from boards import board, chessboard, photograph, poses, studio
 from typer.testing import CliRunner
 
+from jawusd.base.errors import CaptureError, SyncError
+from jawusd.cameras.calibration import load_calibration
 from jawusd.cli.main import app
-from jawusd.errors import CaptureError, SyncError
-from jawusd.formats.calibration import load_calibration
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 
 
 def film(path, start, fps=24.0):

@@ -14,7 +14,8 @@ from package_copy import ROOT
 from short_example import write_short
 from typer.testing import CliRunner
 
-from jawusd import __version__, errors
+from jawusd import __version__
+from jawusd.base import errors
 from jawusd.cli.command import with_vectors_split
 from jawusd.cli.main import app
 from jawusd.cli.summaries import EXIT_CODES, SUMMARIES

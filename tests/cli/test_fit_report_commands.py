@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
-from jawusd.fitting import nlpca_training, synthesis
 from jawusd.formats.model import load_model
 from jawusd.formats.poses import write_poses
 from jawusd.geometry import LANDMARKS, make_transform
+from jawusd.paper import nlpca_training, synthesis
 from jawusd.pipeline.report import TABLE_FILE
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person

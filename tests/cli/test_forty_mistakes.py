@@ -7,8 +7,8 @@ import pytest
 from capture_texts import HEAD, TABLES, write_media
 from typer.testing import CliRunner
 
+from jawusd.base.errors import JawusdError
 from jawusd.cli.main import app
-from jawusd.errors import JawusdError
 
 BOARDS = '[boards]\ncols = 9\nrows = 6\nsquare_mm = 8.0\nvideos = ["left.mp4", "right.mp4"]\n'
 TEXT = HEAD + TABLES + BOARDS

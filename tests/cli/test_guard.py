@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from jawusd import guard
-from jawusd.errors import ResourceError
+from jawusd.base import guard
+from jawusd.base.errors import ResourceError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and limits of Linux")
 BEGIN = "import os, resource, signal, sys, time; from jawusd import guard; guard.begin(); "

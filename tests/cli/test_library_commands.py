@@ -12,8 +12,8 @@ from pxr import Sdf, Usd
 from typer.testing import CliRunner
 
 import jawusd
+from jawusd.base.errors import FittingError, FormatError, OutputError, RigError
 from jawusd.cli.main import app
-from jawusd.errors import FittingError, FormatError, OutputError, RigError
 from jawusd.formats.model import load_model
 from jawusd.formats.poses import write_parameters
 from jawusd.geometry import LANDMARKS

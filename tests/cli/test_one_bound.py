@@ -32,7 +32,7 @@ from jawusd.formats.model import JawModel, save_model
 from jawusd.formats.performance import SolveState
 from jawusd.formats.poses import write_parameters, write_poses
 from jawusd.formats.solved import SolvedJaw
-from jawusd.imaging.status_bar import StatusBar
+from jawusd.media.status_bar import StatusBar
 from jawusd.pipeline.library import retarget
 from jawusd.plugins import extension
 from jawusd.report.solve_figures import seen_figure

@@ -9,8 +9,8 @@ import trimesh
 from closed_mouth import VIEWS, Mouth, search_little
 from typer.testing import CliRunner
 
+from jawusd.base.errors import CaptureError, OutputError, TrackingError
 from jawusd.cli.main import app
-from jawusd.errors import CaptureError, OutputError, TrackingError
 from jawusd.pipeline.photographs import read_drawing
 
 

@@ -10,8 +10,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 from typer.testing import CliRunner
 
 import jawusd
+from jawusd.base.errors import FormatError
 from jawusd.cli.main import app
-from jawusd.errors import FormatError
 from jawusd.pipeline.view import viewed_actor
 from jawusd.rig import allow_folders
 from jawusd.rig.bake import bake_rig

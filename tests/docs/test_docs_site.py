@@ -16,7 +16,7 @@ from doc_blocks import COMMANDS
 from package_copy import ROOT
 
 import jawusd
-from jawusd.errors import JawusdError
+from jawusd.base.errors import JawusdError
 from jawusd.formats.capture import capture_keys
 
 pytest.importorskip("mkdocs", reason="jawusd[docs] is not installed")
@@ -187,7 +187,7 @@ def kinds(error=JawusdError):
 
 def test_every_error_is_in_the_reference(site):
     text = (site / "reference/errors.html").read_text()
-    named = [kind.__name__ for kind in kinds() if kind.__module__ == "jawusd.errors"]
+    named = [kind.__name__ for kind in kinds() if kind.__module__ == "jawusd.base.errors"]
     assert len(named) > 10
     assert [name for name in named if f">{name}</code>" not in text] == []
 

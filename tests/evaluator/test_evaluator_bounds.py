@@ -6,7 +6,7 @@ import shapely
 from example_model import example_arrays, example_meta
 from scipy.optimize import minimize as scipy_minimize
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig
 
 ARRAYS = example_arrays()

@@ -7,7 +7,7 @@ from example_model import example_arrays, example_meta
 from key_sets import hollow_rig, measured, random_keys
 from scipy.interpolate import CubicHermiteSpline
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig
 
 ARRAYS = example_arrays()

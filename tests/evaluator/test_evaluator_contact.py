@@ -5,7 +5,7 @@ import pytest
 from example_model import example_arrays, example_meta
 from scipy.interpolate import RegularGridInterpolator
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.contact import ContactField
 from jawusd.evaluator.verdicts import Reason

@@ -7,7 +7,7 @@ import pytest
 from example_model import example_arrays, example_meta
 
 from jawusd import evaluator
-from jawusd.errors import FormatError, UnitsError, VersionError
+from jawusd.base.errors import FormatError, UnitsError, VersionError
 from jawusd.formats.model import JawModel, save_model
 
 

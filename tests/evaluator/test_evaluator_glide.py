@@ -6,7 +6,7 @@ from example_model import example_arrays, example_meta, touching_arrays
 from example_rig import touching_rig
 from scipy.interpolate import CubicHermiteSpline
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.glide import GlideTable
 

@@ -78,7 +78,7 @@ def test_the_package_offers_its_names_and_loads_them_when_used():
     done = run(code)
     assert done.stdout.splitlines() == [
         "JawRig JawusdError __version__ build load track",
-        "jawusd.plugin_path False",
+        "jawusd.base.plugin_path False",
         "JawRig JawusdError False",
     ], done.stderr
     assert callable(jawusd.build) and callable(jawusd.track)

@@ -9,7 +9,7 @@ import reference_jaw as reference
 from example_model import example_arrays, example_meta
 from scipy.spatial.transform import Rotation
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import se3_exp, se3_log
 

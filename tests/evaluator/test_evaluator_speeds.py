@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from example_model import example_arrays, example_meta, moving_arrays
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig, Speeds
 
 

@@ -49,7 +49,7 @@ def test_fast_gives_a_compiled_rig_and_plain_does_not(model):
 
 def test_without_numba_one_error_names_the_command(model):
     code = (
-        "from jawusd.errors import MissingDependencyError\n"
+        "from jawusd.base.errors import MissingDependencyError\n"
         "try:\n"
         "    jawusd.load(sys.argv[1], fast=True)\n"
         "except MissingDependencyError as error:\n"

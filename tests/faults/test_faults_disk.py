@@ -20,9 +20,9 @@ import sys, resource
 from pathlib import Path
 import numpy as np
 from pxr import Sdf
-from jawusd.errors import OutputError
+from jawusd.base.errors import OutputError
 from jawusd.formats.atomic import write_npz_atomic, write_text_atomic
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 from jawusd.rig.layers import new_layer, write_layer
 
 def layer(size):

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from package_copy import ROOT
 
-from jawusd.errors import OutputError
+from jawusd.base.errors import OutputError
 from jawusd.formats.atomic import refuse_existing, write_bytes_atomic, write_npz_atomic, write_text_atomic
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 from jawusd.report.style import new_figure, save_figure
 from jawusd.rig.layers import new_layer, write_layer
 
@@ -173,7 +173,7 @@ def test_no_other_place_of_the_package_replaces_or_makes_files():
         "jawusd/viewer/file_panel.py",  # in a folder of its own, as are the next two
         "jawusd/imaging/redraw.py",
         "jawusd/plugins/extension.py",
-        "jawusd/formats/camera_files.py",  # the name of a column
+        "jawusd/cameras/files.py",  # the name of a column
         "jawusd/rig/reader_process.py",  # pipes to its own child
     }
     words = ("os.replace(", "os.rename(", '"wb"', '"w"', '"a"', ".write_text(", ".write_bytes(", "shutil.move(")

@@ -7,7 +7,7 @@ import pytest
 from package_copy import ROOT
 from stage_results import stage_result
 
-from jawusd.errors import CaptureError
+from jawusd.base.errors import CaptureError
 from jawusd.pipeline import build, capture_inputs
 from jawusd.pipeline.build import BuildOptions
 from jawusd.pipeline.capture_inputs import InputWatch, input_files, open_capture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from face_takes import JAW_FPS, Performer
 
-from jawusd.errors import FittingError
+from jawusd.base.errors import FittingError
 from jawusd.fitting.face import fit_arkit
 from jawusd.formats.arkit import FaceCapture, shares_of
 

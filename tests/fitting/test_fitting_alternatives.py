@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
-from jawusd.errors import FittingError
+from jawusd.base.errors import FittingError
 from jawusd.evaluator import JawRig
-from jawusd.fitting import FittingConfig, fit_model, nlpca_training
+from jawusd.fitting import FittingConfig, fit_model
 from jawusd.fitting.curves import in_millimetres
 from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.fitting.metric import MandibleMetric
-from jawusd.fitting.nlpca_training import train_nlpca
-from jawusd.fitting.paper import fit_paper
 from jawusd.fitting.pca import fit_pca
 from jawusd.geometry import make_transform, mandible_metric, se3_exp, se3_log
+from jawusd.paper import nlpca_training
+from jawusd.paper.model import fit_paper
+from jawusd.paper.nlpca_training import train_nlpca
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jawusd.errors import FittingError
+from jawusd.base.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
 from jawusd.fitting.anatomy_gate import check_anatomy

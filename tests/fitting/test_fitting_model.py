@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from jawusd.errors import FittingError
+from jawusd.base.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
 from jawusd.fitting.data import SubjectAnatomy, select_poses

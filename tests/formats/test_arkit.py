@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.formats.arkit import read_arkit
 
 HEADER = "Timecode,BlendShapeCount,EyeBlinkLeft,JawForward,JawRight,JawLeft,JawOpen,HeadYaw"

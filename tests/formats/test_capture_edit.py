@@ -5,7 +5,7 @@ import tomllib
 
 import pytest
 
-from jawusd.errors import FormatError, OutputError
+from jawusd.base.errors import FormatError, OutputError
 from jawusd.formats.capture import Bootstrap, Pick, PickView
 from jawusd.formats.capture_edit import with_bootstrap, write_bootstrap
 

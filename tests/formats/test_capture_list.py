@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.formats.capture_list import ListedCapture, load_capture_list
 
 

@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from jawusd.errors import CalibrationError, TrackingError
+from jawusd.base.errors import CalibrationError, TrackingError
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from example_model import example_arrays, example_meta
 from example_tracks import make_tracks
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.model import JawModel, load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks

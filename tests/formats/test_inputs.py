@@ -6,20 +6,20 @@ from pathlib import Path
 
 import pytest
 
-from jawusd.errors import JawusdError
-from jawusd.formats.calibration import load_calibration
-from jawusd.formats.camera_files import load_cameras_file
+from jawusd.base.errors import JawusdError
+from jawusd.base.inputs import check_input
+from jawusd.cameras.calibration import load_calibration
+from jawusd.cameras.files import load_cameras_file
 from jawusd.formats.capture import load_capture
 from jawusd.formats.keys import load_keys
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.model import load_model
 from jawusd.formats.poses import read_parameters, read_poses
 from jawusd.formats.tracks import load_tracks
-from jawusd.imaging.audio import read_sound
-from jawusd.imaging.meshio import load_mesh
-from jawusd.imaging.pictures import read_gray
-from jawusd.imaging.video import Video
-from jawusd.inputs import check_input
+from jawusd.media.audio import read_sound
+from jawusd.media.pictures import read_gray
+from jawusd.media.video import Video
+from jawusd.meshes.meshio import load_mesh
 
 READERS = {
     "calibration.toml": load_calibration,

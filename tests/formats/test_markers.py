@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.formats.markers import read_markers
 from jawusd.formats.rigid_bodies import read_body
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from example_tracks import make_tracks
 
-from jawusd.errors import FormatError, UnitsError, VersionError
+from jawusd.base.errors import FormatError, UnitsError, VersionError
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.model import JawModel, load_model, save_model
 from jawusd.formats.solved import SolvedJaw

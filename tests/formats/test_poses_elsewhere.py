@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jawusd.errors import FormatError, UnitsError, VersionError
+from jawusd.base.errors import FormatError, UnitsError, VersionError
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.poses import read_poses
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jawusd.errors import FormatError, OutputError, VersionError
+from jawusd.base.errors import FormatError, OutputError, VersionError
 from jawusd.formats.mesh import BASE, BOUNDARY, GUM, TOOTH, Mesh, crown_face_mask, tooth_labels
 from jawusd.formats.scan_labels import ScanLabels, labels_path, load_scan_labels, save_scan_labels
 

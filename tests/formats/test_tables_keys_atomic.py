@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from jawusd.errors import FormatError, OutputError
+from jawusd.base.errors import FormatError, OutputError
 from jawusd.formats.atomic import atomic_path, write_bytes_atomic
 from jawusd.formats.keys import Key, Keys, load_keys, save_keys
 from jawusd.formats.poses import read_parameters, read_poses, write_parameters, write_poses

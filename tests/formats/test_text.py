@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.formats.arkit_mapping import load_mapping
 from jawusd.formats.keys import load_keys
 from jawusd.formats.landmarks import load_landmarks

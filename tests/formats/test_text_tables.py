@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
+from jawusd.base.tables import read_table, read_text
+from jawusd.cameras.files import load_cameras_file
 from jawusd.formats.arkit import read_arkit
-from jawusd.formats.camera_files import load_cameras_file
 from jawusd.formats.performance import HEADER
 from jawusd.formats.poses import read_parameters, read_poses, read_poses_or_parameters
-from jawusd.tables import read_table, read_text
 
 RNG = np.random.default_rng(0)
 

@@ -4,7 +4,7 @@ from itertools import count
 
 import pytest
 
-from jawusd.errors import CaptureError
+from jawusd.base.errors import CaptureError
 from jawusd.formats.timecode import frame_of_timecode
 
 

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from package_copy import ROOT
 
-from jawusd.errors import JawusdError
+from jawusd.base.errors import JawusdError
 from jawusd.formats.capture import read_capture
 from jawusd.rig.read import open_stage
 

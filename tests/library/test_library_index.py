@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from example_people import person, save
 
-from jawusd.errors import FormatError, VersionError
+from jawusd.base.errors import FormatError, VersionError
 from jawusd.evaluator import load
 from jawusd.library.index import INDEX_FILE, load_donors, scan_library
 

@@ -5,7 +5,7 @@ import pytest
 from example_people import person
 from scipy.spatial.transform import Rotation
 
-from jawusd.errors import FittingError
+from jawusd.base.errors import FittingError
 from jawusd.geometry import make_transform, random_rotation, rigid_fit, so3_exp, transform_points
 from jawusd.library.personal import leave_one_out, personal_motion
 from jawusd.library.transport import Donor, displacements, landmark_distance_mm

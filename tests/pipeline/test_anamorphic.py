@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from jawusd.errors import CalibrationError
-from jawusd.formats.calibration import save_calibration
+from jawusd.base.errors import CalibrationError
+from jawusd.cameras.calibration import save_calibration
 from jawusd.geometry import Camera
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 

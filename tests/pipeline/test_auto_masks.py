@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from package_copy import ROOT
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import make_transform

@@ -15,8 +15,8 @@ from package_copy import ROOT
 from pxr import Usd, UsdGeom
 
 import jawusd
-from jawusd.errors import CaptureError, JawusdError, OutputError
-from jawusd.formats.calibration import load_calibration
+from jawusd.base.errors import CaptureError, JawusdError, OutputError
+from jawusd.cameras.calibration import load_calibration
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_points
 from jawusd.pipeline.build import BuildOptions, build
@@ -170,7 +170,7 @@ def missing_mask_folder(folder):
 
 
 def masks_of_another_size(folder):
-    from jawusd.imaging.video_writer import VideoWriter
+    from jawusd.media.video_writer import VideoWriter
 
     path = next((folder / "masks").rglob("*.mkv"))
     path.unlink()

@@ -9,10 +9,10 @@ from package_copy import ROOT
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from jawusd.base.errors import CalibrationError
+from jawusd.cameras.calibration import load_calibration
 from jawusd.capture.boards import find_boards
 from jawusd.cli.main import app
-from jawusd.errors import CalibrationError
-from jawusd.formats.calibration import load_calibration
 from jawusd.geometry import triangulate
 from jawusd.pipeline.build import BuildOptions, build
 from jawusd.pipeline.build_lines import build_lines

@@ -5,7 +5,7 @@ import pytest
 from example_model import example_arrays
 from example_rig import example_rig
 
-from jawusd.errors import FittingError
+from jawusd.base.errors import FittingError
 from jawusd.fitting import fit_model
 from jawusd.geometry import make_transform, so3_exp
 from jawusd.tracking.sequence.smoothing import smooth_poses

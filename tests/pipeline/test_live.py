@@ -16,11 +16,11 @@ from package_copy import ROOT
 from pythonosc.osc_packet import OscPacket
 
 import jawusd
-from jawusd.errors import CaptureError, FormatError, OutputError
+from jawusd.base.errors import CaptureError, FormatError, OutputError
 from jawusd.formats.performance import SolveState
 from jawusd.geometry import transform_point
-from jawusd.imaging import live_clock
-from jawusd.imaging.live_source import LiveSource
+from jawusd.media import live_clock
+from jawusd.media.live_source import LiveSource
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.cuts import Cutter

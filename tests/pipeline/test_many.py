@@ -18,8 +18,8 @@ from package_copy import ROOT
 from short_example import results, write_short
 from typer.testing import CliRunner
 
+from jawusd.base.errors import CaptureError, ClusterError, OutputError
 from jawusd.cli.main import app
-from jawusd.errors import CaptureError, ClusterError, OutputError
 from jawusd.formats.capture_list import ListedCapture
 from jawusd.pipeline import many
 from jawusd.pipeline.build import BuildOptions, build

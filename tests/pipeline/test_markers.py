@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jawusd.errors import FormatError, MissingDependencyError
+from jawusd.base.errors import FormatError, MissingDependencyError
 from jawusd.pipeline.fit import TrajectoryOptions, read_trajectory
 from jawusd.pipeline.markers import marker_poses, read_c3d
 

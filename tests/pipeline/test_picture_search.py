@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.pipeline import picture_search
 from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch
 from jawusd.pipeline.state import no_progress

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from jawusd.formats.calibration import save_calibration
+from jawusd.cameras.calibration import save_calibration
 from jawusd.geometry import Camera, make_transform
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.media import write_plates
 from jawusd.rig.cameras import PLATE
@@ -88,8 +88,8 @@ def test_plates_of_light_are_light(capture, tmp_path):
     """The same ball as EXR far above white: undistorted, and as bright as it was."""
     from clip_files import write_picture
 
-    from jawusd.imaging.stored_picture import read_stored
-    from jawusd.imaging.video import Video
+    from jawusd.media.stored_picture import read_stored
+    from jawusd.media.video import Video
     from jawusd.rig.cameras import LIGHT_PLATE
 
     pictures = [frame.image for frame in Video(capture / "left.mp4").frames(colour="rgb")]

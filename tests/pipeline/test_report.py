@@ -11,8 +11,8 @@ from example_rig import FPS, example_meshes
 from report_data import report_data
 from typer.testing import CliRunner
 
+from jawusd.base.errors import FormatError
 from jawusd.cli.main import app
-from jawusd.errors import FormatError
 from jawusd.evaluator import JawRig
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
@@ -82,7 +82,7 @@ def test_a_placeholder_is_not_shown_as_a_mandible(built):
 @pytest.mark.slow
 def test_the_experiments_of_a_build_go_into_its_report(built, monkeypatch):
     """With the paper's networks, which a build leaves out; how long they are trained is nothing to a report."""
-    monkeypatch.setattr("jawusd.fitting.nlpca_training._STAGES", (60, 100))
+    monkeypatch.setattr("jawusd.paper.nlpca_training._STAGES", (60, 100))
     tracks = load_tracks(built / "tracks.npz")
     sure = {name: 1e-6 * getattr(tracks, f"covariance_{name}") for name in ("upper", "lower", "relative")}
     save_tracks(built / "tracks.npz", replace(tracks, **{f"covariance_{name}": value for name, value in sure.items()}))

@@ -10,12 +10,12 @@ import trimesh
 from package_copy import ROOT
 from typer.testing import CliRunner
 
+from jawusd.base.errors import FormatError, OutputError
 from jawusd.cli.main import app
-from jawusd.errors import FormatError, OutputError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh, crown_face_mask, tooth_labels
 from jawusd.formats.scan_labels import ScanLabels, labels_path, load_scan_labels, save_scan_labels
-from jawusd.imaging.meshio import load_mesh
+from jawusd.meshes.meshio import load_mesh
 from jawusd.pipeline.capture_inputs import input_hashes
 from jawusd.pipeline.meshes import load_labelled, load_meshes
 from jawusd.pipeline.scan_labels import label_teeth

@@ -6,7 +6,7 @@ import pytest
 from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
-from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR
+from jawusd.media.overlay import LOWER_COLOUR, UPPER_COLOUR
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth
 from jawusd.pipeline.segment_record import LEARNED, RECORD, with_masks, write_summary
 from jawusd.segmentation.files import mask_path, write_mask

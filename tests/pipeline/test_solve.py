@@ -12,12 +12,12 @@ from pxr import Sdf
 from short_example import write_short
 
 import jawusd
-from jawusd.errors import CaptureError, OutputError, RigError, TrackingError
+from jawusd.base.errors import CaptureError, OutputError, RigError, TrackingError
 from jawusd.formats.performance import SolveState
 from jawusd.formats.poses import read_parameters
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point
-from jawusd.imaging.video import Video
+from jawusd.media.video import Video
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.solve import check_output, solve, solve_summary, write_solved

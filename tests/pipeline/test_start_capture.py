@@ -5,10 +5,10 @@ import pytest
 from boards import board, charuco, chessboard, photograph, poses, studio
 from typer.testing import CliRunner
 
+from jawusd.base.errors import CaptureError
 from jawusd.cli.main import app
-from jawusd.errors import CaptureError
 from jawusd.formats.capture import read_capture
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 from jawusd.pipeline.folder_files import camera_names, find_files, pair
 from jawusd.pipeline.start_capture import start_capture, start_lines, write_start
 
@@ -103,7 +103,7 @@ def test_scans_of_two_people_are_not_guessed(folder):
 
 @pytest.mark.slow
 def test_a_calibration_gives_the_cameras_their_names(folder):
-    from jawusd.formats.calibration import save_calibration
+    from jawusd.cameras.calibration import save_calibration
 
     cameras = studio(lens=(0.0, 0.0))[:2]
     from dataclasses import replace

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from jawusd.errors import FormatError, OutputError
+from jawusd.base.errors import FormatError, OutputError
 from jawusd.pipeline.calibrate import SyncResult
 from jawusd.pipeline.report import CheckResult
 from jawusd.pipeline.state import BUILD_FILE, LABELS, BuildState, changed_files, hash_files, hash_value, locked

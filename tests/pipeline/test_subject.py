@@ -9,7 +9,7 @@ from example_model import example_arrays, example_meta
 from example_rig import FPS, example_meshes, example_motion, example_rig
 from package_copy import ROOT
 
-from jawusd.errors import CaptureError, FormatError, RigError
+from jawusd.base.errors import CaptureError, FormatError, RigError
 from jawusd.formats.model import JawModel, save_model
 from jawusd.geometry import LANDMARKS, landmark_frame
 from jawusd.pipeline.bake import bake_subject

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks, vertex_error_mm
 
-from jawusd.formats.calibration import save_calibration
+from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point

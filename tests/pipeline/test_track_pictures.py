@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from package_copy import ROOT
 
-from jawusd.errors import CaptureError, TrackingError
+from jawusd.base.errors import CaptureError, TrackingError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import se3_exp, transform_points

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jawusd.errors import FormatError, MissingDependencyError
+from jawusd.base.errors import FormatError, MissingDependencyError
 from jawusd.formats.poses import write_poses
 from jawusd.geometry import se3_exp
 from jawusd.pipeline.fit import RAW_GROUP, TrajectoryOptions, read_hdf5, read_motion, read_trajectory

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from jawusd.errors import FormatError, MissingDependencyError
+from jawusd.base.errors import FormatError, MissingDependencyError
 from jawusd.plugins.conversion import converted
 
 

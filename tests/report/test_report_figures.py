@@ -8,8 +8,8 @@ from matplotlib.patches import Rectangle
 from PIL import Image
 from report_data import experiments
 
-from jawusd.errors import OutputError
-from jawusd.report.figures import (
+from jawusd.base.errors import OutputError
+from jawusd.paper.figures import (
     FIGURES,
     coverage_figure,
     draw_experiments,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from report_data import FPS, report_data, solve_data
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.report.solve_figures import jaw_figure, seen_figure
 from jawusd.report.solve_page import solve_page, unseen_runs
 

@@ -5,7 +5,7 @@ import pytest
 from example_rig import assert_valid_usd, example_motion, example_rig, mandible_vertices, moved
 from pxr import Sdf, Usd, UsdGeom
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.rig import write_animation
 
 

@@ -16,7 +16,7 @@ from pxr import Kind, Usd, UsdGeom, UsdShade
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import so3_left_jacobian
 from jawusd.rig.bake import bake_rig

@@ -6,7 +6,7 @@ from example_rig import assert_valid_usd, example_motion, moved
 from pxr import Gf, Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.geometry import Camera, make_transform
 from jawusd.rig.cameras import write_cameras
 

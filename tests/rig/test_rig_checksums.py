@@ -8,7 +8,7 @@ import pytest
 from example_rig import FPS, assert_valid_usd, forget_checksums
 from pxr import Sdf
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.rig import describe, load_rig, validate_stage, write_animation
 from jawusd.rig.checksums import CHECKSUMS
 from jawusd.rig.publish import publish_rig

@@ -7,7 +7,7 @@ import pytest
 from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig, scanned_meshes
 from pxr import Usd, UsdGeom
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.geo import read_geometry, read_gum
 from jawusd.rig.scan_look import linear_from_srgb, srgb_from_linear

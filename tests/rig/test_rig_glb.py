@@ -9,7 +9,7 @@ import trimesh
 from example_rig import FPS, example_meshes, example_motion, example_rig, mandible_vertices, moved, scanned_meshes
 from scipy.spatial.transform import Rotation, Slerp
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.formats.mesh import crown_face_mask
 from jawusd.geometry import make_transform
 from jawusd.rig.animation import write_animation

@@ -8,8 +8,8 @@ from example_rig import example_motion, example_rig
 from pxr import Gf, Usd, UsdGeom
 from typer.testing import CliRunner
 
+from jawusd.base.errors import FormatError
 from jawusd.cli.main import app
-from jawusd.errors import FormatError
 from jawusd.rig import write_animation
 from jawusd.rig.motion_read import read_poses_of_stage
 

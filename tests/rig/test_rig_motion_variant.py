@@ -6,8 +6,8 @@ from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, e
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from typer.testing import CliRunner
 
+from jawusd.base.errors import FormatError, RigError
 from jawusd.cli.main import app
-from jawusd.errors import FormatError, RigError
 from jawusd.rig import load_rig, validate_stage, write_animation
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.geo import MESH_PATHS

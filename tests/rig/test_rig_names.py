@@ -9,8 +9,8 @@ from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, e
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 from typer.testing import CliRunner
 
+from jawusd.base.errors import RigError
 from jawusd.cli.main import app
-from jawusd.errors import RigError
 from jawusd.geometry import Camera
 from jawusd.rig import describe, write_animation, write_splines
 from jawusd.rig.bake import bake_rig

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.rig.nvidia import PROGRAM, find_nvidia_validator, nvidia_findings
 from jawusd.rig.rules import Finding
 

@@ -14,7 +14,7 @@ from example_rig import FPS, example_meshes, example_rig, mandible_vertices, mov
 from onnx.reference import ReferenceEvaluator
 
 import jawusd
-from jawusd.errors import FormatError, RigError
+from jawusd.base.errors import FormatError, RigError
 from jawusd.evaluator import JawRig
 from jawusd.geometry import se3_exp
 from jawusd.rig import onnx_check

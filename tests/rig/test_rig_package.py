@@ -7,7 +7,7 @@ import pytest
 from example_rig import assert_valid_usd, example_motion, example_rig
 from pxr import Sdf, Usd, UsdGeom
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.rig import load_rig
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.rig.package import write_package

@@ -8,8 +8,8 @@ from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, e
 from pxr import Sdf, Usd, UsdUtils
 from typer.testing import CliRunner
 
+from jawusd.base.errors import FormatError, RigError
 from jawusd.cli.main import app
-from jawusd.errors import FormatError, RigError
 from jawusd.rig import load_rig, write_splines
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_poses_of_stage

@@ -8,7 +8,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
 
 import jawusd
-from jawusd.errors import FormatError, RigError, UnitsError, VersionError
+from jawusd.base.errors import FormatError, RigError, UnitsError, VersionError
 from jawusd.evaluator import JawRig
 from jawusd.geometry import make_transform
 from jawusd.rig import describe, load_rig, write_animation

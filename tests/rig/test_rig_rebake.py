@@ -9,8 +9,8 @@ from pxr import Gf, Sdf, Ts, Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from jawusd.base.errors import FormatError, RigError
 from jawusd.cli.main import app
-from jawusd.errors import FormatError, RigError
 from jawusd.evaluator import JawRig
 from jawusd.rig import write_animation
 from jawusd.rig.bake import bake_rig

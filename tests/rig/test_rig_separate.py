@@ -11,7 +11,7 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 import jawusd
-from jawusd.errors import FormatError, ResourceError, RigError
+from jawusd.base.errors import FormatError, ResourceError, RigError
 from jawusd.formats.allowed_folders import SETTING
 from jawusd.rig import arrays, separate, untrusted
 from jawusd.rig.geo import read_geometry, read_gum

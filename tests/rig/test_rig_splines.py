@@ -5,7 +5,7 @@ import pytest
 from example_rig import assert_valid_usd
 from pxr import Usd
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.rig import write_animation, write_splines
 
 KEYS, VALUES = np.array([101, 120, 149]), np.array([[0, 0, 0], [15, 2, 1], [3, -2, 0]], dtype=float)

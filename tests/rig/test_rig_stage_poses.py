@@ -9,8 +9,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from jawusd.base.errors import FormatError
 from jawusd.cli.main import app
-from jawusd.errors import FormatError
 from jawusd.rig.motion_read import read_parameters_of_stage
 from jawusd.rig.stage_poses import fit_poses_of_stage
 

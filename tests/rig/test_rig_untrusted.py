@@ -7,7 +7,7 @@ import sys
 import pytest
 from pxr import Sdf, Usd
 
-from jawusd.errors import RigError
+from jawusd.base.errors import RigError
 from jawusd.formats.allowed_folders import SETTING
 from jawusd.rig import describe, untrusted
 from jawusd.rig.asset_paths import file_of
@@ -237,7 +237,7 @@ def test_a_search_path_leads_to_rigs_alone(anchored_folder, tmp_path):
     for name, asset in (("rig", "hero/v1/actor.usda"), ("other", "evil.usda")):
         text = f'#usda 1.0\n( defaultPrim = "A" )\ndef "A" ( references = @{asset}@</Actor> ) {{}}\n'
         (tmp_path / "shots" / f"{name}.usda").write_text(text)
-    code = "import sys, jawusd; from jawusd.errors import RigError\ntry: print(jawusd.load(sys.argv[1]).kind)\n"
+    code = "import sys, jawusd; from jawusd.base.errors import RigError\ntry: print(jawusd.load(sys.argv[1]).kind)\n"
     code += "except RigError as error: print(error)"
     said = {}
     for name in ("rig", "other"):

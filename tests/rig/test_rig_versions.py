@@ -5,7 +5,7 @@ import pytest
 from example_rig import example_rig, forget_checksums
 from pxr import Sdf, Usd
 
-from jawusd.errors import VersionError
+from jawusd.base.errors import VersionError
 from jawusd.rig import describe, load_rig, validate_stage, versions
 
 NEXT = versions.FORMAT_VERSION + 1

@@ -6,7 +6,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from jawusd.errors import CaptureError
+from jawusd.base.errors import CaptureError
 from jawusd.geometry import Camera
 from jawusd.segmentation.arches import Seeds, cut_arches, part_arches
 from jawusd.segmentation.border import settle_borders

@@ -7,7 +7,7 @@ import pytest
 import torch
 from example_model import example_arrays, example_meta, joint_arrays, moving_arrays, touching_arrays
 
-from jawusd.errors import EvaluatorError
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import se3_exp
 from jawusd.solvers import JawLayer

@@ -7,7 +7,7 @@ import numpy as np
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, make_transform, se3_exp, se3_inverse, so3_exp
-from jawusd.imaging.raster import draw_depth_labels, project
+from jawusd.meshes.raster import draw_depth_labels, project
 
 RED, GREY = (215, 45, 40), (150, 150, 150)
 TEETH = 8

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
 
 HEAD = """format = "jawusd-capture/1"
 name = "x"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from package_copy import ROOT
 
-from jawusd.npz import check_format
+from jawusd.base.npz import check_format
 from jawusd.pipeline.state import BUILD_FILE, LOCK_FILE, hash_value
 
 REPORT = "report.html"

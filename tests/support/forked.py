@@ -5,7 +5,7 @@ import mmap
 import os
 import signal
 
-from jawusd import guard
+from jawusd.base import guard
 
 
 def in_copy(work):

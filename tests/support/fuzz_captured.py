@@ -40,7 +40,7 @@ def write_captures(folder):
 
 
 def write_cameras(folder):
-    from jawusd.formats.camera_files import load_cameras_file
+    from jawusd.cameras.files import load_cameras_file
 
     folder.mkdir(parents=True)
     shutil.copy(EXAMPLE / "calibration.toml", folder / "calibration.toml")
@@ -131,7 +131,7 @@ Quartic Distortion - Degree 4
 
 
 def write_foreign_cameras(folder):
-    from jawusd.formats.camera_files import load_cameras_file
+    from jawusd.cameras.files import load_cameras_file
 
     texts = {"metashape/cameras.xml": _METASHAPE, "xmp/cam0.xmp": _XMP, "yaml/cam0.yml": _YAML}
     texts["csv/cameras.csv"] = "#name,x,y,alt,heading,pitch,roll,f,k1\ncam0.jpg,1,2,3,10,20,30,35,-0.1\n"
@@ -162,7 +162,7 @@ def write_pngs(folder):
 
 
 def read_png(place, path):
-    from jawusd.imaging.masks import MaskReader, mask_size_px
+    from jawusd.media.masks import MaskReader, mask_size_px
 
     mask_size_px(place / "%06d.png")
     with MaskReader(place / "%06d.png", SIZE) as reader:
@@ -171,7 +171,7 @@ def read_png(place, path):
 
 
 def write_videos(folder):
-    from jawusd.imaging.video_writer import VideoWriter
+    from jawusd.media.video_writer import VideoWriter
 
     folder.mkdir(parents=True)
     for name, lossless in (("mask.mkv", True), ("mask.mp4", False)):
@@ -182,9 +182,9 @@ def write_videos(folder):
 
 
 def read_video(place, path):
-    from jawusd.imaging.audio import read_sound
-    from jawusd.imaging.masks import MaskReader
-    from jawusd.imaging.video import Video
+    from jawusd.media.audio import read_sound
+    from jawusd.media.masks import MaskReader
+    from jawusd.media.video import Video
 
     video = Video(path)
     with MaskReader(path, video.size_px) as reader:
@@ -210,6 +210,6 @@ def write_meshes(folder):
 
 def read_mesh(place, path):
     from jawusd.formats.mesh import tooth_labels
-    from jawusd.imaging.meshio import load_mesh
+    from jawusd.meshes.meshio import load_mesh
 
     tooth_labels(load_mesh(path))

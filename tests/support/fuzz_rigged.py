@@ -17,7 +17,7 @@ def write_rig(folder, kind):
 
 
 def read_rig(place, path):
-    from jawusd.errors import JawusdError
+    from jawusd.base.errors import JawusdError
     from jawusd.rig import describe, load_rig
     from jawusd.rig.geo import read_geometry, read_gum
     from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage

@@ -126,7 +126,7 @@ def answer(request, targets, folder):
 
 def outcome(target, place, path):
     """Read a damaged file and return how that went."""
-    from jawusd.errors import JawusdError
+    from jawusd.base.errors import JawusdError
 
     Guard.found, Guard.watching = None, True
     start = time.process_time()

@@ -7,18 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from subjects.scanner import Scanner, encoded
 
+from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
-from jawusd.formats.calibration import save_calibration
 from jawusd.geometry import LANDMARKS, transform_point, transform_points
-from jawusd.imaging.raster import draw_depth_labels
-from jawusd.imaging.video_writer import VideoWriter
+from jawusd.media.video_writer import VideoWriter
+from jawusd.meshes.raster import draw_depth_labels
 from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.picks import choose_picks
 from jawusd.synthetic.render import Renderer
-from jawusd.synthetic.scanner import Scanner, encoded
 from jawusd.synthetic.scene import Scene
 from jawusd.synthetic.studio import build_cameras
 from jawusd.synthetic.take import FPS, perform

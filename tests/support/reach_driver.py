@@ -114,7 +114,7 @@ _STEPS = {
 def _ends_well(step, shot):
     import typer
 
-    from jawusd.errors import JawusdError
+    from jawusd.base.errors import JawusdError
 
     with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(JawusdError, typer.Exit):
         step(shot)

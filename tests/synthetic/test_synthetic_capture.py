@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from jawusd.errors import MissingDependencyError, OutputError
-from jawusd.formats.calibration import load_calibration
+from jawusd.base.errors import MissingDependencyError, OutputError
+from jawusd.cameras.calibration import load_calibration
 from jawusd.formats.capture import Capture, load_capture
 from jawusd.geometry import LANDMARKS, transform_point, transform_points
 from jawusd.synthetic.capture_writer import DemoConfig, write_demo

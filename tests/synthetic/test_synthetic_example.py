@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from jawusd.formats.calibration import load_calibration
+from jawusd.cameras.calibration import load_calibration
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import transform_point
 

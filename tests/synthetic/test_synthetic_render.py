@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from jawusd.errors import MissingDependencyError
+from jawusd.base.errors import MissingDependencyError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, make_transform, so3_exp, transform_points
-from jawusd.imaging import raster
+from jawusd.meshes import raster
 from jawusd.synthetic import render
 from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.person import Person

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
-
-from jawusd.synthetic.short_take import _between
+from subjects.short_take import _between
 
 
 def test_motion_between_frames_is_that_of_scipys_monotone_cubic():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bumpy_teeth import arch, jaw_poses, make_cameras, vertex_error_mm
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Pick, PickView
 from jawusd.geometry import transform_point
 from jawusd.tracking.initialization.bootstrap import pose_from_picks

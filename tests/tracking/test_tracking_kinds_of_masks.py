@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from small_take import CAMERAS, FIRST, OFFSETS, ROWS, errors_mm, make_capture, png, source, track, write_masks
 
-from jawusd.errors import CaptureError, TrackingError
+from jawusd.base.errors import CaptureError, TrackingError
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import Tracks
 from jawusd.pipeline.track import track_lines, track_summary

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import (
     anatomical_frame,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_take import make_capture, track, write_masks
 
-from jawusd.errors import OutputError
+from jawusd.base.errors import OutputError
 from jawusd.formats.tracks import LostReason
 from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
 from jawusd.tracking.sequence import packed_records, passes

@@ -9,7 +9,7 @@ import small_take
 from bumpy_teeth import disturbed, jaw_poses, render_masks
 from example_model import LANDMARKS_ANATOMICAL, example_arrays, example_meta
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.formats.performance import SolveState
 from jawusd.geometry import relative_pose, transform_point, transform_points

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_take import CAMERAS, MESHES, jaw_poses
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import transform_point, transform_points
 from jawusd.tracking.contour.scan import prepare_scan

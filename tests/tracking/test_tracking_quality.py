@@ -5,7 +5,7 @@ import pytest
 from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks
 from small_take import CAMERAS, FIRST, MESHES, OFFSETS, make_capture, write_masks
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.tracks import TRACKED
 from jawusd.geometry import make_transform, relative_pose, se3_exp, se3_inverse, se3_log, transform_points
 from jawusd.tracking.config import TrackingConfig

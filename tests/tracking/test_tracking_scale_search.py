@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_take import CAMERAS, MESHES, OFFSETS, make_capture, write_masks
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.tracking.initialization import scale_search
 from jawusd.tracking.initialization.scale_search import seen_size
 from jawusd.tracking.initialization.start_search import Found, StartSearch

@@ -6,7 +6,7 @@ import trimesh
 from bumpy_teeth import GREY, RED, arch, jaw_poses, make_cameras, render_masks, vertex_error_mm
 from scipy.spatial import cKDTree
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments

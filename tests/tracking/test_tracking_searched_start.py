@@ -7,7 +7,7 @@ import pytest
 from bumpy_teeth import jaw_poses, vertex_error_mm
 from small_take import CAMERAS, FIRST, MESHES, OFFSETS, ROWS, make_capture, write_masks
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.geometry import make_transform, se3_exp, se3_inverse
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.scan import prepare_scan

@@ -21,7 +21,7 @@ from small_take import (
     write_masks,
 )
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.tracks import LOST, load_tracks, save_tracks
 from jawusd.pipeline.track import track_lines, track_summary
 from jawusd.tracking import track_capture

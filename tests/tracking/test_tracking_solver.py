@@ -9,7 +9,7 @@ from bumpy_teeth import arch, disturbed, jaw_poses, make_cameras, render_masks, 
 from scipy import ndimage
 
 from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_inverse, transform_point, transform_points
-from jawusd.imaging.raster import draw_depth_labels, project
+from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, search_edges
 from jawusd.tracking.contour.equations import GingivalMarginTerm, NormalEquations, SilhouetteTerm

@@ -22,10 +22,10 @@ from small_take import (
     write_masks,
 )
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, random_rotation, se3_exp, se3_inverse, transform_point, transform_points
-from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
+from jawusd.meshes.raster import draw_silhouette, project, unpack_bits, words_for
 from jawusd.tracking import track_capture
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.scan import prepare_scan

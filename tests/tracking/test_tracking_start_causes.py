@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_take import CAMERAS, OFFSETS
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture_parts import CameraSource, Masks
 from jawusd.tracking.initialization import mixups, start_causes
 from jawusd.tracking.initialization.footage import Footage

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_take import CAMERAS, FIRST, OFFSETS, ROWS, errors_mm, make_capture, source, track, write_masks
 
-from jawusd.imaging.video import Video
+from jawusd.media.video import Video
 from jawusd.segmentation.footage import ColourFootage
 
 COUNT = 8

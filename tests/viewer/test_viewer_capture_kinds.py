@@ -9,8 +9,8 @@ from short_example import write_short
 from typer.testing import CliRunner
 from viewed_example import copy_example, quiet, write_true_tracks
 
+from jawusd.base.errors import CaptureError, FormatError
 from jawusd.cli.main import app
-from jawusd.errors import CaptureError, FormatError
 from jawusd.pipeline.view_capture import viewed_capture
 from jawusd.viewer.server import CaptureViewer
 

@@ -7,7 +7,7 @@ import pytest
 from example_rig import FPS, assert_valid_usd, example_motion, example_rig
 from pxr import Usd
 
-from jawusd.errors import FormatError, MissingDependencyError, OutputError, RigError
+from jawusd.base.errors import FormatError, MissingDependencyError, OutputError, RigError
 from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.formats.tracks import Tracks, save_tracks
 from jawusd.pipeline.view import motion_names, open_viewer, part_of, viewed_actor

@@ -5,7 +5,7 @@ import asyncio
 import numpy as np
 import pytest
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.formats.keys import Key
 from jawusd.viewer import motion
 from jawusd.viewer.motion import Clip, Player, frame_after

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from jawusd.errors import OutputError
+from jawusd.base.errors import OutputError
 from jawusd.viewer.server import Viewer, is_loopback, is_own_page
 
 

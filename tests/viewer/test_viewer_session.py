@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from example_rig import FPS, example_rig
 
-from jawusd.errors import FormatError
+from jawusd.base.errors import FormatError
 from jawusd.formats.keys import Key, Keys
 from jawusd.geometry import LANDMARKS
 from jawusd.viewer.session import Session

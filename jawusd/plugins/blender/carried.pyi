@@ -1,9 +1,9 @@
 # What the extension uses of jawusd. `jawusd.plugins.carrying` puts these modules, and all they import, into the zip,
 # and makes a module of this stub that takes the names from there.
 
-from jawusd.errors import JawusdError as JawusdError
+from jawusd.base.arrays import Array as Array
+from jawusd.base.errors import JawusdError as JawusdError
 from jawusd.evaluator import JawRig as JawRig
-from jawusd.geometry.arrays import Array as Array
 from jawusd.geometry.quaternion import continuous_wxyz as continuous_wxyz
 from jawusd.geometry.quaternion import wxyz_from_matrix as wxyz_from_matrix
 from jawusd.geometry.se3 import transform_point as transform_point

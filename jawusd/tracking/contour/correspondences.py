@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.samples import (
     COLUMNS,

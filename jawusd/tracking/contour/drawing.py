@@ -9,8 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
-from jawusd.imaging.warp import warp_nearest
+from jawusd.base.arrays import Array
+from jawusd.media.warp import warp_nearest
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V, X, Y, Z
 from jawusd.tracking.contour.scan import Scan
 

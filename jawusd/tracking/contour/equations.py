@@ -12,8 +12,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, se3_log
-from jawusd.geometry.arrays import Array
 
 
 def translation(t: Array) -> Array:

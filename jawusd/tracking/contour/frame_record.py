@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.formats.tracks import LOST, LostReason
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import residual_px, score_px
 

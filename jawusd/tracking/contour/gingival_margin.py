@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array, Indices, Mask
+from jawusd.base.arrays import Array, Indices, Mask
 
 _SHORTEST_MM = 1e-3  # shorter pieces carry no direction
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import hat, mandible_metric, se3_adjoint, se3_inverse, transform_points
-from jawusd.geometry.arrays import Array
-from jawusd.imaging.raster import count_and_not, count_bits, pack_bits
+from jawusd.meshes.raster import count_and_not, count_bits, pack_bits
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.equations import NormalEquations, ResidualTerm, Solution, translation
 from jawusd.tracking.contour.scan import ARCHES, Scan

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.contour.drawing import Drawing, projected
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.views import View

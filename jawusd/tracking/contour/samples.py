@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.contour.scan import CROWN, GUM, Faces, Scan
 
 # Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the picture, contour length it

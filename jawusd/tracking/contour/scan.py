@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.geometry import transform_point
-from jawusd.geometry.arrays import Array
 from jawusd.geometry.welding import welded
-from jawusd.imaging.decimation import decimated_scan
-from jawusd.imaging.raster import draw_depth_labels, draw_silhouette, project, words_for
+from jawusd.meshes.decimation import decimated_scan
+from jawusd.meshes.raster import draw_depth_labels, draw_silhouette, project, words_for
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments
 
 #: Vertex indices of faces, or other tables of indices that compiled code reads.

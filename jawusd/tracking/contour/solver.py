@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate_outline, scatter_of_tiles, search_edges
 from jawusd.tracking.contour.drawing import Drawings

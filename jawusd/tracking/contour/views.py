@@ -10,14 +10,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.mask_survey import ARCHES, odd_pictures, survey_masks
-from jawusd.imaging.masks import open_masks
-from jawusd.imaging.working_view import WorkingView
+from jawusd.media.mask_survey import ARCHES, odd_pictures, survey_masks
+from jawusd.media.masks import open_masks
+from jawusd.media.working_view import WorkingView
 
 #: Cameras that are needed where nothing but the masks tells how far away the teeth are.
 FEWEST_CAMERAS = 2

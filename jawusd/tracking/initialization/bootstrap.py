@@ -9,7 +9,8 @@ from math import comb
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Pick
 from jawusd.geometry import (
     Camera,
@@ -20,7 +21,6 @@ from jawusd.geometry import (
     transform_points,
     triangulate,
 )
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import motion_about
 
 _FEWEST = 3

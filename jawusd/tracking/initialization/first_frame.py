@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import TrackingError
 from jawusd.formats.tracks import PARTIAL, TRACKED
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import FrameRecord

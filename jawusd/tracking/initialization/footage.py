@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.geometry import Camera, triangulate
-from jawusd.geometry.arrays import Array
-from jawusd.imaging.masks import open_masks
-from jawusd.imaging.working_view import WorkingView
+from jawusd.media.masks import open_masks
+from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
 _BESIDE = 2  # surveyed frames to either side that show much the same

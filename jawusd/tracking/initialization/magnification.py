@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import transform_point, transform_points
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.correspondences import search_edges
 from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z, contour_samples

@@ -8,9 +8,9 @@ from itertools import combinations
 
 import numpy as np
 
-from jawusd.errors import CaptureError, TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError, TrackingError
 from jawusd.formats.capture_parts import CameraSource, Masks
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.quality import coverage_error, uncovered_px
 from jawusd.tracking.contour.scan import teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.scan import Scan
 
 _SAMPLES = 8000  # pieces of surface per arch: one per half millimetre

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from jawusd.base.arrays import Array
 from jawusd.formats.capture import Pick
 from jawusd.geometry import Camera, rigid_fit, se3_exp, transform_points, triangulate
-from jawusd.geometry.arrays import Array
 
 # What may be wrong, standard deviations: shift over the picture's width, relative focal length; and of a click [mm].
 _SHIFT, _FOCAL, _CLICK_MM = 0.05, 0.1, 0.3

@@ -14,10 +14,10 @@ from itertools import combinations, islice
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Pick
 from jawusd.geometry import Camera, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.initialization.bootstrap import TOLERANCE_MM, picked_size, picks_miss_mm, pose_from_picks
 from jawusd.tracking.initialization.pick_cameras import fitted_camera

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.formats.finding import Finding, Severity
 from jawusd.tracking.initialization.pick_causes import ON, Evidence, Mistake, Seen, Setting, evidence, explanation
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, so3_exp, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.scan import CROWN, Scan, prepare_scan
 from jawusd.tracking.contour.views import View

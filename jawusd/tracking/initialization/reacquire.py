@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import transform_point
-from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.raster import unpack_bits
+from jawusd.meshes.raster import unpack_bits
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.contour.views import View
 

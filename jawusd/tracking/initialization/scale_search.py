@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.quality import arch_fit, score_px, uncovered_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, prepare_scan, teeth_centre

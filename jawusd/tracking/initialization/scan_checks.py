@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.finding import Finding
 from jawusd.geometry import anatomical_frame
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusion
 

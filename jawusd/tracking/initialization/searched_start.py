@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.finding import Finding
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.mixups import all_arches_exchanged, likely_mixup
 from jawusd.tracking.initialization.start_causes import CLEAR_FIT, EXPLAINS, MOST_PICTURES, aligned, refuse_by_cause

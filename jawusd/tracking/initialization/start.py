@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_point
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources

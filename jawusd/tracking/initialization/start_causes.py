@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-from jawusd.errors import CaptureError, TrackingError
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError, TrackingError
 from jawusd.tracking.contour.scan import ARCH_NAMES, teeth_centre
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log, transform_point, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import arch_fit, score_px, uncovered_px

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, residual_px, score_px
 from jawusd.tracking.contour.rendering import Rendering

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.geometry import (
     make_transform,
@@ -21,7 +22,6 @@ from jawusd.geometry import (
     se3_log,
     transform_point,
 )
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.scan import Scan
 
 HEAD, JAW = slice(0, 6), slice(6, 9)

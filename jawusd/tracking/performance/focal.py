@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import View

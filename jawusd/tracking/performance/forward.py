@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.reacquire import shift_to_masks

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, thinned

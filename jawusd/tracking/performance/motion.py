@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator import JawRig
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
 
 # Variance of the prior over the mean square of what was seen [-]: motion is even most of the time and jerky where it

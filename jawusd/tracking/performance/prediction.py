@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jawusd.geometry.arrays import Mask
+from jawusd.base.arrays import Mask
 from jawusd.tracking.performance.attempts import MOST_UNSURE
 from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import Expected

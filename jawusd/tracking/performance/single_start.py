@@ -12,12 +12,12 @@ from functools import partial
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, transform_point, transform_points
-from jawusd.geometry.arrays import Array
-from jawusd.imaging.raster import count_bits
+from jawusd.meshes.raster import count_bits
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.quality import arch_fit
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.quality import correlation_px, residual_px
 from jawusd.tracking.contour.rendering import Rendering

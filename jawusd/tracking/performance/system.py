@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 
 _BEND = (1.0, -2.0, 1.0)
 _STEP = (-1.0, 1.0)

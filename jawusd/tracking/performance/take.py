@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.formats.performance import Performance
 from jawusd.tracking.config import TrackingConfig

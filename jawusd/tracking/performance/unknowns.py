@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.attempts import FrameFit

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import hat, transform_point
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import NormalEquations, Solution
 
 # How far points of the lower teeth lie above the closed bite of the scans, standard deviation [mm]: what registrations

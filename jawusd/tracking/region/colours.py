@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.base.arrays import Array, Mask
 
 PATCHES = 8  # per arch
 KINDS = 2  # free edges and gum line

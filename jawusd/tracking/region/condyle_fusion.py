@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import orthonormalise, relative_pose, se3_adjoint, se3_exp
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.region.condyles import CondyleMotion
 from jawusd.tracking.region.strained import strain_factors
 

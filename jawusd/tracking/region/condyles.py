@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import hat, relative_pose, rigid_fit, se3_adjoint, se3_inverse, transform_point
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import NormalEquations, Solution, translation
 from jawusd.tracking.contour.quality import landmark_sigmas
 

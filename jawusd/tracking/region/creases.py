@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.contour.samples import NX, NY, U, V, pixel_of
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.region.edges import colour_at

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.colours import PATCHES, CameraColours, colour_bins

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.quality import residual_px, score_px
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned

@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.scan import Scan, teeth_centre, thinned

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.scan import ARCHES, CROWN, GUM, Scan
 from jawusd.tracking.region.colours import Areas, CameraColours, colour_bins
 

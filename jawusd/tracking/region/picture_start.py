@@ -7,12 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Bootstrap, CameraSource
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.contour.solver import ContourSolver

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.contour.samples import NX, NY, U, V, X, Y, Z, pixel_of
 from jawusd.tracking.contour.scan import GUM
 from jawusd.tracking.region.colours import KINDS

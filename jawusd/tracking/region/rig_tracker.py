@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, score_px
 from jawusd.tracking.contour.rendering import Rendering

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import relative_pose, se3_inverse
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import score_px

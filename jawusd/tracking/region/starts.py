@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import se3_exp, transform_points
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.contour.views import View

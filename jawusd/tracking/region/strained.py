@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.quality import landmark_sigmas
 from jawusd.tracking.region.condyles import CondyleMotion
 

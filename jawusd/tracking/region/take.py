@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.tracks import LOST, TRACKED, LostReason, Tracks, TracksMeta
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.formats.finding import Finding
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import score_px

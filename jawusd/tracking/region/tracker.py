@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import Camera, relative_pose
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, relative_covariance, residual_px, twist_covariance

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.region.colours import BINS, KINDS, TABLES
 from jawusd.tracking.region.creases import search_creases

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.finding import Finding, Severity
 from jawusd.formats.tracks import LOST, Registration
 from jawusd.geometry import relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import ARCHES

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks
 from jawusd.geometry import orthonormalise, relative_pose, se3_exp, se3_inverse, se3_log, transform_points
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance
 from jawusd.tracking.sequence.smoothing import smooth_poses
 

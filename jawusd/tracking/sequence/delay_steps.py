@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import TakeEquations

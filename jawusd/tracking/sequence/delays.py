@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.tracks import LOST
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import motion_about, twist_between
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import ARCHES

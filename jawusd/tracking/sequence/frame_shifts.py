@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.rendering import Rendering

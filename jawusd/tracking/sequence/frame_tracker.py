@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, LostReason
 from jawusd.geometry import transform_point
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, motion_about, translation
 from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss

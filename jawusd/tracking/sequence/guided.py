@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import TrackingError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Bootstrap
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import FOR_AUTO_MASKS, TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.quality import coverage_error, uncovered_px

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.geometry import orthonormalise, se3_inverse, transform_points
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.scan import ARCHES
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.geometry import (
     make_transform,
@@ -17,7 +18,6 @@ from jawusd.geometry import (
     se3_log,
     transform_points,
 )
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import NormalEquations, Solution
 
 _NORMAL_DIRECTIONS = 3  # six motions of a rigid body less the three the model allows

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.scan import Scan, mirrored

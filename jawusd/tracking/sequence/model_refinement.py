@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera, relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log, transform_point
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import FOR_TAKES, TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import (

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.formats.tracks import Tracks, TracksMeta
 from jawusd.geometry import orthonormalise, se3_exp, se3_inverse, se3_log
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.sequence.kinematic_prior import KinematicPrior
 
 _FEWEST = 15  # poses, below which a model says nothing of its own spread

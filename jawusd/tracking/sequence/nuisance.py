@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jawusd.geometry.arrays import Array
+from jawusd.base.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, motion_about
 from jawusd.tracking.contour.frame_record import FrameRecord

@@ -11,9 +11,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jawusd.errors import OutputError
+from jawusd.base.arrays import Array
+from jawusd.base.errors import OutputError
 from jawusd.formats.tracks import LostReason
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import OutlineSums, Solution
 from jawusd.tracking.contour.frame_record import FrameRecord, Loss
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.tracks import LOST, RECOVERED
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import score_px

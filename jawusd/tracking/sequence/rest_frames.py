@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import relative_pose
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 
 # Teeth held together rest: slower than this against one another [mm/frame at the teeth], and no farther from the

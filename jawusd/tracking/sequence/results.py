@@ -9,9 +9,9 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.formats.tracks import LOST, Tracks, TracksMeta
 from jawusd.geometry import relative_pose, se3_adjoint
-from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, translation
 from jawusd.tracking.contour.frame_record import FrameRecord

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.ndimage import uniform_filter1d
 
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import make_transform, orthonormalise, se3_adjoint, se3_exp, se3_inverse, se3_log
-from jawusd.geometry.arrays import Array, Mask
 
 # Frames on either side over which process noise is estimated: a third of a second at 24 fps.
 _WINDOW = 4

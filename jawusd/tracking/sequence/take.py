@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks, TracksMeta
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import FOR_TAKES, TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 from jawusd.tracking.contour.scan import prepare_scan, teeth_centre

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from subjects.short_capture import ShortConfig, draw_capture, labelled
 
-from jawusd.geometry.arrays import Array
-from jawusd.synthetic.short_capture import ShortConfig, draw_capture, labelled
+from jawusd.base.arrays import Array
 
 CROP_PX = 160
 PX_PER_MM = (2.5, 9.0)  # of the crops; trackers work at 7.2 at most

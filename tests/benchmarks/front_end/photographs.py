@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "real"))
 from compare import Network
 from patients import BESIDE_PX, COLOUR, LARGEST_TOOTH, LINE, VIEWS, labels, overlap
 
-from jawusd.imaging.pictures import read_picture
+from jawusd.media.pictures import read_picture
 from jawusd.segmentation.rows import tooth_rows
 
 WIDTH_PX = 480  # of the photographs for the network: about 5 px/mm

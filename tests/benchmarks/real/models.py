@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import model_peers
 import numpy as np
 
-from jawusd.errors import FittingError
+from jawusd.base.errors import FittingError
 from jawusd.evaluator.distances import carried
 from jawusd.fitting import FittingConfig
 from jawusd.fitting.coverage import shown_parameters
 from jawusd.fitting.data import TrainingData, displacement
 from jawusd.fitting.fit import fit_form
 from jawusd.fitting.metric import MandibleMetric
-from jawusd.fitting.nlpca import Nlpca
 from jawusd.geometry import make_transform, se3_exp, se3_log, so3_exp, so3_log
+from jawusd.paper.nlpca import Nlpca
 
 Array = np.ndarray
 Rebuild = Callable[[Array], Array]

@@ -13,9 +13,13 @@ from sources import PATIENTS
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, so3_log, transform_point, transform_points
-from jawusd.imaging.meshio import load_mesh
-from jawusd.imaging.overlay import save_png
-from jawusd.imaging.pictures import read_gray, read_picture
+from jawusd.media.overlay import save_png
+from jawusd.media.pictures import read_gray, read_picture
+from jawusd.meshes.meshio import load_mesh
+from jawusd.photographs import PhotoAlignment, align_photographs
+from jawusd.photographs.align import _AT_WIDTH_PX, _TURN_PX, _lower_incisor, _refined
+from jawusd.photographs.contact import Contact
+from jawusd.photographs.solve import Bite, match, seen_outlines
 from jawusd.pipeline.photographs import drawn_over, read_drawing
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
@@ -25,10 +29,6 @@ from jawusd.segmentation.picture import Window
 from jawusd.segmentation.rows import tooth_rows
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.initialization.occlusion import measure_occlusion
-from jawusd.tracking.photographs import PhotoAlignment, align_photographs
-from jawusd.tracking.photographs.align import _AT_WIDTH_PX, _TURN_PX, _lower_incisor, _refined
-from jawusd.tracking.photographs.contact import Contact
-from jawusd.tracking.photographs.solve import Bite, match, seen_outlines
 
 Array = np.ndarray
 COLOUR = 1  # cv2.IMREAD_COLOR

@@ -10,10 +10,10 @@ import patients
 from report import Origin, saved, table, title
 from sources import PATIENTS, SCANNER
 
-from jawusd.errors import MissingDependencyError
+from jawusd.base.errors import MissingDependencyError
 from jawusd.formats.mesh import GUM, Mesh
-from jawusd.imaging.meshio import load_mesh
-from jawusd.imaging.scan_labels import label_scan
+from jawusd.meshes.meshio import load_mesh
+from jawusd.meshes.scan_labels import label_scan
 
 ORIGIN = Origin(
     f"`{SCANNER.repository}` TestData, `{PATIENTS.repository}` demo/ref_mesh",

@@ -1,0 +1,252 @@
+"""Run the program in a child process with limits, so that the death of a native library becomes one message.
+
+OpenUSD, FFmpeg, OpenCV and others parse what a file holds, and may crash or use all memory over a damaged one. The
+parent does nothing but wait: it passes signals and the exit code on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import mmap
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
+from typing import NoReturn
+
+from jawusd.base.errors import ResourceError
+
+try:
+    import resource
+except ImportError:  # on Windows, which has no such limits
+    resource = None  # type: ignore[assignment]
+
+#: Environment variable: how much memory [GB] a command may use; 0 for no limit.
+SETTING = "JAWUSD_MEMORY_GB"
+
+_SHARE, _LEAST_GB = 0.75, 4.0  # of the machine's memory; ordinary builds take less than the least
+_LEAST_SPACE_GB = 1.5  # 1.3 GB with OpenUSD's libraries
+_CHILD = "_JAWUSD_CHILD"  # marks the child where processes cannot fork
+_SI_KERNEL = 0x80  # of Linux's siginfo.h: a terminal sent the signal, to the child as well
+_PR_SET_PDEATHSIG = 1  # of Linux's prctl.h
+_PASSED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGTSTP", "SIGCONT")
+_KEYS = ("SIGINT", "SIGQUIT", "SIGTSTP")
+_CRASHES = ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGILL", "SIGFPE", "SIGSYS", "SIGTRAP")
+
+_in_hand: mmap.mmap | None = None
+
+
+def begin() -> None:
+    """Go on in a child process with limits; the parent waits for it and ends as it does.
+
+    Call it before anything heavy is imported and before any thread starts.
+    """
+    global _in_hand
+    try:
+        limit = memory_limit()
+        _check_space()
+    except ResourceError as error:
+        _leave_with(error)
+    if os.environ.pop(_CHILD, None):
+        return
+    if not hasattr(os, "fork"):
+        _leave_by_subprocess()
+    _in_hand = mmap.mmap(-1, mmap.PAGESIZE)
+    passed = {getattr(signal, name) for name in _PASSED}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {*passed, signal.SIGCHLD})
+    parent = os.getpid()
+    gc.freeze()  # collections would copy what parent and child share
+    child = os.fork()
+    if child:
+        _leave_as(_wait(child, passed))
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    _die_with(parent)
+    limit_process(limit)
+
+
+def memory_limit() -> int:
+    """Return how much memory a command may use [bytes]; 0 for no limit.
+
+    Raises:
+        ResourceError: The environment variable is no number.
+    """
+    named = os.environ.get(SETTING)
+    if not named:
+        return int(max(_SHARE * machine_memory(), _LEAST_GB * 1e9))
+    with contextlib.suppress(ValueError):
+        if 0 <= (limit := float(named)) < 1e6:
+            return int(limit * 1e9)
+    raise ResourceError(f"{SETTING} is {named!r}, allowed is a number of GB, 0 for no limit.")
+
+
+def machine_memory() -> int:
+    """Return the memory of the machine, or of the container this runs in [bytes]; 0 where the system does not say."""
+    try:
+        found = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):  # Windows has no sysconf
+        return 0
+    for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(OSError, ValueError):  # "max"
+            found = min(found, int(Path(name).read_text()))
+    return found
+
+
+def _check_space() -> None:
+    """Refuse less address space than OpenUSD's libraries need: others report what they lack as damage of files."""
+    space = -1 if resource is None else resource.getrlimit(resource.RLIMIT_AS)[0]  # -1: no limit
+    if 0 <= space < _LEAST_SPACE_GB * 1e9:
+        found = (
+            f"address space is limited to {space / 1e9:.2g} GB (ulimit -v), at least {_LEAST_SPACE_GB:g} GB are needed."
+        )
+        raise ResourceError(found)
+
+
+def limit_process(memory: int, cpu_s: int | None = None) -> None:
+    """Limit this process and those that it starts.
+
+    Args:
+        memory: [bytes], 0 for no limit. It counts what a process can write to and shares with no other: address space
+            that CUDA, numba and threads only reserve is free.
+        cpu_s: Processor time [s].
+    """
+    if resource is None:
+        return
+    _lower(resource.RLIMIT_CORE, 0)
+    if memory:
+        _lower(resource.RLIMIT_DATA, memory)
+    if cpu_s is not None:
+        _lower(resource.RLIMIT_CPU, cpu_s)
+
+
+def _lower(kind: int, most: int) -> None:
+    soft, hard = resource.getrlimit(kind)
+    if soft == resource.RLIM_INFINITY or most < soft:
+        resource.setrlimit(kind, (most, hard))
+
+
+def out_of_memory(path: str | PathLike[str] | None = None) -> ResourceError:
+    """Return the error for a lack of memory over a file, that in hand by default, with the limit."""
+    limits = []
+    if resource is not None:
+        found = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_DATA, resource.RLIMIT_AS))
+        limits = [limit for limit in found if limit != resource.RLIM_INFINITY]
+    allowed = f", {min(limits) / 1e9:.2g} GB" if limits else ""
+    return ResourceError(
+        f"needs more memory than jawusd may use here{allowed}.", path=path or file_in_hand(), hint=_MORE
+    )
+
+
+_MORE = f"Set {SETTING} (and ulimit -v) to allow more, or use a smaller input."
+
+
+def take_in_hand(path: str | PathLike[str]) -> None:
+    """Note the file that is read next, for the message if it ends the program."""
+    if _in_hand is not None:
+        name = os.fsencode(os.path.abspath(path))[: mmap.PAGESIZE - 1]
+        _in_hand[:] = name.ljust(mmap.PAGESIZE, b"\0")
+
+
+def file_in_hand() -> str:
+    """Return the file that was noted last, else the command line."""
+    import shlex
+
+    noted = bytes(_in_hand).rstrip(b"\0") if _in_hand is not None else b""
+    return os.fsdecode(noted) if noted else shlex.join(["jawusd", *sys.argv[1:]])
+
+
+@contextlib.contextmanager
+def most_cpu(seconds: int) -> Iterator[None]:
+    """Let the child end where the work inside takes more processor time [s]; without a guard, do nothing."""
+    if resource is None or _in_hand is None:
+        yield
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_CPU)
+    _lower(resource.RLIMIT_CPU, int(time.process_time()) + 1 + seconds)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
+
+
+def _die_with(parent: int) -> None:
+    """Let the system end this process when its parent ends, where it can (Linux)."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
+
+
+def _wait(child: int, passed: set[signal.Signals]) -> int:
+    """Pass signals on until a child ends; return its wait status."""
+    while True:
+        number, is_from_terminal = _next_signal({*passed, signal.SIGCHLD})
+        if number != signal.SIGCHLD:
+            if not is_from_terminal:
+                os.kill(child, number)
+            continue
+        pid, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
+        if pid and os.WIFSTOPPED(status):
+            os.kill(os.getpid(), signal.SIGSTOP)  # so that the shell sees a stopped job
+        elif pid:
+            return status
+
+
+def _next_signal(awaited: set[signal.Signals]) -> tuple[int, bool]:
+    """Return the next signal, and whether a terminal has sent it to all processes of the group."""
+    if hasattr(signal, "sigwaitinfo"):
+        found = signal.sigwaitinfo(awaited)
+        return found.si_signo, found.si_code == _SI_KERNEL
+    number = signal.sigwait(awaited)  # macOS does not say who sent it
+    try:
+        in_front = os.tcgetpgrp(0) == os.getpgrp()
+    except OSError:
+        in_front = False
+    return number, in_front and signal.Signals(number).name in _KEYS
+
+
+def _leave_as(status: int) -> NoReturn:
+    """End this process as its child did: with its exit code, by its signal, or with a message where it crashed."""
+    if os.WIFEXITED(status):
+        os._exit(os.WEXITSTATUS(status))
+    number = signal.Signals(os.WTERMSIG(status))
+    if number.name in (*_CRASHES, "SIGXCPU", "SIGKILL"):
+        _leave_with(_death(number.name))
+    signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
+    os.kill(os.getpid(), number)
+    os._exit(128 + number)
+
+
+def _death(name: str) -> ResourceError:
+    if name == "SIGXCPU":
+        found, hint = "takes too much processor time to read: it is damaged, or was made to.", ""
+    elif name == "SIGKILL":
+        found, hint = "the program was killed while it used this, by the system for lack of memory or by a user.", _MORE
+    else:
+        found = f"a library crashed while it used this ({name}): a file is damaged, or memory did not suffice."
+        hint = "The option -v says where in the program, before the command."
+    return ResourceError(found, path=file_in_hand(), hint=hint or None)
+
+
+def _leave_with(error: ResourceError) -> NoReturn:
+    with contextlib.suppress(OSError):
+        os.write(2, f"jawusd: {error}\n".encode(errors="backslashreplace"))
+    os._exit(error.exit_code)
+
+
+def _leave_by_subprocess() -> NoReturn:
+    """Run the program in a second Python and end as it does, where processes cannot fork."""
+    import subprocess
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the console sends it to both
+    line = [sys.executable, "-m", "jawusd", *sys.argv[1:]]
+    code = subprocess.run(line, env={**os.environ, _CHILD: "1"}, check=False).returncode
+    if code < 0 or code >= 0xC0000000:  # codes of Windows for exceptions that nobody caught
+        _leave_with(_death(f"{code & 0xFFFFFFFF:#x}"))
+    os._exit(code)

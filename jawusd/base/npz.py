@@ -1,0 +1,144 @@
+"""Read npz files that hold plain arrays and a JSON string `meta`, guarded against damaged and hostile files."""
+
+from __future__ import annotations
+
+import json
+import lzma
+import os
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, UnitsError, VersionError
+from jawusd.base.inputs import check_input
+
+UNITS = {"length": "mm", "angle": "rad"}
+TWIST_ORDER = ["omega", "v"]
+
+NamedArrays = dict[str, Array]  # of whatever type the file has; `take` checks those that are used
+JsonObject = dict[str, object]
+
+# Ten times what 20,000 frames take; guards against archives that unpack to fill the memory.
+_MAX_ARRAY_BYTES = 512 << 20
+#: What zipfile and numpy raise for damaged members, beside OSError: their decoders' own errors, missing methods and
+# passwords (RuntimeError), headers that declare more than there is (MemoryError) or nest too deeply; headers that are
+# no Python literal numpy takes apart with Python's tokenizer, which raises errors of its own.
+DAMAGED = (
+    ValueError, EOFError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError,
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError, SyntaxError,
+)  # fmt: skip
+
+
+def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[NamedArrays, JsonObject]:
+    """Read the arrays and the meta data of a jawusd npz file and check format, version and units.
+
+    Args:
+        family: Format name without version, e.g. ``"jawusd-tracks"``.
+        version: Newest version this reader knows.
+
+    Raises:
+        FormatError: not such a file, or damaged.
+        VersionError: written by a newer version.
+        UnitsError: other units or twist order.
+    """
+    path = Path(path)
+    check_input(path)
+    arrays: NamedArrays = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            total = sum(member.file_size for member in archive.infolist())
+        if total > _MAX_ARRAY_BYTES:
+            raise FormatError(f"unpacks to {total / 1e9:.1f} GB; at most 0.5 GB are read.", path=path)
+        with np.load(path, allow_pickle=False) as archive:
+            for name in archive.files:
+                arrays[name] = archive[name]
+                if not isinstance(arrays[name], np.ndarray):
+                    raise FormatError(f'"{name}" is no array.', path=path)
+    except FileNotFoundError as error:
+        raise FormatError("there is no such file.", path=path) from error
+    except (OSError, *DAMAGED) as error:
+        raise FormatError(f"is not a readable npz file ({error!s:.200}).", path=path) from error
+    if "meta" not in arrays:
+        raise FormatError(f'has no "meta"; a {family} file carries its format and units there.', path=path)
+    try:
+        meta = json.loads(str(arrays.pop("meta")))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f'"meta" is not JSON ({error}).', path=path) from error
+    if not isinstance(meta, dict):
+        raise FormatError('"meta" must be a JSON object.', path=path)
+    check_format(meta.get("format"), family, version, path)
+    check_units(meta, path)
+    return arrays, meta
+
+
+def check_format(found: object, family: str, version: int, path: str | os.PathLike[str]) -> int:
+    """Check a format label such as ``"jawusd-tracks/1"`` and return its version.
+
+    Raises:
+        FormatError: another format, or no label.
+        VersionError: a newer version.
+    """
+    name, _, number = str(found).partition("/")
+    if name != family or not (number.isascii() and number.isdigit() and len(number) < 10):
+        raise FormatError(f'format is "{found}", expected "{family}/{version}".', path=path)
+    if int(number) > version:
+        raise VersionError(
+            f'format is "{found}", this jawusd reads up to "{family}/{version}".', path=path, hint="Update jawusd."
+        )
+    return int(number)
+
+
+def check_units(meta: Mapping[str, object], path: str | os.PathLike[str]) -> None:
+    """Check the units and the twist order written in a file's meta data.
+
+    Raises:
+        UnitsError: they differ from mm, rad and (omega, v), or are missing.
+    """
+    if meta.get("units") != UNITS:
+        raise UnitsError(f"units are {meta.get('units')}, allowed are {UNITS}.", path=path)
+    if meta.get("twist_order") != TWIST_ORDER:
+        raise UnitsError(f"twist order is {meta.get('twist_order')}, allowed is {TWIST_ORDER}.", path=path)
+
+
+def upgraded_model(arrays: NamedArrays, path: object) -> NamedArrays:
+    """Return the arrays of a model of any version under their present names.
+
+    Version 1 held the tolerance of measured poses as the smallest margin of a valid pose, "margin_limit_mm".
+
+    Raises:
+        FormatError: that margin is no number.
+    """
+    known = dict(arrays)
+    if "margin_limit_mm" in known:
+        known.setdefault("tolerance_mm", np.negative(take(arrays, "margin_limit_mm", (), path), dtype=np.float64))
+        del known["margin_limit_mm"]
+    return known
+
+
+def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: object, *, finite: bool = True) -> Array:
+    """Return one of the arrays of `read_npz` after checking its shape and finiteness.
+
+    Args:
+        shape: Required shape, None where any length goes.
+        finite: Refuse NaN and infinity.
+
+    Raises:
+        FormatError: missing, of another shape, or not finite.
+    """
+    if name not in arrays:
+        raise FormatError(f'has no array "{name}".', path=str(path))
+    value = arrays[name]
+    if value.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, value.shape, strict=True)):
+        wanted = "(" + ", ".join("any" if w is None else str(w) for w in shape) + ")"
+        raise FormatError(f'"{name}" has shape {value.shape}, expected {wanted}.', path=str(path))
+    if value.dtype.kind not in "fiub":
+        raise FormatError(f'"{name}" holds {value.dtype}, expected numbers.', path=str(path))
+    if finite and value.dtype.kind == "f" and not np.isfinite(value).all():
+        raise FormatError(f'"{name}" holds values that are not finite.', path=str(path))
+    return value

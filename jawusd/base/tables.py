@@ -1,0 +1,254 @@
+"""Read text and tables as editors, spreadsheets and other programs of any locale write them.
+
+One place decides for all readers:
+
+* the encoding: UTF-8, or UTF-16 and UTF-32 as the byte order mark or the first bytes say;
+* the ends of lines: LF, CRLF, CR;
+* the separator: tab, semicolon or comma, the first that splits header and first row alike, or the header; a line
+  `sep=;` names it;
+* the decimal sign: a point, or a comma in tables whose numbers have no points. Thousands separators are not read, and
+  `1,234` alone, which may be either, is refused.
+
+Blank lines, comments and blank columns at the end are skipped.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
+from jawusd.base.inputs import check_input
+
+SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}
+_AS_UTF8 = "Save it as UTF-8: editors ask for the encoding under Save As."
+_NAMED_SEPARATOR = re.compile(r'"?sep=(.)"?[ \t]*\n', re.IGNORECASE)
+_COMMA_NUMBER = re.compile(r"[+-]?\d*,\d*(e[+-]?\d+)?", re.IGNORECASE)
+_MAYBE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+
+
+def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
+    """Return what a text file holds, lines ended by LF alone.
+
+    Args:
+        path: the file.
+        most_bytes: the largest size that is read.
+        encoding: of files that neither a byte order mark nor null bytes tell to be UTF-16 or UTF-32.
+
+    Raises:
+        FormatError: missing, no file, too large or no text in this encoding.
+    """
+    check_input(path)
+    try:
+        size = path.stat().st_size
+        if size > most_bytes:
+            raise FormatError(f"is {size} bytes, at most {most_bytes} are read.", path=path)
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FormatError("there is no such file.", path=path) from error
+    except OSError as error:
+        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+    found = json.detect_encoding(data)
+    try:
+        text = data.decode(encoding if found == "utf-8" else found)
+    except UnicodeDecodeError as error:
+        raise _not_text(path, error, found) from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _not_text(path: Path, error: UnicodeDecodeError, encoding: str) -> FormatError:
+    if not encoding.startswith("utf-8"):
+        words = f"begins as {encoding.upper()} text and holds bytes that are none."
+        return FormatError(words, path=path, hint=_AS_UTF8)
+    line, byte = error.object[: error.start].count(b"\n") + 1, error.object[error.start]
+    return FormatError(
+        f"is not UTF-8 text: line {line} holds the byte 0x{byte:02x}, as an accented letter in another encoding.",
+        path=path,
+        hint=_AS_UTF8,
+    )
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Hold a table below a header, cells as text.
+
+    Attributes:
+        path: the file, for messages.
+        header: names of the columns, blank ones at the end left out.
+        rows: cells, as many as the header names.
+        places: where each row stands, as "line 3".
+    """
+
+    path: Path
+    header: list[str]
+    rows: list[list[str]]
+    places: list[str]
+
+    def numbers(self, columns: Sequence[int], rows: Sequence[int] | None = None) -> Array:
+        """Return columns as numbers, shape (rows, columns), `nan` and `inf` as they stand.
+
+        Args:
+            columns: indices in the header.
+            rows: indices of rows, None for all.
+
+        Raises:
+            FormatError: a cell that is no number, or numbers whose decimal sign cannot be told.
+        """
+        chosen = range(len(self.rows)) if rows is None else rows
+        cells = [[self.rows[i][k] for k in columns] for i in chosen]
+        return to_numbers(cells, lambda i, j: self.named(chosen[i], columns[j]), self.path).reshape(-1, len(columns))
+
+    def named(self, row: int, column: int) -> str:
+        """Return how messages name a cell."""
+        return f'{self.places[row]}, column "{self.header[column]}"'
+
+
+def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool = False) -> TextTable:
+    """Read a table of text whose first row names the columns.
+
+    Args:
+        path: the file.
+        most_bytes: the largest size that is read.
+        comment: what lines that are skipped begin with.
+        short_rows: rows may end early; the caller checks them with `check_width`.
+
+    Raises:
+        FormatError: no text, no table, or a row with more or fewer cells than the header.
+    """
+    found, separator = split_rows(read_text(path, most_bytes), path, comment)
+    if not found:
+        raise FormatError("is empty; the first line must name the columns.", path=path)
+    header = [name.strip() for name in found[0][1]]
+    while header and not header[-1]:
+        header.pop()
+    table = TextTable(path, header, [], [])
+    for line, row in found[1:]:
+        while len(row) > len(header) and not row[-1].strip():
+            row.pop()
+        table.rows.append(row)
+        table.places.append(f"line {line}")
+        if not short_rows:
+            check_width(table, len(table.rows) - 1, separator)
+    return table
+
+
+def check_width(table: TextTable, index: int, separator: str = "") -> None:
+    """Check that a row has as many cells as the header.
+
+    Raises:
+        FormatError: it has not.
+    """
+    found, wanted = len(table.rows[index]), len(table.header)
+    if found != wanted:
+        more = separator == "," and found > wanted
+        raise FormatError(
+            f"{table.places[index]} has {found} values, the header names {wanted}.",
+            path=table.path,
+            hint="Commas separate the columns here: write decimals with points." if more else None,
+        )
+
+
+def split_rows(
+    text: str, path: Path, comment: str = "#", blank_rows: bool = False
+) -> tuple[list[tuple[int, list[str]]], str]:
+    """Return the rows of a table with their line numbers, and what separates the cells.
+
+    Args:
+        text: of the file.
+        path: the file, for messages.
+        comment: what lines that are skipped begin with.
+        blank_rows: rows of several blank cells count, but at the end.
+
+    Raises:
+        FormatError: quotes that do not match.
+    """
+    named = _NAMED_SEPARATOR.match(text)
+    separator = named[1] if named else _separator(text, comment)
+    reader = csv.reader(io.StringIO(text[named.end() :] if named else text), delimiter=separator, strict=True)
+    above = 1 if named else 0
+    try:
+        rows = [(reader.line_num + above, row) for row in reader if blank_rows and len(row) > 1 or _is_filled(row)]
+    except csv.Error as error:
+        raise FormatError(f"is not a CSV table ({error}).", path=path) from error
+    while rows and not _is_filled(rows[-1][1]):
+        rows.pop()
+    return [(line, row) for line, row in rows if not row[0].lstrip().startswith(comment)], separator
+
+
+def _is_filled(row: Sequence[str]) -> bool:
+    return any(map(str.strip, row))
+
+
+def _separator(text: str, comment: str) -> str:
+    """Return what separates the cells of the first line that is split, see the module."""
+    lines = (line for line in io.StringIO(text) if line.strip() and not line.lstrip().startswith(comment))
+    first = next((line for line in lines if any(sign in line for sign in SEPARATORS)), "")
+    second = next(lines, "")
+    widths = {sign: [len(row) for row in csv.reader([first, second], delimiter=sign)] for sign in SEPARATORS}
+    splitting = [sign for sign, (width, *_) in widths.items() if width > 1]
+    alike = [sign for sign in splitting if len(set(widths[sign])) == 1]
+    return (alike or splitting or [","])[0]
+
+
+def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str], path: Path) -> Array:
+    """Return cells as numbers, shape as theirs, `nan` and `inf` as they stand.
+
+    Args:
+        cells: rows of the same length.
+        named: what row and column are called in messages.
+        path: the file, for messages.
+
+    Raises:
+        FormatError: a cell that is no number, or numbers whose decimal sign cannot be told.
+    """
+    if any("," in cell for row in cells for cell in row):
+        cells = _with_points(cells, named, path)
+    try:
+        return np.array(cells, dtype=np.float64)
+    except ValueError as error:
+        for i, row in enumerate(cells):
+            for j, cell in enumerate(row):
+                if not _is_number(cell):
+                    raise FormatError(f'{named(i, j)}: "{cell:.80}" is not a number.', path=path) from error
+        raise
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _with_points(cells: Sequence[Sequence[str]], named: Callable[[int, int], str], path: Path) -> list[list[str]]:
+    """Return cells with decimal points for commas."""
+    flat = [(i, j, cell.strip()) for i, row in enumerate(cells) for j, cell in enumerate(row)]
+    commas = [place for place in flat if "," in place[2]]
+    point = next((place for place in flat if "." in place[2] and _is_number(place[2].replace(",", ""))), None)
+    i, j, cell = commas[0]
+    if point is not None:
+        raise FormatError(
+            f'{named(i, j)} is "{cell}" and {named(*point[:2])} is "{point[2]}": commas and points cannot both be '
+            "decimal signs, and thousands separators are not read.",
+            path=path,
+            hint="Write all decimals with points, and no thousands separators.",
+        )
+    if all(_MAYBE_THOUSANDS.fullmatch(cell) for _, _, cell in commas):
+        raise FormatError(
+            f'{named(i, j)}: "{cell}" may be {cell.replace(",", ".")} or {cell.replace(",", "")}, and no other number '
+            "of the table tells which.",
+            path=path,
+            hint="Write decimals with points, and no thousands separators.",
+        )
+    return [
+        [cell.replace(",", ".") if _COMMA_NUMBER.fullmatch(cell.strip()) else cell for cell in row] for row in cells
+    ]

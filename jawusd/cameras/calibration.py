@@ -1,0 +1,117 @@
+"""Camera calibration: the TOML of aniposelib, lengths in mm; Pose2Sim and Caliscope write the same keys, in metres.
+
+Each table `[cam_0]`, `[cam_1]`, ... holds name, size, matrix, distortions, rotation (Rodrigues vector) and
+translation; the last two take world to camera coordinates. Pose2Sim calls the tables after its cameras, Caliscope puts
+them below `[cameras]`, by port.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError
+from jawusd.cameras.parts import check_lens_model
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.text import read_toml
+from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp, so3_log
+
+# Entries of R R^T - I; a rotation written with 6 digits stays below it.
+_ROTATION_TOLERANCE = 1e-4
+_CAMERA_TABLE = re.compile(r"^cam_\d+$")
+
+
+def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
+    """Read the cameras of a calibration file.
+
+    Raises:
+        CalibrationError: a value is missing, of the wrong shape or not finite, or a rotation is not one.
+        FormatError: not TOML.
+    """
+    path = Path(path)
+    data = read_toml(path)
+    tables = sorted((k for k in data if _CAMERA_TABLE.match(k)), key=lambda k: int(k[4:]))
+    if not tables:
+        below = data.get("cameras")
+        if isinstance(below, dict):  # Caliscope
+            data = {f"cam_{port}": table for port, table in below.items()}
+        tables = [key for key, table in data.items() if isinstance(table, dict) and "matrix" in table]
+    if not tables:
+        raise CalibrationError('has no camera tables "[cam_0]", "[cam_1]", ...', path=path)
+    cameras = [_camera(path, table, data[table]) for table in tables]
+    names = [camera.name for camera in cameras]
+    if len(set(names)) != len(names):
+        raise CalibrationError(f"names a camera twice: {', '.join(names)}.", path=path)
+    return cameras
+
+
+def _numbers(path: Path, table: str, values: dict[str, object], key: str, shapes: tuple[tuple[int, ...], ...]) -> Array:
+    if key not in values:
+        raise CalibrationError(f'[{table}] has no "{key}".', path=path)
+    try:
+        array = np.array(values[key], dtype=np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise CalibrationError(f'[{table}] "{key}" is not an array of numbers.', path=path) from error
+    if array.shape not in shapes:
+        allowed = " or ".join(str(s) for s in shapes)
+        raise CalibrationError(f'[{table}] "{key}" has shape {array.shape}, allowed is {allowed}.', path=path)
+    if not np.isfinite(array).all():
+        raise CalibrationError(f'[{table}] "{key}" holds a value that is not finite.', path=path)
+    return array
+
+
+def _camera(path: Path, table: str, values: object) -> Camera:
+    if not isinstance(values, dict):
+        raise CalibrationError(f"[{table}] must be a table.", path=path)
+    size = _numbers(path, table, values, "size", ((2,),))
+    K = _numbers(path, table, values, "matrix", ((3, 3),))
+    distortion = _numbers(path, table, values, "distortions", ((0,), (4,), (5,), (8,)))
+    rotation = _numbers(path, table, values, "rotation", ((3,), (3, 3)))
+    translation = _numbers(path, table, values, "translation", ((3,),))
+    check_lens_model(path, f"[{table}]", values)
+    if (size < 16).any() or (size != np.round(size)).any():
+        raise CalibrationError(f"[{table}] size is {size.tolist()} px, allowed: whole numbers from 16.", path=path)
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 0 or K[2, 2] != 1:
+        raise CalibrationError(
+            f"[{table}] matrix must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 px.", path=path
+        )
+    if rotation.ndim == 1:
+        rotation = so3_exp(rotation)
+    defect = float(rigidity_defect(make_transform(rotation, np.zeros(3))))
+    if defect > _ROTATION_TOLERANCE:
+        raise CalibrationError(
+            f"[{table}] rotation is not a rotation (R R^T - I up to {defect:.2g}, allowed {_ROTATION_TOLERANCE:g}).",
+            path=path,
+            hint="Write the Rodrigues vector of a proper rotation, world to camera.",
+        )
+    # Exact rotation from one written with few digits.
+    rotation = so3_exp(so3_log(rotation))
+    name = str(values.get("name", table))
+    return Camera(name, (int(size[0]), int(size[1])), K, distortion, make_transform(rotation, translation))
+
+
+def save_calibration(path: str | os.PathLike[str], cameras: list[Camera]) -> None:
+    """Write cameras as aniposelib TOML, atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    lines = []
+    for index, camera in enumerate(cameras):
+        matrix = ", ".join("[" + ", ".join(repr(float(v)) for v in row) + "]" for row in camera.K)
+        rotation = so3_log(camera.T_cam_world[:3, :3])
+        lines += [
+            f"[cam_{index}]",
+            f'name = "{camera.name}"',
+            f"size = [{camera.size_px[0]}, {camera.size_px[1]}]",
+            f"matrix = [{matrix}]",
+            f"distortions = {[float(v) for v in camera.distortion]}",
+            f"rotation = {[float(v) for v in rotation]}",
+            f"translation = {[float(v) for v in camera.T_cam_world[:3, 3]]}",
+            "",
+        ]
+    write_text_atomic(path, "\n".join([*lines, "[metadata]", 'units = "mm"', ""]))

@@ -1,0 +1,144 @@
+"""Cameras of COLMAP: text models (https://colmap.github.io/format.html).
+
+`cameras.txt` holds lenses, `images.txt` two lines an image: rotation (w, x, y, z) and translation, world to camera, and
+the points that it sees, which may be left out. The centre of the top-left pixel is at (0.5, 0.5), OpenCV's at (0, 0).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError, FormatError
+from jawusd.base.tables import read_text
+from jawusd.cameras.parts import MOST_BYTES, CameraFormat, cameras_of_images, corner_matrix, files_in
+from jawusd.geometry import Camera, make_transform, matrix_from_wxyz
+
+_FILES = ("cameras.txt", "images.txt")
+# Per model: which parameters are fx, fy, cx, cy and, from there on, OpenCV's distortion; SIMPLE ones share f.
+_MODELS = {
+    "SIMPLE_PINHOLE": ("f", 0),
+    "PINHOLE": ("fxfy", 0),
+    "SIMPLE_RADIAL": ("f", 1),
+    "RADIAL": ("f", 2),
+    "OPENCV": ("fxfy", 4),
+    "FULL_OPENCV": ("fxfy", 8),
+}
+_POINTS = re.compile(r"(?:\S+ \S+ -?\d+(?: |$))+")
+
+
+def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
+    """Read a COLMAP text model; return the cameras by name, in the model's unit.
+
+    Several images of one camera must share its pose and lens: the cameras of a capture stand still.
+
+    Raises:
+        CalibrationError: a file is missing, a value is missing or wrong, or the camera model is not supported.
+    """
+    folder = Path(folder)
+    path = folder / "images.txt"
+    lenses = {row[0]: _lens(folder / "cameras.txt", row) for row in _rows(folder / "cameras.txt") if row}
+    images: list[tuple[str, Camera]] = []
+    for row in _image_rows(path):
+        if row[8] not in lenses:
+            raise CalibrationError(f"image {row[9]} names camera {row[8]}, which cameras.txt does not hold.", path=path)
+        q, t = np.split(_floats(path, row[1:8]), [4])
+        if not np.linalg.norm(q) > 0:
+            raise CalibrationError(f"image {row[9]} has a quaternion of length 0.", path=path)
+        size, K, distortion = lenses[row[8]]
+        file = " ".join(row[9:])
+        images.append((file, Camera(file, size, K, distortion, make_transform(matrix_from_wxyz(q), t))))
+    if not images:
+        raise CalibrationError("holds no images.", path=path)
+    return cameras_of_images(path, images)
+
+
+def _image_rows(path: Path) -> Iterator[list[str]]:
+    """Yield the words of each image; what follows it is its line of points, three numbers each, or the next image.
+
+    Raises:
+        CalibrationError: a line is neither.
+    """
+    after_image = False
+    for row in _rows(path):
+        # the third number of a point is that of a point in space
+        if not row or (after_image and _POINTS.fullmatch(" ".join(row))):
+            after_image = False
+            continue
+        if len(row) < 10 or not all(_is_number(word) for word in row[:9]):
+            raise CalibrationError(
+                f'"{" ".join(row):.80}" is not an image: an id, 4 + 3 pose values, a camera id and a name are needed.',
+                path=path,
+            )
+        after_image = True
+        yield row
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _rows(path: Path) -> list[list[str]]:
+    """Return the words of every line but remarks."""
+    try:
+        text = read_text(path, MOST_BYTES)
+    except FormatError as error:
+        binary = path.with_suffix(".bin").exists() and not path.exists()
+        convert = "colmap model_converter --input_path . --output_path . --output_type TXT"
+        raise CalibrationError(
+            f"cannot be read ({error.message.rstrip('.')}).",
+            path=path,
+            hint=f"The model here is binary; write it as text: {convert}"
+            if binary
+            else "A COLMAP text model has cameras.txt and images.txt.",
+        ) from error
+    return [line.split() for line in text.split("\n") if not line.lstrip().startswith("#")]
+
+
+def _floats(path: Path, words: Iterable[str]) -> Array:
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise CalibrationError(f'"{" ".join(words)}" are not numbers.', path=path) from error
+    if not np.isfinite(values).all():
+        raise CalibrationError(f'"{" ".join(words)}" holds a value that is not finite.', path=path)
+    return values
+
+
+def _lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Array]:
+    if len(row) < 5 or row[1] not in _MODELS:
+        found = row[1] if len(row) > 1 else "nothing"
+        raise CalibrationError(
+            f"camera {row[0]} has the model {found}, allowed are {', '.join(_MODELS)}.",
+            path=path,
+            hint="Undistort the footage first, or solve again with --ImageReader.camera_model OPENCV.",
+        )
+    focal, terms = _MODELS[row[1]]
+    values = _floats(path, row[2:])
+    expected = 2 + (3 if focal == "f" else 4) + terms
+    if len(values) != expected:
+        raise CalibrationError(f"camera {row[0]} has {len(values)} values, {row[1]} needs {expected}.", path=path)
+    size = (int(values[0]), int(values[1]))
+    fx, fy, cx, cy = (values[2], *values[2:5]) if focal == "f" else values[2:6]
+    distortion = values[expected - terms :]
+    if 0 < terms < 4:  # radial terms only
+        distortion = np.concatenate([distortion, np.zeros(4 - terms)])
+    return size, corner_matrix(path, f"camera {row[0]}", fx, fy, cx, cy), distortion
+
+
+FORMAT = CameraFormat(
+    lambda path: (
+        path.name in _FILES or any(file.stem in ("cameras", "images") for file in files_in(path, ".txt", ".bin"))
+    ),
+    lambda path, _: load_colmap(path if path.is_dir() else path.parent),
+    lambda path: [(path if path.is_dir() else path.parent) / name for name in _FILES],
+)

@@ -1,0 +1,184 @@
+"""Cameras of 3DEqualizer: its Nuke export (.nk), with the lenses beside it (`lens_3de`).
+
+Poses, focal length and film back come from the `Camera` nodes that "Export Project, Nuke" writes (that script, in a
+studio's version: NyanNyanGringo/match-move-exporter on GitHub): camera axes x right, y up, z backward; `rotate` in
+degrees, z applied first, then x, then y (`rot_order ZXY`); `translate` in the units of the project, mostly cm; `focal`,
+`haperture` and `vaperture` in mm; `win_translate` is -2 times the lens centre's offset over the film back. An `Axis`
+above a camera is the scene's transform and scale. The optical axis meets the film back at its middle plus that offset,
+x right, y up; the film back spans the outer edges of the pixels. The size of the pictures is not in the file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError
+from jawusd.cameras.equalizer_lens import FoundLens, Lens, find_lenses, opencv_of
+from jawusd.cameras.nuke_script import SAME, NukeNode, knob_values, read_nuke_script, steady_values
+from jawusd.cameras.parts import CameraFormat, Size, files_in, known_size
+from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
+
+_OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+def load_3de(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
+    """Read the cameras of 3DEqualizer's Nuke export by name, with the lenses beside it, in the project's unit.
+
+    A camera takes the lens that has its name (of the node, the file, or within it), else the only one there is; where
+    there is none, it is a pinhole, for footage that was undistorted.
+
+    Args:
+        path: the script, or the folder that holds it.
+        sizes: (width, height) [px] of the pictures by camera.
+
+    Raises:
+        CalibrationError: no camera, a camera that moves or zooms, a size that is not known, a distortion model that is
+            not read, or a lens that cannot be identified or cannot be written with OpenCV's coefficients.
+        FormatError: a file cannot be read.
+    """
+    scripts = [path] if path.is_file() else sorted(path.glob("*.nk"))
+    nodes = {script: read_nuke_script(script) for script in scripts}
+    folder = path if path.is_dir() else path.parent
+    beside = {script: read_nuke_script(script) for script in sorted(folder.glob("*.nk")) if script not in nodes}
+    lenses = find_lenses(folder, nodes | beside)
+    cameras: dict[str, Camera] = {}
+    for script, inside in nodes.items():
+        for node in inside:
+            if not re.fullmatch(r"Camera\d?", node.kind):
+                continue
+            if node.name in cameras:
+                raise CalibrationError(f"names camera {node.name} twice.", path=script)
+            cameras[node.name] = _camera(script, node, lenses, sizes)
+    if not cameras:
+        raise CalibrationError(
+            "holds no Camera node.",
+            path=path,
+            hint='3DEqualizer writes cameras with "Export Project, Nuke"; lenses alone have no poses.',
+        )
+    return [cameras[name] for name in sorted(cameras)]
+
+
+def files_of_3de(path: Path) -> list[Path]:
+    """Return the scripts and lens files that `load_3de` reads."""
+    folder = path if path.is_dir() else path.parent
+    return sorted({*folder.glob("*.nk"), *(lens.path for lens in find_lenses(folder, {}))})
+
+
+def _camera(path: Path, node: NukeNode, lenses: list[FoundLens], sizes: Mapping[str, Size]) -> Camera:
+    name = node.name
+    size = known_size(path, name, sizes)
+    focal_mm = float(steady_values(path, node, "focal", (50.0,))[0])
+    back = (
+        float(steady_values(path, node, "haperture", (24.576,))[0]),
+        float(steady_values(path, node, "vaperture", (18.672,))[0]),
+    )
+    if not (focal_mm > 0 and min(back) > 0):
+        raise CalibrationError(
+            f"camera {name} has the focal length {focal_mm:g} mm and the film back {back[0]:g} x {back[1]:g} mm, "
+            "allowed are lengths above 0.",
+            path=path,
+        )
+    if (steady_values(path, node, "win_scale", (1.0, 1.0)) != 1).any() or steady_values(path, node, "winroll", (0.0,))[
+        0
+    ] != 0:
+        raise CalibrationError(f"camera {name} has win_scale or winroll, allowed are 1 1 and 0.", path=path)
+    shift = steady_values(path, node, "win_translate", (0.0, 0.0))
+    offset = (-float(shift[0]) * back[0] / 2, -float(shift[1]) * back[1] / 2)
+    lens = _lens_of(path, name, lenses)
+    if lens is not None:
+        _check_same_plate(path, name, back, offset, lens)
+    K = np.array(
+        [
+            [focal_mm * size[0] / back[0], 0.0, size[0] * (0.5 + offset[0] / back[0]) - 0.5],
+            [0.0, focal_mm * size[1] / back[1], size[1] * (0.5 - offset[1] / back[1]) - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    T_cam_world = _world_to_camera(path, node)
+    if lens is None:
+        return Camera(name, size, K, np.zeros(0), T_cam_world)
+    K, distortion, turn = opencv_of(lens, K, size, back, focal_mm)
+    turned = make_transform(so3_exp(turn), np.zeros(3))
+    return Camera(name, size, K, distortion, turned @ T_cam_world)
+
+
+def _world_to_camera(path: Path, node: NukeNode) -> Array:
+    """Return T_cam_world of a camera, below the axes it hangs on."""
+    R, t = _placed(path, node)
+    above = node.parent
+    while above is not None and re.fullmatch(r"(Axis|Camera)\d?", above.kind):
+        turn, shift = _placed(path, above)
+        scale = steady_values(path, above, "scaling", (1.0, 1.0, 1.0)) * steady_values(
+            path, above, "uniform_scale", (1.0,)
+        )
+        if np.ptp(scale) > 1e-9 or scale[0] <= 0:
+            raise CalibrationError(
+                f"{above.name}, above camera {node.name}, has the scale {scale.tolist()}, allowed is one above 0.",
+                path=path,
+            )
+        R, t = turn @ R, turn @ (scale[0] * t) + shift
+        above = above.parent
+    return se3_inverse(make_transform(R @ _OPENGL, t))
+
+
+def _placed(path: Path, node: NukeNode) -> tuple[Array, Array]:
+    """Return the rotation (3, 3) and translation (3,) of a node at rest."""
+    for knob in ("useMatrix", "pivot", "skew"):
+        if set(re.findall(r"[\w.]+", node.knobs.get(knob, "0"))) - {"0", "false", "0.0"}:
+            raise CalibrationError(f"node {node.name} has {knob}, which 3DEqualizer does not write.", path=path)
+    order = node.knobs.get("rot_order", "ZXY")
+    if sorted(order) != ["X", "Y", "Z"] or node.knobs.get("xform_order", "SRT") != "SRT":
+        raise CalibrationError(
+            f'node {node.name} has the orders "{order}", allowed are SRT and ZXY or alike.', path=path
+        )
+    angles = np.deg2rad(knob_values(path, node, "rotate", (0.0, 0.0, 0.0)))
+    turns = np.broadcast_to(np.eye(3), (len(angles), 3, 3))
+    for axis in ("XYZ".index(letter) for letter in order):
+        turns = so3_exp(angles[:, [axis]] * np.eye(3)[axis]) @ turns
+    places = knob_values(path, node, "translate", (0.0, 0.0, 0.0))
+    reach = SAME * float(np.abs(places[0]).max())
+    if np.abs(turns - turns[0]).max() > SAME or np.abs(places - places[0]).max() > reach + 1e-12:
+        raise CalibrationError(
+            f"camera {node.name} moves from frame to frame; the cameras of a capture stand still.",
+            path=path,
+            hint="Constrain it to a fixed position in 3DEqualizer, and export again.",
+        )
+    return np.array(turns[0]), places[0]
+
+
+def _lens_of(path: Path, name: str, lenses: list[FoundLens]) -> Lens | None:
+    for candidates in ([lens for lens in lenses if name in (lens.name, lens.path.stem)], lenses):
+        if len(candidates) == 1:
+            return candidates[0].read()
+        if candidates:
+            listed = ", ".join(f"{lens.name} ({lens.path.name})" for lens in candidates)
+            raise CalibrationError(
+                f"camera {name} may have any of the lenses {listed}.",
+                path=path,
+                hint=f"Name the lens file after the camera: {name}.txt.",
+            )
+    return None
+
+
+def _check_same_plate(
+    path: Path, name: str, back_mm: tuple[float, float], offset_mm: tuple[float, float], lens: Lens
+) -> None:
+    theirs = (*(lens.filmback_mm or back_mm), *lens.offset_mm)
+    if np.abs(np.subtract(theirs, (*back_mm, *offset_mm))).max() > SAME * back_mm[0]:
+        shown = [f"{v[0]:.6g} x {v[1]:.6g} mm with the lens centre at {v[2]:.4g}, {v[3]:.4g}" for v in
+                 (theirs, (*back_mm, *offset_mm))]  # fmt: skip
+        raise CalibrationError(
+            f"camera {name} has a film back of {shown[1]}, its lens {lens.name} in {lens.path.name} one of {shown[0]}.",
+            path=path,
+            hint="Export camera and lens from the same project.",
+        )
+
+
+FORMAT = CameraFormat(
+    lambda path: path.suffix.lower() == ".nk" or bool(files_in(path, ".nk")), load_3de, files_of_3de, lacks_sizes=True
+)

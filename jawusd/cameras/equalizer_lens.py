@@ -1,0 +1,278 @@
+"""Lenses of 3DEqualizer, from text files and from nodes of Nuke, and their models as OpenCV's coefficients.
+
+A text file (File, Export, Lens) holds: name; film back width and height, focal length, film aspect, lens centre offset
+x and y, all in cm, pixel aspect; 0, 1 or DISTORTION_...; the model; per parameter its name, its value, the number of
+keys of its curve, and a line per key; <end_of_file>. `LD_...` nodes (File, Export, Nuke LD_3DE4 Lens Distortion Node)
+hold the same as knobs.
+
+The models (Science-D-Visions, "The Standard Models for Lens Distortion in 3DE4", and its Lens Distortion Plugin Kit)
+take recorded points to undistorted ones, on coordinates from the lens centre, y up, over half the film back's diagonal.
+OpenCV's go the other way: its coefficients are fitted to the model over the picture, and a lens that they miss by more
+than 0.05 px is refused. Only "OpenCV Radial Degree 6, Decentered Degree 2" has OpenCV's own coefficients.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError, FormatError
+from jawusd.cameras.nuke_script import NukeNode, steady_values
+from jawusd.formats.text import read_text
+from jawusd.geometry.lens_fit import opencv_lens
+
+Size = tuple[int, int]
+
+_MOST_BYTES = 4 << 20
+_CLASSIC, _RADIAL = "3DE Classic LD Model", "3DE4 Radial - Standard, Degree 4"
+_BROWN, _OPENCV = "3DE4 Brown-Conrady, Degree 6/2", "OpenCV Radial Degree 6, Decentered Degree 2"
+# The parameters of each model, with their values where a file leaves them out, as Nuke does with defaults.
+_PARAMETERS: dict[str, dict[str, float]] = {
+    _CLASSIC: {
+        "Distortion": 0.0,
+        "Anamorphic Squeeze": 1.0,
+        "Curvature X": 0.0,
+        "Curvature Y": 0.0,
+        "Quartic Distortion": 0.0,
+    },
+    _RADIAL: dict.fromkeys(
+        (
+            "Distortion - Degree 2",
+            "U - Degree 2",
+            "V - Degree 2",
+            "Quartic Distortion - Degree 4",
+            "U - Degree 4",
+            "V - Degree 4",
+            "Phi - Cylindric Direction",
+            "B - Cylindric Bending",
+        ),
+        0.0,
+    ),
+    _BROWN: dict.fromkeys(("C2", "C4", "C6", "T1", "T2"), 0.0),
+    _OPENCV: dict.fromkeys(
+        (
+            "Radial Distortion - Degree 2 - k1",
+            "Radial Distortion - Degree 4 - k2",
+            "Decentering Y - Degree 2 - p1",
+            "Decentering X - Degree 2 - p2",
+            "Radial Distortion - Degree 6 - k3",
+        ),
+        0.0,
+    ),
+}
+_STATIC = ("0", "DISTORTION_STATIC")
+_FOV = {"xa": 0.0, "xb": 1.0, "ya": 0.0, "yb": 1.0}
+_LARGEST_ERROR_PX = 0.05
+_MM_PER_CM = 10.0
+_GRID, _BEYOND = 33, 0.03  # points along a side of the picture, and how far beyond it they reach
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Hold one lens."""
+
+    name: str
+    path: Path
+    filmback_mm: tuple[float, float] | None
+    offset_mm: tuple[float, float]  # of the lens centre, x right, y up
+    model: str
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class FoundLens:
+    """Hold where a lens is, and how to read it."""
+
+    name: str
+    path: Path
+    read: Callable[[], Lens]
+
+
+def find_lenses(folder: Path, scripts: Mapping[Path, list[NukeNode]]) -> list[FoundLens]:
+    """Return the lenses of Nuke scripts, given by file, and of the text files of a folder."""
+    out = []
+    for script, nodes in scripts.items():
+        for node in nodes:
+            if node.kind.startswith("LD_"):
+                name = re.sub(r"^LD_3DE4_", "", node.name)
+                out.append(FoundLens(name, script, partial(_node_lens, script, node, name)))
+    for path in sorted(folder.glob("*.txt")):
+        lines = _lens_lines(path)
+        if lines is not None:
+            out.append(FoundLens(lines[0], path, partial(_text_lens, path, lines)))
+    return out
+
+
+def _node_lens(path: Path, node: NukeNode, name: str) -> Lens:
+    """Return the lens of an LD node; its class and knobs are the model's names in letters, digits and underscores."""
+    models = {_nuke_name(model): model for model in _PARAMETERS}
+    model = models.get(node.kind.removeprefix("LD").lstrip("_"))
+    if model is None:
+        raise _unread(path, node.kind)
+
+    def value(knob: str, default: float) -> float:
+        return float(steady_values(path, node, knob, (default,))[0])
+
+    for side, whole in _FOV.items():
+        if abs(value(f"field_of_view_{side}_unit", whole) - whole) > 1e-6:
+            raise CalibrationError(
+                f"lens {node.name} has a field of view that is not the whole picture (field_of_view_{side}_unit), "
+                "allowed are 0, 1, 0, 1.",
+                path=path,
+                hint="Set the camera's field of view to the whole picture in 3DEqualizer.",
+            )
+    sides = [f"tde4_filmback_{side}_cm" for side in ("width", "height")]
+    stated = all(side in node.knobs for side in sides)
+    return Lens(
+        name,
+        path,
+        (_MM_PER_CM * value(sides[0], 0), _MM_PER_CM * value(sides[1], 0)) if stated else None,
+        (
+            _MM_PER_CM * value("tde4_lens_center_offset_x_cm", 0),
+            _MM_PER_CM * value("tde4_lens_center_offset_y_cm", 0),
+        ),
+        model,
+        {key: value(_nuke_name(key), default) for key, default in _PARAMETERS[model].items()},
+    )
+
+
+def _nuke_name(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "_", name.strip())
+
+
+def _lens_lines(path: Path) -> list[str] | None:
+    """Return the lines of a lens file; none if a text file is something else.
+
+    Raises:
+        CalibrationError: it ends as a lens file does, but does not begin so.
+    """
+    try:
+        lines = [line.strip() for line in read_text(path, _MOST_BYTES).splitlines()]
+    except FormatError:
+        return None
+    try:
+        numbers = [float(word) for word in lines[1].split()]
+        if len(numbers) == 7 and lines[3] and lines[2].startswith(("0", "1", "DISTORTION_")):
+            return lines
+    except (ValueError, IndexError):
+        pass
+    if "<end_of_file>" in lines:
+        raise CalibrationError(
+            "is a lens file whose first four lines are not name, seven numbers, kind of distortion and model.",
+            path=path,
+            hint="Export the lens again, or take the file away.",
+        )
+    return None
+
+
+def _text_lens(path: Path, lines: list[str]) -> Lens:
+    width, height, _, _, x, y, _ = (float(word) for word in lines[1].split())
+    mode, model = lines[2], lines[3]
+    if model not in _PARAMETERS:
+        raise _unread(path, model)
+    if mode not in _STATIC:
+        raise CalibrationError(
+            f'lens {lines[0]} has a distortion that changes ("{mode}"), allowed is {" or ".join(_STATIC)}.',
+            path=path,
+            hint="Make the lens static in 3DEqualizer, and export it again.",
+        )
+    values = dict(_PARAMETERS[model])
+    at = 4
+    try:
+        while at < len(lines) and lines[at] not in ("", "<end_of_file>"):
+            values[lines[at]] = float(lines[at + 1])
+            at += 3 + int(lines[at + 2])
+    except (ValueError, IndexError) as error:
+        raise CalibrationError(
+            f'line {at + 1}: "{lines[at]:.60}" is not followed by a number and the keys of its curve.', path=path
+        ) from error
+    unknown = sorted(set(values) - set(_PARAMETERS[model]))
+    if unknown or not np.isfinite(list(values.values())).all():
+        raise CalibrationError(
+            f'{model} has no "{unknown[0]}", allowed are {", ".join(_PARAMETERS[model])}.'
+            if unknown
+            else "holds a value that is not finite.",
+            path=path,
+        )
+    back = (_MM_PER_CM * width, _MM_PER_CM * height)
+    return Lens(lines[0], path, back, (_MM_PER_CM * x, _MM_PER_CM * y), model, values)
+
+
+def _unread(path: Path, model: str) -> CalibrationError:
+    return CalibrationError(
+        f'has the distortion model "{model}", allowed are {", ".join(_PARAMETERS)}.',
+        path=path,
+        hint="Calibrate with one of them, or undistort the footage and take the lens file away.",
+    )
+
+
+def opencv_of(
+    lens: Lens, K: Array, size: Size, back_mm: tuple[float, float], focal_mm: float
+) -> tuple[Array, Array, Array]:
+    """Return K (3, 3), OpenCV's coefficients, and a rotation vector (3,) [rad] by which the camera's points turn first.
+
+    Args:
+        lens: the lens.
+        K: the camera's pinhole [px].
+        size: width and height of its picture [px].
+        back_mm: width and height of its film back.
+        focal_mm: its focal length.
+
+    Raises:
+        CalibrationError: they miss the lens by more than 0.05 px.
+    """
+    values = list(lens.values.values())
+    if values == list(_PARAMETERS[lens.model].values()):
+        return K, np.zeros(0), np.zeros(3)
+    if lens.model == _OPENCV:
+        return K, np.array(values), np.zeros(3)
+    axes = [np.linspace(-0.5 - _BEYOND * side, (1 + _BEYOND) * side - 0.5, _GRID) for side in size]
+    recorded = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    half_mm = float(np.hypot(*back_mm)) / 2
+    from_centre = (recorded - K[:2, 2]) / np.diag(K)[:2] * focal_mm / half_mm
+    x, y = _undistorted(lens.model, values, from_centre[:, 0], -from_centre[:, 1])
+    ideal = np.column_stack([x, -y]) * half_mm / focal_mm
+    fitted, distortion, turn, off = opencv_lens(K, recorded, ideal)
+    if off > _LARGEST_ERROR_PX:
+        raise CalibrationError(
+            f'lens {lens.name} ("{lens.model}") cannot be written with OpenCV\'s coefficients (off by {off:.2f} px, '
+            f"allowed are {_LARGEST_ERROR_PX:g}).",
+            path=lens.path,
+            hint="Solve without decentering and bending, or undistort the footage in 3DEqualizer or Nuke and take the "
+            "lens file away.",
+        )
+    return fitted, distortion, turn
+
+
+def _undistorted(model: str, values: list[float], x: Array, y: Array) -> tuple[Array, Array]:
+    """Return undistorted points of recorded ones, from the lens centre, y up, over half the film back's diagonal.
+
+    The Standard Models for Lens Distortion in 3DE4; Lens Distortion Plugin Kit 2.12.
+    """
+    xx, yy, xy = x * x, y * y, x * y
+    r2 = xx + yy
+    if model == _CLASSIC:
+        k, squeeze, bend_x, bend_y, quartic = values
+        wide = 1 + k * xx + (k + bend_x) * yy + quartic * r2**2
+        high = 1 + (k + bend_y) * xx + k * yy + quartic * r2**2
+        return x * (1 + (wide - 1) / squeeze), y * high
+    if model == _BROWN:
+        c2, c4, c6, u, v = values
+        radial, phi, bending = 1 + r2 * (c2 + r2 * (c4 + r2 * c6)), 0.0, 0.0
+        off = (np.full_like(r2, u), np.full_like(r2, v))
+    else:
+        c2, u2, v2, c4, u4, v4, phi, bending = values
+        radial, off = 1 + r2 * (c2 + r2 * c4), (u2 + u4 * r2, v2 + v4 * r2)
+    out_x, out_y = (
+        x * radial + off[0] * (r2 + 2 * xx) + 2 * off[1] * xy,
+        y * radial + off[1] * (r2 + 2 * yy) + 2 * off[0] * xy,
+    )
+    c, s, q = np.cos(np.deg2rad(phi)), np.sin(np.deg2rad(phi)), np.sqrt(1 + bending)
+    along, across, mixed = c * c * q + s * s / q, c * c / q + s * s * q, (q - 1 / q) * c * s
+    return along * out_x + mixed * out_y, mixed * out_x + across * out_y

@@ -1,0 +1,123 @@
+"""Cameras of Agisoft Metashape: XML (File, Export, Export Cameras, "Agisoft XML").
+
+Metashape User Manual, appendix "Camera models", frame camera: `transform` of a camera maps camera to chunk, x right, y
+down, z forward; the chunk's (or component's) transform leads from there to the world, with a scale. With x, y
+undistorted, r their length and lengths over the focal length,
+    x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y,
+    y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p2 (r^2 + 2 y^2) + 2 p1 x y,
+    u = width / 2 + cx + x' f + x' b1 + y' b2,  v = height / 2 + cy + y' f,
+the corner of the top-left pixel at (0, 0). OpenCV's p1 and p2 are Metashape's p2 and p1. The unit is mostly metres.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError
+from jawusd.cameras.parts import (
+    UNDISTORT,
+    CameraFormat,
+    Size,
+    lens_with_k4,
+    names_of_labels,
+    numbers,
+    parsed_xml,
+    world_to_camera,
+)
+from jawusd.geometry import Camera
+
+_HALF_PX, _MOST_PX = 0.5, 1e6
+
+
+def load_metashape(path: Path) -> list[Camera]:
+    """Read the aligned cameras of a Metashape XML, by their labels, in the file's unit.
+
+    Raises:
+        CalibrationError: no cameras are aligned, two have one label, or a sensor is no frame camera or has no
+            calibration.
+        FormatError: the file is damaged.
+    """
+    root = parsed_xml(path)
+    nodes = [
+        (chunk, node)
+        for chunk in root.findall("chunk") or [root]
+        for node in chunk.iter("camera")
+        if (node.findtext("transform") or "").strip()  # others are not aligned
+    ]
+    if not nodes:
+        raise CalibrationError(
+            "holds no aligned cameras.", path=path, hint="Align the photos, then export the cameras."
+        )
+    names = names_of_labels(path, [str(node.get("label")) for _, node in nodes])
+    cameras = [_camera(path, name, chunk, node) for name, (chunk, node) in zip(names, nodes, strict=True)]
+    return sorted(cameras, key=lambda camera: camera.name)
+
+
+def _camera(path: Path, name: str, chunk: ElementTree.Element, node: ElementTree.Element) -> Camera:
+    sensors = {str(one.get("id")): one for one in chunk.iter("sensor")}
+    components = {str(one.get("id")): one.find("transform") for one in chunk.iter("component")}
+    T_chunk_cam = numbers(path, node.findtext("transform", ""), 16, f"camera {name}").reshape(4, 4)
+    R, t, scale = _placement(path, components.get(str(node.get("component_id")), chunk.find("transform")))
+    sensor = sensors.get(str(node.get("sensor_id")))
+    if sensor is None:
+        raise CalibrationError(f"camera {name} names a sensor that the file does not hold.", path=path)
+    size, K, lens = _lens(path, sensor)
+    centre = scale * R @ T_chunk_cam[:3, 3] + t
+    return Camera(name, size, K, lens, world_to_camera(path, name, R @ T_chunk_cam[:3, :3], centre))
+
+
+def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
+    label = sensor.get("label") or sensor.get("id")
+    found = {node.get("class", ""): node for node in sensor.findall("calibration")}
+    node = found.get("adjusted") if "adjusted" in found else next(iter(found.values()), None)
+    resolution = sensor.find("resolution") if node is None else node.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
+    if node is None or resolution is None:
+        raise CalibrationError(f"sensor {label} has no calibration.", path=path, hint="Align the photos first.")
+    kind = node.get("type", sensor.get("type", "frame"))
+    if kind != "frame":
+        raise CalibrationError(
+            f'sensor {label} is a "{kind}" camera; "frame" cameras are read.', path=path, hint=UNDISTORT
+        )
+    values = {child.tag: child.text or "" for child in node}
+
+    def value(key: str, other: float = 0.0) -> float:
+        return other if key not in values else float(numbers(path, values[key], 1, f"sensor {label} {key}")[0])
+
+    sides = (numbers(path, resolution.get(side, "0"), 1, f"sensor {label} {side}")[0] for side in ("width", "height"))
+    width, height = (int(min(side, _MOST_PX)) for side in sides)
+    size = (width, height)
+    focal = value("f", value("fy"))
+    if not focal > 0 or min(size) < 1:
+        raise CalibrationError(f"sensor {label} has no focal length or no resolution.", path=path)
+    wide = value("fx", focal + value("b1"))
+    # Before version 1.0, cx and cy counted from the corner, and fx stood beside fy.
+    old = "fx" in values
+    cx = value("cx") + (0.0 if old else size[0] / 2) - _HALF_PX
+    cy = value("cy") + (0.0 if old else size[1] / 2) - _HALF_PX
+    K = np.array([[wide, value("b2"), cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+    for key in ("p3", "p4"):  # which older versions fitted
+        if value(key):
+            raise CalibrationError(
+                f"sensor {label} has {key} = {value(key):g}, allowed is 0.", path=path, hint=UNDISTORT
+            )
+    radial = np.array([value(f"k{k}") for k in (1, 2, 3, 4)])
+    return size, K, lens_with_k4(path, str(label), K, size, radial, (value("p2"), value("p1")))
+
+
+def _placement(path: Path, node: ElementTree.Element | None) -> tuple[Array, Array, float]:
+    """Return rotation, translation and scale of a chunk's or component's transform; none is the identity."""
+    if node is None:
+        return np.eye(3), np.zeros(3), 1.0
+    parts = {child.tag: child.text or "" for child in node}
+    R = numbers(path, parts["rotation"], 9, "rotation").reshape(3, 3) if "rotation" in parts else np.eye(3)
+    t = numbers(path, parts["translation"], 3, "translation") if "translation" in parts else np.zeros(3)
+    scale = float(numbers(path, parts["scale"], 1, "scale")[0]) if "scale" in parts else 1.0
+    return R, t, scale
+
+
+FORMAT = CameraFormat(lambda path: path.suffix.lower() == ".xml", lambda path, _: load_metashape(path))

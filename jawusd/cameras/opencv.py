@@ -1,0 +1,199 @@
+"""Cameras in OpenCV's storage: YAML, XML and JSON.
+
+`cv::FileStorage` (https://docs.opencv.org/4.x/d4/da4/group__core__xml.html): matrices in the forms that OpenCV's
+samples, ROS `camera_info` and EasyMocap write: camera_matrix, cameraMatrix, K or M with distortion coefficients, and R
+(3 x 3 or Rodrigues vector) and T, world to camera. Names may end with the camera's, `K_left`, `R_left`; of M1, D1, M2,
+D2, R, T the first camera is the world. Pixels and axes are OpenCV's. Values that no camera needs may be anything.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError
+from jawusd.base.tables import read_text
+from jawusd.cameras.parts import CameraFormat, Size, check_lens_model, files_in, parsed_xml, plain_name
+from jawusd.formats.text import parse_json
+from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp
+
+_MOST_BYTES = 16 << 20
+_YAML = (".yml", ".yaml")
+_BEGINNING = 4096  # bytes in which XML and JSON show that they are OpenCV's
+_MATRIX = re.compile(
+    r"^\s*(?P<name>[\w.-]+)\s*:\s*(?:!!opencv-matrix)?\s*\n\s*rows\s*:\s*(?P<rows>\d+)\s*\n\s*cols\s*:\s*(?P<cols>\d+)"
+    r"\s*\n(?:\s*dt\s*:\s*\S+\s*\n)?\s*data\s*:\s*\[(?P<data>[^\]]*)\]",
+    re.MULTILINE,
+)
+_VALUE = re.compile(r"^(?P<name>\w+)[ \t]*:[ \t]*(?P<value>[^\s\[!{][^\n]*?)[ \t]*$", re.MULTILINE)
+_ROLES = {
+    "K": r"(?:camera_matrix|cameramatrix|intrinsic_matrix|intrinsics|k|m)",
+    "dist": r"(?:distortion_coefficients|distortion|dist_coeffs?|distcoeffs|dist|d)",
+    "R": r"(?:rotation_matrix|rotation|rot|rvec|r)",
+    "T": r"(?:translation_vector|translation|tvec|t)",
+    "width": r"(?:image_width|imagewidth|width|w)",
+    "height": r"(?:image_height|imageheight|height|h)",
+}
+_LARGEST_DEFECT = 1e-4
+_MOST_PX = 1e6
+
+
+def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
+    """Read cameras from OpenCV's storage: one file per camera, named after it, or files that hold several.
+
+    Args:
+        paths: the files; what one says of a camera is joined with what others say, and cameras whose lens alone is
+            known are left out.
+        sizes: of the pictures by camera, where the files do not say them.
+
+    Raises:
+        CalibrationError: a camera lacks intrinsics, pose or size, or a value is wrong.
+        FormatError: a file cannot be read.
+    """
+    found: dict[str, dict[str, Array]] = {}
+    for path in paths:
+        for name, parts in _parts_of(path).items():
+            own = found.setdefault(name, {})
+            twice = [role for role in parts if role in own and not np.array_equal(parts[role], own[role])]
+            if twice:
+                raise CalibrationError(
+                    f"says {twice[0]} of camera {name or path.stem} otherwise than another file beside it.",
+                    path=path,
+                    hint="Give each camera a file of its own, and a name of its own.",
+                )
+            own.update(parts)
+    shared = found.pop("", {}) if any("K" in parts for name, parts in found.items() if name) else {}
+    if set(found) == {"1", "2"} and {"R", "T"} <= set(shared):  # a stereo pair: the first camera is the world
+        found["1"] |= {"R": np.eye(3), "T": np.zeros(3)}
+        found["2"] |= {"R": shared["R"], "T": shared["T"]}
+    whole = {name: shared | parts for name, parts in found.items()}
+    posed = {name: parts for name, parts in whole.items() if len({"K", "R", "T"} & parts.keys()) > 1}
+    known = {name: parts for name, parts in whole.items() if "K" in parts}
+    cameras = [_camera(paths[0], name, parts, sizes) for name, parts in (posed or known).items()]
+    if not cameras:
+        raise CalibrationError("holds no camera matrix.", path=paths[0])
+    return sorted(cameras, key=lambda camera: camera.name)
+
+
+def _parts_of(path: Path) -> dict[str, dict[str, Array]]:
+    """Return the matrices and numbers of a file, by camera and role; "" is the camera that is not named."""
+    out: dict[str, dict[str, Array]] = {}
+    seen: set[str] = set()
+    for key, shape, words in _values(path):
+        check_lens_model(path, "the file", {key: " ".join(words)})
+        for role, pattern in _ROLES.items():
+            named = re.fullmatch(rf"{pattern}(?:_?(?P<camera>\d+|(?<=_)[\w-]+))?", key, re.IGNORECASE)
+            if named is None or (not shape and role not in ("width", "height")):
+                continue
+            if key in seen:
+                raise CalibrationError(
+                    f'holds "{key}" twice.', path=path, hint="Write a file per camera, or names as K_left and K_right."
+                )
+            seen.add(key)
+            parts = out.setdefault(named["camera"] or "", {})
+            if not (role == "R" and parts.get("R") is not None and parts["R"].shape == (3, 3)):
+                parts[role] = _array(path, key, shape, words)
+            break
+    return {path.stem: out[""]} if set(out) == {""} else out
+
+
+def _array(path: Path, key: str, shape: tuple[int, ...], words: list[str]) -> Array:
+    plain = [re.sub(r"^([-+]?)\.(?=nan|inf)", r"\1", word.lower()) for word in words]  # OpenCV writes .Nan and -.Inf
+    try:
+        data = np.array([float(word) for word in plain]).reshape(shape)
+    except ValueError as error:
+        what = (
+            "is not a matrix as its rows and cols say" if shape else f"is {' '.join(words):.40}, which is not a number"
+        )
+        raise CalibrationError(f'"{key}" {what}.', path=path) from error
+    if not np.isfinite(data).all():
+        raise CalibrationError(f'"{key}" holds a value that is not finite.', path=path)
+    return data
+
+
+def _values(path: Path) -> Iterator[tuple[str, tuple[int, ...], list[str]]]:
+    """Yield the name, shape and words of each value at the top of a file; a scalar's or text's shape is ()."""
+    suffix = path.suffix.lower()
+    if suffix == ".xml":
+        for node in parsed_xml(path):
+            rows, cols = node.findtext("rows"), node.findtext("cols")
+            if node.find("data") is not None and (rows or "").strip().isdecimal() and (cols or "").strip().isdecimal():
+                yield node.tag, (int(rows or 0), int(cols or 0)), node.findtext("data", "").split()
+            elif not len(node):
+                yield node.tag, (), [(node.text or "").strip().strip('"')]
+        return
+    text = read_text(path, _MOST_BYTES)
+    if suffix == ".json":
+        stored = parse_json(text, path)
+        for name, value in stored.items() if isinstance(stored, dict) else ():
+            if isinstance(value, dict) and isinstance(value.get("data"), list):
+                rows, cols = value.get("rows"), value.get("cols")
+                yield (
+                    name,
+                    (rows, cols) if isinstance(rows, int) and isinstance(cols, int) else (-1, -1),
+                    [str(word) for word in value["data"]],
+                )
+            elif not isinstance(value, dict | list):
+                yield name, (), [str(value)]
+        return
+    for match in _MATRIX.finditer(text):
+        yield match["name"], (int(match["rows"]), int(match["cols"])), match["data"].replace(",", " ").split()
+    for match in _VALUE.finditer(text):
+        yield match["name"], (), [match["value"].split(" #")[0].strip().strip("\"'")]
+
+
+def _is_opencv(path: Path) -> int:
+    """Return 1 for YAML, 2 for XML and JSON that begin as OpenCV's storage, 0 for others."""
+    suffix = path.suffix.lower()
+    if suffix in _YAML or suffix not in (".xml", ".json") or not path.is_file():
+        return int(suffix in _YAML)
+    with open(path, "rb") as file:
+        beginning = file.read(_BEGINNING)
+    return 2 * ((b"<opencv_storage" if suffix == ".xml" else b'"opencv-matrix"') in beginning)
+
+
+def _stored(path: Path) -> list[Path]:
+    if path.is_dir():
+        return [file for file in files_in(path, *_YAML, ".xml", ".json") if _is_opencv(file)]
+    pair = path.parent / path.name.replace("intri", "extri", 1)
+    return [path, pair] if path.stem in ("intri", "intrinsics") and pair.exists() else [path]
+
+
+def _camera(path: Path, name: str, parts: Mapping[str, Array], sizes: Mapping[str, Size]) -> Camera:
+    lacking = [role for role in ("K", "R", "T") if role not in parts]
+    if lacking:
+        raise CalibrationError(
+            f"camera {name} has no {lacking[0]}.", path=path, hint="Pose (R, T) and intrinsics (K, D) are both needed."
+        )
+    if "width" in parts and "height" in parts:
+        sides = np.array([parts["width"], parts["height"]], np.float64).ravel()
+        if sides.size != 2 or not ((sides >= 1) & (sides <= _MOST_PX)).all():
+            raise CalibrationError(
+                f"camera {name} has pictures of {sides.tolist()} px, allowed are 1 to 1e6.", path=path
+            )
+        size = (int(sides[0]), int(sides[1]))
+    elif name in sizes or plain_name(name) in sizes:
+        size = sizes[name if name in sizes else plain_name(name)]
+    else:
+        raise CalibrationError(f"camera {name} has no image_width and image_height.", path=path)
+    R = so3_exp(parts["R"].ravel()) if parts["R"].size == 3 else parts["R"]
+    K, T, lens = parts["K"], parts["T"].ravel(), parts.get("dist", np.zeros(0)).ravel()
+    if K.shape != (3, 3) or R.shape != (3, 3) or T.shape != (3,) or lens.size not in (0, 4, 5, 8, 12, 14):
+        raise CalibrationError(f"camera {name} has a matrix of the wrong size.", path=path)
+    if lens[8:].any():
+        raise CalibrationError(f"camera {name} has thin-prism or tilt coefficients, allowed are 8.", path=path)
+    if rigidity_defect(make_transform(R, np.zeros(3))) > _LARGEST_DEFECT or not np.isfinite(K).all():
+        raise CalibrationError(f"camera {name} has a rotation that is none.", path=path)
+    return Camera(name, size, K, lens[:8], make_transform(R, T))
+
+
+FORMAT = CameraFormat(
+    lambda path: len(_stored(path)[:1]) if path.is_dir() else _is_opencv(path),
+    lambda path, sizes: load_opencv(_stored(path), sizes),
+    _stored,
+    lacks_sizes=True,
+)

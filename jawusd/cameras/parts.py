@@ -1,0 +1,231 @@
+"""What readers of cameras share: the description of a format, names, sizes, lens models, XML, numbers."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from xml.etree import ElementTree
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError
+from jawusd.base.tables import read_text
+from jawusd.geometry import Camera, make_transform, rigidity_defect
+from jawusd.geometry.lens_fit import opencv_radial
+
+Size = tuple[int, int]
+
+MOST_BYTES = 64 << 20
+UNDISTORT = "Undistort the footage first, or calibrate with OpenCV's standard model."
+_LARGEST_DEFECT = 1e-3
+# Images of one camera may differ this much before they count as a moving camera.
+_MOVED_RAD, _MOVED_SHARE = 1e-3, 1e-3
+_LARGEST_ERROR_PX = 0.05  # of a lens written with other coefficients
+_MODEL_KEYS = ("distortion_model", "distortion_type", "lens_model", "camera_model", "model_type", "projection_model")
+_FLAG_KEYS = ("fisheye", "fisheye_model", "is_fisheye", "use_fisheye")
+# Names of OpenCV's radial-tangential model with up to eight coefficients, in ROS, Kalibr, camodocal and others.
+_READ_MODELS = {"plumb_bob", "rational_polynomial", "radtan", "radial_tangential", "brown", "brown_conrady", "opencv"}
+_READ_MODELS |= {"pinhole", "perspective", "standard", "none", "no_distortion", "frame", "full_opencv", ""}
+_OTHER_MODELS = re.compile(
+    r"fisheye|equidist|equisolid|omni|kannala|mei\b|ucm|double.?sphere|\bfov\b|scaramuzza|division|spher"
+)
+
+
+@dataclass(frozen=True)
+class CameraFormat:
+    """Describe a format of cameras: a module `camera_*` with one of these as FORMAT is all that a new one needs."""
+
+    # 1 if a file or folder is of this format by its name, 2 if it begins so, 0 if it is another
+    reads: Callable[[Path], int]
+    # reads the cameras in the file's order and unit, given (width, height) [px] of pictures by camera
+    load: Callable[[Path, Mapping[str, Size]], list[Camera]]
+    files: Callable[[Path], list[Path]] = lambda path: [path]  # that make up such a calibration
+    lacks_sizes: bool = False  # it does not hold the sizes of pictures, or not always
+
+
+def files_in(path: Path, *suffixes: str) -> list[Path]:
+    """Return the files of a folder that have one of some suffixes; none if it is no folder."""
+    return sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes) if path.is_dir() else []
+
+
+def plain_name(name: str) -> str:
+    """Return a name in the letters that cameras of a capture may have."""
+    return re.sub(r"[^A-Za-z0-9_\-]+", "_", name)
+
+
+def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
+    """Return a name for each label of a picture: without folder and suffix, which are kept where names would be equal.
+
+    Raises:
+        CalibrationError: two labels are equal.
+    """
+    places = [PurePosixPath(label.strip().replace("\\", "/")) for label in labels]
+    forms = [[place.stem for place in places], [place.name for place in places]]
+    forms.append(["_".join(place.with_suffix("").parts) for place in places])
+    counts = [Counter(form) for form in forms]
+    names = [
+        next((form[k] for form, count in zip(forms, counts, strict=True) if form[k] and count[form[k]] == 1), label)
+        for k, label in enumerate(labels)
+    ]
+    name, times = Counter(names).most_common(1)[0] if names else ("", 1)
+    if times > 1:
+        alike = ", ".join(f'"{label}"' for label, own in zip(labels, names, strict=True) if own == name)
+        raise CalibrationError(
+            f"labels {times} cameras alike: {alike}. Each needs a name of its own.",
+            path=path,
+            hint="Rename the pictures, as left_0001.jpg, or the cameras, and export them again.",
+        )
+    return names
+
+
+def known_size(path: Path, name: str, sizes: Mapping[str, Size]) -> Size:
+    """Return the size of a camera's pictures.
+
+    Raises:
+        CalibrationError: it is not known.
+    """
+    for known in (name, plain_name(name)):
+        if known in sizes:
+            return sizes[known]
+    raise CalibrationError(
+        f"camera {name}: the size of pictures is not in the file, and there is no footage of that name "
+        f"(there is: {', '.join(sizes) or 'none'}).",
+        path=path,
+        hint="Name the picture of each camera as its [[camera]], or give --size.",
+    )
+
+
+def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> None:
+    """Check that what a file says of its lens model, by the keys that programs use, is OpenCV's standard one.
+
+    Raises:
+        CalibrationError: it is another one.
+    """
+    for key, value in values.items():
+        said = re.sub(r"[\s-]+", "_", str(value).strip().lower())
+        flag = key.lower() in _FLAG_KEYS and said not in ("0", "false", "no", "none", "")
+        named = key.lower() in _MODEL_KEYS and said not in _READ_MODELS
+        # a "camera_model" may be the name of a product
+        if flag or (named and (key.lower().startswith("distortion") or _OTHER_MODELS.search(said))):
+            raise CalibrationError(
+                f"{where} has {key} = {value}, a lens model that is not read; OpenCV's radial-tangential one is "
+                "(plumb_bob, rational_polynomial).",
+                path=path,
+                hint=UNDISTORT,
+            )
+
+
+def numbers(path: Path, text: str, count: int, what: str) -> Array:
+    """Return the numbers of a text, shape (count,).
+
+    Raises:
+        CalibrationError: they are others.
+    """
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError as error:
+        raise CalibrationError(f'{what}: "{text:.60}" are not numbers.', path=path) from error
+    if len(values) != count or not np.isfinite(values).all():
+        raise CalibrationError(f"{what} has {len(values)} values, {count} finite ones are needed.", path=path)
+    return values
+
+
+def parsed_xml(path: Path) -> ElementTree.Element:
+    """Return the root of an XML file.
+
+    Raises:
+        CalibrationError: it is none, or declares a document type.
+        FormatError: it cannot be read.
+    """
+    text = read_text(path, MOST_BYTES)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can name other files, and grow without end
+        raise CalibrationError("declares a document type, which calibrations do not.", path=path)
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise CalibrationError(f"is not XML that can be read ({error}).", path=path) from error
+
+
+def world_to_camera(path: Path, name: str, rotation: Array, centre: Array) -> Array:
+    """Return T_cam_world of a camera's axes in the world (3, 3) and its centre (3,).
+
+    Raises:
+        CalibrationError: the axes are not square.
+    """
+    if rigidity_defect(make_transform(rotation, np.zeros(3))) > _LARGEST_DEFECT:
+        raise CalibrationError(f"camera {name} has a rotation that is none.", path=path)
+    u, _, vt = np.linalg.svd(rotation)
+    exact = u @ vt
+    return make_transform(exact.T, -exact.T @ centre)
+
+
+def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tangential: tuple[float, float]) -> Array:
+    """Return OpenCV's coefficients of a lens with four radial terms and OpenCV's (p1, p2).
+
+    Raises:
+        CalibrationError: they follow the lens by more than 0.05 px off.
+    """
+    k, error_px = opencv_radial(K, size, radial)
+    if error_px > _LARGEST_ERROR_PX:
+        raise CalibrationError(
+            f"camera {name}: its lens cannot be written with OpenCV's coefficients (off by {error_px:.2f} px, allowed "
+            f"are {_LARGEST_ERROR_PX:g}).",
+            path=path,
+            hint="Calibrate without k4, or undistort the footage first.",
+        )
+    lens = np.concatenate([k[:2], tangential, k[2:]])
+    return lens if lens.any() else np.zeros(0)
+
+
+def corner_matrix(path: Path, where: str, fx: float, fy: float, cx: float, cy: float) -> Array:
+    """Return K (3, 3) of values for pixels whose first one has its centre at (0.5, 0.5).
+
+    Raises:
+        CalibrationError: a focal length cannot be.
+    """
+    if not (fx > 0 and fy > 0):
+        raise CalibrationError(f"{where} has the focal lengths {fx:g} and {fy:g} px, allowed are > 0 px.", path=path)
+    return np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
+
+
+def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[Camera]:
+    """Return the cameras by name that took images (file, camera).
+
+    An image in a folder is named after it (`cam0/0001.png` is cam0), else after its file (`cam0.png`).
+
+    Raises:
+        CalibrationError: images of one camera have different poses or lenses.
+    """
+    places = [PurePosixPath(file.replace("\\", "/")) for file, _ in images]
+    alone = sorted({place.name for place in places if place.parent.name in ("", "images")})
+    names = dict(zip(alone, names_of_labels(path, alone), strict=True))
+    cameras: dict[str, Camera] = {}
+    for place, (_, camera) in zip(places, images, strict=True):
+        folder = place.parent.name
+        name = names[place.name] if folder in ("", "images") else folder
+        known = cameras.setdefault(name, replace(camera, name=name))
+        turned = np.abs(known.T_cam_world[:3, :3] - camera.T_cam_world[:3, :3]).max()
+        moved = np.linalg.norm(known.centre_world() - camera.centre_world())
+        what = ""
+        if turned > _MOVED_RAD or moved > _MOVED_SHARE * np.linalg.norm(known.centre_world()) + 1e-12:
+            what = "stands in different places"
+        elif known.size_px != camera.size_px or not _same_lens(known, camera):
+            what = "has different lenses"
+        if what:
+            raise CalibrationError(
+                f"camera {name} {what} in its images.",
+                path=path,
+                hint="Name the images after the cameras, one per camera (cam0.png) or one folder each (cam0/0001.png), "
+                "and let the images of a camera share its lens.",
+            )
+    return [cameras[name] for name in sorted(cameras)]
+
+
+def _same_lens(one: Camera, other: Camera) -> bool:
+    return one.distortion.shape == other.distortion.shape and bool(
+        np.allclose(one.K, other.K, rtol=1e-4) and np.allclose(one.distortion, other.distortion, atol=1e-4)
+    )

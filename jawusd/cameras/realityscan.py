@@ -1,0 +1,164 @@
+"""Cameras of RealityScan (RealityCapture): XMP beside the pictures, and CSV.
+
+XMP, `IMAGE.xmp` ("Camera Geometry in RealityScan", dev.epicgames.com, and "RealityCapture XMP Camera Math",
+support.capturingreality.com): Rotation (row by row) takes world to camera axes, x right, y down, z forward; Position is
+the camera's centre. FocalLength35mm is for 36 mm along the longer side; PrincipalPointU and V are from the middle of
+the picture in lengths of that side. Distortion "brown3" and "brown4" (with t2: tangential) works as OpenCV's on
+coordinates over the focal length: k1 k2 k3 k4 t1 t2 with t1, t2 = OpenCV's p1, p2. The size of the picture is not in
+the file.
+
+CSV ("Internal/External camera parameters"; columns may be chosen and are found by name): x, y, alt is the camera's
+centre; the camera's axes in the world, x right, y up, z backward, are Rz(-heading) Rx(pitch) Ry(roll) in degrees, as
+nerfstudio and brush read them; f, px, py, k1 .. k4, t1, t2 as in XMP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CalibrationError
+from jawusd.base.tables import read_table
+from jawusd.cameras.parts import (
+    CameraFormat,
+    Size,
+    files_in,
+    known_size,
+    lens_with_k4,
+    names_of_labels,
+    numbers,
+    parsed_xml,
+    world_to_camera,
+)
+from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
+
+_MOST_BYTES = 16 << 20
+_HALF_PX = 0.5
+_FILM_MM = 36.0
+_LARGEST_SKEW = 1e-6
+_RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
+_XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+_NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
+_LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+_OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera]:
+    """Read the XMP files of a folder as cameras by the files' names, in their unit.
+
+    Args:
+        folder: of the files.
+        sizes: (width, height) [px] of the pictures by camera; those of others are not read.
+
+    Raises:
+        CalibrationError: a size is not known, or a value is missing or wrong.
+        FormatError: a file is damaged.
+    """
+    out = []
+    for path in files_in(folder, ".xmp"):
+        node = next(parsed_xml(path).iter(f"{_RDF}Description"), None)
+        values = {} if node is None else _xmp_values(node)
+        if "Rotation" not in values or "Position" not in values:
+            raise CalibrationError("has no Rotation and Position.", path=path, hint="Export XMP with camera poses.")
+        size = known_size(path, path.stem, sizes)
+        f35 = numbers(path, values.get("FocalLength35mm", ""), 1, "FocalLength35mm")[0]
+        principal = [float(numbers(path, values.get(f"PrincipalPoint{a}", "0"), 1, "PrincipalPoint")[0]) for a in "UV"]
+        model = values.get("DistortionModel", "perspective").lower()
+        if not model.startswith(("brown", "perspective")):
+            raise CalibrationError(
+                f'has the distortion model "{model}"; "brown3" and "brown4" are read.',
+                path=path,
+                hint="Choose Brown3 or Brown4 with tangential as distortion model, and align again.",
+            )
+        terms = numbers(path, values.get("DistortionCoeficients", "0 0 0 0 0 0"), 6, "DistortionCoeficients")
+        for key, square in (("Skew", 0.0), ("AspectRatio", 1.0)):
+            if abs(numbers(path, values.get(key, str(square)), 1, key)[0] - square) > _LARGEST_SKEW:
+                raise CalibrationError(
+                    f"has {key} {values[key]}, allowed is {square:g}.", path=path, hint="Align with square pixels."
+                )
+        K, lens = _lens(path, path.stem, size, f35, (principal[0], principal[1]), terms)
+        rotation = numbers(path, values["Rotation"], 9, "Rotation").reshape(3, 3)
+        centre = numbers(path, values["Position"], 3, "Position")
+        out.append(Camera(path.stem, size, K, lens, world_to_camera(path, path.stem, rotation.T, centre)))
+    if not out:
+        raise CalibrationError("holds no .xmp files.", path=folder)
+    return out
+
+
+def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
+    """Read RealityScan's camera parameters, by the names of the pictures, in the file's unit.
+
+    Args:
+        path: the CSV.
+        sizes: (width, height) [px] of the pictures by camera.
+
+    Raises:
+        CalibrationError: a column or a size is missing, or a value is not finite.
+        FormatError: the file is no table of numbers.
+    """
+    table = read_table(path, _MOST_BYTES, comment="#cameras")
+    header = [word.lstrip("#").strip().lower() for word in table.header]
+    lacking = [key for key in _NEEDED if key not in header]
+    if lacking:
+        raise CalibrationError(
+            f"has no column {lacking[0]}; RealityScan's camera parameters have {', '.join(_NEEDED)}.", path=path
+        )
+    columns = [k for k, key in enumerate(header) if key in (*_NEEDED[1:], *_LENS)]
+    column = header.index("name")
+    names = names_of_labels(path, [row[column] for row in table.rows])
+    out = []
+    for where, name, values in zip(table.places, names, table.numbers(columns), strict=True):
+        if not np.isfinite(values).all():
+            raise CalibrationError(f"{where} has a value that is not finite.", path=path)
+        found = {header[k]: float(value) for k, value in zip(columns, values)}
+        size = known_size(path, name, sizes)
+        terms = np.array([found.get(key, 0.0) for key in _LENS[2:]])
+        K, lens = _lens(path, name, size, found["f"], (found.get("px", 0.0), found.get("py", 0.0)), terms)
+        heading, pitch, roll = (np.deg2rad(found[key]) for key in ("heading", "pitch", "roll"))
+        turns = so3_exp(np.array([[0, 0, -heading], [pitch, 0, 0], [0, roll, 0]]))
+        axes = turns[0] @ turns[1] @ turns[2] @ _OPENGL
+        T_world_cam = make_transform(axes, np.array([found["x"], found["y"], found["alt"]]))
+        out.append(Camera(name, size, K, lens, se3_inverse(T_world_cam)))
+    if not out:
+        raise CalibrationError("holds no cameras.", path=path)
+    return sorted(out, key=lambda camera: camera.name)
+
+
+def _lens(
+    path: Path, name: str, size: Size, f35_mm: float, principal: tuple[float, float], terms: Array
+) -> tuple[Array, Array]:
+    """Return K (3, 3) and OpenCV's coefficients of RealityScan's values: terms are k1 k2 k3 k4 t1 t2.
+
+    Raises:
+        CalibrationError: the focal length cannot be, or the lens cannot be written with OpenCV's coefficients.
+    """
+    longer = max(size)
+    if not f35_mm > 0:
+        raise CalibrationError(f"camera {name} has the focal length {f35_mm:g} mm, allowed is more than 0.", path=path)
+    focal = f35_mm / _FILM_MM * longer
+    cx, cy = (principal[k] * longer + size[k] / 2 - _HALF_PX for k in (0, 1))
+    K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+    return K, lens_with_k4(path, name, K, size, terms[:4], (float(terms[4]), float(terms[5])))
+
+
+def _xmp_values(node: ElementTree.Element) -> dict[str, str]:
+    found = {key.removeprefix(_XCR): value for key, value in node.attrib.items() if key.startswith(_XCR)}
+    return found | {child.tag.removeprefix(_XCR): child.text or "" for child in node if child.tag.startswith(_XCR)}
+
+
+def _load(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
+    if path.suffix.lower() == ".csv":
+        return load_realityscan_csv(path, sizes)
+    return load_realityscan_xmp(path if path.is_dir() else path.parent, sizes)
+
+
+FORMAT = CameraFormat(
+    lambda path: path.suffix.lower() in (".csv", ".xmp") or bool(files_in(path, ".xmp")),
+    _load,
+    lambda path: [path] if path.suffix.lower() == ".csv" else files_in(path if path.is_dir() else path.parent, ".xmp"),
+    lacks_sizes=True,
+)

@@ -1,1 +1,0 @@
-"""Pictures in and out: video, masks, meshes, and the CPU rasteriser that projects meshes into them."""

@@ -1,0 +1,75 @@
+"""What lies behind drawn scans: a camera's footage, or its masks where it has none."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.errors import CaptureError
+from jawusd.formats.capture import CameraSource
+from jawusd.media.footage import open_clip
+from jawusd.media.frame_reader import FrameReader
+from jawusd.media.masks import mask_size_px, open_masks
+
+#: Gray of masks of the upper and the lower teeth, and of what is neither.
+_UPPER, _LOWER, _NEITHER = 150, 105, 25
+
+
+class Backdrop:
+    """Read the pictures of one camera by frames of the reference camera; safe to use from several threads.
+
+    Attributes:
+        size_px: (width, height) of the pictures.
+        count: one past the camera's own last frame.
+        is_footage: they are footage, not masks.
+    """
+
+    def __init__(self, source: CameraSource, offset: int) -> None:
+        """Open what a camera has; frame k of it shows the instant of frame k + offset of the reference camera.
+
+        Raises:
+            CaptureError: it has neither video nor masks, or they cannot be decoded.
+        """
+        self._offset = offset
+        self._lock = threading.Lock()
+        self.is_footage = source.clip is not None
+        if source.clip is not None:
+            self._reader = FrameReader(open_clip(source.clip))
+            self.size_px, self.count = self._reader.video.size_px, self._reader.video.timeline.count
+        elif source.masks is not None:
+            self.size_px = mask_size_px(source.masks.upper)
+            self._masks = open_masks(source, self.size_px)
+            self.count = max(masks.count for masks in self._masks)
+        else:
+            raise CaptureError(
+                "has neither a video nor masks, so there is nothing to draw over.",
+                camera=source.name,
+                hint="Name one of them in the capture file.",
+            )
+
+    def picture(self, frame: int) -> NDArray[np.uint8] | None:
+        """Return the picture at a frame of the reference camera, (h, w, 3) RGB, read-only; None where there is none.
+
+        Raises:
+            CaptureError: it cannot be decoded.
+        """
+        own = frame - self._offset
+        if self.is_footage:
+            number = self._reader.video.timeline.picture(own)
+            return None if number is None else self._reader.picture(number)
+        with self._lock:
+            found = [masks.read(own) for masks in self._masks]
+        width, height = self.size_px
+        out = np.full((height, width), _NEITHER, np.uint8)
+        for mask, gray in zip(found, (_UPPER, _LOWER), strict=True):
+            if mask is not None:
+                out[mask > 127] = gray
+        return np.repeat(out[:, :, None], 3, axis=2)
+
+    def close(self) -> None:
+        """Stop decoding ahead."""
+        if not self.is_footage:
+            for masks in self._masks:
+                masks.close()

@@ -1,0 +1,69 @@
+"""Open files of pictures and sound: one that is what it holds, and names no others."""
+
+from __future__ import annotations
+
+import os
+import zlib
+
+import av
+
+from jawusd.media.pictures import MOST_PX
+
+#: Formats of one file. FFmpeg also follows playlists (HLS, DASH, concat, SDP), which name other files and addresses.
+FORMATS = (
+    "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "mxf", "flv", "ogg", "asf", "nut",
+    "ivf", "dv", "h264", "hevc", "av1", "obu", "m4v", "mjpeg", "yuv4mpegpipe", "gif", "apng", "rm", "gxf", "wtv", "y4m",
+    "wav", "w64", "aiff", "au", "caf", "flac", "mp3", "aac", "ac3", "mp2",
+)  # fmt: skip
+
+
+#: Formats of single pictures.
+PICTURES = (
+    "image2", "png_pipe", "exr_pipe", "dpx_pipe", "tiff_pipe", "bmp_pipe", "jpeg_pipe", "j2k_pipe", "webp_pipe",
+    "pam_pipe", "pgm_pipe", "ppm_pipe", "sgi_pipe", "cin_pipe", "hdr_pipe",
+)  # fmt: skip
+
+
+# Decoders that raise errors for damage only if they are asked to, checksums included. Not all: that of TIFF refuses
+# good files then, and others gain nothing.
+_STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
+_STRICT_CODECS = ("hevc", "mjpeg", "png")
+_REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
+
+
+def open_container(
+    path: str | os.PathLike[str], formats: tuple[str, ...] = FORMATS, most_px: int = MOST_PX
+) -> av.container.InputContainer:
+    """Open a video or sound file, or one of other formats.
+
+    Decoders raise errors for damage that they see, or mark pictures as corrupt, and refuse pictures of more than so
+    many pixels.
+
+    Raises:
+        av.FFmpegError: it is none, or one that names other files.
+        OSError: it cannot be read.
+    """
+    limit = {"max_pixels": str(most_px)}
+    options = {"format_whitelist": ",".join(formats), "protocol_whitelist": "file"}
+    container = av.open(os.fspath(path), metadata_errors="replace", options=options | limit)  # it decodes some, too
+    for stream in container.streams.video:
+        if stream.codec_context is not None:  # of codecs that are not known
+            strict = _STRICT if stream.codec_context.name in _STRICT_CODECS else {}
+            stream.codec_context.options = limit | strict
+    return container
+
+
+def slices_are_whole(packet: bytes) -> bool:
+    """Compare the slices of an FFV1 picture with their checksums; false also where they have none.
+
+    FFmpeg replaces slices whose checksum is wrong by those of the picture before, and sets no flag. RFC 9043, 4.9: a
+    slice ends in its size (3 bytes), a status (1) and a CRC (4; polynomial 0x04C11DB7, highest bit first, from 0).
+    """
+    end = len(packet)
+    while end >= 8:
+        size = int.from_bytes(packet[end - 8 : end - 5], "big") + 8
+        # zlib has the lowest bit first, and inverts.
+        if size > end or zlib.crc32(packet[end - size : end].translate(_REVERSED), 0xFFFFFFFF) != 0xFFFFFFFF:
+            return False
+        end -= size
+    return end == 0

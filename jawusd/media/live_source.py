@@ -1,0 +1,165 @@
+"""Pictures of a camera as they come: from a device, a network stream, or a file played at its own rate."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import numpy as np
+
+from jawusd.base.errors import CaptureError
+from jawusd.media import live_clock
+from jawusd.media.pixels import ColourPicture, DecodedPicture
+from jawusd.media.video import Video
+
+_WAIT_S = 0.1
+_KEPT = 8  # last pictures: more than those of an instant that waits for its turn
+# How PyAV names cameras of this machine, by the beginning of their address.
+_DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
+
+
+@dataclass(frozen=True, eq=False)
+class LivePicture:
+    """Hold a picture: its time on the clock all sources share [s], and its pixels, RGB uint8 (H, W, 3).
+
+    What nobody looks at is not turned into RGB.
+    """
+
+    time_s: float
+    rgb: ColourPicture
+
+
+class LiveSource:
+    """Read one camera in a thread of its own; keeps the last pictures only."""
+
+    def __init__(self, where: str, size_px: tuple[int, int], early_s: float = 0.0) -> None:
+        """Take an address.
+
+        Args:
+            where: a file, a network address (rtsp://, http://, ...), or a device (/dev/video0 on Linux).
+            size_px: width and height that the camera was calibrated for.
+            early_s: how much earlier than the other sources a file was begun [s].
+        """
+        self.where, self._size_px, self._early_s = where, size_px, early_s
+        self._kept: deque[LivePicture] = deque(maxlen=_KEPT)
+        self._changed, self._stopped = threading.Condition(), threading.Event()
+        self._open, self._playing, self._begin_s = threading.Event(), threading.Event(), 0.0
+        self._streams, self._heard_s = not Path(where).is_file(), 0.0
+        self._error: CaptureError | None = None
+        self.ended = False
+
+    def open(self, from_s: float = 0.0) -> None:
+        """Open the source in its thread, a file at a time since the sources' recordings began [s]; see `play`."""
+        self._heard_s = live_clock.now_s()
+        threading.Thread(target=self._read, args=(from_s,), daemon=True).start()
+
+    def wait_open(self, silence_s: float) -> None:
+        """Wait until the source is open or has failed.
+
+        Raises:
+            CaptureError: see `refuse_silence`.
+        """
+        while not self._open.wait(_WAIT_S):
+            self.refuse_silence(silence_s)
+
+    def refuse_silence(self, silence_s: float) -> None:
+        """Refuse a device or stream that has sent no picture for so long [s].
+
+        Raises:
+            CaptureError: it has not.
+        """
+        if self._streams and not self.ended and live_clock.now_s() - self._heard_s > silence_s:
+            raise CaptureError(
+                f"has sent no picture for {silence_s:g} s.",
+                path=self.where,
+                hint="Is the camera on, and its program sending? Allow more with --silence.",
+            )
+
+    def play(self, begin_s: float) -> None:
+        """Give out pictures; those of a file as if the recordings began at a time of `live_clock.now_s`."""
+        self._begin_s = begin_s
+        self._playing.set()
+
+    def stop(self) -> None:
+        """Stop reading."""
+        self._stopped.set()
+        self._playing.set()
+
+    def times_s(self) -> list[float]:
+        """Return the times of the pictures kept, the newest last.
+
+        Raises:
+            CaptureError: the source cannot be read.
+        """
+        if self._error is not None:
+            raise self._error
+        with self._changed:
+            return [picture.time_s for picture in self._kept]
+
+    def at(self, time_s: float) -> LivePicture | None:
+        """Return the kept picture nearest to a time, None before the first one."""
+        with self._changed:
+            return min(self._kept, key=lambda picture: abs(picture.time_s - time_s), default=None)
+
+    def wait(self, after_s: float, timeout_s: float) -> bool:
+        """Wait for a picture newer than a time; return whether there is one."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self.ended or self._error is not None or (bool(self._kept) and self._kept[-1].time_s > after_s),
+                timeout_s,
+            )
+
+    def _read(self, from_s: float) -> None:
+        try:
+            pictures = self._stream() if self._streams else self._file(from_s)
+            for picture in pictures:
+                if picture.rgb.shape[1::-1] != self._size_px:
+                    found, wanted = "{} x {}".format(*picture.rgb.shape[1::-1]), "{} x {}".format(*self._size_px)
+                    raise CaptureError(f"pictures of {found} px, the calibration is for {wanted}.", path=self.where)
+                with self._changed:
+                    self._kept.append(picture)
+                    self._changed.notify_all()
+                if self._stopped.is_set():
+                    return
+        except CaptureError as error:
+            self._error = error
+        finally:
+            self._open.set()
+            with self._changed:
+                self.ended = True
+                self._changed.notify_all()
+
+    def _file(self, from_s: float) -> Iterator[LivePicture]:
+        """Yield the pictures of a file at the times they were taken."""
+        video = Video(self.where)
+        first = int(np.searchsorted(video.times_s, from_s + self._early_s))
+        numbers = range(first, video.count)
+        for time_s, picture in zip(video.times_s[first:], video.colour_pictures(numbers, threads=1), strict=True):
+            self._open.set()
+            self._playing.wait()
+            due = self._begin_s - self._early_s + float(time_s)
+            if picture is None or live_clock.wait_until(due, self._stopped):
+                return
+            yield LivePicture(due, picture)
+
+    def _stream(self) -> Iterator[LivePicture]:
+        start, name = _DEVICES.get(sys.platform, ("", ""))
+        device = bool(start) and self.where.startswith(start)
+        address = self.where.removeprefix(start) if device and start.endswith(":") else self.where
+        try:
+            with av.open(address, format=name if device else None) as container:
+                for frame in container.decode(video=0):
+                    self._open.set()
+                    self._heard_s = live_clock.now_s()
+                    yield LivePicture(self._heard_s, DecodedPicture(frame, 0))
+        except (av.FFmpegError, OSError, IndexError) as error:
+            raise CaptureError(
+                f"cannot be read ({error}).",
+                path=self.where,
+                hint="Name a file, a device such as /dev/video0, or a stream such as rtsp://host/camera.",
+            ) from error

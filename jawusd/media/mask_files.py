@@ -1,0 +1,222 @@
+"""Masks written by other programs: numbered PNG files and videos, and which pixels count as tooth."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.errors import CaptureError
+from jawusd.formats.numbered import numbered_files
+from jawusd.media.mask_levels import MaskImage, RawImage
+from jawusd.media.mask_source import SourceLevels, load_png, mask_video, png_levels, video_levels
+from jawusd.media.pictures import read_palette_numbers
+from jawusd.media.pixels import Colour
+
+#: Gray values of the wanted arch and of the other one in label images; all else must be 0.
+LabelValues = tuple[int, int]
+
+_NUMBER = re.compile(r"%(0(\d+))?d")
+_FEW = 6  # label values listed in an error
+
+
+class PngMasks:
+    """Masks as numbered PNG files.
+
+    Attributes:
+        count: one past the highest number.
+        odd: pictures read so far that contradict the others and count as not segmented, and how.
+    """
+
+    def __init__(
+        self,
+        pattern: Path,
+        size_px: tuple[int, int] | None,
+        labels: LabelValues | None = None,
+        is_other: Callable[[RawImage], bool] | None = None,
+    ) -> None:
+        """Find the files of a pattern with one %d or %06d.
+
+        Args:
+            pattern: path of the files.
+            size_px: (width, height) of all of them, if known.
+            labels: see `LabelValues`.
+            is_other: tells pictures that are no masks, from which nothing follows for the others.
+
+        Raises:
+            CaptureError: the folder is missing or holds no such file.
+        """
+        self._pattern, self._size_px, self._labels, self._is_other = pattern, size_px, labels, is_other
+        self.odd: dict[int, str] = {}
+        # Names, not paths: hours of several cameras are a hundred thousand files.
+        self._names = self._found(pattern) if "%" in pattern.name else _names(numbered_files(pattern))
+        self.count = max(self._names) + 1
+
+    @property
+    def numbers(self) -> set[int]:
+        """Return the numbers of the files."""
+        return set(self._names)
+
+    @staticmethod
+    def _found(pattern: Path) -> dict[int, str]:
+        number = _NUMBER.search(pattern.name)
+        if number is None or pattern.name.count("%") != 1:
+            raise CaptureError(
+                "the mask pattern needs one number such as %06d.", path=pattern, hint="Correct it in capture.toml."
+            )
+        if not pattern.parent.is_dir():
+            raise CaptureError(
+                f"there is no folder {pattern.parent}.", path=pattern, hint="Correct it in capture.toml."
+            )
+        digits = rf"\d{{{number[2]},}}" if number[2] else r"\d+"
+        before, after = (re.escape(part) for part in (pattern.name[: number.start()], pattern.name[number.end() :]))
+        name = re.compile(f"{before}({digits}){after}")
+        found = (name.fullmatch(entry.name) for entry in os.scandir(pattern.parent))
+        names = {int(match[1]): match[0] for match in found if match}
+        if not names:
+            raise CaptureError(
+                "no file of the folder has such a name.", path=pattern, hint="Correct `masks` in capture.toml."
+            )
+        return names
+
+    @cached_property
+    def levels(self) -> SourceLevels:
+        """Find what the values mean, from some pictures of the whole take.
+
+        Raises:
+            CaptureError: the pictures have another size or are no masks.
+        """
+        found = png_levels([self._path(k) for k in sorted(self._names)], self._is_other)
+        if self._size_px is not None:
+            for path, size in found.sizes_px:
+                _check_size(path, size, self._size_px)
+        return found
+
+    def masks(self, first: int) -> Iterator[MaskImage | None]:
+        """Yield the masks from a number on, (h, w) uint8, None where there is no file or nothing segmented.
+
+        Raises:
+            CaptureError: a file cannot be decoded or has another size, or the pictures are no masks.
+        """
+        for number in range(first, self.count):
+            if number not in self._names:
+                yield None
+                continue
+            path = self._path(number)
+            if self._labels is not None:
+                image = self._load(path)
+                image = image if image.ndim == 2 else read_palette_numbers(path, image)
+                yield _labelled(image, self._labels, path, "")
+            else:
+                yield self._mask(path, number)
+
+    def _mask(self, path: Path, number: int) -> MaskImage | None:
+        image, found = self._load(path), self.levels
+        if found.levels is None:
+            return None
+        if found.palette_numbers:
+            image = read_palette_numbers(path, image)
+        mask, odd = found.levels.coverage(image)
+        if odd:
+            self.odd[number] = f"{path.name} {odd}"
+        return mask
+
+    def first_size_px(self) -> tuple[int, int]:
+        """Return the (width, height) of the first file."""
+        height, width = self._load(self._path(min(self._names))).shape[:2]
+        return width, height
+
+    def _path(self, number: int) -> Path:
+        return self._pattern.parent / self._names[number]
+
+    def _load(self, path: Path) -> RawImage:
+        image = load_png(path)
+        if self._size_px is not None:
+            _check_size(path, image.shape[1::-1], self._size_px)
+        return image
+
+
+class VideoMasks:
+    """Masks as the pictures of a video: black and white, or as its transparency.
+
+    Attributes:
+        count: number of pictures.
+        timeline: which picture is shown at which frame.
+        odd: pictures read so far that contradict the others and count as not segmented, and how.
+    """
+
+    def __init__(self, path: Path, size_px: tuple[int, int], labels: LabelValues | None = None) -> None:
+        """Open the video; see `PngMasks` for the arguments.
+
+        Raises:
+            CaptureError: the video is missing or damaged, or has another size.
+        """
+        self._video, self._labels = mask_video(path), labels
+        self.odd: dict[int, str] = {}
+        _check_size(path, self._video.size_px, size_px)
+        self.count, self.timeline = self._video.count, self._video.timeline
+
+    @cached_property
+    def levels(self) -> SourceLevels:
+        """Find what the values mean; see `PngMasks.levels`."""
+        return video_levels(self._video.path)[0]
+
+    def masks(self, first: int) -> Iterator[MaskImage | None]:
+        """Yield the masks from a picture on, (h, w) uint8, None where nothing is segmented.
+
+        Raises:
+            CaptureError: a picture cannot be decoded, or they are no masks.
+        """
+        if self._labels is not None:  # luma, unless there is none: conversions would change values
+            colour: Colour = "rgb" if self._video.is_rgb else "gray"
+            for frame in self._video.frames(first, colour=colour, threads=1):
+                yield _labelled(frame.image, self._labels, self._video.path, f"picture {frame.index}: ")
+            return
+        found, colour = video_levels(self._video.path)
+        if found.levels is None:
+            yield from (None for _ in range(first, self.count))
+            return
+        for frame in self._video.frames(first, colour=colour, threads=1):
+            mask, odd = found.levels.coverage(frame.image)
+            if odd:
+                self.odd[frame.index] = f"picture {frame.index} {odd}"
+            yield mask
+
+
+def _names(files: Mapping[int, Path]) -> dict[int, str]:
+    return {number: path.name for number, path in files.items()}
+
+
+def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) -> None:
+    if tuple(found) != tuple(allowed):
+        raise CaptureError(
+            f"the mask is {found[0]} x {found[1]} px, the camera's pictures are {allowed[0]} x {allowed[1]} px.",
+            path=path,
+            hint="Export the masks at the size of the video.",
+        )
+
+
+def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> MaskImage:
+    """Return 255 where a label image shows the wanted arch; refuse other values."""
+    plane = image if image.ndim == 2 else image[..., 0]
+    if image.ndim == 3 and not all((image[..., c] == plane).all() for c in (1, 2)):
+        raise CaptureError(
+            f"{where}the label image is coloured; one gray value per row of teeth is needed.",
+            path=path,
+            hint="Export the labels as gray values (an index image without palette).",
+        )
+    found = np.flatnonzero(np.bincount(plane.ravel()))
+    if not np.isin(found, (0, *labels)).all():
+        shown = ", ".join(map(str, found[:_FEW])) + (f" and {len(found) - _FEW} more" if len(found) > _FEW else "")
+        low, high = sorted(labels)
+        raise CaptureError(
+            f"{where}the label image has the values {shown}; 0, {low} and {high} are allowed.",
+            path=path,
+            hint="Correct masks.upper_value and masks.lower_value, or export without other labels, smooth edges and "
+            "lossy compression.",
+        )
+    return np.where(plane == labels[0], np.uint8(255), np.uint8(0))

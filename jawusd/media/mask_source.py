@@ -1,0 +1,182 @@
+"""What the values of numbered mask files and of mask videos mean, looked up once per file and version."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from jawusd.base.errors import CaptureError
+from jawusd.media.level_search import NotMasks, find_levels
+from jawusd.media.mask_levels import MaskLevels, RawImage, spread_of_colours
+from jawusd.media.pictures import has_palette, read_palette_numbers, read_picture
+from jawusd.media.pixels import Colour
+from jawusd.media.video import Video
+
+_SAMPLED = 10  # pictures of a take that show what its values mean
+_FEWEST_OF_VIDEO = 4
+_NEUTRAL = 12  # of 255: colour that coding with loss leaves in black, gray and white
+
+
+@dataclass(frozen=True)
+class SourceLevels:
+    """Hold what the values of one source mean.
+
+    `levels` is None if none of its pictures shows anything. `palette_numbers` are read instead of colours that are all
+    the same. `sizes_px` are the (width, height) of files looked at, one file per size.
+    """
+
+    levels: MaskLevels | None
+    palette_numbers: bool = False
+    sizes_px: tuple[tuple[Path, tuple[int, int]], ...] = ()
+
+
+def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | None = None) -> SourceLevels:
+    """Find the levels of numbered files, from some of them; `is_other` tells pictures that are no masks.
+
+    Raises:
+        CaptureError: the pictures are no masks.
+    """
+    chosen = _spread(len(files), _SAMPLED)
+    sample = [files[k] for k in chosen]
+    versions = tuple((stat.st_mtime_ns, stat.st_size) for stat in (path.stat() for path in sample))
+    others = _Others([path for k, path in enumerate(files) if k not in chosen])
+    try:
+        return _png_levels_of_version(tuple(sample), versions, others, is_other)
+    finally:
+        others.files = []  # the cache keeps this object, and takes have tens of thousands of files
+
+
+def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
+    """Find the levels of a video, from some of its pictures, and what to decode them as.
+
+    Raises:
+        CaptureError: it cannot be decoded, or the pictures are no masks.
+    """
+    return _video_levels_of_version(path, path.stat().st_mtime_ns)
+
+
+def mask_video(path: Path) -> Video:
+    """Return a video of masks; its table of frames is read once, though a take opens it a dozen times.
+
+    Raises:
+        CaptureError: as `Video`.
+    """
+    if not path.is_file():
+        return Video(path)  # which says so
+    found = path.stat()
+    return _video_of_version(path, found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=64)
+def _video_of_version(path: Path, changed_ns: int, size: int) -> Video:
+    """Open a video; time of its last change and size identify its version."""
+    return Video(path)
+
+
+class _Others:
+    """Hold files besides a sample; as many others are equal, so that a cache does not compare them."""
+
+    def __init__(self, files: list[Path]) -> None:
+        self.files, self._count = files, len(files)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Others) and self._count == other._count
+
+    def __hash__(self) -> int:
+        return self._count
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """Return at most so many of `count` numbers, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+
+
+@lru_cache(maxsize=256)
+def _png_levels_of_version(
+    sample: tuple[Path, ...],
+    versions: tuple[tuple[int, int], ...],
+    others: _Others,
+    is_other: Callable[[RawImage], bool] | None,
+) -> SourceLevels:
+    """Find the levels of files, reading them once; times and sizes of the sample identify their version."""
+    for palette_numbers in (False, True) if any(map(has_palette, sample)) else (False,):
+        read: list[Path] = []
+        sizes: dict[tuple[int, int], Path] = {}
+
+        def pictures(
+            paths: Sequence[Path], as_numbers: bool, read: list[Path], sizes: dict[tuple[int, int], Path]
+        ) -> Iterator[RawImage]:
+            for path in paths:
+                try:
+                    image = load_png(path)
+                except CaptureError:
+                    continue  # that frame reports it
+                if is_other is None or not is_other(image):
+                    read.append(path)
+                    sizes.setdefault((image.shape[1], image.shape[0]), path)
+                    yield read_palette_numbers(path, image) if as_numbers else image
+
+        more = partial(pictures, others.files, palette_numbers, read, sizes)
+        try:
+            found = find_levels(pictures(sample, palette_numbers, read, sizes), False, more)
+        except NotMasks as error:
+            where = read[error.index] if error.index is not None else sample[0].parent
+            raise CaptureError(error.reason, path=where, hint=error.hint) from error
+        if not read:
+            return SourceLevels(MaskLevels())  # nothing can be read, which every frame reports
+        if found is not None:
+            return SourceLevels(found, palette_numbers, tuple((path, size) for size, path in sizes.items()))
+    return SourceLevels(None, sizes_px=tuple((path, size) for size, path in sizes.items()))
+
+
+@lru_cache(maxsize=256)
+def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels, Colour]:
+    """Find the levels of a video and what to decode; the time of its last change identifies its version."""
+    video = mask_video(path)
+    colour: Colour = "gray" if video.is_gray else "rgba" if video.has_alpha else "rgb"
+    # Pictures that decode by themselves are cheap; few of them may be empty, as the first often is.
+    sample = [int(video.keys[k]) for k in _spread(len(video.keys), _SAMPLED)]
+    if len(sample) < _FEWEST_OF_VIDEO:
+        sample = sorted({*sample, *_spread(video.count, _FEWEST_OF_VIDEO)})
+    numbers: list[int] = []
+    neutral = [True]
+
+    def pictures(chosen: Sequence[int] | None) -> Iterator[RawImage]:
+        spans = [(0, video.count)] if chosen is None else [(k, k + 1) for k in chosen]
+        for first, stop in spans:
+            for frame in video.frames(first, stop, colour=colour, threads=1):
+                if chosen is None and frame.index in sample:
+                    continue
+                numbers.append(frame.index)
+                if colour != "gray":
+                    neutral[0] &= spread_of_colours(frame.image) <= _NEUTRAL
+                yield frame.image
+
+    lossy = not (video.is_gray or video.is_rgb or video.has_alpha)
+    try:
+        found = find_levels(pictures(sample), lossy, partial(pictures, None))
+    except NotMasks as error:
+        where = "" if error.index is None else f"picture {numbers[error.index]}: "
+        raise CaptureError(where + error.reason, path=path, hint=error.hint) from error
+    if lossy and neutral[0]:
+        colour = "gray"  # its own luma, at full resolution
+    return SourceLevels(found), colour
+
+
+def load_png(path: Path) -> RawImage:
+    """Return a picture as stored.
+
+    Raises:
+        CaptureError: it cannot be decoded.
+    """
+    image = read_picture(path, cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise CaptureError(
+            "the mask cannot be decoded.", path=path, hint="Export it again, or delete it: that frame is skipped."
+        )
+    return image

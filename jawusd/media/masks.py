@@ -1,0 +1,296 @@
+"""Read segmentation masks, numbered by their camera's own video frames, decoding ahead in the background."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import threading
+from collections.abc import Callable, Generator, Iterator
+from functools import cached_property, lru_cache
+from pathlib import Path
+from types import TracebackType
+
+from jawusd.base.errors import CaptureError
+from jawusd.formats.capture import CameraSource
+from jawusd.formats.clip_source import ClipSource
+from jawusd.formats.numbered import is_pattern
+from jawusd.media.footage import open_clip
+from jawusd.media.mask_files import LabelValues, PngMasks, VideoMasks
+from jawusd.media.mask_levels import MaskImage, MaskLevels
+from jawusd.media.timeline import Timeline
+from jawusd.media.video import Video
+
+_LOOKED_AT = 10  # pictures of labels that are looked at first
+_AHEAD = 4  # pictures waiting at most: 8 MB of full HD per reader
+
+
+class MaskReader:
+    """Read the masks of one arch in one camera.
+
+    Reading frame after frame decodes the next few in a background thread; any other order works and decodes on
+    demand. One reader serves one thread; use it as a context manager or close it, or its thread never ends.
+
+    Frames are those of the camera's clock: frame k is shown k nominal frame durations after its first picture. In a
+    video of variable rate some have no picture, and no mask.
+
+    Attributes:
+        count: one past the last frame of the source.
+        levels: what the values mean; None if nothing is segmented, or if they are labels.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        size_px: tuple[int, int],
+        *,
+        timeline: Timeline | None = None,
+        labels: LabelValues | None = None,
+        prepare: Callable[[MaskImage], MaskImage] | None = None,
+    ) -> None:
+        """Find the masks, and what their values mean from some pictures of the whole take.
+
+        Args:
+            path: a PNG pattern with one `%d` or `%06d` (the number of the picture in the camera's video), or a video
+                with one picture per picture, or per frame, of the camera's video.
+            timeline: of the camera's video; without one, PNG files are numbered by frames.
+            labels: for label images, the gray values of the wanted arch and of the other one.
+            prepare: applied to each mask in the background thread, such as `WorkingView.mask`.
+
+        Raises:
+            CaptureError: the folder or file is missing, holds no masks, or their size or count is wrong.
+        """
+        self._labels = labels
+        self.path = Path(path)
+        self._source: PngMasks | VideoMasks
+        self._timeline: Timeline | None
+        if is_pattern(self.path):
+            self._source = pngs = PngMasks(self.path, size_px, labels)
+            self._timeline = _timeline_of_pngs(self.path, pngs, timeline)
+        else:
+            self._source = pictures = VideoMasks(self.path, size_px, labels)
+            self._timeline = _timeline_of_video(self.path, pictures, timeline)
+        self._place = _place_of(self._timeline, self._source)
+        self.count = self._source.count if self._timeline is None else self._timeline.count
+        self.levels: MaskLevels | None = None if labels else self._source.levels.levels
+        self._prepare = prepare
+        self._previous: int | None = None
+        self._ahead: _Ahead | None = None
+
+    def read(self, frame: int) -> MaskImage | None:
+        """Return the mask (h, w) of a frame of the camera, prepared: 255 = tooth, 0 = not, soft edges in between.
+
+        None where the frame is not segmented: outside the video, no picture, or a black one.
+
+        Raises:
+            CaptureError: the picture cannot be decoded, has the wrong size, or is no mask.
+        """
+        if not 0 <= frame < self.count:
+            self._previous = frame
+            return None
+        follows = self._previous is not None and frame == self._previous + 1
+        self._previous = frame
+        if self._ahead is not None and self._ahead.next_frame == frame:
+            return self._ahead.take()
+        if not follows:
+            with contextlib.closing(self._results(frame)) as results:
+                return next(results)
+        self.close()
+        self._ahead = _Ahead(self._results(frame), frame)
+        return self._ahead.take()
+
+    @cached_property
+    def is_black(self) -> bool:
+        """Tell whether no picture shows anything.
+
+        Raises:
+            CaptureError: a picture of labels cannot be decoded, has the wrong size or means nothing.
+        """
+        if self._labels is None:
+            return self.levels is None
+        some = range(self.count // 2, self.count, max(1, self.count // _LOOKED_AT))
+        with contextlib.closing(self._results(0)) as results:
+            return all(self.read(frame) is None for frame in some) and all(mask is None for mask in results)
+
+    @property
+    def odd(self) -> list[str]:
+        """Return which pictures read so far contradict the others, and how; they count as not segmented."""
+        return [self._source.odd[number] for number in sorted(self._source.odd)]
+
+    def read_some(self, first: int, stop: int) -> list[MaskImage | None]:
+        """Return the masks of frames in a row, [first, stop), as `read` would, without decoding more than these.
+
+        Raises:
+            CaptureError: a picture cannot be decoded, has the wrong size, or is no mask.
+        """
+        inside = range(max(first, 0), min(stop, self.count))
+        if not inside:
+            return [None] * (stop - first)
+        with contextlib.closing(self._results(inside.start)) as results:
+            found = [next(results) for _ in inside]
+        return [None] * (inside.start - first) + found + [None] * (stop - inside.stop)
+
+    def close(self) -> None:
+        """Stop decoding ahead; the reader can still be used."""
+        if self._ahead is not None:
+            self._ahead.stop()
+            self._ahead = None
+
+    def __enter__(self) -> MaskReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _results(self, first: int) -> Generator[MaskImage | None]:
+        for mask in self._masks(first):
+            if mask is not None and not mask.any():
+                mask = None
+            yield mask if mask is None or self._prepare is None else self._prepare(mask)
+
+    def _masks(self, first: int) -> Iterator[MaskImage | None]:
+        """Yield the mask of every frame from the first on."""
+        if self._timeline is None:
+            yield from self._source.masks(first)
+            return
+        pictures, at = None, 0
+        for frame in range(first, self.count):
+            picture = self._place(frame)
+            if picture is None or picture >= self._source.count:
+                yield None
+                continue
+            if pictures is None:
+                pictures, at = self._source.masks(picture), picture
+            while at < picture:  # two pictures in one frame: the first counts
+                next(pictures)
+                at += 1
+            yield next(pictures)
+            at += 1
+
+
+def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> Timeline | None:
+    """Return the timeline that maps frames to file numbers; None where they are equal."""
+    if video is None or not (video.missing or video.is_numbered):
+        return None
+    if video.is_numbered:
+        if not source.numbers & set(video.stored.tolist()):
+            raise CaptureError(
+                f"the masks are numbered {min(source.numbers)} to {max(source.numbers)}, the camera's pictures "
+                f"{video.stored[0]} to {video.stored[-1]}.",
+                path=path,
+                hint="Number masks as the pictures that they belong to.",
+            )
+        return video
+    if source.count > len(video.numbers):
+        raise CaptureError(
+            f"the masks are numbered up to {source.count - 1}, but the camera's video, of variable rate, has only "
+            f"pictures 0 to {len(video.numbers) - 1} (in {video.count} frames).",
+            path=path,
+            hint="Number masks by the pictures of the video, or convert it to a constant rate before making masks.",
+        )
+    return video
+
+
+def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks) -> Callable[[int], int | None]:
+    """Return what maps frames to the numbers of masks in their source."""
+    if timeline is None:
+        return lambda frame: frame
+    return timeline.number if isinstance(source, PngMasks) else timeline.picture
+
+
+def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -> Timeline:
+    """Return the timeline that maps the camera's frames to pictures of a mask video."""
+    if video is None or source.timeline.count == video.count != len(video.numbers) != source.count:
+        return source.timeline  # a constant rate was made of the variable one
+    if source.count != len(video.numbers):
+        frames = f" in {video.count} frames" if video.missing else ""
+        raise CaptureError(
+            f"the mask video has {source.count} pictures, the camera's video {len(video.numbers)}{frames}.",
+            path=path,
+            hint="Export the masks again, one picture per picture of the video, from its first one on.",
+        )
+    return video
+
+
+def open_masks(
+    source: CameraSource, size_px: tuple[int, int], *, prepare: Callable[[MaskImage], MaskImage] | None = None
+) -> tuple[MaskReader, MaskReader]:
+    """Return readers of the masks of the upper and the lower teeth of a camera that has some; see `MaskReader`.
+
+    Raises:
+        CaptureError: masks or video are missing, damaged or do not belong together.
+        ValueError: the camera has no masks.
+    """
+    masks = source.masks
+    if masks is None:
+        raise ValueError(f"camera {source.name} has no masks")
+    timeline = None if source.clip is None else _timeline(source.clip, _changed_ns(source.clip.path))
+    labels = masks.labels
+    upper = MaskReader(masks.upper, size_px, timeline=timeline, labels=labels, prepare=prepare)
+    lower = MaskReader(masks.lower, size_px, timeline=timeline, labels=labels and labels[::-1], prepare=prepare)
+    return upper, lower
+
+
+@lru_cache(maxsize=64)
+def _timeline(clip: ClipSource, changed_ns: int) -> Timeline:
+    """Return the timeline of a clip; the time of its last change identifies its version."""
+    return open_clip(clip).timeline
+
+
+def _changed_ns(path: Path) -> int:
+    return (path.parent if is_pattern(path) else path).stat().st_mtime_ns
+
+
+def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Return the (width, height) of the first mask of a PNG pattern or video.
+
+    Raises:
+        CaptureError: the folder or file is missing, holds no masks, or cannot be decoded.
+    """
+    path = Path(path)
+    if not is_pattern(path):
+        return Video(path).size_px
+    return PngMasks(path, None).first_size_px()
+
+
+class _Ahead:
+    """Run an iterator in a thread, a few items ahead of the reader."""
+
+    def __init__(self, items: Generator[MaskImage | None], first_frame: int) -> None:
+        self.next_frame = first_frame
+        self._queue: queue.Queue[tuple[MaskImage | None, Exception | None]] = queue.Queue(_AHEAD)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(items,), daemon=True, name="jawusd-masks")
+        self._thread.start()
+
+    def take(self) -> MaskImage | None:
+        self.next_frame += 1
+        item, error = self._queue.get()
+        if error is not None:
+            self.next_frame = -1  # the thread has ended
+            raise error
+        return item
+
+    def stop(self) -> None:
+        self._stopping.set()
+        # The thread may wait for room, and puts one item at most from now on.
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._queue.get_nowait()
+        self._thread.join()
+
+    def _run(self, items: Generator[MaskImage | None]) -> None:
+        try:
+            with contextlib.closing(items):
+                for item in items:
+                    self._put(item, None)
+                    if self._stopping.is_set():
+                        return
+        except Exception as error:  # handed to the thread that reads, whatever it is
+            self._put(None, error)
+
+    def _put(self, item: MaskImage | None, error: Exception | None) -> None:
+        if not self._stopping.is_set():
+            self._queue.put((item, error))

@@ -1,0 +1,197 @@
+"""Draw tracked scans over the footage, for visual checks (paper figs. 10 and 11)."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array
+from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.formats.mesh import Mesh, crown_face_mask
+from jawusd.formats.performance import STATE_COLOURS, SolveState
+from jawusd.formats.tracks import LOST, Tracks
+from jawusd.geometry import Camera, transform_points
+from jawusd.media.backdrop import Backdrop
+from jawusd.meshes.raster import draw_depth_labels
+
+#: Red, green and blue.
+Colour = tuple[int, int, int]
+
+UPPER_COLOUR: Colour = (255, 170, 0)
+LOWER_COLOUR: Colour = (0, 200, 255)
+_LINE_PX = 2
+CAPTION_PX = 22
+#: Where a camera has no picture.
+EMPTY_GRAY = 60
+_MARGIN = 0.25  # of the teeth's extent, left around them in a tile
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedScan:
+    """Hold a teeth scan where it was tracked."""
+
+    mesh: Mesh  # the scan [mm]; its gum hides what lies behind and is not painted
+    T_world_scan: Array  # its pose, shape (4, 4); NaN leaves the scan out
+    colour: Colour
+
+
+def draw_overlay(
+    image: NDArray[np.uint8], camera: Camera, scans: Sequence[PlacedScan], *, fill: float = 0.3
+) -> NDArray[np.uint8]:
+    """Return a copy of a recorded picture (h, w, 3) RGB with the visible crowns tinted (opacity `fill`) and outlined.
+
+    Raises:
+        ValueError: the picture has not the camera's size.
+    """
+    if image.shape != (camera.size_px[1], camera.size_px[0], 3) or image.dtype != np.uint8:
+        raise ValueError(f"picture must be RGB of {camera.size_px} px, got {image.dtype} {image.shape}")
+    labels = _visible_crowns(camera, scans)
+    out = image.copy()
+    kernel = np.ones((2 * _LINE_PX + 1,) * 2, np.uint8)
+    for number, scan in enumerate(scans, start=1):
+        crown = (labels == number).astype(np.uint8)
+        inner = cv2.erode(crown, kernel, borderType=cv2.BORDER_REPLICATE) > 0
+        if fill:
+            tint = (1 - fill) * image[inner] + fill * np.array(scan.colour)
+            out[inner] = np.round(tint).astype(np.uint8)
+        out[(crown > 0) & ~inner] = scan.colour
+    return out
+
+
+def arch_colours(tracks: Tracks, row: int) -> tuple[Colour, Colour]:
+    """Return the colours of upper and lower arch in the frame at a row: of their states in a solved performance."""
+    if tracks.solved is None:
+        return UPPER_COLOUR, LOWER_COLOUR
+    whole = SolveState(int(tracks.solved.state[row]))
+    seen, unseen = STATE_COLOURS[SolveState.SOLVED], STATE_COLOURS[whole]
+    upper, lower = (unseen if status == LOST else seen for status in tracks.status[row])
+    return upper, lower
+
+
+def placed_scans(tracks: Tracks, row: int, meshes: Sequence[Mesh]) -> list[PlacedScan]:
+    """Return the upper and the lower scan at the poses of the frame at a row."""
+    poses = tracks.T_world_upper[row], tracks.T_world_lower[row]
+    return [PlacedScan(*one) for one in zip(meshes, poses, arch_colours(tracks, row), strict=True)]
+
+
+def tracking_sheet(
+    tracks: Tracks,
+    frames: Sequence[int],
+    cameras: Sequence[Camera],
+    backdrops: Mapping[str, Backdrop],
+    upper: Mesh,
+    lower: Mesh,
+    *,
+    tile_px: tuple[int, int] = (480, 270),
+) -> NDArray[np.uint8]:
+    """Return one RGB picture with a row per frame and a column per camera, cut to the teeth and captioned.
+
+    A tile is gray where the camera has no picture, without tint where the jaw was lost.
+
+    Args:
+        frames: frames of the reference camera, all of them in tracks.
+        backdrops: pictures by camera.
+
+    Raises:
+        ValueError: a frame is not in tracks.
+        CaptureError: a video cannot be decoded.
+    """
+    row_of = {int(frame): row for row, frame in enumerate(tracks.frames)}
+    missing = [frame for frame in frames if frame not in row_of]
+    if missing:
+        raise ValueError(f"frame {missing[0]} is not in the tracks, which hold {len(row_of)} frames")
+    tiles = []
+    for frame in frames:
+        scans = placed_scans(tracks, row_of[frame], (upper, lower))
+        for camera in cameras:
+            picture = backdrops[camera.name].picture(frame)
+            tile = np.full((tile_px[1], tile_px[0], 3), EMPTY_GRAY, np.uint8)
+            if picture is not None:
+                tile = _cut_to_teeth(draw_overlay(picture, camera, scans), camera, scans, tile_px)
+            tiles.append(captioned(tile, f"{camera.name}  frame {frame}"))
+    return contact_sheet(tiles, len(cameras))
+
+
+def contact_sheet(tiles: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
+    """Lay pictures of one size out in rows; return RGB uint8, the last row filled up with black.
+
+    Raises:
+        ValueError: there are no pictures, or they differ in size.
+    """
+    if not tiles or columns < 1 or len({tile.shape for tile in tiles}) != 1:
+        raise ValueError(f"needs pictures of one size, got {[tile.shape for tile in tiles]}")
+    height, width, channels = tiles[0].shape
+    rows = math.ceil(len(tiles) / columns)
+    sheet = np.zeros((rows * height, columns * width, channels), np.uint8)
+    for k, tile in enumerate(tiles):
+        top, left = k // columns * height, k % columns * width
+        sheet[top : top + height, left : left + width] = tile
+    return sheet
+
+
+def save_png(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
+    """Write an RGB picture (h, w, 3) as PNG.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_bytes_atomic(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Return an RGB picture (h, w, 3) as a JPEG file; quality 0 .. 100."""
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def _points(camera: Camera, scan: PlacedScan) -> NDArray[np.float32]:
+    """Return recorded pixels and depth per vertex: triangles of a scan are small enough to stay straight."""
+    world = transform_points(scan.T_world_scan, scan.mesh.vertices)
+    return np.column_stack([camera.project(world), camera.depth(world)]).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _parted_faces(mesh: Mesh) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the faces of gum and of crowns; kept, since a video asks for every frame."""
+    crown = crown_face_mask(mesh)
+    return mesh.faces[~crown], mesh.faces[crown]
+
+
+def _visible_crowns(camera: Camera, scans: Sequence[PlacedScan]) -> NDArray[np.uint8]:
+    width, height = camera.size_px
+    inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
+    for number, scan in enumerate(scans, start=1):
+        if not np.isfinite(scan.T_world_scan).all():
+            continue
+        points = _points(camera, scan)
+        gum, crowns = _parted_faces(scan.mesh)
+        for faces, label in ((gum, 0), (crowns, number)):
+            draw_depth_labels(points, faces, 0, 0, False, inverse_depth, labels, label)
+    return labels
+
+
+def _cut_to_teeth(
+    image: NDArray[np.uint8], camera: Camera, scans: Sequence[PlacedScan], tile_px: tuple[int, int]
+) -> NDArray[np.uint8]:
+    """Cut the surroundings of the scans out of a picture and bring them to a tile, keeping the aspect."""
+    seen = [_points(camera, scan)[:, :2] for scan in scans if np.isfinite(scan.T_world_scan).all()]
+    whole = np.array([[0, 0], camera.size_px], float)
+    low, high = whole if not seen else (np.min(np.vstack(seen), axis=0), np.max(np.vstack(seen), axis=0))
+    centre = (low + high) / 2
+    scale = float(np.min(np.array(tile_px) / np.maximum((high - low) * (1 + 2 * _MARGIN), 1)))
+    to_tile = np.array([[scale, 0, tile_px[0] / 2 - scale * centre[0]], [0, scale, tile_px[1] / 2 - scale * centre[1]]])
+    shrinks = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.warpAffine(image, to_tile, tile_px, flags=shrinks), np.uint8)
+
+
+def captioned(tile: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    """Return an RGB tile (h, w, 3) under a line of text."""
+    out = np.vstack([np.zeros((CAPTION_PX, tile.shape[1], 3), np.uint8), tile])
+    cv2.putText(out, text, (6, CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
+    return out

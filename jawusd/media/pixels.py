@@ -1,0 +1,209 @@
+"""Decoded pictures as arrays: gray at full range, RGB, RGB with transparency; turned as the file asks."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+from functools import lru_cache
+from typing import Literal, TypeAlias, cast
+
+import av
+import av.filter
+import cv2
+import numpy as np
+from av.sidedata.sidedata import SideData
+from av.video.reformatter import Interpolation
+from numpy.typing import DTypeLike, NDArray
+
+from jawusd.base.errors import CaptureError
+from jawusd.media.display import to_display
+
+Colour = Literal["gray", "rgb", "rgba"]
+#: Rows and columns of a part of a picture.
+Slices: TypeAlias = "tuple[slice[int, int, int], slice[int, int, int]]"
+
+# ITU-R BT.709 / BT.601 video range: 16 is black, 235 is white.
+_STRETCH = np.clip(np.round((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
+_BYTE_BITS = 8
+# ffmpeg's quick way to RGB is dark by 1.3 of 255 levels and repeats colours over blocks of pixels; this way rounds, and
+# interpolates colours.
+TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+_AROUND_PX = 8  # kept around a part of a picture: colours are interpolated
+_STEP_PX = 32  # of its sides
+_ANY_TIME = Fraction(1, 1000)  # filters ask for a unit of time
+_FULL_RANGE = 2  # AVCOL_RANGE_JPEG
+_PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
+_PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
+# Planar formats of more than 8 bits in two bytes each, lowest first; p010 and its like have them in the highest.
+_DEEP = re.compile(r"(yuva?4\d\dp|p0)(10|12|14|16)le")
+
+
+_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])  # counter-clockwise, as display matrices have it: rows map x and y
+
+
+def turn_deg(frame: av.VideoFrame) -> int:
+    """Return the counter-clockwise turn that a file asks for: 0, 90, 180 or 270.
+
+    Raises:
+        CaptureError: its display matrix mirrors the picture, or is no quarter turn.
+    """
+    try:
+        stored = frame.side_data.get("DISPLAYMATRIX")
+    except ValueError:  # beside something that PyAV does not know, as Exif: the turn alone can be asked for
+        return frame.rotation % 360
+    if stored is None:
+        return 0
+    rows = np.frombuffer(bytes(cast(SideData, stored)), np.int32, 9).reshape(3, 3)[:2, :2].astype(float)
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    if not lengths.all():
+        return 0  # a matrix of zeros says nothing
+    rows /= lengths  # players scale pictures to the size of the track anyhow
+    for quarters in range(4):
+        if np.allclose(rows, np.linalg.matrix_power(_QUARTER_TURN, quarters), atol=1e-3):
+            return 90 * quarters
+    if np.linalg.det(rows) < 0:
+        raise CaptureError(
+            "the file asks to be shown mirrored; cameras see no mirrored teeth.",
+            hint="Switch mirroring off in the camera. If the stored picture is as the camera saw it, drop the mark: "
+            "ffmpeg -display_rotation 0 -i IN -c copy OUT.",
+        )
+    raise CaptureError(
+        f"the file asks for a turn by {frame.rotation} degrees or a skew; only quarter turns are allowed.",
+        hint="Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4.",
+    )
+
+
+@lru_cache(maxsize=16)
+def _deep_table(bits: int, high: bool, full: bool) -> NDArray[np.uint8]:
+    """Return the gray of each value of luma, (65536,) uint8; video range is 16 to 235 of 8 bits, BT.709."""
+    luma = np.arange(1 << 16) / (1 << (16 - bits) if high else 1)
+    low, span = (0.0, (1 << bits) - 1.0) if full else (16.0 * (1 << (bits - 8)), 219.0 * (1 << (bits - 8)))
+    return np.asarray(np.clip(np.rint((luma - low) * 255 / span), 0, 255), np.uint8)
+
+
+class DecodedPicture:
+    """A decoded picture of which parts are turned into RGB as they are asked for, as parts of an array are.
+
+    Attributes:
+        shape: that of the array: height, width, 3.
+    """
+
+    def __init__(self, frame: av.VideoFrame, rotation_deg: int) -> None:
+        """Take what the decoder gives, and the turn that the file asks for."""
+        self._frame, self._rotation_deg = frame, rotation_deg
+        turned = rotation_deg in (90, 270)
+        self.shape = (frame.width, frame.height, 3) if turned else (frame.height, frame.width, 3)
+
+    def __getitem__(self, window: Slices) -> NDArray[np.uint8]:
+        """Return the RGB pixels of some rows and columns, (h, w, 3)."""
+        return converted(self._frame, "rgb", self._rotation_deg, window)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.uint8]:
+        """Return the whole picture."""
+        whole = (slice(0, self.shape[0], 1), slice(0, self.shape[1], 1))
+        return np.asarray(self[whole], dtype)
+
+
+#: A picture in RGB, (h, w, 3) uint8, as a whole or by parts.
+ColourPicture: TypeAlias = "NDArray[np.uint8] | DecodedPicture"
+
+
+def converted(frame: av.VideoFrame, colour: Colour, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
+    """Return a window (h, w), (h, w, 3) or (h, w, 4) of a decoded picture after its turn."""
+    if colour == "gray":
+        return _gray(frame, rotation_deg, window)
+    part, inside = _around(frame, _stored_window(frame, rotation_deg, window))
+    pixels: NDArray[np.uint8]
+    if colour == "rgb" and max(one.bits for one in frame.format.components) > _BYTE_BITS:
+        # The way from 10 bits to 8 loses up to two levels in ffmpeg; rounding from 16 bits does not.
+        pixels = to_display(*deep_rgb(part), None, None)
+    elif colour == "rgb" and not part.format.is_rgb:
+        # ffmpeg writes three planes twice as fast as pixels, with the same values.
+        green, blue, red = (_plane(p) for p in part.reformat(format="gbrp", interpolation=TO_RGB).planes)
+        pixels = np.asarray(cv2.merge([red, green, blue]), np.uint8)
+    else:
+        shape = "rgb24" if colour == "rgb" else "rgba"
+        pixels = np.asarray(part.to_ndarray(format=shape, interpolation=TO_RGB), np.uint8)
+    return np.ascontiguousarray(np.rot90(pixels[inside], rotation_deg // 90))
+
+
+def _plane(plane: av.video.plane.VideoPlane) -> NDArray[np.uint8]:
+    """Return a plane of bytes, (h, w), without a copy."""
+    return np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
+
+
+def _stored_window(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> Slices:
+    """Return the rows and columns of a stored picture that its turn takes to a window."""
+    turns = rotation_deg // 90
+    height, width = (frame.width, frame.height) if turns % 2 else (frame.height, frame.width)
+    rows, columns = (slice(*part.indices(side)[:2]) for part, side in zip(window, (height, width), strict=True))
+    for _ in range(turns):
+        rows, columns = columns, slice(height - rows.stop, height - rows.start)
+        height, width = width, height
+    return rows, columns
+
+
+def _widened(part: slice[int, int, int], limit: int) -> tuple[int, int]:
+    """Return where a part of a side begins and ends with what is kept around it, in steps that ffmpeg is quick with."""
+    start = max(0, part.start - _AROUND_PX) // _STEP_PX * _STEP_PX
+    return start, min(limit, start + -(-(part.stop + _AROUND_PX - start) // _STEP_PX) * _STEP_PX)
+
+
+def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices]:
+    """Return what surrounds a window of a stored picture, and the window in it; the whole if that is not much more."""
+    rows, columns = window
+    (top, bottom), (left, right) = (_widened(*sides) for sides in zip(window, (frame.height, frame.width)))
+    height, width = bottom - top, right - left
+    if height * width > 0.5 * frame.height * frame.width:
+        return frame, window
+    # ffmpeg's own filter keeps what the decoder says of colours and of where they are sampled.
+    graph = av.filter.Graph()
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=_ANY_TIME)
+    crop = graph.add("crop", f"{width}:{height}:{left}:{top}:exact=1")
+    sink = graph.add("buffersink")
+    source.link_to(crop)
+    crop.link_to(sink)
+    graph.configure()
+    graph.vpush(frame)
+    inside = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+    return graph.vpull(), inside
+
+
+def deep_rgb(frame: av.VideoFrame) -> tuple[NDArray[np.uint16], int]:
+    """Return a decoded picture as RGB of two bytes (h, w, 3), not turned, and the value of white in it."""
+    stored = np.asarray(frame.to_ndarray(format="rgb48le", interpolation=TO_RGB), np.uint16)
+    if frame.format.is_rgb:
+        return stored, 65535
+    bits = max(part.bits for part in frame.format.components)
+    full = frame.color_range == _FULL_RANGE or len(frame.format.components) == 1
+    # ffmpeg shifts: whites end in zeros.
+    return stored, ((1 << bits) - 1) << (16 - bits) if full else 255 << 8
+
+
+def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
+    name = frame.format.name
+    deep = _DEEP.fullmatch(name)
+    if deep is not None:
+        # ffmpeg's own way to gray mixes colour into it: up to 11 levels of 255.
+        plane = frame.planes[0]
+        stored = np.frombuffer(memoryview(plane), "<u2").reshape(-1, plane.line_size // 2)
+        luma = np.rot90(stored[: frame.height, : frame.width], rotation_deg // 90)[window]
+        return _deep_table(int(deep[2]), deep[1] == "p0", frame.color_range == _FULL_RANGE)[luma]
+    full = name in _PLANAR_FULL_RANGE or (name in _PLANAR_VIDEO_RANGE and frame.color_range == _FULL_RANGE)
+    if not full and name not in _PLANAR_VIDEO_RANGE:
+        frame = frame.reformat(format="gray")
+    image = np.rot90(_plane(frame.planes[0]), rotation_deg // 90)[window]
+    if name in _PLANAR_VIDEO_RANGE and not full:
+        return np.asarray(cv2.LUT(np.ascontiguousarray(image), _STRETCH), np.uint8)
+    return image
+
+
+def coloured(shown: NDArray[np.uint8], colour: Colour) -> NDArray[np.uint8]:
+    """Return a picture (h, w) or (h, w, 3) RGB in the form asked for; its transparency is none."""
+    if colour == "gray":
+        gray = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY)
+        return np.ascontiguousarray(gray, np.uint8)
+    rgb = np.repeat(shown[..., None], 3, axis=2) if shown.ndim == 2 else shown
+    if colour == "rgb":
+        return np.ascontiguousarray(rgb)
+    return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])

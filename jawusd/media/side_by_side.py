@@ -1,0 +1,165 @@
+"""All cameras side by side in one picture, each cut to the teeth over a whole take, with the scans drawn over it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array
+from jawusd.formats.mesh import Mesh, crown_face_mask
+from jawusd.formats.tracks import Tracks
+from jawusd.geometry import Camera, transform_points
+from jawusd.media.backdrop import Backdrop
+from jawusd.media.overlay import CAPTION_PX, EMPTY_GRAY, PlacedScan, captioned, contact_sheet, draw_overlay
+
+#: Left, top, width and height of a part of a picture [px].
+Part = tuple[int, int, int, int]
+
+_MOST_IN_ROW = 3
+_MOST_FRAMES, _MOST_POINTS = 200, 300  # of a take and of a scan, that tell where the teeth are
+_STRAYS_PERCENT = 1.0  # frames whose teeth may leave the part that is shown, at each side
+_ROOM = 0.25  # of the teeth's extent, left around them
+_LEAST_PX = 32
+_SHOW_PARTLY_S = 0.3  # what takes longer is shown as it comes
+
+
+class CameraWall:
+    """Draw all cameras side by side.
+
+    Attributes:
+        size_px: (width, height) of the pictures.
+    """
+
+    def __init__(
+        self,
+        cameras: Mapping[str, Camera],
+        backdrops: Mapping[str, Backdrop],
+        tracks: Tracks | None,
+        scans: Sequence[Mesh],
+        tile_px: tuple[int, int],
+    ) -> None:
+        """Cut the pictures of cameras to the teeth over a take; without tracks they are shown whole.
+
+        Args:
+            cameras: those with a backdrop; the others are shown without scans.
+            backdrops: pictures by camera.
+            scans: teeth scans of the tracks, upper and lower [mm].
+            tile_px: (width, height) of each camera's picture.
+        """
+        parts = {} if tracks is None else _teeth_parts(cameras, tracks, scans, tile_px[0] / tile_px[1])
+        whole = {name: (0, 0, *one.size_px) for name, one in backdrops.items()}
+        self._cells = {name: _Cell(parts.get(name, whole[name]), cameras.get(name), tile_px) for name in backdrops}
+        self._backdrops = backdrops
+        count = len(backdrops)
+        self._pool = ThreadPoolExecutor(min(count, os.cpu_count() or 1))
+        self._columns = count if count <= _MOST_IN_ROW else math.ceil(math.sqrt(count))
+        rows = -(-count // self._columns)
+        self.size_px = (self._columns * tile_px[0], rows * (tile_px[1] + CAPTION_PX))
+
+    def draw(
+        self,
+        frame: int,
+        scans: Sequence[PlacedScan],
+        *,
+        fill: float,
+        partly: Callable[[NDArray[np.uint8]], None] | None = None,
+    ) -> NDArray[np.uint8]:
+        """Return the picture of a frame of the reference camera, (h, w, 3) RGB.
+
+        Args:
+            scans: what to draw over it.
+            fill: opacity of the crowns.
+            partly: called with the picture so far as cameras are decoded, if that takes a while.
+
+        Raises:
+            CaptureError: a camera's picture cannot be decoded.
+        """
+        tiles = {name: self._pool.submit(self._tile, name, frame, scans, fill) for name in self._cells}
+        if partly is not None:
+            _, missing = wait(tiles.values(), _SHOW_PARTLY_S)
+            while missing:
+                partly(contact_sheet([self._so_far(name, frame, tile) for name, tile in tiles.items()], self._columns))
+                _, missing = wait(missing, return_when=FIRST_COMPLETED)
+        return contact_sheet([tile.result() for tile in tiles.values()], self._columns)
+
+    def _so_far(self, name: str, frame: int, tile: Future[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+        if tile.done() and tile.exception() is None:
+            return tile.result()
+        return captioned(self._cells[name].draw(None, (), 0.0), f"{name}   frame {frame}   loading")
+
+    def _tile(self, name: str, frame: int, scans: Sequence[PlacedScan], fill: float) -> NDArray[np.uint8]:
+        backdrop = self._backdrops[name]
+        image = backdrop.picture(frame)
+        words = "no picture" if image is None else "" if backdrop.is_footage else "masks, no footage"
+        return captioned(self._cells[name].draw(image, scans, fill), f"{name}   frame {frame}   {words}")
+
+    def close(self) -> None:
+        """Stop decoding ahead."""
+        self._pool.shutdown()
+        for backdrop in self._backdrops.values():
+            backdrop.close()
+
+
+class _Cell:
+    """Hold how a part of one camera's pictures fits into a tile."""
+
+    def __init__(self, part: Part, camera: Camera | None, tile_px: tuple[int, int]) -> None:
+        x, y, width, height = part
+        scale = min(tile_px[0] / width, tile_px[1] / height)
+        self._size_px = (max(round(width * scale), 1), max(round(height * scale), 1))
+        self._window = (slice(y, y + height), slice(x, x + width))
+        self._how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        self._tile_px = tile_px
+        self._camera = None if camera is None else camera.cropped(x, y, (width, height)).scaled(self._size_px)
+
+    def draw(self, image: NDArray[np.uint8] | None, scans: Sequence[PlacedScan], fill: float) -> NDArray[np.uint8]:
+        """Return the tile (h, w, 3) of a picture; empty where there is none."""
+        width, height = self._tile_px
+        tile = np.full((height, width, 3), EMPTY_GRAY, np.uint8)
+        if image is not None:
+            small = np.asarray(cv2.resize(image[self._window], self._size_px, interpolation=self._how), np.uint8)
+            if scans and self._camera is not None:
+                small = draw_overlay(small, self._camera, scans, fill=fill)
+            left, top = (width - self._size_px[0]) // 2, (height - self._size_px[1]) // 2
+            tile[top : top + self._size_px[1], left : left + self._size_px[0]] = small
+        return tile
+
+
+def _teeth_parts(
+    cameras: Mapping[str, Camera], tracks: Tracks, meshes: Sequence[Mesh], aspect: float
+) -> dict[str, Part]:
+    """Return the part of each camera's pictures that holds the teeth over a take, by name.
+
+    The parts have the aspect (width over height) where the pictures allow it.
+    """
+    rows = np.unique(np.linspace(0, len(tracks.frames) - 1, _MOST_FRAMES).round().astype(int))
+    moved = []
+    for mesh, poses in zip(meshes, (tracks.T_world_upper, tracks.T_world_lower), strict=True):
+        crowns = np.unique(mesh.faces[crown_face_mask(mesh)])
+        some = mesh.vertices[crowns[:: max(1, len(crowns) // _MOST_POINTS)]]
+        moved.append(transform_points(poses[rows], some))
+    world = np.concatenate(moved, axis=1)
+    return {name: _part_around(camera, world, aspect) for name, camera in cameras.items()}
+
+
+def _part_around(camera: Camera, world: Array, aspect: float) -> Part:
+    """Return the part around places (F, n, 3) [mm] of many frames, NaN where not known, inside the picture."""
+    size = np.array(camera.size_px)
+    pixels = camera.project(world)
+    pixels[camera.depth(world) <= 0] = np.nan
+    known = pixels[np.any(np.isfinite(pixels[..., 0]), axis=1)]
+    if not len(known):
+        return (0, 0, int(size[0]), int(size[1]))
+    low = np.percentile(np.nanmin(known, axis=1), _STRAYS_PERCENT, axis=0)
+    high = np.percentile(np.nanmax(known, axis=1), 100 - _STRAYS_PERCENT, axis=0)
+    extent = np.maximum((high - low) * (1 + 2 * _ROOM), _LEAST_PX)
+    extent = np.maximum(extent, [extent[1] * aspect, extent[0] / aspect])
+    extent = np.minimum(np.ceil(extent), size).astype(int)
+    first = np.clip(np.round((low + high - extent) / 2), 0, size - extent).astype(int)
+    return int(first[0]), int(first[1]), int(extent[0]), int(extent[1])

@@ -1,0 +1,74 @@
+"""Map frames, which lie evenly in time, to pictures of a video, which need not."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array
+
+
+class Timeline:
+    """Place the pictures of a video on an even grid of frames by their presentation times.
+
+    Frame k is the picture shown k nominal frame durations after the first one. At a constant rate that is picture k;
+    a variable rate leaves frames without a picture.
+
+    Attributes:
+        numbers: frame of each picture, increasing, shape (n,).
+        count: one past the frame of the last picture.
+        stored: number of each picture in its files, increasing, shape (n,); in a video 0, 1, 2, ...
+    """
+
+    def __init__(self, times_s: Array, fps: float) -> None:
+        """Fit the grid to presentation times (n,) [s]; the file's average rate is used for one or two pictures."""
+        self._set(*_grid(times_s, fps), np.arange(len(times_s)))
+
+    @classmethod
+    def of_files(cls, stored: NDArray[np.int64], fps: float) -> Timeline:
+        """Return the line of numbered pictures, (n,) increasing: the first is frame 0, gaps are frames without one."""
+        line = cls.__new__(cls)
+        line._set(stored - stored[0], fps, stored)
+        return line
+
+    def _set(self, numbers: NDArray[np.int64], rate: float, stored: NDArray[np.int64]) -> None:
+        self.numbers, self.rate, self.stored = numbers, rate, stored
+        self.count = int(numbers[-1]) + 1
+        # Of two pictures in one frame, the first counts.
+        self._picture = dict(zip(numbers[::-1].tolist(), range(len(numbers) - 1, -1, -1)))
+
+    @property
+    def is_numbered(self) -> bool:
+        """Tell whether the pictures are numbered otherwise than 0, 1, 2, ..."""
+        return bool(self.stored[0] != 0 or self.stored[-1] != len(self.stored) - 1)
+
+    def number(self, frame: int) -> int | None:
+        """Return the number in its files of the picture shown at a frame; None where there is none."""
+        picture = self.picture(frame)
+        return None if picture is None else int(self.stored[picture])
+
+    @property
+    def missing(self) -> int:
+        """Return how many frames have no picture of their own."""
+        return self.count - len(self._picture)
+
+    def picture(self, frame: int) -> int | None:
+        """Return the number of the picture shown at a frame; None outside the video and where there is none."""
+        return self._picture.get(int(frame))
+
+
+def _grid(times_s: Array, fps: float) -> tuple[NDArray[np.int64], float]:
+    """Return the frame of each picture and frames per second."""
+    steps = np.diff(times_s)
+    if len(steps) < 2 or not (median := float(np.median(steps))) > 0:
+        return np.arange(len(times_s)), fps
+    # Frames next to each other; gaps would bias the mean, rounded time stamps the median.
+    period = float(steps[(steps > 0.5 * median) & (steps < 1.5 * median)].mean())
+    last = 16  # jitter still leaves it off by some per mille: fit longer and longer stretches
+    while True:
+        stretch = times_s[:last]
+        numbers = np.round(stretch / period)
+        period = float((numbers @ stretch) / (numbers @ numbers))
+        if last >= len(times_s):
+            return np.round(times_s / period).astype(np.int64), 1 / period
+        last *= 2

@@ -1,0 +1,157 @@
+"""Bring pictures to the undistorted working size the tracker computes at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import ceil
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Mask
+from jawusd.geometry.camera import Camera
+from jawusd.media.pixels import ColourPicture, DecodedPicture, Slices
+
+_NODE_PX = 16  # spacing of the map samples that locate a region
+
+
+_Pixel = TypeVar("_Pixel", np.uint8, np.float32)
+
+
+def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pixel]:
+    """Return an image sampled bilinearly at positions (h, w, 2) [px], 0 outside of it."""
+    # cv2's stub requires a second map, which a map of two channels does not need.
+    found = cv2.remap(image, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+    return np.asarray(found, image.dtype)
+
+
+def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return a picture of which only what lies within the sides of positions (h, w, 2) [px] is converted.
+
+    The rest is black; memory that nobody touches costs nothing.
+    """
+    sides = np.concatenate([positions[0], positions[-1], positions[:, 0], positions[:, -1]])
+    limit = np.array(picture.shape[1::-1])
+    low = np.clip(np.floor(sides.min(0)), 0, limit - 1).astype(int)
+    high = np.clip(np.floor(sides.max(0)) + 2, low + 1, limit).astype(int)
+    out = np.zeros(picture.shape, np.uint8)
+    box = (slice(low[1], high[1]), slice(low[0], high[0]))
+    out[box] = picture[box]
+    return out
+
+
+class WorkingView:
+    """Undistort and shrink the pictures of one camera.
+
+    A working pixel is the mean of n x n bilinear samples of the recorded picture, n = the reduction rounded up, at the
+    undistorted positions of an n times larger working picture: the same as undistorting at full size and averaging
+    areas, in one interpolation and only where there is something. Safe to use from several threads.
+
+    Attributes:
+        camera: the pinhole camera of the working pictures.
+        source: the camera as recorded.
+    """
+
+    def __init__(self, source: Camera, size_px: tuple[int, int]) -> None:
+        """Prepare the maps to working pictures of size_px (width, height).
+
+        Raises:
+            ValueError: the working size is larger than the recorded one, or empty.
+        """
+        if not (0 < size_px[0] <= source.size_px[0] and 0 < size_px[1] <= source.size_px[1]):
+            raise ValueError(f"working size {size_px} px must be within 1 x 1 and the recorded {source.size_px} px")
+        self.source = source
+        self.camera = replace(source.scaled(size_px), distortion=np.zeros(0))
+        self._samples = ceil(max(source.size_px[0] / size_px[0], source.size_px[1] / size_px[1]))
+        fine_size = (size_px[0] * self._samples, size_px[1] * self._samples)
+        distortion = source.distortion if source.distortion.size else None
+        maps = cv2.initUndistortRectifyMap(
+            source.K, distortion, None, source.scaled(fine_size).K, fine_size, cv2.CV_32FC2
+        )
+        self._map = np.asarray(maps[0], np.float32)
+        self._nodes = np.ascontiguousarray(np.moveaxis(self._map[::_NODE_PX, ::_NODE_PX], 2, 0))
+        # No node of a region lies farther from its neighbour than this [px of the recorded picture].
+        steps = [np.abs(np.diff(self._nodes, axis=axis)).max(initial=_NODE_PX) for axis in (1, 2)]
+        self._reach_px = float(max(steps)) + 1
+
+    def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the covered share of each working pixel, 255 = all, (h, w), of a recorded mask (H, W).
+
+        Only the surroundings of what is not black are touched.
+
+        Raises:
+            ValueError: the mask has not the size of the recorded pictures.
+        """
+        self._check(mask)
+        width, height = self.camera.size_px
+        out = np.zeros((height, width), np.uint8)
+        window = self._window(mask)
+        if window is not None:
+            out[window] = self._averaged(mask, window)
+        return out
+
+    def picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return a recorded picture, (H, W) or (H, W, 3), at the working size; black where nothing was recorded.
+
+        Raises:
+            ValueError: the picture has not the size of the recorded ones.
+        """
+        self._check(image)
+        width, height = self.camera.size_px
+        return self._averaged(image, (slice(0, height), slice(0, width)))
+
+    def light(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return recorded light (H, W, 3) without distortion, at its own size; 0 where none was recorded.
+
+        Raises:
+            ValueError: the picture has not the size of the recorded ones, or the view is smaller than they are.
+        """
+        if image.shape[1::-1] != self.source.size_px or self._map.shape[1::-1] != self.source.size_px:
+            raise ValueError(f"light must be of {self.source.size_px} px and stay so, got {image.shape}")
+        return remap(image, self._map)
+
+    def part(self, image: ColourPicture, window: Slices) -> NDArray[np.uint8]:
+        """Return the part of `picture` at rows and columns whose start and stop lie inside it.
+
+        Raises:
+            ValueError: the picture has not the size of the recorded ones.
+        """
+        self._check(image)
+        return self._averaged(image, window)
+
+    def _check(self, image: ColourPicture) -> None:
+        if image.shape[1::-1] != self.source.size_px or (isinstance(image, np.ndarray) and image.dtype != np.uint8):
+            kind = getattr(image, "dtype", "")
+            raise ValueError(f"picture must be uint8 of {self.source.size_px} px, got {kind} {image.shape}")
+
+    def _averaged(self, image: ColourPicture, window: Slices) -> NDArray[np.uint8]:
+        n, (rows, cols) = self._samples, window
+        part = self._map[rows.start * n : rows.stop * n, cols.start * n : cols.stop * n]
+        fine = remap(image if isinstance(image, np.ndarray) else _needed(image, part), part)
+        if n == 1:
+            return fine
+        size = (cols.stop - cols.start, rows.stop - rows.start)
+        return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    def _window(self, mask: NDArray[np.uint8]) -> Slices | None:
+        """Return the working pixels that can see a non-black pixel of the mask, or None."""
+        rows = np.flatnonzero(mask.max(axis=1))
+        if rows.size == 0:
+            return None
+        cols = np.flatnonzero(mask[rows[0] : rows[-1] + 1].max(axis=0))
+        reach, (x, y) = np.float32(self._reach_px), self._nodes
+        # Within the reach of the box there is at least one node beyond each of its sides; the ring of cells around
+        # those nodes therefore holds the box.
+        across: Mask = (x >= cols[0] - reach) & (x <= cols[-1] + reach)
+        inside: Mask = across & (y >= rows[0] - reach) & (y <= rows[-1] + reach)
+        spans = []
+        for hits, limit in zip((inside.any(axis=1), inside.any(axis=0)), self.camera.size_px[::-1]):
+            where = np.flatnonzero(hits)
+            if where.size == 0:
+                return None
+            first = int(where[0] - 1) * _NODE_PX // self._samples
+            last = int(where[-1] + 1) * _NODE_PX // self._samples
+            spans.append(slice(max(first, 0), min(last + 1, limit)))
+        return spans[0], spans[1]

@@ -1,0 +1,185 @@
+"""How the teeth of a person meet: both scans as solids, and the clearance of every pose of a jaw model."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from jawusd.base.arrays import Array
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM, UNIT_MM, ContactField
+from jawusd.formats.mesh import BASE, Mesh
+from jawusd.geometry.se3 import se3_inverse, transform_points
+from jawusd.meshes.collision import FARTHEST_MM, STEP_MM, Pair, Solid, solid, tips_box
+
+_CROWN_MM = 14.0  # from the tips of the teeth to where gums begin, at most
+_LEAST_WOUND = 0.6  # share of lines that enter a scan where they first meet it; 0.93 and more for scans wound alike
+_WIDEST_GAP_MM = 1.0
+_DEEPEST_MM = 2.5
+_COARSEST_MM = 1.5
+
+_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # of teeth
+_CLOSE_MM = 1.0  # larger clearances are taken from the coarser field; twice what errors are measured below
+_BEYOND_MM = 1.0  # outside the bound, still sampled
+_FREE_MM = 0.8  # surfaces so far apart at all valid parameters of larger openings end the field
+_ERROR_SAMPLES = 30000  # all over the field; one in twenty is of a valid pose of close teeth
+_CAPTURED_QUANTILE = 0.01
+_LARGEST_LIMIT_MM = 1.0
+
+
+class NoContact(Exception):
+    """The scans do not show how the teeth meet; the message says why."""
+
+
+class Surfaces(Protocol):
+    """Surfaces of skull and mandible that meet: teeth, or condyles and their fossae."""
+
+    @property
+    def closed_mm(self) -> float:
+        """How deep they run into each other in the closed bite."""
+
+    def clearances(self, T_skull_mandible: Array) -> Array:
+        """Return what they leave [mm], shape (n,), in poses (n, 4, 4), compared with the closed bite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Teeth:
+    """Both rows of teeth in the anatomical frame, the lower ones in the closed bite.
+
+    Attributes:
+        pair: Both as solids.
+        closed_mm: How deep they run into each other in the closed bite; negative if they leave a gap.
+        T_anatomical_skull: Skull to anatomical coordinates, shape (4, 4).
+        T_rest: T_skull_mandible of the closed bite, shape (4, 4).
+    """
+
+    pair: Pair
+    closed_mm: float
+    T_anatomical_skull: Array
+    T_rest: Array
+
+    def clearances(self, T_skull_mandible: Array) -> Array:
+        """Return the clearance [mm], shape (n,), of poses (n, 4, 4): closed bite's depth less theirs."""
+        A = self.T_anatomical_skull
+        return self.closed_mm - self.pair.depth(A @ T_skull_mandible @ se3_inverse(A @ self.T_rest))
+
+
+def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Array) -> Teeth:
+    """Return both rows of teeth as solids.
+
+    Args:
+        upper: Upper scan, skull frame [mm].
+        lower: Lower scan, mandible frame [mm].
+
+    Raises:
+        NoContact: A scan is too coarse or wound at random, or there is no closed bite.
+    """
+    placed = (("upper", upper, T_anatomical_skull, 1.0), ("lower", lower, T_anatomical_skull @ T_rest, -1.0))
+    with ThreadPoolExecutor(len(placed)) as pool:  # most of the work is done without Python's lock
+        pair = Pair(*pool.map(lambda row: _solid(*row), placed))
+    closed = float(pair.depth(np.eye(4)[None])[0])
+    if closed < -_WIDEST_GAP_MM:
+        raise NoContact(f"the closed bite leaves more than {_WIDEST_GAP_MM:g} mm between the rows of teeth")
+    if closed > _DEEPEST_MM:
+        raise NoContact(
+            f"in the closed bite the teeth run {closed:.1f} mm into each other (at most {_DEEPEST_MM:g} mm is allowed)"
+        )
+    return Teeth(pair, closed, T_anatomical_skull, T_rest)
+
+
+def _solid(name: str, mesh: Mesh, T: Array, up: float) -> Solid:
+    faces = mesh.faces if mesh.labels is None else mesh.faces[(mesh.labels[mesh.faces] != BASE).all(axis=1)]
+    corners = transform_points(T, mesh.vertices)[faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    if not len(corners) or np.median(edges) > _COARSEST_MM:
+        raise NoContact(f"the {name} scan is coarse: edges of {np.median(edges) if len(edges) else 0:.1f} mm")
+    return wound_solid(f"{name} scan", corners, up, tips_box(corners, up, _CROWN_MM))
+
+
+def wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> Solid:
+    """Return the solid of triangles wound either way, see `jawusd.meshes.collision.solid`.
+
+    Raises:
+        NoContact: They are not wound alike; naming the mesh.
+    """
+    found = solid(corners, up, box, step_mm)
+    if found.entering < 0.5:  # wound the other way round
+        found = solid(np.ascontiguousarray(corners[:, ::-1]), up, box, step_mm)
+    if found.entering < _LEAST_WOUND:
+        raise NoContact(f"the triangles of the {name} are not wound alike")
+    return found
+
+
+def sample_field(
+    surfaces: Surfaces, rig: JawRig, step_mm: float = _STEP_MM, most_opening_mm: float = _MOST_OPENING_MM
+) -> ContactField:
+    """Sample the clearance of a rig's poses over its bound, finely where surfaces are close.
+
+    Args:
+        surfaces: What meets.
+        rig: The rig.
+        step_mm: Between values; those of surfaces that are apart are measured twice as far from each other.
+        most_opening_mm: Where the field ends, if the surfaces have not parted before.
+    """
+    box = _box(surfaces, rig, step_mm, most_opening_mm)
+    field = _sampled(surfaces, rig, box, step_mm, _sampled(surfaces, rig, box, 2.0 * step_mm))
+    captured = rig.captured_d
+    least = float(np.quantile(field.clearance(captured).clearance_mm, _CAPTURED_QUANTILE)) if len(captured) else 0.0
+    limit = -float(np.clip(-least, AUTHORED_MM, _LARGEST_LIMIT_MM))
+    return replace(field, error_mm=_error(surfaces, rig, field), limit_mm=limit)
+
+
+def _sampled(
+    surfaces: Surfaces, rig: JawRig, box: Array, step_mm: float, coarse: ContactField | None = None
+) -> ContactField:
+    """Sample the clearance over a box (3, 2) [mm]; given a coarse field, anew only where that says surfaces are close.
+
+    0 is one of the values along every axis, so that the closed bite is exact.
+    """
+    ends = [(np.floor(low / step_mm), np.ceil(high / step_mm)) for low, high in box]
+    axes = [step_mm * np.arange(first, last + 1) for first, last in ends]
+    d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    wanted = rig.margin(d) > -(_BEYOND_MM + step_mm)
+    values = np.zeros(d.shape[:3])
+    if coarse is not None:
+        values = coarse.clearance(d.reshape(-1, 3)).clearance_mm.reshape(values.shape)
+        wanted &= values < _CLOSE_MM
+    values[wanted] = surfaces.clearances(rig.pose(d[wanted]))
+    if coarse is None:
+        nearest = distance_transform_edt(~wanted, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
+    first = np.array([axis[0] for axis in axes])
+    values = np.round(values / UNIT_MM) * UNIT_MM
+    return ContactField(first, np.full(3, step_mm), values, surfaces.closed_mm, 0.0, -AUTHORED_MM)
+
+
+def _box(surfaces: Surfaces, rig: JawRig, step_mm: float, most_opening_mm: float) -> Array:
+    """Return the parameters (3, 2) [mm] that the field spans: those near the bound at which surfaces are close."""
+    wide = rig.d_range + np.array([-_BEYOND_MM, _BEYOND_MM])
+    wide[0, 1] = min(wide[0, 1], most_opening_mm)
+    axes = [np.linspace(low, high, n) for (low, high), n in zip(wide, (33, 9, 7))]
+    d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    clearances = np.full(d.shape[:3], np.inf)
+    valid = rig.margin(d) > -_BEYOND_MM
+    clearances[valid] = surfaces.clearances(rig.pose(d[valid])) - max(surfaces.closed_mm, 0.0)
+    close = np.flatnonzero((clearances < _FREE_MM).any(axis=(1, 2)))
+    top = axes[0][min(close.max(initial=0) + 1, len(axes[0]) - 1)]
+    wide[0, 1] = max(top, wide[0, 0] + 2 * step_mm)
+    return wide
+
+
+def _error(surfaces: Surfaces, rig: JawRig, field: ContactField) -> float:
+    """Return the largest error [mm] of the field at random valid parameters where the surfaces are close."""
+    rng = np.random.default_rng(0)
+    low = field.first_mm
+    d = rng.uniform(low, low + field.step_mm * (np.array(field.values.shape) - 1), (_ERROR_SAMPLES, 3))
+    d = d[rig.margin(d) >= 0]
+    read = field.clearance(d).clearance_mm
+    d, read = d[read < NEAR_MM], read[read < NEAR_MM]
+    if not len(d):
+        return 0.0
+    return float(np.abs(np.minimum(surfaces.clearances(rig.pose(d)), FARTHEST_MM) - read).max())

@@ -1,0 +1,164 @@
+"""Read scans and bones from PLY, STL and OBJ, and scans from 3Shape DCM."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError, explain_missing_packages
+from jawusd.base.inputs import check_input, why_unreadable
+from jawusd.formats.file_kinds import MESHES
+from jawusd.formats.mesh import Mesh, tooth_labels, without_loose
+from jawusd.formats.mesh_data import NO_COLOUR, MeshData
+from jawusd.formats.mesh_obj import read_obj
+from jawusd.formats.mesh_ply import read_ply
+from jawusd.formats.mesh_stl import read_stl
+from jawusd.geometry.welding import welded
+
+# People who read scans with this module label them next; scripts outside the package import both from here.
+__all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]
+
+_NO_FACES = "Export the surface, not a point cloud, under a name that says its format."
+# Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch has about 80, a mandible 165, a skull 290.
+_DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
+_UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
+
+
+@np.errstate(invalid="ignore", over="ignore")  # damaged numbers are named, where faces use them
+def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
+    """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM, its vertices in the order of the file.
+
+    Larger polygons are cut into triangles; STL files, which share no vertices, give three per triangle. Materials and
+    textures are not read, the places of corners in a texture are, of OBJ and PLY. A closed mesh that is inside out has
+    its triangles turned; open ones stay as they are. A vertex that no face uses keeps its number, but lies where one
+    lies that a face uses. The kind, teeth scan or bone, sets which sizes are accepted.
+
+    Raises:
+        CaptureError: the file is missing, damaged, cut off or too large, holds no triangles or coordinates that are not
+            finite, or is of a size that cannot be in mm.
+        MissingDependencyError: the mesh is a DCM file and open3sdcm is not installed.
+    """
+    path = Path(path)
+    check_input(path, CaptureError)
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise CaptureError(f"meshes are read from {', '.join(MESHES)} files.", path=path, hint="Convert the mesh.")
+    try:
+        if (said := why_unreadable(path)) is not None:
+            raise CaptureError(said[0], path=path, hint=said[1])
+        data = read(path)
+    except FileNotFoundError as error:
+        raise CaptureError("no such mesh.", path=path, hint="Check the path in capture.toml.") from error
+    except (OSError, ValueError, OverflowError) as error:
+        raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it again.") from error
+    if len(data.faces) == 0:
+        raise CaptureError("the file holds no triangles.", path=path, hint=_NO_FACES)
+    return _checked(path, data, kind)
+
+
+@explain_missing_packages("dcm")
+def _read_dcm(path: Path) -> MeshData:
+    """Read a 3Shape scan, with colours from its texture.
+
+    Raises:
+        CaptureError: the file is damaged.
+    """
+    import open3sdcm
+
+    try:
+        found = open3sdcm.load(str(path))
+        vertices, faces = np.array(found.vertices, np.float64), np.array(found.faces).astype(np.int64)
+        texture, corners = found.texture, found.uv
+    except Exception as error:  # its parser reports damaged and encrypted files by exceptions of its own
+        raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it as PLY or STL.") from error
+    return MeshData(vertices, faces, _texture_colors(texture, corners, faces, len(vertices)))
+
+
+_READERS = {".ply": read_ply, ".stl": read_stl, ".obj": read_obj, ".dcm": _read_dcm}
+
+
+def _texture_colors(
+    texture: bytes | None, corners: Array | None, faces: NDArray[np.int64], count: int
+) -> NDArray[np.uint8] | None:
+    """Return the colour of every vertex: of a texture (JPEG) at its last corner's place (u to the right, v upwards)."""
+    if texture is None or corners is None or len(corners) != faces.size:
+        return None
+    image = cv2.imdecode(np.frombuffer(texture, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        return None
+    known = np.isfinite(corners).all(axis=1)
+    height, width = image.shape[:2]
+    place = np.clip(corners[known], 0.0, 1.0) * [width - 1, height - 1]
+    column, row = place[:, 0].astype(np.int64), height - 1 - place[:, 1].astype(np.int64)
+    colors = np.full((count, 3), NO_COLOUR, np.uint8)
+    colors[faces.ravel()[known]] = image[row, column, ::-1]
+    return colors
+
+
+def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
+    faces = data.faces
+    outside = np.flatnonzero(((faces < 0) | (faces >= len(data.vertices))).any(axis=1))
+    if outside.size:
+        raise CaptureError(
+            f"triangle {outside[0]} names a vertex that does not exist; there are {len(data.vertices)}.",
+            path=path,
+            hint="Export the mesh again.",
+        )
+    vertices, colors = without_loose(data.vertices, faces, data.colors)
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if bad.size:
+        raise CaptureError(
+            f"vertex {bad[0]} has a coordinate that is not finite ({bad.size} such vertices).",
+            path=path,
+            hint="Export the mesh again.",
+        )
+    low, typical, high = _DIAGONAL_MM[kind]
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if not low <= diagonal <= high:
+        fitting = {unit: abs(math.log(diagonal * mm / typical)) for unit, mm in _UNITS_MM.items() if diagonal > 0}
+        unit = min(fitting, key=fitting.__getitem__) if fitting else ""
+        guess = f" It looks like {unit}." if fitting and low <= diagonal * _UNITS_MM[unit] <= high else ""
+        raise CaptureError(
+            f"the mesh is {diagonal:.4g} mm across its bounding box, a {kind} has {low:g} to {high:g} mm.{guess}",
+            path=path,
+            hint="Lengths must be in mm: scale the mesh and export it again.",
+        )
+    mesh = Mesh(vertices, faces.astype(np.int32), colors, uv=data.uv)
+    turned = winding(mesh)
+    if turned.closed and not turned.outward:
+        return replace(mesh, faces=mesh.faces[:, ::-1], uv=None if mesh.uv is None else mesh.uv[:, ::-1])
+    return mesh
+
+
+class Winding(NamedTuple):
+    """Say how the triangles of a mesh are turned."""
+
+    closed: bool  # every edge is shared by exactly two triangles that run along it in opposite directions
+    outward: bool  # triangles are counter-clockwise seen from outside; a strong hint only, unless the mesh is closed
+    volume_mm3: float  # signed volume, positive if outward
+
+
+def winding(mesh: Mesh) -> Winding:
+    """Find out whether a mesh is closed and which way its triangles are turned.
+
+    The signed volume is the sum of the tetrahedra over the triangles with the centroid as apex (C. Zhang, T. Chen,
+    "Efficient feature extraction for 2D/3D objects in mesh representation", ICIP 2001). Vertices at the same place
+    count as one.
+    """
+    places, index = welded(mesh.vertices)
+    faces = index[mesh.faces]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there = np.sort(edges[:, 0] * len(places) + edges[:, 1])
+    back = np.sort(edges[:, 1] * len(places) + edges[:, 0])
+    closed = bool((there[1:] != there[:-1]).all() and (there == back).all())
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0), 1, 0)
+    volume = float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
+    return Winding(closed, volume > 0, volume)

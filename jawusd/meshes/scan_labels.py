@@ -1,0 +1,155 @@
+"""Tell crown and gum of a teeth scan apart by its shape.
+
+Scans come in two kinds. Where crowns are pieces of their own, the pieces say which is which. Where one surface covers
+crowns and gum, the line between them is the crease around every crown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.formats.mesh import GUM, TOOTH, Mesh
+from jawusd.meshes.scan_colours import crown_by_colour
+from jawusd.meshes.scan_surface import ScanSurface
+from jawusd.meshes.scan_tops import Tops, biting_direction, topped_by, tops
+from jawusd.meshes.scan_walk import CreaseWalk
+
+# From corner to corner of its box, a crown with what a scan keeps of its root and gum is smaller than this, the gum of
+# an arch or a quadrant larger [mm].
+_TOOTH_MM = 30.0
+_FEWEST_FACES = 100  # with fewer there is no shape to tell anything from, nor an arch to track
+# From corner to corner of its box the smallest crown; smaller pieces are scraps and brackets, which get the label of
+# what they lie at [mm].
+_CROWN_MM = 4.0
+# The lowest part of a piece, from which the walker may start as from gum if there is no surer gum [share of height].
+_LOWEST = 0.12
+# How readily walks leave a highest place for the gum, per mm of its outline [1/mm]: 0.003 (median) to 0.030 at crowns,
+# 0.026 to 0.074 at ridges without teeth, which mostly lie below the hull of the arch (40 scans of one surface).
+_LEAVING, _DOUBT_PER_MM, _MOST_DOUBT_MM = 0.06, 3.0, 0.6
+# Share of a piece's border without a crease, median over an arch: 0.02 to 0.162 where crowns carry a collar of gum (58
+# scans of synthetic persons of 5,000 faces and more), 0.8 to 1.0 at plain synthetic crowns; 0.24 to 0.34 at real ones,
+# 0.167 once when seen from the roots, whose grooves and necks look like short creases.
+_MOST_WEAK = 0.165
+_COARSE_MM = 1.2  # edges of this length hide a gum line [mm]: what looks like crowns alone may have one
+# Pieces that begin this far above the lower end of the crown they lie at are on it (brackets), not around it (gum)
+# [share of the crown's height].
+_ON_CROWN = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Labelling:
+    """Hold what the shape of a scan says."""
+
+    labels: NDArray[np.uint8]  # GUM or TOOTH per vertex of the scan, shape (V,)
+    up: Array  # the direction in which the crowns point, shape (3,)
+    # share of the border between crown and gum on one surface that runs along no crease, 0 .. 1; 0 without a border,
+    # 1 where the faces are too large to show one
+    weak_share: float
+
+
+def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
+    """Tell crown and gum of a teeth scan apart by its shape, and by its colours where crowns and gum differ in them.
+
+    A scan of crowns alone is crown all over.
+
+    Args:
+        mesh: the scan [mm].
+        towards: middle of the other arch in the same frame, teeth in occlusion, shape (3,); None if not known.
+    """
+    surface = ScanSurface.of(mesh)
+    if len(surface.faces) < _FEWEST_FACES:
+        return Labelling(np.full(len(mesh.vertices), TOOTH, np.uint8), np.array([0.0, 1.0, 0.0]), 0.0)
+    up = biting_direction(surface.vertices, towards)
+    surface = surface.wound(up)
+    seen = tops(surface.vertices, up)
+    by_colour = None if mesh.colors is None else crown_by_colour(mesh.colors, surface, seen)
+    walk = CreaseWalk(surface, by_colour)
+    crown, weak = _by_pieces(surface, seen, up, walk)
+    crown = _scraps_joined(surface, crown)
+    if crown.all() and surface.edge_mm(walk.edges) > _COARSE_MM:
+        weak = 1.0
+    labels = np.where(crown, TOOTH, GUM).astype(np.uint8)
+    return Labelling(labels[surface.of_vertex], up, weak)
+
+
+def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) -> tuple[Mask, float]:
+    """Return which vertices are crown, shape (v,), and the weak share of the border on pieces that carry both."""
+    piece, extent = surface.piece, _extent_mm(surface)
+    small = extent < _TOOTH_MM
+    starts = np.bincount(piece, seen.crown, len(extent))
+    alone = small & (extent > _CROWN_MM) & topped_by(surface.vertices, up, piece)
+    bearing = (extent > _CROWN_MM) & (starts > 0) | alone
+    high = (seen.crown | (alone & (starts == 0))[piece] & (_height_share(surface, up) > 1 - _LOWEST)) & bearing[piece]
+    if (bearing & small).sum() >= 3 and high[~small[piece]].sum() < 0.2 * high.sum():
+        bearing &= small  # the others are the gum of the small ones
+        high &= small[piece]
+    low = seen.gum | ~bearing[piece]
+    surely = np.bincount(piece, seen.gum, len(extent)) > 0
+    low |= (bearing & ~(surely & ~small))[piece] & (_height_share(surface, up) < _LOWEST)
+    doubt = 1.0 + _DOUBT_PER_MM * np.clip(seen.top_depth, 0.0, _MOST_DOUBT_MM)
+    crown = walk.crowns(high & ~low, low, np.where(small[piece], np.inf, _LEAVING / doubt))
+    across, weak = walk.weak(crown)
+    owner = piece[across[:, 0]]
+    count = np.bincount(owner, minlength=len(extent))
+    share = np.bincount(owner, weak, len(extent)) / np.maximum(count, 1)
+    own = bearing & small
+    both = own.any() and (
+        walk.by_colour is not None or bool(np.median(np.where(count > 0, share, 1.0)[own]) <= _MOST_WEAK)
+    )
+    whole = own if not both else own & (count == 0)
+    crown = crown & bearing[piece] | whole[piece]
+    crown |= _carried(surface, up, bearing & small, ~bearing & small)[piece]
+    counted = ~whole[owner]
+    return crown, float(weak[counted].mean()) if counted.any() else 0.0
+
+
+def _carried(surface: ScanSurface, up: Array, crowns: Mask, others: Mask) -> Mask:
+    """Return which of other pieces (P,) sit on one of the crowns that are pieces of their own (P,), shape (P,)."""
+    out = np.zeros(len(others), dtype=bool)
+    if not crowns.any() or not others.any():
+        return out
+    height, piece, count = surface.vertices @ up, surface.piece, len(others)
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, piece, height)
+    np.maximum.at(high, piece, height)
+    standing = np.flatnonzero(crowns[piece])
+    size = np.maximum(np.bincount(piece, minlength=count), 1)
+    middle = np.stack([np.bincount(piece, axis, count) / size for axis in surface.vertices.T], axis=1)[others]
+    at = piece[standing[cKDTree(surface.vertices[standing]).query(middle)[1]]]
+    out[others] = low[others] > low[at] + _ON_CROWN * (high - low)[at]
+    return out
+
+
+def _extent_mm(surface: ScanSurface) -> Array:
+    """Return the diagonal of the box around every piece [mm], shape (P,)."""
+    count = int(surface.piece.max()) + 1
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, surface.piece, surface.vertices)
+    np.maximum.at(high, surface.piece, surface.vertices)
+    return np.asarray(np.linalg.norm(high - low, axis=1))
+
+
+def _height_share(surface: ScanSurface, up: Array) -> Array:
+    """Return the height of every vertex in its piece, from 0 at its lowest to 1 at its highest place, shape (v,)."""
+    height = surface.vertices @ up
+    count = int(surface.piece.max()) + 1
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, surface.piece, height)
+    np.maximum.at(high, surface.piece, height)
+    return np.asarray((height - low[surface.piece]) / np.maximum(high - low, 1e-9)[surface.piece])
+
+
+def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
+    """Return the crowns with scraps counted to whatever larger piece they lie at."""
+    scrap = (_extent_mm(surface) < _CROWN_MM)[surface.piece]
+    if not scrap.any() or scrap.all():
+        return crown
+    nearest = cKDTree(surface.vertices[~scrap]).query(surface.vertices[scrap])[1]
+    out = crown.copy()
+    out[scrap] = crown[~scrap][nearest]
+    return out

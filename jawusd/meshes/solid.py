@@ -1,0 +1,287 @@
+"""Signed distances to what a scan encloses, on a grid: negative inside the crowns, also of scans that are open above.
+
+The inside of a scan is found along vertical lines that come from the other jaw: a line is inside wherever it has
+entered more surfaces than it has left (the winding number of closed surfaces; Jacobson et al. 2013, ACM TOG 32:33, on
+why counts and not parity stand overlapping parts). It needs no closed surface, only one whose triangles are wound
+alike. Faces that lie inside other parts, as where neighbouring teeth overlap, are no surface and left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.meshes.spreading import spread
+
+_BUCKET_MM = 1.0
+_BAND_CELLS = 3.0  # cells around each triangle whose distance to it is computed, the others take a nearby triangle
+_DIAGONAL_CELLS = 3.0**0.5
+_OFF_FACE_MM = 0.01  # how far before a face its outside is looked at
+_JITTER_MM = np.array([1.23e-4, 0.0, 2.71e-4])  # lines through vertices and edges of round coordinates are ambiguous
+_MOST_CROSSINGS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceGrid:
+    """Hold signed distances on a grid.
+
+    Attributes:
+        origin: of the first value [mm], shape (3,).
+        step_mm: between values, along every axis.
+        values: signed distances [mm], negative inside, shape (nx, ny, nz), float32.
+    """
+
+    origin: Array
+    step_mm: float
+    values: NDArray[np.float32]
+
+
+class _Columns(NamedTuple):
+    """The triangles over every square of the (x, z) plane: numbers of those over square i are list[start[i]:end[i]]."""
+
+    low: Array
+    shape: tuple[int, int]
+    start: NDArray[np.int64]
+    faces: NDArray[np.int64]
+
+
+def outer_faces(corners: Array, up: float) -> tuple[Mask, float]:
+    """Tell which faces bound a solid that is open to one side, and how well they are wound.
+
+    Args:
+        corners: of the triangles [mm], shape (F, 3, 3), y vertical.
+        up: 1.0 if the solid is entered upwards (upper teeth), -1.0 if downwards (lower teeth).
+
+    Returns:
+        Outer faces, shape (F,); and the share of vertical lines that enter the solid where they first meet it: 1 for
+        triangles that are counter-clockwise seen from outside, 0 for the opposite.
+    """
+    flipped = _upwards(corners, up)
+    columns = _columns_of(flipped)
+    normals = np.cross(flipped[:, 1] - flipped[:, 0], flipped[:, 2] - flipped[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    before = flipped.mean(axis=1) + _OFF_FACE_MM * normals / np.maximum(length, 1e-12)[:, None]
+    count, first = _crossings(before + _JITTER_MM, flipped, columns)
+    met = first[first != 0]
+    entering = float((met > 0).mean()) if len(met) else 0.0
+    return (count <= 0) & (length > 0), entering
+
+
+def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: float, far_mm: float) -> DistanceGrid:
+    """Sample the signed distance to a solid: near its surface to rounding, farther away at times a little too large.
+
+    More than 0.01 mm in 0.4 % of values 0.5 to 1 mm inside teeth, in 2 % of those 1 to 2 mm inside, 0.12 at most.
+
+    Args:
+        corners: of all triangles [mm], shape (F, 3, 3), y vertical, counter-clockwise seen from outside.
+        outer: those that bound the solid, see `outer_faces`, shape (F,).
+        box: what the grid spans, rows low and high [mm], shape (2, 3).
+        step_mm: between values.
+        up: see `outer_faces`.
+        far_mm: values outside the solid that are farther from it may be less than their distance, but not than this.
+    """
+    nx, ny, nz = (int(n) for n in np.ceil((box[1] - box[0]) / step_mm) + 1)
+    kept = np.ascontiguousarray(corners[outer])
+    nearest = _nearest_faces(kept, box[0], step_mm, (nx, ny, nz), _BAND_CELLS)
+    away = spread(nearest)
+    flipped = _upwards(corners, up)
+    values = np.ones(nearest.shape, np.float32)
+    _set_signs(values, flipped, box[0], step_mm, up, _columns_of(flipped))
+    _set_distances(values, kept, nearest, away, _walls(kept, box[0], step_mm, values.shape), box[0], step_mm, far_mm)
+    return DistanceGrid(np.array(box[0]), step_mm, values)
+
+
+def _walls(corners: Array, origin: Array, step: float, shape: tuple[int, ...]) -> Array:
+    """Return the first and last cells, shape (2, 3), of axes along which triangles go on beyond, else infinity."""
+    last = np.array(shape) - 1
+    low, high = (corners.reshape(-1, 3) - origin).min(axis=0), (corners.reshape(-1, 3) - origin).max(axis=0)
+    return np.array([np.where(low < 0, 0.0, -np.inf), np.where(high > step * last, last, np.inf)])
+
+
+def _upwards(corners: Array, up: float) -> Array:
+    """Return triangles with the open side up, wound as they were."""
+    if up > 0:
+        return np.ascontiguousarray(corners)
+    return np.ascontiguousarray((corners * [1.0, -1.0, 1.0])[:, ::-1])
+
+
+def _columns_of(corners: Array) -> _Columns:
+    low, high = corners.min(axis=1)[:, [0, 2]], corners.max(axis=1)[:, [0, 2]]
+    origin = low.min(axis=0) - 1e-6
+    first, last = (np.floor((ends - origin) / _BUCKET_MM).astype(np.int64) for ends in (low, high))
+    shape = last.max(axis=0) + 1
+    count = np.prod(last - first + 1, axis=1)
+    face = np.repeat(np.arange(len(corners)), count)
+    within = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+    width = (last - first + 1)[face, 1]
+    square = (first[face, 0] + within // width) * shape[1] + first[face, 1] + within % width
+    order = np.argsort(square, kind="stable")
+    start = np.searchsorted(square[order], np.arange(shape[0] * shape[1] + 1))
+    return _Columns(origin, (int(shape[0]), int(shape[1])), start, face[order])
+
+
+@numba.njit(nogil=True, cache=True)
+def _crossing(corners: Array, f: int, x: float, z: float) -> tuple[int, float]:
+    """Return how a vertical line meets a triangle, 1 entering, -1 leaving, 0 not at all; and the height."""
+    ax, ay, az = corners[f, 0, 0] - x, corners[f, 0, 1], corners[f, 0, 2] - z
+    bx, by, bz = corners[f, 1, 0] - x, corners[f, 1, 1], corners[f, 1, 2] - z
+    cx, cy, cz = corners[f, 2, 0] - x, corners[f, 2, 1], corners[f, 2, 2] - z
+    u, v, w = bx * cz - cx * bz, cx * az - ax * cz, ax * bz - bx * az
+    area = u + v + w  # y of the normal is minus this
+    if not ((u >= 0 and v >= 0 and w >= 0) or (u <= 0 and v <= 0 and w <= 0)) or area == 0:
+        return 0, 0.0
+    return (1 if area > 0 else -1), (u * ay + v * by + w * cy) / area
+
+
+@numba.njit(nogil=True, cache=True)
+def _crossings(points: Array, corners: Array, columns: _Columns) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the winding count below each point, and the kind of the lowest crossing below it."""
+    low, shape, start, faces = columns
+    count = np.zeros(len(points), np.int64)
+    first = np.zeros(len(points), np.int64)
+    for p in range(len(points)):
+        i = int(np.floor((points[p, 0] - low[0]) / _BUCKET_MM))
+        k = int(np.floor((points[p, 2] - low[1]) / _BUCKET_MM))
+        if i < 0 or k < 0 or i >= shape[0] or k >= shape[1]:
+            continue
+        lowest = np.inf
+        square = i * shape[1] + k
+        for j in range(start[square], start[square + 1]):
+            kind, height = _crossing(corners, faces[j], points[p, 0], points[p, 2])
+            if kind != 0 and height < points[p, 1]:
+                count[p] += kind
+                if height < lowest:
+                    lowest = height
+                    first[p] = kind
+    return count, first
+
+
+@numba.njit(nogil=True, cache=True)
+def _set_signs(
+    values: NDArray[np.float32], corners: Array, origin: Array, step: float, up: float, columns: _Columns
+) -> None:
+    low, shape, start, faces = columns
+    heights, kinds = np.empty(_MOST_CROSSINGS), np.empty(_MOST_CROSSINGS, np.int64)
+    nx, ny, nz = values.shape
+    for i in range(nx):
+        x = origin[0] + i * step + 1.23e-4
+        for k in range(nz):
+            z = origin[2] + k * step + 2.71e-4
+            a, b = int(np.floor((x - low[0]) / _BUCKET_MM)), int(np.floor((z - low[1]) / _BUCKET_MM))
+            if a < 0 or b < 0 or a >= shape[0] or b >= shape[1]:
+                continue
+            found, square = 0, a * shape[1] + b
+            for j in range(start[square], start[square + 1]):
+                kind, height = _crossing(corners, faces[j], x, z)
+                if kind != 0 and found < _MOST_CROSSINGS:
+                    heights[found], kinds[found] = height, kind
+                    found += 1
+            for y in range(ny):
+                at = up * (origin[1] + y * step)
+                count = 0
+                for j in range(found):
+                    if heights[j] < at:
+                        count += kinds[j]
+                if count > 0:
+                    values[i, y, k] = -values[i, y, k]
+
+
+@numba.njit(nogil=True, cache=True)
+def _squared_distance(corners: Array, f: int, x: float, y: float, z: float) -> float:
+    """Return the squared distance of a point to a triangle (Ericson 2005, Real-time collision detection, 5.1.5)."""
+    ax, ay, az = corners[f, 0, 0], corners[f, 0, 1], corners[f, 0, 2]
+    ux, uy, uz = corners[f, 1, 0] - ax, corners[f, 1, 1] - ay, corners[f, 1, 2] - az
+    vx, vy, vz = corners[f, 2, 0] - ax, corners[f, 2, 1] - ay, corners[f, 2, 2] - az
+    px, py, pz = x - ax, y - ay, z - az
+    uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
+    pu, pv = px * ux + py * uy + pz * uz, px * vx + py * vy + pz * vz
+    area = uu * vv - uv * uv
+    s, t = pu * vv - pv * uv, pv * uu - pu * uv
+    if area > 0 and s >= 0 and t >= 0 and s + t <= area:
+        s, t = s / area, t / area
+        return (px - s * ux - t * vx) ** 2 + (py - s * uy - t * vy) ** 2 + (pz - s * uz - t * vz) ** 2
+    best = np.inf
+    for edge in range(3):  # the nearest point lies on an edge
+        if edge == 0:
+            s, t = min(max(pu / uu, 0.0), 1.0), 0.0
+        elif edge == 1:
+            s, t = 0.0, min(max(pv / vv, 0.0), 1.0)
+        else:
+            along = (pv - pu + uu - uv) / max(uu - 2 * uv + vv, 1e-300)
+            t = min(max(along, 0.0), 1.0)
+            s = 1.0 - t
+        best = min(best, (px - s * ux - t * vx) ** 2 + (py - s * uy - t * vy) ** 2 + (pz - s * uz - t * vz) ** 2)
+    return best
+
+
+@numba.njit(nogil=True, cache=True)
+def _nearest_faces(
+    corners: Array, origin: Array, step: float, shape: tuple[int, int, int], band: float
+) -> NDArray[np.int32]:
+    """Return the number of the nearest triangle at the values near triangles, shape (nx, ny, nz); -1 elsewhere."""
+    nearest = np.full(shape, -1, np.int32)
+    # beyond the band, a triangle whose box reaches a value is not always the nearest one
+    best = np.full(shape, np.float32((band * step) ** 2), np.float32)
+    for f in range(len(corners)):
+        low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+        for c in range(3):
+            a, b = corners[f, :, c].min(), corners[f, :, c].max()
+            low[c] = max(0, int(np.ceil((a - origin[c]) / step - band)))
+            high[c] = min(shape[c] - 1, int(np.floor((b - origin[c]) / step + band)))
+        for i in range(low[0], high[0] + 1):
+            for j in range(low[1], high[1] + 1):
+                for k in range(low[2], high[2] + 1):
+                    found = _squared_distance(
+                        corners, f, origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
+                    )
+                    if found < best[i, j, k]:
+                        best[i, j, k], nearest[i, j, k] = found, f
+    return nearest
+
+
+@numba.njit(nogil=True, cache=True)
+def _set_distances(
+    values: NDArray[np.float32],
+    corners: Array,
+    nearest: NDArray[np.int32],
+    away: NDArray[np.int32],
+    walls: Array,
+    origin: Array,
+    step: float,
+    far: float,
+) -> None:
+    """Multiply signs by the distances to the nearest of a value's own triangle and those of its six neighbours.
+
+    Positive ones that are certainly farther than `far` get the least that they can be.
+    """
+    nx, ny, nz = nearest.shape
+    for i in range(nx):
+        for j in range(ny):
+            to_wall = min(i - walls[0, 0], walls[1, 0] - i, j - walls[0, 1], walls[1, 1] - j)
+            for k in range(nz):
+                own = found = nearest[i, j, k]
+                # A surface within the walls is known at a value half a diagonal beside where it leaves its band.
+                least = step * min(
+                    np.sqrt(away[i, j, k]) + _BAND_CELLS - _DIAGONAL_CELLS, to_wall, k - walls[0, 2], walls[1, 2] - k
+                )
+                if own < 0 or (values[i, j, k] > 0 and least > far):
+                    values[i, j, k] *= least
+                    continue
+                x, y, z = origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
+                best = _squared_distance(corners, own, x, y, z)
+                for di, dj, dk in ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)):
+                    a, b, c = i + di, j + dj, k + dk
+                    if a < 0 or b < 0 or c < 0 or a >= nx or b >= ny or c >= nz:
+                        continue
+                    other = nearest[a, b, c]
+                    if other in (own, found):
+                        continue
+                    squared = _squared_distance(corners, other, x, y, z)
+                    if squared < best:
+                        best, found = squared, other
+                values[i, j, k] *= np.sqrt(best)

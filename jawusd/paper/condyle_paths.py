@@ -1,0 +1,147 @@
+"""Paper Fig. 5: the paths of the condyles when the jaw opens, in the principal component and in the models."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.evaluator.models import JawModelForm
+from jawusd.fitting.data import SubjectAnatomy, TrainingData
+from jawusd.formats.experiments import CondylePath, Distances, ParameterPath
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import se3_exp, se3_log, transform_point, transform_points
+
+EXPERIMENT = "condyle path"
+PRINCIPAL = "principal component 1"
+
+_STEPS = 121
+_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the path with the condyle's outline: four, as in the paper
+_AROUND_MM = 24.0  # half size of the outlines
+_NEAR_CLOSED_MM = 5.0
+_HABITUAL_MM = 1.5  # captured poses with |d2| and |d3| below this belong to plain opening
+_BESIDE_MM = 0.75  # captured condyles this near in z bound the height of a condyle under the eminence
+_FEWEST_BESIDE = 3
+
+
+def condyle_paths(
+    data: TrainingData,
+    models: dict[str, JawModelForm],
+    widest_mm: float,
+    mandible: Mesh | None,
+    anatomy: SubjectAnatomy,
+) -> list[CondylePath]:
+    """Sweep the first principal component, then the opening d1 of each model up to `widest_mm`.
+
+    Args:
+        mandible: for outlines of the condyle, mandible frame.
+    """
+    sweeps = {PRINCIPAL: principal_opening(data)}
+    d = np.zeros((_STEPS, 3))
+    d[:, 0] = np.linspace(0.0, widest_mm, _STEPS)
+    sweeps |= {name: model.motion(d) for name, model in models.items()}
+    bone = None if mandible is None else Mesh(anatomy.at_rest(mandible.vertices), mandible.faces)
+    return [_path(name, motion, data, bone) for name, motion in sweeps.items()]
+
+
+def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], captured: Array) -> tuple[ParameterPath, ...]:
+    """Sweep each parameter of each model alone, from the closed bite over its captured range.
+
+    Args:
+        captured: parameters of the captured poses in the default model [mm], shape (N, 3).
+    """
+    found = []
+    # The other parameters stay zero, so that d2 and d3 reach only what was captured with the teeth nearly together.
+    near = captured[captured[:, 0] < _NEAR_CLOSED_MM]
+    for name, model in models.items():
+        for axis in range(3):
+            d = np.zeros((_STEPS, 3))
+            shown = near if axis and len(near) else captured
+            low, high = np.percentile(shown[:, axis], [0.5, 99.5])
+            d[:, axis] = np.linspace(min(low, 0.0) if axis else 0.0, max(high, 0.0), _STEPS)
+            points = transform_point(model.motion(d), data.landmarks[3])
+            found.append(ParameterPath(name, axis, d[:, axis], points))
+    return tuple(found)
+
+
+def principal_opening(data: TrainingData) -> Array:
+    """Return the motions log M = w p1 for w between the captured extremes, shape (K, 4, 4), ordered to open.
+
+    p1 is the first principal component of the captured twists under the mandible metric, not centred, so that the
+    sweep passes the closed bite as the models' do (the paper's w1 p1).
+    """
+    root = data.metric.twist_root()
+    points = se3_log(data.motion) @ root * np.sqrt(data.weights)[:, None]
+    first = np.linalg.svd(points, full_matrices=False)[2][0]
+    scores = se3_log(data.motion) @ root @ first
+    if np.median(scores) < 0:
+        first, scores = -first, -scores
+    weights = np.linspace(min(np.percentile(scores, 0.5), 0.0), np.percentile(scores, 99.5), _STEPS)
+    return se3_exp(weights[:, None] * np.linalg.solve(root.T, first))
+
+
+def _path(name: str, motion: Array, data: TrainingData, bone: Mesh | None) -> CondylePath:
+    points = np.stack([transform_point(motion, centre) for centre in data.landmarks[3:]])
+    opening = -(transform_point(motion, data.incisor) - data.incisor)[:, 1]
+    heads = []
+    if bone is not None:
+        around = np.linalg.norm(bone.vertices - data.landmarks[3], axis=1) < 2 * _AROUND_MM
+        near = Mesh(bone.vertices, bone.faces[around[bone.faces].all(axis=1)])
+        for share in _SHOWN_OPENINGS:
+            k = round(share * (len(motion) - 1))
+            moved = Mesh(transform_points(motion[k], near.vertices), near.faces)
+            heads.append(sagittal_section(moved, points[0, k], _AROUND_MM))
+    return CondylePath(name, opening, points, tuple(heads))
+
+
+def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
+    """Cut a mesh (anatomical frame) with the plane x = centre[0], within `around_mm` of the centre (3,) [mm].
+
+    Returns:
+        Segments of the cut, end points (z, y) [mm], shape (S, 2, 2).
+    """
+    side = mesh.vertices[:, 0] > centre[0]
+    cut = mesh.vertices[mesh.faces[side[mesh.faces].sum(axis=1) % 3 > 0]]
+    if not len(cut):
+        return np.empty((0, 2, 2))
+    height = cut[:, :, 0] - centre[0]
+    above = height > 0
+    # One of three corners is alone on its side of the plane: the cut connects its two edges.
+    alone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
+    rows = np.arange(len(cut))
+    ends = []
+    for other in (1, 2):
+        far = (alone + other) % 3
+        share = height[rows, alone] / (height[rows, alone] - height[rows, far])
+        ends.append(cut[rows, alone] + share[:, None] * (cut[rows, far] - cut[rows, alone]))
+    segments = np.stack(ends, axis=1)[:, :, [2, 1]]
+    return segments[np.all(np.abs(segments - centre[[2, 1]]) < around_mm, axis=(1, 2))]
+
+
+def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[Distances]:
+    """Measure the paths against the captured condyles.
+
+    Args:
+        captured: condyle centres of the captured poses [mm], shape (2, N, 3).
+        d: parameters of the captured poses in the default model [mm], shape (N, 3).
+
+    Returns:
+        For each path the distances of its points from the nearest captured condyle of plain opening, and their heights
+        above the highest captured condyle beside them, if any, which the eminence makes impossible.
+    """
+    habitual = captured[:, np.all(np.abs(d[:, 1:]) < _HABITUAL_MM, axis=1)]
+    found = []
+    for path in paths:
+        above = np.concatenate([_above(path.points[side], captured[side]) for side in (0, 1)])
+        found.append(Distances(EXPERIMENT, path.model, "above every captured condyle", above))
+        if habitual.shape[1]:
+            away = np.linalg.norm(path.points[:, :, None] - habitual[:, None], axis=-1).min(2).ravel()
+            found.append(Distances(EXPERIMENT, path.model, "from the captured opening path", away))
+    return found
+
+
+def _above(path: Array, captured: Array) -> Array:
+    """Return heights of path points (K, 3) above the highest captured ones (N, 3) at the same z [mm], 0 if below."""
+    beside = np.abs(path[:, None, 2] - captured[None, :, 2]) < _BESIDE_MM
+    highest = np.where(beside, captured[None, :, 1], -np.inf).max(1)
+    known = beside.sum(1) >= _FEWEST_BESIDE
+    return np.maximum(path[known, 1] - highest[known], 0.0)

@@ -1,0 +1,141 @@
+"""The energy of the paper: eqs. 6 to 9, counted pixels of a scan against the masks of one instant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import TrackingError
+from jawusd.formats.mesh import BOUNDARY, Mesh, crown_face_mask, tooth_labels
+from jawusd.geometry import transform_points
+from jawusd.meshes.meshio import winding
+from jawusd.tracking.contour.views import View
+
+_MARGIN_PX = 48  # of the screen buffer around the scan at the start: 7 mm, farther than any search goes
+_FARTHEST_PX = 1024  # that the buffer reaches beyond the masks, wherever the search starts
+
+
+class PixelCounter(Protocol):
+    """Draw a scan and count pixels: `paper.pixel_counts.RasterCounter` or `paper.gl.GlCounter`."""
+
+    def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
+        """Set the pictures of one instant: matrices (C, 3, 4), masks and free (C, h, w)."""
+
+    def counts(self, poses: Array) -> NDArray[np.int64]:
+        """Return E_SP and E_BND of poses (N, 4, 4) in every view, shape (N, C, 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PaperScan:
+    """Hold the regions of a teeth scan that the paper draws (fig. 8)."""
+
+    vertices: Array  # scan coordinates [mm], shape (V, 3)
+    plain_faces: NDArray[np.int32]  # red: teeth that only have to cover their masks, shape (F, 3)
+    boundary_faces: NDArray[np.int32]  # green: the boundary of interest, shape (B, 3)
+    cull: bool  # whether faces turned away may be left out
+    centre: Array  # centroid of the teeth [mm], shape (3,)
+
+
+def paper_scan(mesh: Mesh, name: str) -> PaperScan:
+    """Take the red and green regions out of a painted teeth scan; a face belongs where two of its corners do.
+
+    Args:
+        mesh: the scan with vertex colours.
+        name: "upper" or "lower", for messages.
+
+    Raises:
+        TrackingError: the scan has no boundary of interest.
+    """
+    corner = tooth_labels(mesh)[mesh.faces]
+    teeth = crown_face_mask(mesh)
+    boundary = (corner == BOUNDARY).sum(1) >= 2
+    if not boundary.any():
+        raise TrackingError(
+            f"{name} teeth scan: no boundary of interest, which the paper's energy needs (eq. 9)",
+            hint="Paint the incisal edges of the front teeth green in the scan, or track with --solver contour.",
+        )
+    return PaperScan(
+        vertices=np.asarray(mesh.vertices, np.float64),
+        plain_faces=np.ascontiguousarray(mesh.faces[teeth & ~boundary], np.int32),
+        boundary_faces=np.ascontiguousarray(mesh.faces[boundary], np.int32),
+        # The side of a solid that faces away is hidden by the side that does not, if all faces agree which is which.
+        cull=winding(mesh).outward and _is_consistent(mesh),
+        centre=mesh.vertices[np.unique(mesh.faces[teeth])].mean(0),
+    )
+
+
+def _is_consistent(mesh: Mesh) -> bool:
+    """Tell whether no two faces run along an edge in the same direction."""
+    unique, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[mesh.faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return len(np.unique(edges[:, 0] * len(unique) + edges[:, 1])) == len(edges)
+
+
+class PaperEnergy:
+    """Give the energy of poses of one arch.
+
+    Every view is drawn into a screen buffer of its own around the teeth, at the working size and undistorted. A pixel
+    is red or green as soon as a triangle of that colour covers its centre, whatever lies in front of it: with faces
+    turned away left out that differs by some ten pixels from what a depth buffer gives.
+    """
+
+    def __init__(self, counter: PixelCounter, scan: PaperScan, boundary_weight: float) -> None:
+        """Weigh the counts.
+
+        Args:
+            counter: knows the scan.
+            scan: the scan.
+            boundary_weight: lambda of eq. 7.
+        """
+        self._counter, self._scan, self._weight = counter, scan, boundary_weight
+        self.evaluations = 0
+
+    def show(self, views: Sequence[View], row: int, start: Array, other_row_hides: bool) -> None:
+        """Set the masks of one instant.
+
+        Args:
+            views: those that have a mask of this row.
+            row: 0 upper, 1 lower.
+            start: pose around which will be searched, T_world_scan, shape (4, 4).
+            other_row_hides: do not count boundary pixels that lie in the mask of the other row.
+        """
+        boxes = np.stack([self._box(view, start) for view in views])
+        width, height = (boxes[:, 2:] - boxes[:, :2]).max(0)
+        masks = np.zeros((len(views), height, width), bool)
+        free = np.zeros_like(masks)
+        matrices = np.empty((len(views), 3, 4))
+        for k, (view, (x0, y0, _, _)) in enumerate(zip(views, boxes, strict=True)):
+            rows, columns = view.masks.shape[1:]
+            inside = (slice(-y0, rows - y0), slice(-x0, columns - x0))
+            masks[k][inside] = view.masks[row] > 127
+            free[k][inside] = view.masks.max(0) > 127 if other_row_hides else masks[k][inside]
+            matrices[k] = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1]]) @ view.matrix
+        self.mask_px = masks.sum((1, 2))
+        self._counter.show(matrices, masks, free)
+
+    def _box(self, view: View, start: Array) -> NDArray[np.int64]:
+        """Return x0, y0, x1, y1 [px] around a view's masks and the scan where it starts; x0, y0 are at most 0."""
+        vertices = self._scan.vertices[np.unique(self._scan.boundary_faces)]
+        h = transform_points(start, vertices) @ view.matrix[:, :3].T + view.matrix[:, 3]
+        seen = h[:, :2] / h[:, 2:]
+        size = np.array(view.masks.shape[:0:-1])
+        low = np.clip(np.floor(seen.min(0)) - _MARGIN_PX, -_FARTHEST_PX, 0)
+        high = np.clip(np.ceil(seen.max(0)) + _MARGIN_PX, size, size + _FARTHEST_PX)
+        return np.concatenate([low, high]).astype(np.int64)
+
+    def __call__(self, poses: Array) -> Array:
+        """Return E = E_SP + lambda E_BND (eq. 7), summed over the views (eq. 6), of poses (N, 4, 4), shape (N,)."""
+        self.evaluations += len(poses)
+        counts = self._counter.counts(poses).sum(1)
+        return counts[:, 0] + self._weight * counts[:, 1]
+
+    def uncovered_px(self, pose: Array) -> NDArray[np.int64]:
+        """Return E_SP (eq. 8) of a pose (4, 4) per view, shape (C,)."""
+        return self._counter.counts(pose[None])[0, :, 0]

@@ -1,0 +1,220 @@
+"""The experiments of Yang et al. (2019) on any take: paper Figs. 5, 12 and 13, and which poses the take lacks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FittingError
+from jawusd.fitting.blas import one_blas_thread
+from jawusd.fitting.coverage import FAR_MM, bound_not_reached, missing_movements, shown_parameters
+from jawusd.fitting.data import Source, SubjectAnatomy, TrainingData, select
+from jawusd.fitting.fit import FittingConfig, Progress, fit_form
+from jawusd.fitting.form import FittedForm
+from jawusd.formats.experiments import Coverage, Distances, Experiments
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import se3_exp, se3_log, transform_point, transform_points
+from jawusd.paper.condyle_paths import condyle_paths, parameter_paths, path_distances, sagittal_section
+from jawusd.paper.model import COMPONENTS, PaperFit
+from jawusd.paper.nlpca import Nlpca
+from jawusd.paper.synthesis import Bounds, captured_reference, distance_to_nearest
+
+#: Models of the experiments by label.
+MODELS: dict[str, FittingConfig] = {
+    "paper, literal": FittingConfig(method="paper", literal=True),
+    "paper": FittingConfig(method="paper"),
+    "additive": FittingConfig(method="additive"),
+    "anchored": FittingConfig(method="anchored"),
+    "pca": FittingConfig(method="pca"),
+}
+DEFAULT, LINEAR = "anchored", "pca"
+#: Models that take seconds, for `quick`.
+QUICK = ("additive", DEFAULT, LINEAR)
+RECONSTRUCTION, SYNTHESIS = "reconstruction", "synthesis"
+
+_LARGEST = "largest vertex distance"
+_OPENING_QUANTILE = 0.995  # where the sweep of Fig. 5 ends, so that a single frame does not decide
+_SKULL_AROUND_MM = 30.0
+_GRID_MM = 0.5
+_SLICES = 60
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """The models of one take, with the captured poses in their parameters."""
+
+    forms: dict[str, FittedForm]
+    d: dict[str, Array]
+    nearest: dict[str, Array]
+    notes: tuple[str, ...]
+
+
+@one_blas_thread
+def run_experiments(
+    source: Source,
+    anatomy: SubjectAnatomy,
+    *,
+    bones: Mapping[str, Mesh] | None = None,
+    config: FittingConfig = FittingConfig(),  # noqa: B008 - frozen
+    actor: str = "",
+    quick: bool = False,
+    progress: Progress | None = None,
+) -> Experiments:
+    """Do the paper's experiments on a take.
+
+    Args:
+        source: of tracks the raw poses are used, except prior-aided ones.
+        bones: meshes "mandible" and "skull" for outlines, scan frame [mm]; either may be missing.
+        config: starts and seed of the networks, trimming, alpha, folds; the method is ignored.
+        quick: leave out the networks and the paper's model, and draw random poses of the default model alone.
+
+    Returns:
+        The results. Models that cannot be fitted to the take are left out and named in `notes`.
+
+    Raises:
+        FittingError: too few poses or no motion.
+    """
+    wanted = QUICK if quick else tuple(MODELS)
+    notify, steps = progress or (lambda done, total: None), len(wanted) + (0 if quick else COMPONENTS)
+    data, bones = select(source, anatomy).data, bones or {}
+    shown, sentences = shown_parameters(data)
+    fitted = _fit_all(data, shown, wanted, config, lambda done: notify(done, steps))
+    nets = [] if quick else _networks(data, config, fitted.forms.get("paper"), lambda d: notify(len(wanted) + d, steps))
+    captured = np.stack([transform_point(data.motion, centre) for centre in data.landmarks[3:]])
+    d, kept = fitted.d[DEFAULT], fitted.d[DEFAULT][fitted.forms[DEFAULT].kept]
+    swept = {name: fitted.forms[name].model for name in ("paper", DEFAULT) if name in fitted.forms}
+    widest = float(np.quantile(kept[:, 0], _OPENING_QUANTILE))
+    paths = condyle_paths(data, swept, widest, bones.get("mandible"), anatomy)
+    drawn = (DEFAULT,) if quick else tuple(fitted.d)
+    bounds = {name: Bounds.of(fitted.d[name][fitted.forms[name].kept], config.alpha) for name in drawn}
+    distances = path_distances(paths, captured, d)
+    distances += _reconstruction(data, fitted, nets) + _synthesis(data, fitted, bounds, config)
+    compared = {name: fitted.forms[name].model for name in (LINEAR, DEFAULT) if name in fitted.forms}
+    notify(steps, steps)
+    skull = np.empty((0, 2, 2))
+    if "skull" in bones:
+        placed = Mesh(transform_points(anatomy.T_anatomical_skull, bones["skull"].vertices), bones["skull"].faces)
+        skull = sagittal_section(placed, data.landmarks[3], _SKULL_AROUND_MM)
+    lacking = (*sentences, *missing_movements(kept, shown))
+    return Experiments(
+        actor=actor,
+        frames=len(data),
+        captured_condyles=captured,
+        skull=skull,
+        condyle_paths=tuple(paths),
+        distances=tuple(distances),
+        coverage=_coverage(kept, bounds[DEFAULT], lacking),
+        notes=fitted.notes,
+        parameter_paths=parameter_paths(data, compared, kept),
+    )
+
+
+def _fit_all(
+    data: TrainingData, shown: Mask, wanted: tuple[str, ...], config: FittingConfig, notify: Callable[[int], None]
+) -> _Fitted:
+    forms: dict[str, FittedForm] = {}
+    parameters: dict[str, Array] = {}
+    nearest: dict[str, Array] = {}
+    nets: dict[int, Nlpca] = {}
+    notes = []
+    for step, name in enumerate(wanted):
+        notify(step)
+        start = time.perf_counter()
+        try:
+            chosen = replace(config, method=MODELS[name].method, literal=MODELS[name].literal)
+            form = fit_form(data, shown, chosen, nets)  # the two variants of the paper's model share their networks
+        except FittingError as error:
+            if name == DEFAULT:
+                raise
+            notes.append(f"{name}: {error}")
+            continue
+        seconds = time.perf_counter() - start
+        d, motion = data.metric.nearest(form.model, data.motion)
+        usable = np.all(np.isfinite(d), axis=1)
+        if not usable[form.kept].all():
+            notes.append(f"{name}: the parameters of {int((~usable[form.kept]).sum())} poses cannot be found.")
+            if name == DEFAULT:
+                raise FittingError(notes[-1], hint="Check the poses' units.")
+            continue
+        forms[name], parameters[name], nearest[name] = form, d, motion
+        notes.append(f"{name}: fitted in {seconds:.1f} s; {int((~form.kept).sum())} frames left out as outliers.")
+    return _Fitted(forms, parameters, nearest, tuple(notes))
+
+
+def _networks(
+    data: TrainingData, config: FittingConfig, paper: FittedForm | None, notify: Callable[[int], None]
+) -> list[Nlpca]:
+    """Return networks of 1..5 components; the last is that of the paper's model, if there is one."""
+    from jawusd.paper.nlpca_training import train_nlpca  # imports torch
+
+    points = se3_log(data.motion) @ data.metric.twist_root()
+    nets = []
+    for count in range(1, COMPONENTS + 1):
+        notify(count - 1)
+        if count == COMPONENTS and isinstance(paper, PaperFit):
+            nets.append(paper.network_sum.net)
+        else:
+            nets.append(train_nlpca(points, count, config.seed))
+    notify(COMPONENTS)
+    return nets
+
+
+def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> list[Distances]:
+    """Paper Fig. 12: every captured pose against its reconstruction by each model, trimmed frames included."""
+    root = data.metric.twist_root()
+    points = se3_log(data.motion) @ root
+    rebuilt = {
+        f"NLPCA {net.components}": se3_exp(np.linalg.solve(root.T, net.decode(net.encode(points)).T).T) for net in nets
+    }
+    for name, form in fitted.forms.items():
+        if isinstance(form, PaperFit):
+            rebuilt[f"{name}, as published"] = form.reconstruct_as_published(data.motion)
+    rebuilt |= fitted.nearest
+    found = []
+    for name, motion in rebuilt.items():
+        known = np.all(np.isfinite(motion), axis=(1, 2))  # a gross outlier may have no nearest pose on a model
+        errors = data.metric.largest(motion[known], data.motion[known])
+        found.append(Distances(RECONSTRUCTION, name, _LARGEST, errors))
+    return found
+
+
+def _synthesis(
+    data: TrainingData, fitted: _Fitted, bounds: dict[str, Bounds], config: FittingConfig
+) -> list[Distances]:
+    """Paper Fig. 13: random poses of each model against the nearest captured pose."""
+    folds = max(config.holdout_folds, 2)
+    reference = captured_reference(data.metric, data.motion, folds)
+    found = [Distances(SYNTHESIS, "captured hold-out poses", f"{folds} contiguous parts", reference)]
+    for name in bounds:
+        form = fitted.forms[name]
+        for bound, d in bounds[name].draw(np.random.default_rng(config.seed)).items():
+            if len(d):
+                distance = distance_to_nearest(data.metric, form.model.motion(d), data.motion)
+                found.append(Distances(SYNTHESIS, name, bound, distance))
+    return found
+
+
+def _coverage(d: Array, bounds: Bounds, sentences: tuple[str, ...]) -> Coverage:
+    low, high = bounds.slices_box[0]
+    openings = np.linspace(low, high, _SLICES)
+    at = np.zeros((_SLICES, 3))
+    at[:, 0] = openings
+    slices = np.stack([np.stack(bounds.slices.chord(at, axis), axis=1) for axis in (1, 2)])
+    (lateral, lateral_share), (forward, forward_share) = (_gaps(d, bounds, axis) for axis in (1, 2))
+    gaps, shares = (lateral, forward), (lateral_share, forward_share)
+    return Coverage(d, bounds.rings, openings, slices, gaps, (*sentences, *bound_not_reached(gaps, shares)))
+
+
+def _gaps(d: Array, bounds: Bounds, axis: int) -> tuple[Array, float]:
+    """Return points (d1, d_axis) of the slice hull, the other parameter zero, far from every pose, and their share."""
+    first, second = (np.arange(low, high, _GRID_MM) for low, high in bounds.slices_box[[0, axis]])
+    grid = np.zeros((len(first) * len(second), 3))
+    grid[:, 0], grid[:, axis] = (part.ravel() for part in np.meshgrid(first, second))
+    grid = grid[bounds.slices.signed_distance(grid) <= 0][:, [0, axis]]
+    scale = FAR_MM[[0, axis]]
+    far = np.array([((((d[:, [0, axis]] - point) / scale) ** 2).sum(1) > 1).all() for point in grid], dtype=bool)
+    return grid[far], float(far.mean()) if len(far) else 0.0

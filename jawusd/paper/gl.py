@@ -1,0 +1,267 @@
+"""The GPU twin of `pixel_counts`: many poses times views in one layered drawing, counted where it was drawn.
+
+Needs OpenGL 4.3 through EGL, so no display; a software driver (llvmpipe) does. Its edges are the driver's: pixels
+whose centre lies within a rounding error of a triangle's side may fall to the other side of it than on the CPU.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import JawusdError, MissingDependencyError
+from jawusd.paper.pixel_counts import checked_screens
+
+try:
+    import moderngl
+except ModuleNotFoundError as error:
+    raise MissingDependencyError(
+        'drawing on the GPU needs the package "moderngl", which is not installed.',
+        hint="Install it with: pip install 'jawusd[all]', or use the CPU backend.",
+    ) from error
+
+
+_LAYER_EXTENSION = "GL_ARB_shader_viewport_layer_array"
+_MOST_PIXELS = 1 << 26  # of one layered picture: 64 MB
+_TILE_PX = 64  # side of the square that one work group of 16 x 16 counts
+_ROUND_PX = 64  # picture sides are rounded up to this, so that frames of changing size share their textures
+
+_VERTEX = f"""#version 430
+#extension {_LAYER_EXTENSION} : require
+in vec3 position;
+layout(std430, binding = 0) readonly buffer Matrices {{ mat4 clip_from_scan[]; }};
+void main() {{
+    gl_Position = clip_from_scan[gl_InstanceID] * vec4(position, 1.0);
+    gl_Layer = gl_InstanceID;
+}}
+"""
+
+_FRAGMENT = """#version 430
+uniform float shade;
+out float colour;
+void main() { colour = shade; }
+"""
+
+_COUNT = f"""#version 430
+layout(local_size_x = 16, local_size_y = 16) in;
+uniform sampler2DArray drawn;
+uniform usampler2DArray masks;
+uniform int views;
+uniform ivec2 size;
+layout(std430, binding = 1) buffer Counts {{ uint counts[]; }};
+shared uint bare, outside;
+void main() {{
+    if (gl_LocalInvocationIndex == 0u) {{ bare = 0u; outside = 0u; }}
+    barrier();
+    int layer = int(gl_WorkGroupID.z);
+    ivec2 corner = ivec2(gl_WorkGroupID.xy) * {_TILE_PX} + ivec2(gl_LocalInvocationID.xy);
+    uint a = 0u, b = 0u;
+    for (int y = corner.y; y < min(size.y, corner.y + {_TILE_PX}); y += 16)
+        for (int x = corner.x; x < min(size.x, corner.x + {_TILE_PX}); x += 16) {{
+            float shade = texelFetch(drawn, ivec3(x, y, layer), 0).r;
+            uint mask = texelFetch(masks, ivec3(x, y, layer % views), 0).r;
+            if ((mask & 1u) != 0u && shade < 0.25) a++;
+            if ((mask & 2u) == 0u && shade > 0.75) b++;
+        }}
+    atomicAdd(bare, a);
+    atomicAdd(outside, b);
+    barrier();
+    if (gl_LocalInvocationIndex == 0u) {{
+        atomicAdd(counts[2 * layer], bare);
+        atomicAdd(counts[2 * layer + 1], outside);
+    }}
+}}
+"""
+
+
+def open_context() -> moderngl.Context:
+    """Open an OpenGL 4.3 context without a window; it belongs to the calling thread. Release it when done.
+
+    Raises:
+        MissingDependencyError: there is no EGL, no driver for it, or the driver lacks what is needed.
+    """
+    try:
+        # moderngl annotates each setting as if it were all of them.
+        context = moderngl.create_standalone_context(backend="egl", require=430)  # type: ignore[arg-type]  # a name
+    except Exception as error:  # moderngl raises bare exceptions with the loader's text
+        raise MissingDependencyError(
+            f"drawing on the GPU needs OpenGL 4.3 through EGL, which did not start ({error}).",
+            hint="Install it, on Debian or Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri, or the graphics "
+            "card's own driver; or use the CPU backend.",
+        ) from error
+    if _LAYER_EXTENSION not in context.extensions:
+        renderer = context.info["GL_RENDERER"]
+        context.release()
+        raise MissingDependencyError(
+            f'the OpenGL driver "{renderer}" lacks {_LAYER_EXTENSION}.',
+            hint="Update the graphics driver, or use the CPU backend.",
+        )
+    return context
+
+
+def describe_graphics() -> str:
+    """Return the name and version of OpenGL here, or why it cannot be used."""
+    try:
+        context = open_context()
+    except JawusdError as error:
+        return f"none ({error.message.rstrip('.')})"
+    try:
+        return f"{context.info['GL_VERSION']}, {context.info['GL_RENDERER']}"
+    finally:
+        context.release()
+
+
+class _Releasable(Protocol):
+    def release(self) -> None: ...
+
+
+Resource = TypeVar("Resource", bound=_Releasable)
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """Hold a layered picture to draw into."""
+
+    texture: moderngl.TextureArray
+    frame: moderngl.Framebuffer
+
+    def release(self) -> None:
+        self.frame.release()
+        self.texture.release()
+
+
+class GlCounter:
+    """Count disagreeing pixels on the GPU; use as a context manager, or close it.
+
+    Counters may share a context. All calls belong to the thread that opened it.
+    """
+
+    def __init__(
+        self,
+        context: moderngl.Context,
+        vertices: Array,
+        plain_faces: NDArray[np.int32],
+        boundary_faces: NDArray[np.int32],
+        *,
+        cull: bool = False,
+    ) -> None:
+        """Copy the scan to the device of an `open_context`; other arguments as for `pixel_counts.RasterCounter`."""
+        self._gl = context
+        self._flags = moderngl.CULL_FACE if cull else moderngl.NOTHING
+        self._stack = contextlib.ExitStack()
+        self._program = self._own(context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT))
+        self._compute = self._own(context.compute_shader(_COUNT))
+        self._compute["drawn"], self._compute["masks"] = 0, 1
+        buffer = self._own(context.buffer(np.ascontiguousarray(vertices, np.float32)))
+        # All teeth first, the boundary over them: later triangles overwrite, so no depth is needed.
+        self._passes = []
+        for shade, faces in ((0.5, plain_faces), (1.0, boundary_faces)):
+            if len(faces):
+                index = self._own(context.buffer(np.ascontiguousarray(faces, np.int32)))
+                array = context.vertex_array(self._program, [(buffer, "3f", "position")], index)
+                self._passes.append((shade, self._own(array)))
+        self._targets: dict[int, _Target] = {}
+        self._masks: moderngl.TextureArray | None = None
+        self._most_layers = int(context.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
+
+    def _own(self, resource: Resource) -> Resource:
+        self._stack.callback(resource.release)
+        return resource
+
+    def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
+        """Set the pictures of one instant; arguments as for `pixel_counts.RasterCounter.show`.
+
+        Raises:
+            ValueError: the shapes do not agree, or the pictures are too large for the device.
+        """
+        checked_screens(matrices, masks, free)
+        views, height, width = masks.shape
+        size = (-(-width // _ROUND_PX) * _ROUND_PX, -(-height // _ROUND_PX) * _ROUND_PX)
+        if size[0] * size[1] * views > _MOST_PIXELS or views > self._most_layers:
+            raise ValueError(f"{views} pictures of {width} x {height} px are more than one drawing may hold")
+        if self._masks is None or self._masks.size != (*size, views):
+            self._drop_textures()
+            self._masks = self._gl.texture_array((*size, views), 1, dtype="u1")
+            self._masks.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        # Padding counts neither as mask nor as a place where a boundary pixel is wrong.
+        flags = np.full((views, size[1], size[0]), 2, np.uint8)
+        flags[:, :height, :width] = masks + np.uint8(2) * free
+        self._masks.write(flags, alignment=1)
+        # To clip coordinates; image row 0 is row 0 of the target: x_ndc = (2 u + 1) / w - 1, and no depth.
+        to_clip = np.array([[2 / size[0], 0, 1 / size[0] - 1], [0, 2 / size[1], 1 / size[1] - 1], [0, 0, 0], [0, 0, 1]])
+        self._to_clip = to_clip @ np.asarray(matrices, np.float64)
+
+    def counts(self, poses: Array) -> NDArray[np.int64]:
+        """Return the counts of poses, as `pixel_counts.RasterCounter.counts` does, shape (N, C, 2)."""
+        width, height, views = self._shown().size
+        most = max(1, min(self._most_layers, _MOST_PIXELS // (width * height)) // views)
+        parts = [self._count_part(poses[k : k + most]) for k in range(0, len(poses), most)]
+        return np.concatenate(parts) if parts else np.empty((0, views, 2), np.int64)
+
+    def _shown(self) -> moderngl.TextureArray:
+        if self._masks is None:
+            raise ValueError("counting needs pictures: call `show` first")
+        return self._masks
+
+    def _count_part(self, poses: Array) -> NDArray[np.int64]:
+        width, height, views = self._shown().size
+        clip = np.einsum("cij,njk->ncki", self._to_clip, poses)  # transposed: GL reads columns first
+        layers = len(poses) * views
+        matrices = self._gl.buffer(np.ascontiguousarray(clip, np.float32))
+        counts = self._gl.buffer(np.zeros(2 * layers, np.uint32))
+        try:
+            self._draw(self._target(layers), matrices, layers)
+            self._shown().use(1)
+            counts.bind_to_storage_buffer(1)
+            self._compute["views"], self._compute["size"] = views, (width, height)
+            self._compute.run(-(-width // _TILE_PX), -(-height // _TILE_PX), layers)
+            self._gl.memory_barrier()
+            return np.frombuffer(counts.read(), np.uint32).astype(np.int64).reshape(len(poses), views, 2)
+        finally:
+            matrices.release()
+            counts.release()
+
+    def _draw(self, target: _Target, matrices: moderngl.Buffer, layers: int) -> None:
+        self._gl.enable_only(self._flags)
+        self._gl.front_face = "cw"  # window rows count downwards here, as in the picture
+        target.frame.use()
+        target.frame.clear()
+        matrices.bind_to_storage_buffer(0)
+        for shade, array in self._passes:
+            self._program["shade"] = shade
+            array.render(instances=layers)
+        target.texture.use(0)
+
+    def _target(self, layers: int) -> _Target:
+        """Return a target of at least this many layers; clearing costs time, so small ones exist beside large ones."""
+        width, height, views = self._shown().size
+        room = min(1 << (layers - 1).bit_length(), self._most_layers)
+        if room not in self._targets:
+            texture = self._gl.texture_array((width, height, room), 1, dtype="f1")
+            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+            self._targets[room] = _Target(texture, self._gl.framebuffer([texture]))
+        return self._targets[room]
+
+    def _drop_textures(self) -> None:
+        for target in self._targets.values():
+            target.release()
+        self._targets.clear()
+        if self._masks is not None:
+            self._masks.release()
+            self._masks = None
+
+    def close(self) -> None:
+        """Free what lies on the device; the context stays."""
+        self._drop_textures()
+        self._stack.close()
+
+    def __enter__(self) -> GlCounter:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()

@@ -1,0 +1,200 @@
+"""Photographs of teeth that are together: pose and focal length of each, and the bite that they share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.formats.finding import Finding
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.photographs import AlignedPhoto, AlignedPhotos
+from jawusd.geometry import transform_point, transform_points
+from jawusd.photographs.contact import Contact
+from jawusd.photographs.drawing import Drawing
+from jawusd.photographs.lens import middle_of
+from jawusd.photographs.search import usual_bites
+from jawusd.photographs.solve import Aligner, Bite, Photo, match, seen_outlines
+from jawusd.photographs.start import Found, Rows, find_first, find_next
+from jawusd.tracking.contour.scan import ARCH_NAMES, Scan, prepare_scan
+
+# Sizes at which all photographs are aligned together, with the gates of the steps [mm].
+_STAGES = (
+    (0.25, (3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 2.0, 2.0)),
+    (0.5, (2.0, 2.0, 1.5, 1.5, 1.2, 1.2, 1.0, 1.0)),
+    (1.0, (1.0,) * 8),
+)
+_AT_WIDTH_PX = 1440.0  # figures in px are for pictures of this width
+_TURN_PX = 10.0  # at that width: outlines across a line are not its own
+_CLEAR_MISFIT = 0.2  # a first photograph below this is not searched for among the others
+# Misfit of lines at half a millimetre beyond which crowns are not those of a picture: 0.28 to 0.36 with the right ones
+# of two patients (six photographs, none refused), 0.55 to 0.70 with those of the other one (six photographs). Front
+# views alone of a synthetic person: 0.08 to 0.10, with the crowns of four others 0.32 to 0.56.
+_GATE_MM, _MOST_MISFIT = 0.5, 0.45
+_SAME_HAND = 1.15  # ratio of the misfits of both handednesses below which they cannot be told apart
+_APART_MM = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoAlignment:
+    """Hold what photographs tell, and what draws it."""
+
+    result: AlignedPhotos
+    bite: Bite  # poses at the size of the pictures
+    rows: Rows
+
+
+def align_photographs(
+    drawings: Sequence[Drawing], meshes: Sequence[Mesh], progress: Callable[[str, int, int], None]
+) -> PhotoAlignment:
+    """Align both rows of teeth with lines drawn in photographs of one bite, taken with one uncalibrated camera.
+
+    Args:
+        drawings: the lines of each photograph; names differ.
+        meshes: upper and lower scan, each in any frame of its own [mm].
+        progress: called with a stage, how much of it is done, and how much there is.
+
+    Raises:
+        TrackingError: a scan has too few faces.
+    """
+    scans = [prepare_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True)]
+    contact = Contact(scans)
+    starts = _starts(drawings, scans, contact, progress)
+    rows = starts[0].rows
+    lines = [one.mirrored() if start.mirrored else one for one, start in zip(drawings, starts, strict=True)]
+    bites = [_refined(start.bite, [own], rows, contact) for start, own in zip(starts, lines, strict=True)]
+    joint = _together(bites, lines, rows, contact)
+    for k in range(len(lines)):
+        progress("check", k, len(lines))
+        own = Bite(joint.photos[k : k + 1], joint.T_upper_lower, joint.gum_mm)
+        bites[k] = _refined(own, lines[k : k + 1], rows, contact)
+    progress("check", len(lines), len(lines))
+    return PhotoAlignment(_result(joint, bites, starts, rows, contact), joint, rows)
+
+
+def _starts(
+    drawings: Sequence[Drawing], scans: Sequence[Scan], contact: Contact, progress: Callable[[str, int, int], None]
+) -> list[Found]:
+    """Return how each photograph begins: one without knowing the bite, the others from its bite."""
+    usual = usual_bites(scans)
+    leads: list[tuple[int, Found]] = []
+    for k, drawing in enumerate(drawings):
+        progress("search", k, len(drawings))
+        leads.append((k, find_first(drawing, scans, usual, contact)))
+        if leads[-1][1].misfit < _CLEAR_MISFIT:
+            break
+    first, lead = min(leads, key=lambda one: one[1].misfit)
+    starts = []
+    for k, drawing in enumerate(drawings):
+        progress("search", k, len(drawings))
+        starts.append(lead if k == first else find_next(drawing, lead.rows, lead.bite.T_upper_lower, contact))
+    progress("search", len(drawings), len(drawings))
+    return starts
+
+
+def _refined(bite: Bite, lines: Sequence[Drawing], rows: Rows, contact: Contact) -> Bite:
+    """Return photographs and bite aligned at growing sizes."""
+    for share, gates in _STAGES:
+        photos = []
+        for photo, own in zip(bite.photos, lines, strict=True):
+            factor = min(1.0, share * _AT_WIDTH_PX / own.size_px[0])
+            drawing = own.shrunk(factor) if factor < 1.0 else own
+            photos.append(Photo(drawing, photo.pose.scaled(drawing.size_px[0] / photo.drawing.size_px[0])))
+        crowns = rows.fine if share == 1.0 else rows.thin
+        aligner = Aligner(crowns, rows.usual.T_upper_lower, contact)
+        bite = aligner.aligned(Bite(tuple(photos), bite.T_upper_lower, bite.gum_mm), gates)
+    photos = [
+        Photo(own, photo.pose.scaled(own.size_px[0] / photo.drawing.size_px[0]))
+        for photo, own in zip(bite.photos, lines, strict=True)
+    ]
+    return Bite(tuple(photos), bite.T_upper_lower, bite.gum_mm)
+
+
+def _together(alone: Sequence[Bite], lines: Sequence[Drawing], rows: Rows, contact: Contact) -> Bite:
+    """Return all photographs with one bite, begun from the bite of each one, the best."""
+    if len(alone) == 1:
+        return alone[0]
+    photos = tuple(bite.photos[0] for bite in alone)
+    aligner = Aligner(rows.fine, rows.usual.T_upper_lower, None)
+    tried = []
+    for one in alone:
+        joint = _refined(Bite(photos, one.T_upper_lower, one.gum_mm), lines, rows, contact)
+        tried.append((float(aligner.misfit(joint, _GATE_MM).mean()), joint))
+    return min(tried, key=lambda entry: entry[0])[1]
+
+
+def _result(joint: Bite, alone: Sequence[Bite], starts: Sequence[Found], rows: Rows, contact: Contact) -> AlignedPhotos:
+    """Return the figures of an alignment."""
+    point = _lower_incisor(rows)
+    misfits = Aligner(rows.fine, rows.usual.T_upper_lower, None).misfit(joint, _GATE_MM).max(1)
+    photos = []
+    for photo, own, start, misfit in zip(joint.photos, alone, starts, misfits, strict=True):
+        off = transform_point(own.T_upper_lower, point) - transform_point(joint.T_upper_lower, point)
+        every, free = _line_distances(photo, joint, rows)
+        photos.append(
+            AlignedPhoto(
+                name=photo.drawing.name,
+                size_px=photo.drawing.size_px,
+                mirrored=start.mirrored,
+                focal_px=photo.pose.focal_px,
+                distortion=photo.pose.opencv_k1(photo.drawing.size_px),
+                T_cam_upper=photo.pose.T_cam_upper,
+                middle_px=middle_of(photo.drawing.size_px),
+                outline_rms_px=_rms(every),
+                outline_median_px=float(np.median(every)),
+                free_rms_px=_rms(free),
+                misfit=float(misfit),
+                other_hand=start.other_misfit / max(start.misfit, 1e-9),
+                T_upper_lower_alone=own.T_upper_lower,
+                alone_off_mm=float(np.linalg.norm(off)),
+            )
+        )
+    depth = contact.depth_mm(joint.T_upper_lower)
+    return AlignedPhotos(joint.T_upper_lower, joint.gum_mm, depth, tuple(photos), _findings(photos))
+
+
+def _line_distances(photo: Photo, joint: Bite, rows: Rows) -> tuple[Array, Array]:
+    """Return distances of all drawn points from outlines, and of those not along the gum [px of 1440], (N,), (M,)."""
+    to_usual = _AT_WIDTH_PX / photo.drawing.size_px[0]
+    found = match(seen_outlines(rows.fine, photo, joint), photo.drawing, _TURN_PX / to_usual)
+    distance = to_usual * np.linalg.norm(found.outlines.pixels - photo.drawing.pixels, axis=1)
+    return distance, distance[found.outlines.gum < 0.5]
+
+
+def _lower_incisor(rows: Rows) -> Array:
+    """Return the highest point of the lower front teeth, scan coordinates [mm], shape (3,)."""
+    points = rows.fine[1].scan.crown_vertices()
+    _, up, front = transform_points(rows.usual.T_anatomical_lower, points).T
+    ahead = np.flatnonzero(front > np.percentile(front, 97))
+    return np.asarray(points[ahead[up[ahead].argmax()]], np.float64)
+
+
+def _findings(photos: Sequence[AlignedPhoto]) -> tuple[Finding, ...]:
+    """Return what is doubtful about an alignment."""
+    out = []
+    for photo in photos:
+        if photo.misfit > _MOST_MISFIT:
+            message = f"the crowns do not fit its lines (misfit {photo.misfit:.2f}, allowed {_MOST_MISFIT})"
+            hint = "Check that the scans are this person's and unchanged since, and that the teeth are together."
+            out.append(
+                Finding("photo_unfit", "error", message, photo.misfit, _MOST_MISFIT, camera=photo.name, hint=hint)
+            )
+        elif photo.other_hand < _SAME_HAND:
+            message = f"it fits about as well if it is {'not ' if photo.mirrored else ''}mirrored"
+            out.append(Finding("photo_hand", "warning", message, photo.other_hand, _SAME_HAND, camera=photo.name))
+        if photo.alone_off_mm > _APART_MM:
+            message = (
+                f"alone it places the lower incisor {photo.alone_off_mm:.1f} mm from where all photographs do "
+                f"(allowed {_APART_MM} mm)"
+            )
+            hint = "One view tells little along its line of sight; other bites in other photographs do as much."
+            out.append(
+                Finding("photo_bite", "warning", message, photo.alone_off_mm, _APART_MM, camera=photo.name, hint=hint)
+            )
+    return tuple(out)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt((values**2).mean()))

@@ -1,0 +1,180 @@
+"""Where a search of photographs begins: all views of both rows, their outlines laid over the drawn lines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.ndimage import distance_transform_edt
+
+from jawusd.base.arrays import Array
+from jawusd.geometry import anatomical_frame, make_transform, se3_inverse, so3_exp
+from jawusd.photographs.crowns import Crowns, draw_teeth, outlines_of
+from jawusd.photographs.drawing import Drawing
+from jawusd.tracking.contour.scan import Scan
+
+_PX_PER_MM = 2.5
+_DISTANCE_MM = 200.0  # from which dental photographs are taken, usually
+_FRONT_MM = np.array([0.0, 0.0, 15.0])  # from the point about which views turn to the front edges
+_YAW = np.radians(np.arange(-75, 76, 15.0))
+_PITCH = np.radians(np.arange(-20, 21, 10.0))
+_ROLL = np.radians([-10.0, 0.0, 10.0])
+# Widths that the picture may have at the teeth [mm].
+_WIDTHS_MM = 38.0 * 1.1 ** np.arange(9)
+_ROWS_APART_MM = 10.0
+_SECTORS = 4  # of directions; lines count only where theirs agree
+_NEAR_PX = 2.0  # of the search: how far off a line still counts half
+# Usual bites: lower front edges behind the upper ones, and how far both rows overlap there [mm].
+_OVERJET_MM, _OVERBITE_MM = 2.5, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Hold one way in which a photograph may show the teeth."""
+
+    share: float  # of the drawn lines that are near an outline [-]
+    T_cam_upper: Array  # shape (4, 4)
+    focal_px: float
+    mirrored: bool
+
+
+@dataclass(frozen=True, eq=False)
+class UsualBite:
+    """Hold where two rows stand if they meet as rows usually do."""
+
+    T_anatomical_upper: Array  # upper scan to (left, up, front) axes, shape (4, 4)
+    T_anatomical_lower: Array  # shape (4, 4)
+
+    @property
+    def frames(self) -> tuple[Array, Array]:
+        """Return both frames, upper and lower."""
+        return self.T_anatomical_upper, self.T_anatomical_lower
+
+    @property
+    def T_upper_lower(self) -> Array:
+        """Return the bite, shape (4, 4)."""
+        return se3_inverse(self.T_anatomical_upper) @ self.T_anatomical_lower
+
+
+def usual_bites(scans: Sequence[Scan]) -> list[UsualBite]:
+    """Return each way in which two rows may stand over one another.
+
+    Each row's plane and forward direction follow from its shape. Which side of a row is up follows from its gum, if it
+    has one; else both are returned.
+    """
+    frames = [[_row_frame(scan, r, side) for side in _sides(scan, r)] for r, scan in enumerate(scans)]
+    shift = make_transform(np.eye(3), np.array([0.0, _OVERBITE_MM, -_OVERJET_MM]))
+    return [UsualBite(upper, shift @ lower) for upper, lower in product(*frames)]
+
+
+def _sides(scan: Scan, arch: int) -> list[float]:
+    """Return the signs that the least axis of a row may have to point up."""
+    if len(scan.gum_faces) < len(scan.crown_faces) // 10:
+        return [1.0, -1.0]
+    gum = scan.vertices[np.unique(scan.gum_faces)].mean(0) - scan.centre
+    towards_gum = float(np.sign(_least_axis(scan) @ gum))
+    return [towards_gum if arch == 0 else -towards_gum]
+
+
+def _least_axis(scan: Scan) -> Array:
+    points = scan.crown_vertices(4000)
+    return np.asarray(np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2], np.float64)
+
+
+def _row_frame(scan: Scan, arch: int, side: float) -> Array:
+    """Return T_anatomical_scan of one row, its origin amid the edges of its front teeth, shape (4, 4)."""
+    points = scan.crown_vertices(4000)
+    up = side * _least_axis(scan)
+    # The frame of a bite whose other row would be this one again, moved.
+    T = anatomical_frame(points, points - _ROWS_APART_MM * up)
+    x, y, z = (points @ T[:3, :3].T).T
+    edge = np.percentile(y[z > np.percentile(z, 90)], 2 if arch == 0 else 98)
+    return make_transform(T[:3, :3], np.array([T[0, 3], -edge, -np.percentile(z, 99.5)]))
+
+
+def searched(
+    drawing: Drawing, crowns: Sequence[Crowns], usual: UsualBite, T_upper_lower: Array, count: int
+) -> list[Candidate]:
+    """Return the most promising views of both rows, at most one for each direction, best first.
+
+    Args:
+        drawing: the lines of the photograph.
+        crowns: upper and lower, thin enough to be drawn thousands of times.
+        usual: says where left, up and front are.
+        T_upper_lower: the bite to search with, shape (4, 4).
+        count: how many candidates to return of each handedness.
+    """
+    size = next_fast_len(int(1.3 * _PX_PER_MM * _WIDTHS_MM.max()), real=True)
+    drawn = list(_drawn_spectra(drawing, size))
+    found: list[Candidate] = []
+    for turn in product(_YAW, _PITCH, _ROLL):
+        base = (
+            make_transform(_facing(turn), np.zeros(3)) @ make_transform(np.eye(3), _FRONT_MM) @ usual.T_anatomical_upper
+        )
+        base[2, 3] += _DISTANCE_MM
+        spectra = _seen_spectra(crowns, base, T_upper_lower, size)
+        best: dict[bool, Candidate] = {}
+        for width_mm, mirrored, spectrum, total in drawn:
+            overlap = irfft2((spectrum * spectra.conj()).sum(0), (size, size))
+            share = float(overlap.max()) / total
+            if mirrored in best and share <= best[mirrored].share:
+                continue
+            row, column = np.unravel_index(int(overlap.argmax()), overlap.shape)
+            # Shifts of the outlines against the middle of the drawn picture, as places of the teeth.
+            shift = [(k + size // 2) % size - size // 2 for k in (column, row)]
+            pose = base.copy()
+            pose[:2, 3] += np.array(shift) / _PX_PER_MM
+            best[mirrored] = Candidate(share, pose, drawing.size_px[0] / width_mm * _DISTANCE_MM, mirrored)
+        found += best.values()
+    found.sort(key=lambda one: -one.share)
+    return [one for way in (False, True) for one in [k for k in found if k.mirrored is way][:count]]
+
+
+def _facing(turn: tuple[float, float, float]) -> Array:
+    """Return the turn from (left, up, front) axes to a camera in front, (right, down, ahead), shape (3, 3)."""
+    yaw, pitch, roll = turn
+    facing = np.diag([1.0, -1.0, -1.0])
+    return np.asarray(so3_exp([0, 0, roll]) @ so3_exp([pitch, 0, 0]) @ facing @ so3_exp([0, yaw, 0]), np.float64)
+
+
+def _drawn_spectra(drawing: Drawing, size: int) -> Iterator[tuple[float, bool, NDArray[np.complex128], float]]:
+    """Yield width of the picture at the teeth [mm], mirrored, spectra by sector, and number of points."""
+    for mirrored in (False, True):
+        lines = drawing.mirrored() if mirrored else drawing
+        middle = 0.5 * (np.array(drawing.size_px) - 1.0)
+        for width_mm in _WIDTHS_MM:
+            pixels = (lines.pixels - middle) * (_PX_PER_MM * width_mm / drawing.size_px[0]) + size / 2
+            picture = _by_sector(pixels, lines.normals, size)
+            yield width_mm, mirrored, rfft2(picture), float(picture.sum())
+
+
+def _by_sector(pixels: Array, normals: Array, size: int) -> Array:
+    """Return pictures that count points by the sector of their direction, shape (_SECTORS, size, size)."""
+    out = np.zeros((_SECTORS, size, size))
+    sector = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / np.pi * _SECTORS).astype(int) % _SECTORS
+    column, row = np.round(pixels).astype(int).T
+    inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
+    out[sector[inside], row[inside], column[inside]] = 1.0
+    return out
+
+
+def _seen_spectra(
+    crowns: Sequence[Crowns], T_cam_upper: Array, T_upper_lower: Array, size: int
+) -> NDArray[np.complex128]:
+    """Return spectra of pictures that are 1 on outlines and fall off around them, shape (_SECTORS, h, w)."""
+    focal = _PX_PER_MM * _DISTANCE_MM
+    K = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    matrices = [K @ T_cam_upper[:3], K @ (T_cam_upper @ T_upper_lower)[:3]]
+    depth, labels = draw_teeth(crowns, matrices, (size, size))
+    seen = outlines_of(crowns, matrices, depth, labels)
+    lines = _by_sector(seen.pixels, seen.normals, size)
+    near = np.zeros_like(lines)
+    for k in range(_SECTORS):
+        any_line = lines[k] > 0
+        if any_line.any():
+            near[k] = np.exp2(-((distance_transform_edt(~any_line) / _NEAR_PX) ** 2))
+    return np.asarray(rfft2(near), np.complex128)

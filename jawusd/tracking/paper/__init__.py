@@ -1,1 +1,0 @@
-"""The energy and the solver of the paper, for comparison."""

@@ -1,7 +1,0 @@
-"""Photographs of teeth that are together, taken with a camera that nobody calibrated."""
-
-from jawusd.tracking.photographs.align import PhotoAlignment, align_photographs
-from jawusd.tracking.photographs.drawing import Drawing, read_lines
-from jawusd.tracking.photographs.solve import seen_outlines
-
-__all__ = ["Drawing", "PhotoAlignment", "align_photographs", "read_lines", "seen_outlines"]

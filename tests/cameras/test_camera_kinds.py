@@ -1,0 +1,391 @@
+"""Calibrations as programs write them: names that collide, lenses that are not read, files that lack or add something.
+
+The cameras that every readable file states are the same three; what is read is compared with their projections.
+"""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jawusd.base.errors import CalibrationError, JawusdError
+from jawusd.cameras import files as camera_files
+from jawusd.cameras.calibration import load_calibration, save_calibration
+from jawusd.cameras.files import calibration_files, lacks_sizes, load_cameras_file
+from jawusd.cameras.parts import CameraFormat, names_of_labels
+from jawusd.geometry import Camera, make_transform, se3_inverse
+from jawusd.pipeline import cameras as capture_cameras
+from jawusd.rig.cameras import read_cameras
+
+NAMES = ("front", "left", "right")
+SIZE = (1280, 720)
+K = np.array([[1400.0, 0, 641.5], [0, 1410.0, 357.0], [0, 0, 1]])
+LENS = np.array([0.05, -0.02, 0.001, -0.0007])
+
+
+def look(angle):
+    R = Rotation.from_euler("yx", [angle, 4], degrees=True).as_matrix() @ np.diag([1.0, -1, -1])
+    return make_transform(R, np.array([3.0, -2.0, 330.0]))
+
+
+CAMERAS = [Camera(name, SIZE, K, LENS, look(angle)) for name, angle in zip(NAMES, (0, -25, 30))]
+POINTS = np.random.default_rng(0).uniform(-40, 40, (200, 3))
+
+
+def same(found, names=NAMES, wanted=CAMERAS):
+    assert [camera.name for camera in found] == list(names)
+    for one, other in zip(found, wanted, strict=True):
+        assert one.size_px == other.size_px
+        np.testing.assert_allclose(one.project(POINTS), other.project(POINTS), atol=1e-5)
+
+
+# --------------------------------------------------------------------------------------------------------- writers
+
+
+def metashape(labels=NAMES, cameras=CAMERAS, extra=""):
+    out = [
+        '<document version="1.5.0"><chunk><sensors><sensor id="0" type="frame"><resolution width="1280" height="720"/>'
+    ]
+    k1, k2, p1, p2 = LENS
+    terms = {"f": K[1, 1], "b1": K[0, 0] - K[1, 1], "cx": K[0, 2] + 0.5 - 640, "cy": K[1, 2] + 0.5 - 360}
+    terms |= {"k1": k1, "k2": k2, "p1": p2, "p2": p1}
+    out += ['<calibration class="adjusted"><resolution width="1280" height="720"/>']
+    out += [f"<{key}>{float(value)!r}</{key}>" for key, value in terms.items()]
+    out += [f"{extra}</calibration></sensor></sensors><cameras>"]
+    for label, camera in zip(labels, cameras, strict=True):
+        matrix = " ".join(repr(float(x)) for x in se3_inverse(camera.T_cam_world).ravel())
+        out.append(f'<camera sensor_id="0" label="{label}"><transform>{matrix}</transform></camera>')
+    return "".join([*out, "</cameras></chunk></document>"])
+
+
+def stored(camera, suffix, *, key="camera_matrix", before="", after=""):
+    """Return what OpenCV's own writer makes of a camera, with text before or behind its values."""
+    file = cv2.FileStorage(f"x{suffix}", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    file.write("image_width", camera.size_px[0])
+    file.write("image_height", camera.size_px[1])
+    file.write(key, camera.K)
+    file.write("distortion_coefficients", camera.distortion[None])
+    file.write("R", camera.T_cam_world[:3, :3])
+    file.write("T", camera.T_cam_world[:3, 3:])
+    text = file.releaseAndGetString()
+    if suffix == ".xml":
+        return text.replace("<opencv_storage>", f"<opencv_storage>{before}").replace(
+            "</opencv_storage>", f"{after}</opencv_storage>"
+        )
+    if suffix == ".json":
+        return text.replace("{", "{" + before, 1)
+    return text.replace("---\n", f"---\n{before}", 1) + after
+
+
+def colmap(folder, points, *, model="OPENCV", names=None, ids=None, lens=None):
+    """Write a text model; points says what stands below each image: None for no line at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    values = " ".join(map(repr, map(float, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, *LENS))))
+    (folder / "cameras.txt").write_text(f"# Camera list\n1 {model} 1280 720 {values}\n" + (lens or ""))
+    lines = ["# Image list with two lines of data per image:"]
+    for k, camera in enumerate(CAMERAS):
+        q = np.roll(Rotation.from_matrix(camera.T_cam_world[:3, :3]).as_quat(), 1)
+        pose = " ".join(repr(float(x)) for x in (*q, *camera.T_cam_world[:3, 3]))
+        lines.append(f"{k + 1} {pose} {(ids or [1, 1, 1])[k]} {(names or [f'{n}.png' for n in NAMES])[k]}")
+        lines += [] if points[k] is None else [points[k]]
+    (folder / "images.txt").write_text("\n".join([*lines, ""]))
+    return folder
+
+
+def nerfstudio(**changes):
+    frames = []
+    for camera in CAMERAS:
+        T = se3_inverse(camera.T_cam_world) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"images/{camera.name}.png", "transform_matrix": T.tolist()})
+    values = {"w": 1280, "h": 720, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
+    values |= dict(zip(("k1", "k2", "p1", "p2"), map(float, LENS)))
+    return json.dumps({**values, "camera_model": "OPENCV", "frames": frames, **changes})
+
+
+def toml(tmp_path):
+    save_calibration(tmp_path / "plain.toml", CAMERAS)
+    return (tmp_path / "plain.toml").read_text()
+
+
+# ----------------------------------------------------------------------------------------------------------- names
+
+LABELS = {
+    ("front.jpg", "left.jpg", "right.jpg"): ("front", "left", "right"),
+    ("cam.01", "cam.02", "cam.03"): ("cam.01", "cam.02", "cam.03"),
+    ("cam.01", "cam.02", "side"): ("cam.01", "cam.02", "side"),
+    ("a.left.png", "a.right.png", "b.png"): ("a.left", "a.right", "b"),
+    ("0001.jpg", "0001.png", "0002.png"): ("0001.jpg", "0001.png", "0002"),
+    ("front/0001.jpg", "left/0001.jpg", "right/0001.jpg"): ("front_0001", "left_0001", "right_0001"),
+    ("D:\\x\\front.tif", "D:\\x\\left.tif", "D:\\x\\right.tif"): ("front", "left", "right"),
+    ("0001", "0001", "0001"): 'labels 3 cameras alike: "0001", "0001", "0001"',
+    ("a.png", "a.png", "b.png"): 'labels 2 cameras alike: "a.png", "a.png"',
+    ("left/1.png", "left/1.png", "right/1.png"): "labels 2 cameras alike",
+}
+
+
+@pytest.mark.parametrize("labels", LABELS)
+def test_labels_become_names_of_their_own(tmp_path, labels):
+    (tmp_path / "a.xml").write_text(metashape(labels))
+    rows = [f"{label},1,2,{k},10,20,30,35" for k, label in enumerate(labels)]
+    (tmp_path / "a.csv").write_text("\n".join(["#name,x,y,alt,heading,pitch,roll,f", *rows, ""]))
+    wanted = LABELS[labels]
+    if isinstance(wanted, str):
+        for name in ("a.xml", "a.csv"):
+            with pytest.raises(CalibrationError, match=rf"a\.\w+: {wanted}"):
+                load_cameras_file(tmp_path / name, sizes=dict.fromkeys(("0001", "a", "b", "1"), SIZE))
+        return
+    order = np.argsort(wanted)
+    same(load_cameras_file(tmp_path / "a.xml"), sorted(wanted), [CAMERAS[k] for k in order])
+    found = load_cameras_file(tmp_path / "a.csv", sizes=dict.fromkeys(wanted, SIZE))
+    assert [camera.name for camera in found] == sorted(wanted) and len({c.T_cam_world.tobytes() for c in found}) == 3
+
+
+def test_a_capture_names_cameras_whose_labels_have_dots_in_its_own_letters(tmp_path, monkeypatch):
+    (tmp_path / "a.xml").write_text(metashape(("cam.01", "cam.02", "cam.03")))
+    sources = [SimpleNamespace(name=f"cam_0{k}", clip=None, masks=None) for k in (1, 2, 3)]
+    capture = SimpleNamespace(calibration=tmp_path / "a.xml", calibration_unit_mm=1.0, cameras=sources, folder=tmp_path)
+    same(capture_cameras.load_cameras(capture), ("cam_01", "cam_02", "cam_03"))
+    sources[0].name = "cam_09"
+    with pytest.raises(
+        CalibrationError, match=r"does not know camera cam_09 of the capture; it names cam\.01, cam\.02"
+    ):
+        capture_cameras.load_cameras(capture)
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".xml", ".json"])
+def test_two_files_of_one_camera_that_differ_are_named(tmp_path, suffix):
+    for camera in CAMERAS:
+        (tmp_path / f"{camera.name}.yml").write_text(stored(camera, ".yml"))
+    (tmp_path / f"left{suffix}").write_text(stored(CAMERAS[1], suffix))
+    same(load_cameras_file(tmp_path))  # says the same
+    (tmp_path / f"left{suffix}").write_text(stored(replace(CAMERAS[2], name="left"), suffix))
+    with pytest.raises(CalibrationError, match=r"says R of camera left otherwise than another file"):
+        load_cameras_file(tmp_path)
+
+
+def test_two_cameras_under_the_same_keys_of_one_file_are_not_one(tmp_path):
+    inner = "".join(f"{c.name}:\n" + stored(c, ".yml").split("---\n")[1].replace("\n", "\n   ") for c in CAMERAS)
+    (tmp_path / "all.yml").write_text("%YAML:1.0\n---\n" + inner)
+    with pytest.raises(CalibrationError, match=r'all\.yml: holds "camera_matrix" twice'):
+        load_cameras_file(tmp_path / "all.yml")
+
+
+def test_cameras_of_a_stage_with_equal_names_are_named_by_their_paths(tmp_path):
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
+    for path in ("/a/cam", "/b/cam", "/b/other", "/top"):
+        UsdGeom.Camera.Define(stage, path)
+    UsdGeom.Camera(stage.GetPrimAtPath("/top")).CreateProjectionAttr("orthographic")
+    stage.Save()
+    sizes = dict.fromkeys(("a_cam", "b_cam", "other"), SIZE)
+    assert [camera.name for camera in read_cameras(tmp_path / "shot.usda", lambda: sizes)] == [
+        "a_cam",
+        "b_cam",
+        "other",
+    ]
+
+
+# ---------------------------------------------------------------------------------------------------- lens models
+
+YAML_MODELS = ["equidistant", "fisheye", "omni-radtan", "inverse_brown_conrady"]
+YAML_MODELS = [f"distortion_model: {model}" for model in YAML_MODELS]
+YAML_MODELS += ['model_type: "KANNALA_BRANDT"', "fisheye_model: 1", "camera_model: omni"]
+
+
+@pytest.mark.parametrize("model", YAML_MODELS)
+@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
+def test_lens_models_of_opencv_storage_that_are_not_read_are_named(tmp_path, model, suffix):
+    key, value = (part.strip().strip('"') for part in model.split(":"))
+    said = {
+        ".yml": f"{model}\n",
+        ".xml": f"<{key}>{value}</{key}>",
+        ".json": f'"{key}": "{value}",',
+    }[suffix]
+    (tmp_path / f"left{suffix}").write_text(stored(CAMERAS[1], suffix, before=said))
+    with pytest.raises(CalibrationError, match=rf"left\{suffix}: .*{key} = {value}, a lens model that is not read"):
+        load_cameras_file(tmp_path / f"left{suffix}")
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        "distortion_model: plumb_bob",
+        "distortion_model: rational_polynomial",
+        "fisheye_model: 0",
+        "camera_model: Basler acA1300",
+        "camera_model: pinhole",
+    ],
+)
+def test_lens_models_that_are_opencvs_are_read(tmp_path, model):
+    (tmp_path / "left.yml").write_text(stored(CAMERAS[1], ".yml", before=f"{model}\n"))
+    same(load_cameras_file(tmp_path / "left.yml"), ["left"], CAMERAS[1:2])
+
+
+def test_lens_models_of_other_files_that_are_not_read_are_named(tmp_path):
+    from pxr import Sdf, Usd, UsdGeom
+
+    (tmp_path / "p3.xml").write_text(metashape(extra="<p3>0.01</p3>"))
+    plain = toml(tmp_path)
+    (tmp_path / "a.toml").write_text(plain.replace("size =", 'distortion_model = "kannala_brandt4"\nsize =', 1))
+    (tmp_path / "b.toml").write_text(plain.replace("size =", "fisheye = true\nsize =", 1))
+    (tmp_path / "a.json").write_text(nerfstudio(camera_model="OPENCV_FISHEYE"))
+    (tmp_path / "b.json").write_text(nerfstudio(is_fisheye=True))
+    models = {"p3.xml": "p3 = 0.01, allowed is 0", "a.toml": "distortion_model = kannala_brandt4"}
+    models |= {"b.toml": "fisheye = True", "a.json": "OPENCV_FISHEYE", "b.json": "only perspective models"}
+    for model in ("OPENCV_FISHEYE", "FOV", "THIN_PRISM_FISHEYE", "SIMPLE_RADIAL_FISHEYE"):
+        colmap(tmp_path / model, [""] * 3, model=model)
+        models[model] = f"model {model}, allowed are"
+    for name, said in models.items():
+        with pytest.raises(CalibrationError, match=said):
+            load_cameras_file(tmp_path / name)
+    for name, value in (("cameraProjectionType", "fisheyePolynomial"), ("omni:lensdistortion:model", "opencvFisheye")):
+        stage = Usd.Stage.CreateInMemory()
+        camera = UsdGeom.Camera.Define(stage, "/cam").GetPrim()
+        camera.CreateAttribute(name, Sdf.ValueTypeNames.Token).Set(value)
+        stage.Export(str(tmp_path / "a.usda"))
+        with pytest.raises(CalibrationError, match=rf"cam: has {name} = {value}"):
+            read_cameras(tmp_path / "a.usda", lambda: {"cam": SIZE})
+
+
+# ------------------------------------------------------------------------------------------------------- COLMAP
+
+POINT_LINES = {
+    "no line of points": [None, None, None],
+    "empty lines": ["", "", ""],
+    "points": ["1.5 2.5 -1", "1.5 2.5 7 3.25 4.75 -1", "1 2 3 4 5 6 7 8 9"],
+    "empty and none": ["", None, ""],
+    "points and none": ["1.5 2.5 -1 3 4 5", None, "1 2 -1"],
+    "blank lines between": ["\n", "", "\n\n"],
+}
+
+
+@pytest.mark.parametrize("kind", POINT_LINES)
+def test_every_image_of_colmap_is_read(tmp_path, kind):
+    same(load_cameras_file(colmap(tmp_path / "m", POINT_LINES[kind])))
+    names = ["front view.png", "left 2.png", "right.png"]
+    found = load_cameras_file(colmap(tmp_path / "n", POINT_LINES[kind], names=names))
+    same(found, ("front view", "left 2", "right"))
+
+
+@pytest.mark.parametrize(
+    ("points", "names", "said"),
+    [
+        (["1.5 2.5 -1 8", "", ""], None, '"1.5 2.5 -1 8" is not an image'),
+        (["", "1 2", ""], None, '"1 2" is not an image'),
+        (["", "", ""], ["a/front.png", "a/left.png", "a/right.png"], "camera a stands in different places"),
+        (["", "", ""], ["a.png", "a.png", "b.png"], "camera a stands in different places"),
+    ],
+)
+def test_lines_of_colmap_that_are_no_image_and_images_of_one_name_are_refused(tmp_path, points, names, said):
+    with pytest.raises(CalibrationError, match=said):
+        load_cameras_file(colmap(tmp_path, points, names=names))
+
+
+def test_images_of_a_camera_with_different_lenses_are_refused(tmp_path):
+    lens = "2 PINHOLE 1280 720 1300 1300 640 360\n"
+    colmap(tmp_path, [""] * 3, names=["a/1.png", "b/1.png", "c/1.png"], ids=[1, 2, 1], lens=lens)
+    assert [camera.K[0, 0] for camera in load_cameras_file(tmp_path)] == [1400, 1300, 1400]
+    text = (tmp_path / "images.txt").read_text().splitlines()
+    again = text[1].replace(" 1 a/1.png", " 2 a/2.png")
+    (tmp_path / "images.txt").write_text("\n".join([*text, again, ""]))
+    with pytest.raises(CalibrationError, match="camera a has different lenses in its images"):
+        load_cameras_file(tmp_path)
+
+
+def test_a_binary_model_of_colmap_says_how_to_make_it_text(tmp_path):
+    for name in ("cameras.bin", "images.bin"):
+        (tmp_path / name).write_bytes(bytes(8))
+    for path in (tmp_path, tmp_path / "cameras.bin"):
+        with pytest.raises(CalibrationError, match="binary"):
+            load_cameras_file(path)
+
+
+# ------------------------------------------------------------------------------------------- OpenCV, byte order marks
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".yaml", ".xml", ".json"])
+def test_opencv_storage_of_any_kind_is_read(tmp_path, suffix):
+    for camera in CAMERAS:
+        text = stored(camera, suffix.replace("yaml", "yml"), key="Camera_Matrix")
+        (tmp_path / f"{camera.name}{suffix}").write_text(text)
+    (tmp_path / "notes.json").write_text("{}")
+    (tmp_path / "other.xml").write_text("<note/>")
+    same(load_cameras_file(tmp_path))
+    same(load_cameras_file(tmp_path / f"left{suffix}"), ["left"], CAMERAS[1:2])
+    assert calibration_files(tmp_path) == [tmp_path / f"{name}{suffix}" for name in NAMES]
+    assert lacks_sizes(tmp_path) and lacks_sizes(tmp_path / f"left{suffix}")
+
+
+NOT_NEEDED = {
+    ".Nan in a matrix": "errors: !!opencv-matrix\n   rows: 2\n   cols: 1\n   dt: f\n   data: [ 0.2, .Nan ]\n",
+    ".Inf in a matrix": "errors: !!opencv-matrix\n   rows: 1\n   cols: 2\n   dt: d\n   data: [ -.Inf, .Inf ]\n",
+    "words in a matrix": "errors: !!opencv-matrix\n   rows: 1\n   cols: 2\n   dt: u\n   data: [ a, b ]\n",
+    "a matrix that is too short": "errors: !!opencv-matrix\n   rows: 3\n   cols: 2\n   dt: d\n   data: [ 1. ]\n",
+    "a scalar": "avg_reprojection_error: .Nan\n",
+    "text": 'calibration_time: "Fri 1 May"\nt: later\n',
+}
+
+
+@pytest.mark.parametrize("kind", NOT_NEEDED)
+def test_values_that_no_camera_needs_do_not_matter(tmp_path, kind):
+    for camera in CAMERAS:
+        (tmp_path / f"{camera.name}.yml").write_text(stored(camera, ".yml", after=NOT_NEEDED[kind]))
+    same(load_cameras_file(tmp_path))
+
+
+@pytest.mark.parametrize("value", [".Nan", ".Inf", "-.Inf"])
+def test_needed_values_that_are_not_finite_are_named(tmp_path, value):
+    text = stored(CAMERAS[1], ".yml")
+    (tmp_path / "left.yml").write_text(text.replace("1400.", value, 1))
+    with pytest.raises(CalibrationError, match='"camera_matrix" holds a value that is not finite'):
+        load_cameras_file(tmp_path / "left.yml")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_byte_order_marks_matter_to_no_reader(tmp_path, encoding):
+    def write(name, text):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(text.replace("\n", "\r\n").encode(encoding))
+        return tmp_path / name
+
+    same(load_cameras_file(write("a.xml", metashape())))
+    same(load_cameras_file(write("a.json", nerfstudio())))
+    same(load_cameras_file(write("a.toml", toml(tmp_path))))
+    for camera in CAMERAS:
+        write(f"cv/{camera.name}.yml", stored(camera, ".yml"))
+    same(load_cameras_file(tmp_path / "cv"))
+    plain = colmap(tmp_path / "plain", [None] * 3)
+    for name in ("cameras.txt", "images.txt"):
+        write(f"colmap/{name}", (plain / name).read_text().split("\n", 1)[1])
+    same(load_cameras_file(tmp_path / "colmap"))
+    same(load_calibration(tmp_path / "a.toml"))
+
+
+# ------------------------------------------------------------------------------------------------------- registry
+
+
+def test_a_new_format_is_a_module(tmp_path, monkeypatch):
+    """What makes a format known is its FORMAT: here one that is put in front of the others."""
+    (tmp_path / "a.rig").write_text("")
+    with pytest.raises(JawusdError):
+        load_cameras_file(tmp_path / "a.rig")
+    mine = CameraFormat(lambda path: path.suffix == ".rig", lambda path, sizes: CAMERAS, lacks_sizes=True)
+    known = camera_files._formats()
+    monkeypatch.setattr(camera_files, "_formats", lambda: [*known, mine])
+    same(load_cameras_file(tmp_path / "a.rig"))
+    assert lacks_sizes(tmp_path / "a.rig") and calibration_files(tmp_path / "a.rig") == [tmp_path / "a.rig"]
+
+
+def test_a_folder_without_cameras_says_what_is_read(tmp_path):
+    (tmp_path / "readme.txt").write_text("nothing")
+    with pytest.raises(CalibrationError, match="a folder without cameras of a kind that is read"):
+        load_cameras_file(tmp_path)
+
+
+def test_no_labels_need_no_names(tmp_path):
+    assert names_of_labels(tmp_path, []) == []

@@ -1,0 +1,201 @@
+"""Pixel counts: the CPU's against numpy on unpacked pictures, OpenGL's against the CPU's, and what fails without GL."""
+
+import importlib
+import sys
+
+import numpy as np
+import pytest
+
+from jawusd.base.errors import MissingDependencyError
+from jawusd.geometry import make_transform, se3_exp
+from jawusd.meshes import raster
+from jawusd.paper.pixel_counts import RasterCounter
+
+moderngl = pytest.importorskip("moderngl", reason="moderngl is not installed")
+gl = importlib.import_module("jawusd.paper.gl")
+
+SIZE = (200, 130)
+VIEWS = 3
+EDGE_TIES_PX = 4  # pixels whose centre lies on a side to rounding, out of some 6000
+
+
+def torus(rings: int = 60, sides: int = 30) -> tuple[np.ndarray, np.ndarray]:
+    """Make a closed mesh with outward winding, about 40 mm across."""
+    i, j = np.meshgrid(np.arange(rings), np.arange(sides), indexing="ij")
+    a, b = i * 2 * np.pi / rings, j * 2 * np.pi / sides
+    r = 15 + 5 * np.cos(b)
+    vertices = np.stack([r * np.cos(a), r * np.sin(a), 5 * np.sin(b)], -1).reshape(-1, 3)
+    at = lambda i, j: (i % rings) * sides + j % sides  # noqa: E731
+    quads = np.stack([at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)], -1).reshape(-1, 4)
+    return vertices, np.vstack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
+
+
+VERTICES, FACES = torus()
+IS_BOUNDARY = VERTICES[FACES[:, 0], 1] > 8
+PLAIN, BOUNDARY = FACES[~IS_BOUNDARY], FACES[IS_BOUNDARY]
+
+
+def matrices() -> np.ndarray:
+    """Make three views of the origin, 200 mm away, y down."""
+    K = np.array([[700.0, 0, 99.3], [0, 720.0, 64.8], [0, 0, 1]])
+    turns = [
+        make_transform(np.diag([1.0, -1, -1]), [0, 0, 200.0]) @ se3_exp([0, yaw, 0, 0, 0, 0]) for yaw in (0, 0.6, -0.7)
+    ]
+    return np.stack([K @ T[:3] for T in turns])
+
+
+def some_poses(count: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.stack([se3_exp(rng.normal(size=6) * [0.3, 0.3, 0.3, 3, 3, 3]) for _ in range(count)])
+
+
+def drawn(faces: np.ndarray, matrix: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    points = np.empty((len(VERTICES), 3), np.float32)
+    raster.project(VERTICES.astype(np.float32), (matrix @ pose).astype(np.float32), points)
+    bits = np.zeros((SIZE[1], raster.words_for(SIZE[0])), np.uint64)
+    raster.draw_silhouette(points, np.ascontiguousarray(faces), 0, 0, SIZE[0], False, bits)
+    return raster.unpack_bits(bits, SIZE[0])
+
+
+def screens() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return matrices, masks drawn at another pose, and free places larger than the masks."""
+    P = matrices()
+    masks = np.stack([drawn(FACES, m, some_poses(1, seed=9)[0]) for m in P])
+    free = masks.copy()
+    free[:, :50, :90] = True
+    return P, masks, free
+
+
+@pytest.fixture(scope="module")
+def context():
+    try:
+        opened = gl.open_context()
+    except MissingDependencyError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    yield opened
+    opened.release()
+
+
+def test_the_cpu_counts_what_numpy_counts() -> None:
+    P, masks, free = screens()
+    poses = some_poses(5)
+    with RasterCounter(VERTICES, PLAIN, BOUNDARY) as counter:
+        counter.show(P, masks, free)
+        found = counter.counts(poses)
+    assert found.shape == (5, VIEWS, 2)
+    for n, pose in enumerate(poses):
+        for c, m in enumerate(P):
+            assert found[n, c, 0] == np.count_nonzero(masks[c] & ~drawn(FACES, m, pose))
+            assert found[n, c, 1] == np.count_nonzero(drawn(BOUNDARY, m, pose) & ~free[c])
+    assert (found > 0).any(axis=(0, 1)).all()
+
+
+@pytest.mark.parametrize("options", [{"threads": 2}, {"threads": 3, "cull": True}, {"cull": True}])
+def test_threads_and_culling_leave_the_silhouette_of_a_solid_alone(options) -> None:
+    P, masks, free = screens()
+    poses = some_poses(7)
+    results = []
+    for chosen in ({}, options):
+        with RasterCounter(VERTICES, PLAIN, BOUNDARY, **chosen) as counter:
+            counter.show(P, masks, free)
+            results.append(counter.counts(poses))
+    np.testing.assert_array_equal(results[0][..., 0], results[1][..., 0])
+    if "cull" not in options:  # the far side of the boundary may lie outside the mask
+        np.testing.assert_array_equal(results[0], results[1])
+    assert (results[1] <= results[0]).all()
+
+
+@pytest.mark.parametrize("cull", [False, True])
+def test_opengl_agrees_with_the_cpu(context, cull) -> None:
+    P, masks, free = screens()
+    poses = some_poses(20)
+    with RasterCounter(VERTICES, PLAIN, BOUNDARY, cull=cull) as cpu:
+        cpu.show(P, masks, free)
+        expected = cpu.counts(poses)
+    with gl.GlCounter(context, VERTICES, PLAIN, BOUNDARY, cull=cull) as counter:
+        counter.show(P, masks, free)
+        found = counter.counts(poses)
+        assert np.abs(found - expected).max() <= EDGE_TIES_PX
+        assert expected.max() > 100 * EDGE_TIES_PX
+        assert context.error is not None  # clears it: making a framebuffer, moderngl binds the one released before
+        # A drawing counts the same alone and in a batch.
+        np.testing.assert_array_equal(np.concatenate([counter.counts(pose[None]) for pose in poses]), found)
+    assert context.error == "GL_NO_ERROR"
+
+
+def test_opengl_splits_what_is_too_much_for_one_drawing(context, monkeypatch) -> None:
+    P, masks, free = screens()
+    poses = some_poses(9)
+    with gl.GlCounter(context, VERTICES, PLAIN, BOUNDARY) as counter:
+        counter.show(P, masks, free)
+        whole = counter.counts(poses)
+        monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192 * 2 * VIEWS)  # two poses at a time
+        np.testing.assert_array_equal(counter.counts(poses), whole)
+        monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192)
+        with pytest.raises(ValueError, match="more than one drawing may hold"):
+            counter.show(P, masks, free)
+
+
+def test_counters_share_a_context_and_take_pictures_of_changing_size(context) -> None:
+    P, masks, free = screens()
+    pose = some_poses(1)
+    with (
+        gl.GlCounter(context, VERTICES, PLAIN, BOUNDARY) as first,
+        gl.GlCounter(context, VERTICES, FACES, np.empty((0, 3), np.int32)) as second,
+        RasterCounter(VERTICES, PLAIN, BOUNDARY) as cpu,
+    ):
+        for views, width, height in ((3, 200, 130), (2, 70, 60), (1, 130, 129), (3, 200, 130)):
+            part = (P[:views], masks[:views, :height, :width], free[:views, :height, :width])
+            for counter in (first, second, cpu):
+                counter.show(*part)
+            expected = cpu.counts(pose)
+            assert np.abs(first.counts(pose) - expected).max() <= EDGE_TIES_PX
+            assert np.abs(second.counts(pose)[..., 0] - expected[..., 0]).max() <= EDGE_TIES_PX
+            assert not second.counts(pose)[..., 1].any()
+
+
+@pytest.mark.parametrize("change", ["matrices", "masks", "free", "empty"])
+def test_wrong_shapes_are_refused(change) -> None:
+    P, masks, free = screens()
+    if change == "matrices":
+        P = P[:2]
+    elif change == "masks":
+        masks = masks[0]
+    elif change == "free":
+        free = free[:, :-1]
+    else:
+        masks = free = masks[:, :0]
+    with RasterCounter(VERTICES, PLAIN, BOUNDARY) as counter, pytest.raises(ValueError, match="needs|free"):
+        counter.show(P, masks, free)
+
+
+def test_no_driver_is_one_clear_error(monkeypatch) -> None:
+    def broken(**_):
+        raise Exception("libEGL.so.1 not loaded")
+
+    monkeypatch.setattr(moderngl, "create_standalone_context", broken)
+    with pytest.raises(MissingDependencyError, match=r"libEGL\.so\.1 not loaded.*apt-get install libegl1.*CPU backend"):
+        gl.open_context()
+
+
+def test_a_driver_without_layers_is_refused(monkeypatch) -> None:
+    class Old:
+        extensions = frozenset({"GL_ARB_compute_shader"})
+        info = {"GL_RENDERER": "Old Card"}
+        released = False
+
+        def release(self):
+            self.released = True
+
+    old = Old()
+    monkeypatch.setattr(moderngl, "create_standalone_context", lambda **_: old)
+    with pytest.raises(MissingDependencyError, match='"Old Card" lacks GL_ARB_shader_viewport_layer_array'):
+        gl.open_context()
+    assert old.released
+
+
+def test_without_moderngl_the_error_says_what_to_install(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "moderngl", None)
+    monkeypatch.delitem(sys.modules, "jawusd.paper.gl")
+    with pytest.raises(MissingDependencyError, match=r"moderngl.*pip install 'jawusd\[all\]'"):
+        importlib.import_module("jawusd.paper.gl")

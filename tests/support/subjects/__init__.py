@@ -1,0 +1,1 @@
+"""Random subjects for tests and benchmarks: mouths, scanners, annotators, short captures."""

@@ -1,0 +1,166 @@
+"""A short take of anybody in front of any cameras: a closed bite, opening, both sides, protrusion, the head moving."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array
+from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
+from jawusd.synthetic.bite import Bite
+from jawusd.synthetic.kinematics import Joint, controlled_pose, smoothstep
+from jawusd.synthetic.soft_tissue import LipState
+
+SIZES_PX = ((640, 360), (960, 540), (1280, 720), (1920, 1080))
+_TARGET_MM = np.array([0.0, -9.0, -12.0])
+_LIFT_STEP, _MOST_LIFT = 0.004, 0.35
+_TOUCH_MM = -0.02
+_LIFT_FRAMES = 4  # within which the jaw is lifted out of a contact
+_LEAST_MOVE, _WHOLE_MOVE = 4, 8  # frames of the shortest movement, and of one over the whole range
+#: Frames of the closed bite at the start.
+CLOSED_FRAMES = 3
+_PIVOT_MM = np.array([0.0, 20.0, -95.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Poses of one person over a take, at any time in frames of the reference camera."""
+
+    joint: Joint
+    controls: Array  # opening, lateral, protrusion per frame, lifted out of tooth contact, shape (F, 3)
+    T_world_head: Array  # pose of the head at rest, shape (4, 4)
+    head_phase: Array  # of the head's motion, shape (6,)
+    head_rate: float  # rad per frame
+    lips: LipState | None  # None with retractors
+    tongue_mm: Array  # forward, up, left, while open, shape (3,)
+
+    def jaw(self, t: float) -> Array:
+        """Return T_skull_mandible (4, 4) in the bite's frame."""
+        now = _between(self.controls, t)
+        pose = controlled_pose(self.joint, *now.tolist())
+        still = controlled_pose(self.joint, 0.0, 0.0, 0.0)
+        return np.asarray(pose @ se3_inverse(still))
+
+    def head(self, t: float) -> Array:
+        """Return T_world_skull (4, 4) for the bite's frame."""
+        wave = np.sin(self.head_rate * t * np.array([1.0, 0.8, 1.2, 0.9, 1.1, 0.7]) + self.head_phase)
+        turn = so3_exp(wave[:3] * np.deg2rad([1.6, 2.2, 1.2]))
+        shift = wave[3:] * [2.0, 1.2, 2.0]
+        return np.asarray(self.T_world_head @ make_transform(turn, _PIVOT_MM + shift - turn @ _PIVOT_MM))
+
+
+def draw_cameras(rng: np.random.Generator) -> tuple[list[Camera], Array]:
+    """Return two to four cameras and the place of the head T_world_bite (4, 4); the world is the first one's frame."""
+    count = int(rng.choice([2, 3, 4], p=[0.1, 0.75, 0.15]))
+    size = SIZES_PX[int(rng.choice(4, p=[0.2, 0.35, 0.3, 0.15]))]
+    apart = rng.uniform(26.0, 48.0)
+    around = {2: (-0.45, 0.45), 3: (0.0, 1.0, -1.0), 4: (0.0, 1.0, -1.0, 0.3)}[count]
+    above = {2: (0.0, 0.0), 3: (0.0, 0.1, -0.1), 4: (-0.15, 0.0, 0.0, 0.6)}[count]
+    distance = rng.uniform(150.0, 600.0)
+    span = rng.uniform(88.0, 140.0)  # what the picture's width shows at the teeth [mm]
+    T_cams: list[Array] = []
+    cameras = []
+    for k in range(count):
+        azimuth = np.deg2rad(around[k] * apart + rng.normal(0.0, 3.0))
+        height = np.deg2rad(above[k] * 40.0 + rng.normal(0.0, 5.0))
+        far = distance * rng.uniform(0.88, 1.12)
+        T_cams.append(_looking(azimuth, height, far, np.deg2rad(rng.normal(0.0, 3.0))))
+        cameras.append(_camera(f"cam{k}", size, size[0] * far / (span * rng.uniform(0.95, 1.12)), rng))
+    T_bite_world = se3_inverse(T_cams[0])
+    placed = [replace(camera, T_cam_world=T @ T_bite_world) for camera, T in zip(cameras, T_cams, strict=True)]
+    return placed, T_cams[0]
+
+
+def _looking(azimuth: float, height: float, distance: float, roll: float) -> Array:
+    """Return T_cam_bite of a camera that looks at the teeth from a direction (to the left, up)."""
+    towards = np.array([np.sin(azimuth) * np.cos(height), np.sin(height), np.cos(azimuth) * np.cos(height)])
+    right = np.cross([0.0, -1.0, 0.0], -towards)
+    right /= np.linalg.norm(right)
+    R = so3_exp(np.array([0.0, 0.0, roll])) @ np.stack([right, np.cross(-towards, right), -towards])
+    return make_transform(R, -R @ (_TARGET_MM + distance * towards))
+
+
+def _camera(name: str, size: tuple[int, int], focal: float, rng: np.random.Generator) -> Camera:
+    """Return a camera at the origin; its lens bends the corners by -3 to +1.5 %."""
+    width, height = size
+    corner = (width**2 + height**2) / (4.0 * focal**2)
+    bend = rng.uniform(-0.03, 0.015)
+    distortion = np.array([bend / corner, 0.15 * abs(bend) / corner**2, *rng.normal(0.0, 2e-4, 2), 0.0])
+    middle = np.array(size) / 2 - 0.5 + rng.normal(0.0, 0.004, 2) * width
+    K = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
+    return Camera(name, size, K, distortion, np.eye(4))
+
+
+def draw_motion(joint: Joint, bite: Bite, T_world_head: Array, frames: int, rng: np.random.Generator) -> Motion:
+    """Draw a take of so many frames; movements are lifted until the teeth pass one another."""
+    joint = replace(joint, incisor=bite.incisor)
+    controls = _exercise(frames, rng)
+    lift = np.zeros(frames)
+    for i in range(CLOSED_FRAMES, frames):
+        while lift[i] < _MOST_LIFT and _cuts(joint, bite, controls[i] + [lift[i], 0.0, 0.0]):
+            lift[i] += _LIFT_STEP
+    controls[CLOSED_FRAMES:, 0] += _evenly(lift)[CLOSED_FRAMES:]
+    turn = so3_exp(np.deg2rad(rng.normal(0.0, [4.0, 5.0, 4.0])))
+    centre = _TARGET_MM
+    T_head = T_world_head @ make_transform(turn, centre - turn @ centre)
+    lips = None
+    if rng.random() < 0.55:
+        lips = LipState(rng.uniform(6.0, 9.0), rng.uniform(6.0, 9.0), rng.uniform(25.0, 29.0), rng.normal(0.0, 0.02))
+    raised = rng.uniform(0.0, 1.0) * (rng.random() < 0.4)
+    tongue = np.array([6.0 * raised, 7.0 * raised, rng.uniform(-2.0, 2.0)])
+    return Motion(joint, controls, T_head, rng.uniform(0.0, 2 * np.pi, 6), rng.uniform(0.1, 0.35), lips, tongue)
+
+
+def _exercise(frames: int, rng: np.random.Generator) -> Array:
+    """Return opening, lateral and protrusion per frame, shape (F, 3): opening, then what there is time for.
+
+    Scaled to what a jaw does in that time: at 24 frames/s it opens by up to some 100 mm/s.
+    """
+    side = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.55)
+    others = np.array([[0.12, side, 0.0], [0.1, -side, 0.1], [0.1, 0.0, rng.uniform(0.4, 0.8)]])
+    rng.shuffle(others)
+    free = frames - CLOSED_FRAMES
+    moves = int(np.clip(free // _LEAST_MOVE, 1, 1 + len(others)))
+    reach = min(1.0, free / moves / _WHOLE_MOVE)
+    values = reach * np.array([[0.0, 0.0, 0.0], [rng.uniform(0.25, 0.45), 0.0, 0.0], *others])[: moves + 1]
+    keys = CLOSED_FRAMES - 1 + free * np.linspace(0.0, 1.0, moves + 1)
+    return np.stack([_through(keys, values, t) for t in range(frames)])
+
+
+def _evenly(lift: Array) -> Array:
+    """Return the least even curve that is nowhere below a lift per frame, shape (F,)."""
+    apart = np.abs(np.subtract.outer(np.arange(len(lift)), np.arange(len(lift))))
+    share = np.where(apart < _LIFT_FRAMES, np.cos(0.5 * np.pi * apart / _LIFT_FRAMES) ** 2, 0.0)
+    return np.asarray((share * lift).max(axis=1), np.float64)
+
+
+def _between(rows: Array, t: float) -> Array:
+    """Interpolate rows (F, n) smoothly in time, never beyond the two neighbours (Fritsch & Butland 1984)."""
+    step = np.diff(rows, axis=0)
+    product, total = step[:-1] * step[1:], step[:-1] + step[1:]
+    inner = np.where(product > 0, 2.0 * product / np.where(product > 0, total, 1.0), 0.0)
+    slope = np.concatenate([step[:1], inner, step[-1:]])
+    k = int(np.clip(np.floor(t), 0, len(step) - 1))
+    s = float(np.clip(t - k, 0.0, 1.0))
+    rising = rows[k] + s * s * (3.0 - 2.0 * s) * step[k]
+    return np.asarray(rising + s * (1.0 - s) * ((1.0 - s) * slope[k] - s * slope[k + 1]))
+
+
+def _through(keys: Array, values: Array, t: float) -> Array:
+    """Interpolate smoothly between key values (K, 3)."""
+    k = int(np.clip(np.searchsorted(keys, t, side="right") - 1, 0, len(keys) - 2))
+    share = smoothstep((t - keys[k]) / (keys[k + 1] - keys[k]))
+    return np.asarray((1.0 - share) * values[k] + share * values[k + 1])
+
+
+def _cuts(joint: Joint, bite: Bite, controls: Array) -> bool:
+    pose = controlled_pose(joint, *controls) @ se3_inverse(controlled_pose(joint, 0.0, 0.0, 0.0))
+    return bite.occlusion.gap(pose) < _TOUCH_MM
+
+
+def sampled(motion: Callable[[float], Array], times: NDArray[np.float64]) -> Array:
+    """Return poses at times, shape (T, 4, 4)."""
+    return np.stack([motion(float(t)) for t in times])
