@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jawusd.base.plugin_path import announce_schema
+from jawusd.base.version import __version__
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from jawusd.pipeline.track import track
 
 __all__ = ["JawRig", "JawusdError", "__version__", "build", "load", "track"]
-__version__ = "0.1.0"
 
 _MODULES = {
     "JawRig": "jawusd.evaluator",

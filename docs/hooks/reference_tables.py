@@ -106,10 +106,9 @@ def errors_page():
         if isinstance(value, type) and issubclass(value, jawusd.base.errors.JawusdError)
     }
     ordered = sorted(kinds, key=lambda kind: (kind.exit_code, len(kind.__mro__), kind.__name__))
-    rows = [
-        f"| {kind.exit_code} | [`{kind.__name__}`][jawusd.base.errors.{kind.__name__}] | {kind.__doc__.splitlines()[0]} |\n"
-        for kind in ordered
-    ]
+    names = {kind: f"[`{kind.__name__}`][{kind.__module__}.{kind.__name__}]" for kind in ordered}
+    rows = [f"| {kind.exit_code} | {names[kind]} | {kind.__doc__.splitlines()[0]} |\n" for kind in ordered]
     table = "| exit code | error | |\n|---|---|---|\n" + "".join(rows)
-    directive = "::: jawusd.base.errors\n    options:\n      show_root_toc_entry: false\n      show_root_heading: false\n"
+    options = "    options:\n      show_root_toc_entry: false\n      show_root_heading: false\n"
+    directive = f"::: jawusd.base.errors\n{options}"
     return f"{ERRORS}{escaped(EXIT_CODES)}\n\n{table}\n## In Python\n\n{directive}"

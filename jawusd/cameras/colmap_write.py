@@ -1,4 +1,4 @@
-"""Write cameras for other programs; see `camera_files` for the conventions."""
+"""Write cameras for other programs; see `files` for the conventions."""
 
 from __future__ import annotations
 

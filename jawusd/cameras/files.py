@@ -1,7 +1,7 @@
-"""Calibrations of other programs, recognised by their names: a registry of the modules `camera_*` beside this one.
+"""Calibrations of other programs, recognised by file name: a registry of the modules beside this one.
 
-Each of them has a CameraFormat as FORMAT (see `camera_parts`). What none of them reads is TOML of aniposelib, Pose2Sim
-or Caliscope: `calibration`.
+A module that defines a CameraFormat as FORMAT (see `parts`) is a format. Files that none of them reads are TOML of
+aniposelib, Pose2Sim or Caliscope: `calibration`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 
-import jawusd.formats
 from jawusd.base.errors import CalibrationError
 from jawusd.base.inputs import check_input
 from jawusd.cameras.calibration import load_calibration
@@ -37,8 +36,8 @@ _INSTEAD = "Export the cameras for Nuke (.nk, from 3DEqualizer) or as USD; `jawu
 
 @cache
 def _formats() -> list[CameraFormat]:
-    names = sorted(module.name for module in pkgutil.iter_modules(jawusd.formats.__path__))
-    modules = [import_module(f"jawusd.formats.{name}") for name in names if name.startswith("camera_")]
+    names = sorted(module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]))
+    modules = [import_module(f"{__package__}.{name}") for name in names]
     return [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
 
 

@@ -37,7 +37,7 @@ _OTHER_MODELS = re.compile(
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """Describe a format of cameras: a module `camera_*` with one of these as FORMAT is all that a new one needs."""
+    """Describe a format of cameras: a module of this folder with one of these as FORMAT is all that a new one needs."""
 
     # 1 if a file or folder is of this format by its name, 2 if it begins so, 0 if it is another
     reads: Callable[[Path], int]

@@ -30,9 +30,7 @@ def live(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; the next free one if taken.")] = 8080,
     head: Annotated[Head, typer.Option(help="fixed: the cameras are worn, and move with the head.")] = Head.free,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so long.", show_default=False)] = None,
-    silence: Annotated[
-        float, typer.Option(min=0.1, help="How long a device or stream may send no picture [s].")
-    ] = 10.0,
+    silence: Annotated[float, typer.Option(min=0.1, help="End when a source sends no picture for so long [s].")] = 10.0,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search and follow the teeth.")] = 2,
     allow_outside: Outside = False,
     prim: Prim = None,
@@ -51,14 +49,13 @@ def live(
     viewer = open_viewer(rig, "127.0.0.1", port, prim) if view else None
     if viewer is not None:
         say(f"{viewer.url}  (Ctrl+C stops)", err=True)
-    fixed = head is Head.fixed
     try:
         for found in follow(
             rig,
             shot,
             sources,
             prim=prim,
-            fixed_head=fixed,
+            fixed_head=head is Head.fixed,
             jobs=jobs,
             seconds=seconds,
             silence_s=silence,

@@ -26,7 +26,7 @@ class RunLog:
         Raises:
             OutputError: it cannot be written.
         """
-        from jawusd import __version__
+        from jawusd.base.version import __version__
         from jawusd.formats.atomic import destination, is_stream, open_stream
 
         self._start = time.monotonic()

@@ -46,7 +46,7 @@ def _root(
     ] = None,
 ) -> None:
     if version:
-        from jawusd import __version__
+        from jawusd.base.version import __version__
 
         say(f"jawusd {__version__}")
         raise typer.Exit

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import scipy
@@ -26,12 +26,11 @@ from jawusd.fitting.pca import fit_pca
 from jawusd.fitting.screening import screened
 from jawusd.formats.model import JawModel
 
-if TYPE_CHECKING:
-    from jawusd.paper.nlpca import Nlpca
-
 #: Called with the steps done and the steps in all.
 Progress = Callable[[int, int], None]
 Method = Literal["anchored", "additive", "paper", "pca"]
+#: Fit the decoder of one method to data that show some parameters (3,).
+FormFitter = Callable[[TrainingData, Mask, "FittingConfig"], FittedForm]
 
 _MOST_CAPTURED = 2000  # captured parameters that a model keeps
 # A measured pose is off the model beyond the residuals of nearly all trained and nearly all left-out poses: 99.5 % of
@@ -67,6 +66,14 @@ class FittingConfig:
             raise ValueError(f"starts must be at least 1, got {self.starts}")
 
 
+#: The methods fitted here; `jawusd.paper.model.FORMS` adds the paper's own, which needs torch.
+FORMS: Mapping[str, FormFitter] = {
+    "anchored": lambda data, shown, config: fit_anchored(data, shown, config.trim_mad),
+    "additive": lambda data, shown, config: fit_additive(data, shown, config.trim_mad),
+    "pca": lambda data, shown, config: fit_pca(data, shown),
+}
+
+
 @one_blas_thread
 def fit_model(
     source: Source,
@@ -77,6 +84,7 @@ def fit_model(
     T_rest: ArrayLike | None = None,
     config: FittingConfig = FittingConfig(),
     actor: str = "",
+    forms: Mapping[str, FormFitter] = FORMS,
     progress: Progress | None = None,
 ) -> JawModel:
     """Fit a person's jaw model.
@@ -88,6 +96,7 @@ def fit_model(
         mandible_vertices: points whose motion is measured, mandible coordinates [mm], shape (V, 3); None: the
             landmarks.
         T_rest: T_skull_mandible of the closed bite, shape (4, 4); None when the scans lie in occlusion.
+        forms: the fitter of each method.
 
     Returns:
         The model. `d` and `residual_mm` are those of the raw poses; `meta` holds the error tables [mm], the frames
@@ -113,8 +122,8 @@ def fit_model(
     warnings += [AnatomyWarning("not_shown", sentence) for sentence in sentences]
     if len(data) < _FEW_POSES:
         warnings.append(AnatomyWarning("few_poses", f"Only {len(data)} poses: the model interpolates coarsely."))
-    form = fit_form(data, shown, config)
-    errors, uncertainty, unseen_mm = _errors(data, shown, form, config, lambda fold: notify(fold + 1, steps))
+    form = forms[config.method](data, shown, config)
+    errors, uncertainty, unseen_mm = _errors(data, shown, form, config, forms, lambda fold: notify(fold + 1, steps))
     d, _ = data.metric.nearest(form.model, data.motion[form.kept])
     if not np.isfinite(d).all():
         raise FittingError("the parameters of some training poses cannot be found.", hint="Check the poses' units.")
@@ -146,27 +155,13 @@ def fit_model(
     return model
 
 
-def fit_form(
-    data: TrainingData, shown: Mask, config: FittingConfig, nets: dict[int, Nlpca] | None = None
-) -> FittedForm:
-    """Fit the decoder of `config.method` alone to data that show some parameters (3,); `nets` as in `fit_paper`.
-
-    Raises:
-        FittingError: the method cannot be fitted to these data.
-    """
-    if config.method == "anchored":
-        return fit_anchored(data, shown, config.trim_mad)
-    if config.method == "additive":
-        return fit_additive(data, shown, config.trim_mad)
-    if config.method == "pca":
-        return fit_pca(data, shown)
-    from jawusd.paper.model import fit_paper
-
-    return fit_paper(data, shown, config.literal, config.starts, config.seed, nets)
-
-
 def _errors(
-    data: TrainingData, shown: Mask, form: FittedForm, config: FittingConfig, notify: Callable[[int], None]
+    data: TrainingData,
+    shown: Mask,
+    form: FittedForm,
+    config: FittingConfig,
+    forms: Mapping[str, FormFitter],
+    notify: Callable[[int], None],
 ) -> tuple[dict[str, ErrorTable], dict[str, dict[str, float]], Array]:
     """Return the error tables of a fit by name, and the rest of `unseen_errors`, empty without hold-out."""
     tables = seen_errors(data, form)
@@ -176,7 +171,7 @@ def _errors(
     seed = form.notes.get("seed")
     again = replace(config, starts=1, seed=seed if isinstance(seed, int) else config.seed)
     tables["holdout"], uncertainty, rms_mm = unseen_errors(
-        data, form.kept, config.holdout_folds, lambda part: fit_form(part, shown, again), notify
+        data, form.kept, config.holdout_folds, lambda part: forms[config.method](part, shown, again), notify
     )
     return tables, uncertainty, rms_mm
 

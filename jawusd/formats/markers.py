@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.base.arrays import Array
+from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FormatError, UnitsError
 from jawusd.base.tables import read_text, split_rows, to_numbers
 from jawusd.formats.numbered import is_pattern, numbered_files
@@ -78,9 +78,9 @@ def mark_hidden(points: Array, zeros: bool = True) -> Array:
         zeros: a marker at exactly 0 0 0 is out of sight.
     """
     with np.errstate(invalid="ignore"):
-        seen = (np.abs(points) < _OUT_OF_SIGHT).all(axis=-1)
+        seen: Mask = np.all(np.abs(points) < _OUT_OF_SIGHT, axis=-1)
     if zeros:
-        seen &= (points != 0).any(axis=-1)
+        seen = seen & (points != 0).any(axis=-1)
     return np.where(seen[..., None], points, np.nan)
 
 

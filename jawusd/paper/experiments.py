@@ -13,13 +13,13 @@ from jawusd.base.errors import FittingError
 from jawusd.fitting.blas import one_blas_thread
 from jawusd.fitting.coverage import FAR_MM, bound_not_reached, missing_movements, shown_parameters
 from jawusd.fitting.data import Source, SubjectAnatomy, TrainingData, select
-from jawusd.fitting.fit import FittingConfig, Progress, fit_form
+from jawusd.fitting.fit import FORMS, FittingConfig, Progress
 from jawusd.fitting.form import FittedForm
 from jawusd.formats.experiments import Coverage, Distances, Experiments
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_exp, se3_log, transform_point, transform_points
 from jawusd.paper.condyle_paths import condyle_paths, parameter_paths, path_distances, sagittal_section
-from jawusd.paper.model import COMPONENTS, PaperFit
+from jawusd.paper.model import COMPONENTS, PaperFit, fit_paper
 from jawusd.paper.nlpca import Nlpca
 from jawusd.paper.synthesis import Bounds, captured_reference, distance_to_nearest
 
@@ -126,7 +126,10 @@ def _fit_all(
         start = time.perf_counter()
         try:
             chosen = replace(config, method=MODELS[name].method, literal=MODELS[name].literal)
-            form = fit_form(data, shown, chosen, nets)  # the two variants of the paper's model share their networks
+            if chosen.method == "paper":  # its two variants share their networks
+                form: FittedForm = fit_paper(data, shown, chosen.literal, chosen.starts, chosen.seed, nets)
+            else:
+                form = FORMS[chosen.method](data, shown, chosen)
         except FittingError as error:
             if name == DEFAULT:
                 raise

@@ -6,13 +6,26 @@ import textwrap
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from jawusd.base.arrays import Array
 from jawusd.formats.experiments import CondylePath, Coverage, Distances, Experiments
-from jawusd.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, PALE, SKY, VERMILION, new_figure, save_figure
+from jawusd.report.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PALE,
+    SKY,
+    VERMILION,
+    inline_svg,
+    new_figure,
+    save_figure,
+)
 
 FIGURES = ("fig5_condyle_path", "fig12_reconstruction", "fig13_synthesis", "coverage")
 
@@ -39,6 +52,18 @@ def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
         coverage_figure(found.coverage, found.actor),
     )
     return [file for name, figure in zip(FIGURES, drawn, strict=True) for file in save_figure(figure, folder, name)]
+
+
+def inline_figures(found: Experiments) -> dict[str, Markup]:
+    """Return the plots of the experiments as SVG, by the names of their places on the report's page."""
+    figures = {
+        "coverage": (coverage_figure(found.coverage, found.actor), "Captured poses, the bounds and the gaps."),
+        "reconstruction": (reconstruction_figure(found), "Histograms of the reconstruction error of each model."),
+        "synthesis": (synthesis_figure(found), "Histograms of the distance of random poses to captured ones."),
+        "condyle": (condyle_figure(found), "Path of the left condyle when the jaw opens."),
+        "parameters": (parameter_figure(found), "Path of the left condyle for each parameter."),
+    }
+    return {key: inline_svg(figure, key, words) for key, (figure, words) in figures.items()}
 
 
 def condyle_figure(found: Experiments) -> Figure:

@@ -12,7 +12,7 @@ Twists enter in mandible-metric coordinates, which makes the result independent 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -22,9 +22,11 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FittingError
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.models import AdditiveModel
+from jawusd.fitting import fit
 from jawusd.fitting.curves import MEASURED, Curve, in_millimetres
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.error_table import pose_errors, summarise
+from jawusd.fitting.fit import FormFitter
 from jawusd.fitting.form import FittedForm
 from jawusd.geometry import se3_exp, se3_log
 from jawusd.paper.nlpca import Nlpca
@@ -143,6 +145,13 @@ def fit_paper(
     notes |= {"groups": [list(part.group) for part in best.parts], "seed": best.seed, "components": COMPONENTS}
     notes["train_errors_as_published"] = summarise(pose_errors(data, _rebuilt(best, data.motion, root)))
     return PaperFit(model, np.ones(len(data), dtype=bool), notes, best, root)
+
+
+#: All methods, the paper's own included.
+FORMS: Mapping[str, FormFitter] = {
+    **fit.FORMS,
+    "paper": lambda data, shown, config: fit_paper(data, shown, config.literal, config.starts, config.seed),
+}
 
 
 def _network_sum(data: TrainingData, points: Array, root: Array, literal: bool, seed: int, net: Nlpca) -> _Sum:

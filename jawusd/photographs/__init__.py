@@ -1,4 +1,7 @@
-"""Photographs of teeth that are together, taken with a camera that nobody calibrated."""
+"""The bite from photographs of closed teeth, taken with uncalibrated cameras.
+
+Uses the contours of `tracking`; nothing but `pipeline` imports it.
+"""
 
 from jawusd.photographs.align import PhotoAlignment, align_photographs
 from jawusd.photographs.drawing import Drawing, read_lines

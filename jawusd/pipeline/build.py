@@ -31,7 +31,7 @@ from jawusd.pipeline.report import (
 )
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
 from jawusd.pipeline.segment_record import delete_masks
-from jawusd.pipeline.state import CALIBRATION, FIRST_PASS, LABELS, Progress, no_progress
+from jawusd.pipeline.state import CALIBRATION, FIRST_PASS, LABELS, Progress, StageRecord, no_progress
 from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
 from jawusd.pipeline.workspace import Stage, Workspace, opened
@@ -149,21 +149,8 @@ def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], 
         for found in check.result["findings"]:
             tell(Finding.from_json(found))
 
-    scans = None
-    if not all_labelled(capture):
-        scans = run.run(SCANS, ["teeth"], [], lambda: _label_scans(run))
-        run.capture = with_stored_labels(run.capture, run.folder / LABELS)
-
-    calibration = None
-    if capture.calibration is None and capture.boards is not None:
-        boards = capture.boards.model_dump(mode="json", exclude={"videos"})
-        picks = capture.bootstrap.model_dump(mode="json") if capture.bootstrap else None
-        # Without picks, the stated size of the squares is checked with the masks.
-        inputs = ["boards", "teeth", *([] if picks else ["masks", "videos"])]
-        calibration = run.run(CALIBRATE, inputs, [boards, picks, names], lambda: _calibrate(run))
-        run.capture = run.capture.model_copy(
-            update={"calibration": run.folder / CALIBRATION, "calibration_unit_mm": 1.0}
-        )
+    scans = None if all_labelled(capture) else _labelled(run)
+    calibration = _calibrated(run) if capture.calibration is None and capture.boards is not None else None
 
     sync = run.run(SYNC, [], [videos, capture.sync.model_dump(), names, capture.fps], lambda: _sync(run))
     offsets = sync.result["offsets"]
@@ -205,21 +192,33 @@ def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], 
     }
 
 
+def _labelled(run: Workspace) -> StageRecord[dict[str, str]]:
+    """Tell crown from gum in scans without paint and without a file of labels."""
+    folder = run.folder / LABELS
+    none: dict[str, str] = {}
+    record = run.run(SCANS, ["teeth"], [], lambda: (store_labels(run.capture, folder), none))
+    run.capture = with_stored_labels(run.capture, folder)
+    return record
+
+
+def _calibrated(run: Workspace) -> StageRecord[CalibrationSummary]:
+    """Calibrate the cameras from the boards."""
+    capture, path = run.capture, run.folder / CALIBRATION
+    boards = capture.boards.model_dump(mode="json", exclude={"videos"}) if capture.boards else None
+    picks = capture.bootstrap.model_dump(mode="json") if capture.bootstrap else None
+    # Without picks, the stated size of the squares is checked with the masks.
+    parts = ["boards", "teeth", *([] if picks else ["masks", "videos"])]
+    settings = [boards, picks, [camera.name for camera in capture.cameras]]
+    record = run.run(CALIBRATE, parts, settings, lambda: ([path], calibrate_boards(capture, path, run.progress)))
+    run.capture = capture.model_copy(update={"calibration": path, "calibration_unit_mm": 1.0})
+    return record
+
+
 def _check(run: Workspace) -> tuple[list[Path], CheckResult]:
     """Check the capture before any work, and refuse it with all errors at once."""
     findings = check_capture(run.capture, run.folder, progress=run.progress)
     refuse_errors(findings, run.capture)
     return [], {"findings": [finding.as_json() for finding in findings]}
-
-
-def _label_scans(run: Workspace) -> tuple[list[Path], dict[str, str]]:
-    """Tell crown from gum in scans without paint and without a file of labels."""
-    return store_labels(run.capture, run.folder / LABELS), {}
-
-
-def _calibrate(run: Workspace) -> tuple[list[Path], CalibrationSummary]:
-    path = run.folder / CALIBRATION
-    return [path], calibrate_boards(run.capture, path, run.progress)
 
 
 def _sync(run: Workspace) -> tuple[list[Path], SyncResult]:

@@ -11,8 +11,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TypedDict
 
-from jawusd import __version__
 from jawusd.base.guard import SETTING, machine_memory, memory_limit
+from jawusd.base.version import __version__
 
 _NEEDED_TO_BUILD = ("build",)
 _NEEDED_CODECS = ("h264", "ffv1", "png")

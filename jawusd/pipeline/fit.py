@@ -45,7 +45,7 @@ from jawusd.pipeline.subject import Subject, registered_subject
 if TYPE_CHECKING:
     import h5py
 
-    from jawusd.fitting.config import Method
+    from jawusd.fitting.fit import Method
 
 #: Frame numbers (F,) and T_skull_mandible [mm] (F, 4, 4), NaN where there is no pose.
 Poses = tuple[NDArray[np.int64], Array]
@@ -106,6 +106,7 @@ def fit_subject(
     """
     from jawusd.fitting import FittingConfig, fit_model
     from jawusd.fitting.speeds import with_speeds
+    from jawusd.paper.model import FORMS
 
     registration = motion.meta.get("registration") if isinstance(motion, Tracks) else None
     if registration is not None:
@@ -122,6 +123,7 @@ def fit_subject(
             T_rest=rest,
             config=FittingConfig(method=cast("Method", method)),  # which checks the name
             actor=subject.name,
+            forms=FORMS,
             progress=partial(progress, "fit"),
         )
         model.meta["inferred"] = list(subject.inferred)

@@ -31,8 +31,8 @@ from distributed import (
 from distributed.comm import connect
 from distributed.utils import silence_logging_cmgr
 
-from jawusd import __version__
 from jawusd.base.errors import ClusterError, JawusdError
+from jawusd.base.version import __version__
 from jawusd.formats.atomic import write_csv_atomic, write_text_atomic
 from jawusd.formats.capture_list import ListedCapture
 from jawusd.pipeline.build import BuildOptions, FitSummary, build

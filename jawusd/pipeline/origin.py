@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 
-from jawusd import __version__
+from jawusd.base.version import __version__
 from jawusd.formats.report import Origin
 
 _PACKAGES = ("numpy", "scipy", "numba", "usd-core", "opencv-contrib-python-headless", "av")

@@ -91,7 +91,9 @@ def write_build_report(
         FormatError, RigError: a file of the build is damaged.
         OutputError: the file cannot be written.
     """
-    from jawusd.report.document import draw_figures, write_document  # before the work: it may not be installed
+    # before the work: they may not be installed
+    from jawusd.paper.figures import inline_figures
+    from jawusd.report.document import draw_figures, write_document
 
     progress("report", 0, 4)
     tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
@@ -103,7 +105,7 @@ def write_build_report(
         met = pool.submit(attempt, "contacts of the teeth", unmet, lambda: contact_pictures(model, subject))
         data = _without_pictures(folder, facts, tracks, model, subject, experiments)
         progress("report", 1, 4)
-        figures = draw_figures(data)
+        figures = draw_figures(data) | (inline_figures(data.experiments) if data.experiments else {})
         progress("report", 2, 4)
         overlays, contacts = drawn.result() or (), met.result() or ()
     left_out = tuple(dict.fromkeys((*data.left_out, *unmet, *unseen)))

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from jawusd import __version__
 from jawusd.base.errors import CaptureError, JawusdError, OutputError
+from jawusd.base.version import __version__
 from jawusd.formats.capture import Capture
 from jawusd.pipeline.capture_inputs import InputWatch
 from jawusd.pipeline.memory import give_back_memory

@@ -25,7 +25,7 @@ def carried_files(stubs: Iterable[Path]) -> dict[str, str]:
         ValueError: A module imports jawusd in another form than `from jawusd.x import y`.
     """
     sources: dict[str, str] = {}
-    version = _VERSION.search((_ROOT / "__init__.py").read_text(encoding="utf-8"))
+    version = _VERSION.search((_ROOT / "base" / "version.py").read_text(encoding="utf-8"))
     files = {"jawusd/__init__.py": version[0] + "\n" if version else ""}
     for stub in stubs:
         text = stub.read_text(encoding="utf-8")

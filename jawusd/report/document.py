@@ -20,13 +20,6 @@ from jawusd.formats.contact import DEEP, TOUCHING
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
-from jawusd.paper.figures import (
-    condyle_figure,
-    coverage_figure,
-    parameter_figure,
-    reconstruction_figure,
-    synthesis_figure,
-)
 from jawusd.report.facts import TracksFacts, model_facts, sync_facts, tracks_facts
 from jawusd.report.ranges import human_ranges
 from jawusd.report.replay import replay_data
@@ -44,7 +37,8 @@ def write_document(
     """Write the report to an HTML file; return what it says in short.
 
     Args:
-        figures: what `draw_figures` returned, if they are drawn already.
+        figures: plots by the names of their places on the page; None: `draw_figures`. Those of the experiments are
+            `paper.figures.inline_figures`.
 
     Raises:
         OutputError: the file cannot be written.
@@ -115,22 +109,11 @@ def own_file(name: str) -> Markup:
 
 
 def draw_figures(data: ReportData) -> dict[str, Markup]:
-    """Return the plots of a report by the names that its page has for them; pictures are not looked at."""
-    drawn = {
+    """Return the plots of tracks and model by the names of their places on the page."""
+    return {
         "tracking": inline_svg(tracking_figure(data.tracks), "tracking", "How every frame was tracked."),
         "model": inline_svg(model_figure(data.model), "model", "Parameters, model error and margin of every frame."),
     }
-    found = data.experiments
-    if found is None:
-        return drawn
-    figures = {
-        "coverage": (coverage_figure(found.coverage, found.actor), "Captured poses, the bounds and the gaps."),
-        "reconstruction": (reconstruction_figure(found), "Histograms of the reconstruction error of each model."),
-        "synthesis": (synthesis_figure(found), "Histograms of the distance of random poses to captured ones."),
-        "condyle": (condyle_figure(found), "Path of the left condyle when the jaw opens."),
-        "parameters": (parameter_figure(found), "Path of the left condyle for each parameter."),
-    }
-    return drawn | {key: inline_svg(figure, key, words) for key, (figure, words) in figures.items()}
 
 
 def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict[str, float]]]]]:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jawusd import __version__
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import RigError
+from jawusd.base.version import __version__
 from jawusd.evaluator import JawRig
 from jawusd.formats.gltf import Material, Node, Surface, save_glb
 from jawusd.formats.mesh import Mesh, natural_colors

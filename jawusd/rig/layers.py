@@ -11,10 +11,10 @@ from typing import TypeVar
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, Vt
 
-from jawusd import __version__
 from jawusd.base.arrays import Array
 from jawusd.base.errors import OutputError, RigError
 from jawusd.base.inputs import check_path
+from jawusd.base.version import __version__
 from jawusd.formats.atomic import atomic_path
 from jawusd.rig import _gf
 from jawusd.rig.layout import ACTOR, BESIDE

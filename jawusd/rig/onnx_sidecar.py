@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 from onnx import helper
 
-from jawusd import __version__
+from jawusd.base.version import __version__
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.rig.arrays import model_hash

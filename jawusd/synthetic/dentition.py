@@ -24,9 +24,9 @@ from jawusd.synthetic.dental_arch import (
     crown_colors,
     gum_ridge,
 )
-from jawusd.synthetic.population import ArchTraits, Gums, Traits
 from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
+from jawusd.synthetic.traits import ArchTraits, Gums, Traits
 
 _AROUND = 36
 # Gum on a crown, from its cervical line down: distance outwards and height [mm].

@@ -1,7 +1,7 @@
 """Do teeth pass through teeth? python tests/benchmarks/contact.py [CAPTURE ...] [--persons 10] [--poses 2000]
 
 CAPTURE is a folder with truth/truth.npz; the persons are synthetic, half of them of `synthetic.anatomy` (with bones),
-half of `synthetic.population` (any bite, scanned). Each rig is fitted to the true motion with tracking noise.
+half of `tests/support/subjects` (any bite, scanned). Each rig is fitted to the true motion with tracking noise.
 
 The oracle shares nothing with the rig's clearances: random points of one surface, their nearest points among random
 points of the other's outside (k-d tree), inside by winding numbers of all triangles (Barill et al. 2018, as libigl has
@@ -31,6 +31,8 @@ import igl
 import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 from subjects.short_capture import ShortConfig, draw_capture
 
 from jawusd.evaluator import JawRig

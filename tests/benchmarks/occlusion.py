@@ -8,10 +8,14 @@ with --faults, what is said of scans that were moved, turned, scaled, mirrored o
 """
 
 import argparse
+import sys
 from collections import Counter
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 from subjects.short_capture import ShortConfig, draw_capture
 
 from jawusd.formats.mesh import Mesh, painted_labels

@@ -41,6 +41,7 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 from population_faults import FAULTS, NotPossible
 from population_score import AXES, ROWS, STEADY_MM, Outcome, run
 from subjects.short_capture import ShortConfig, write_short_capture

@@ -8,11 +8,15 @@ those where both share one.
 """
 
 import argparse
+import sys
 import time
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 from subjects.short_capture import ShortConfig, draw_capture
 
 from jawusd.formats.capture import load_capture

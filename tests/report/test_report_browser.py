@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 from browser import headless_chromium, keep_picture, open_page
-from report_data import experiments, report_data, solve_data
+from report_data import experiments, report_data, solve_data, write_document
 
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.report import Origin, ReplayPart
-from jawusd.report.document import write_document
 from jawusd.report.solve_page import write_solve_page
 
 chromium = pytest.fixture(headless_chromium, scope="module")

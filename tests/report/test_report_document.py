@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from example_rig import moved
 from package_copy import ROOT
-from report_data import experiments, report_data
+from report_data import document, experiments, report_data
 
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import Origin, Overlay, RigFacts
 from jawusd.formats.tracks import LostReason
 from jawusd.report import document as report_document
-from jawusd.report.document import _frame_lists, document, worded
+from jawusd.report.document import _frame_lists, worded
 from jawusd.report.replay import replay_data
 
 SECTIONS = (

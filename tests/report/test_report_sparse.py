@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from report_data import experiments, report_data, solve_data
+from report_data import document, experiments, report_data, solve_data
 
 from jawusd.paper.figures import condyle_figure, parameter_figure, reconstruction_figure, synthesis_figure
-from jawusd.report.document import document
 from jawusd.report.solve_page import solve_page
 from jawusd.report.verdicts import GOOD, OPEN, judge
 

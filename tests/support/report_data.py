@@ -13,6 +13,8 @@ from jawusd.formats.performance import SolveState
 from jawusd.formats.report import CameraFacts, Origin, Overlay, ReplayPart, ReportData, RigFacts, SolveReportData
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, TRACKED, Tracks
+from jawusd.paper.figures import inline_figures
+from jawusd.report import document as report_document
 
 FPS = 24.0
 CAMERAS = ("cam0", "cam1")
@@ -146,3 +148,18 @@ def _parts():
         ReplayPart(name, "tooth" if "teeth" in name else "bone", name in moves, mesh)
         for name, mesh in example_meshes().items()
     )
+
+
+def all_figures(data):
+    """Return all plots of a report, as a build draws them."""
+    return report_document.draw_figures(data) | (inline_figures(data.experiments) if data.experiments else {})
+
+
+def document(data):
+    """Return the report with all its plots."""
+    return report_document.document(data, all_figures(data))
+
+
+def write_document(path, data):
+    """Write the report with all its plots."""
+    return report_document.write_document(path, data, all_figures(data))

@@ -9,7 +9,6 @@ from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks, vertex_erro
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_point
 from jawusd.tracking import TrackingConfig
 from jawusd.tracking.contour.drawing import Drawing, Drawings
-from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
@@ -82,8 +81,8 @@ def test_a_warped_drawing_is_as_one_drawn_there(pose):
     # Contours: their points lie where those of a new drawing do, and their normals have turned with the scan.
     solver = ContourSolver(SCANS, TrackingConfig())
     drawing = Drawing(SCANS[0], *seen(POSE), SHAPE)
-    kept, count = drawing.contour(solver, 0, seen(pose)[0], SHAPE, turned)
-    fresh, _ = Drawing(SCANS[0], *seen(pose), SHAPE).contour(solver, 0, seen(pose)[0], SHAPE, 0.0)
+    kept, count = drawing.samples(solver.contours[0], seen(pose)[0], SHAPE, turned)
+    fresh, _ = Drawing(SCANS[0], *seen(pose), SHAPE).samples(solver.contours[0], seen(pose)[0], SHAPE, 0.0)
     assert 0 < count < len(kept)
     gap = np.linalg.norm(kept[:, None, [U, V]] - fresh[None, :, [U, V]], axis=2)
     nearest = gap.argmin(1)
@@ -108,9 +107,9 @@ def test_what_another_look_shows_is_drawn_anew():
 
 def test_contours_end_at_the_window():
     drawing, solver = Drawing(SCANS[0], *seen(POSE), SHAPE), ContourSolver(SCANS, TrackingConfig())
-    whole, _ = drawing.contour(solver, 0, seen(POSE)[0], SHAPE, 0.0)
+    whole, _ = drawing.samples(solver.contours[0], seen(POSE)[0], SHAPE, 0.0)
     middle = int(np.median(whole[:, U]))
-    part, count = drawing.contour(solver, 0, seen(POSE)[0], (SHAPE[0], middle), 0.0)
+    part, count = drawing.samples(solver.contours[0], seen(POSE)[0], (SHAPE[0], middle), 0.0)
     assert 0 < count < len(part) < len(whole) and part[:, U].max() < middle - 1
 
 
@@ -118,12 +117,12 @@ def test_pictures_of_one_instant_serve_the_next():
     view = View(CAMERA.projection_matrix(), CAMERA.centre_world(), np.zeros((2, *SHAPE), np.uint8), np.ones(2, bool))
     solver = ContourSolver(SCANS, TrackingConfig())
     poses = np.stack([POSE, jaw_poses(3)[2][1]])
-    Rendering(solver, [view]).update(poses)
+    solver.rendering([view]).update(poses)
     known = dict(solver.drawings._kept)
     assert len(known) == 2
-    Rendering(solver, [view]).update(np.stack([moved(sideways_mm=1.0), poses[1]]))
+    solver.rendering([view]).update(np.stack([moved(sideways_mm=1.0), poses[1]]))
     assert solver.drawings._kept == known
-    Rendering(solver, [view]).update(np.stack([moved(turn_rad=0.1), poses[1]]))
+    solver.rendering([view]).update(np.stack([moved(turn_rad=0.1), poses[1]]))
     assert [key for key in known if solver.drawings._kept[key] is not known[key]] == [next(iter(known))]
 
 
@@ -158,8 +157,8 @@ def test_the_next_alignment_is_the_same_without_what_was_drawn_before():
 def test_contours_are_found_where_threads_draw(monkeypatch):
     view = View(CAMERA.projection_matrix(), CAMERA.centre_world(), np.zeros((2, *SHAPE), np.uint8), np.ones(2, bool))
     solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(3)[2]
-    rendering = Rendering(solver, [view])
+    rendering = solver.rendering([view])
     rendering.update(poses)
     monkeypatch.setattr(ContourSolver, "contour", None)
-    samples, silhouettes = rendering.contour(solver, 0, 0, poses[0])
+    samples, silhouettes = rendering.samples(solver.contours[0], 0, 0, poses[0])
     assert 0 < silhouettes <= len(samples)

@@ -13,7 +13,6 @@ from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, search_edges
 from jawusd.tracking.contour.equations import GingivalMarginTerm, NormalEquations, SilhouetteTerm
-from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.samples import (
     COLUMNS,
     CROWN,
@@ -101,12 +100,12 @@ def test_samples_of_a_rough_scan_do_not_lie_inside_of_its_outline():
 
 def test_contours_move_with_a_scan_until_it_is_drawn_again():
     views, solver = _views(2), ContourSolver(SCANS, replace(CONFIG, redraw_px=2.0))
-    rendering, moved = Rendering(solver, views), POSES[2].copy()
+    rendering, moved = solver.rendering(views), POSES[2].copy()
     rendering.update(POSES[2])
     moved[0] = moved[0] @ make_transform(se3_exp(np.r_[0.002, 0.0, 0.001, np.zeros(3)])[:3, :3], [0.05, 0.05, 0.0])
     before = rendering.labels[1][0].copy()
     rendering.update(moved)
-    kept, count = rendering.contour(solver, 0, 1, moved[0])
+    kept, count = rendering.samples(solver.contours[0], 0, 1, moved[0])
     assert (rendering.labels[1][0] == before).all()  # not drawn again
     at = CAMERAS[1].project(transform_points(moved[0], kept[:, :3]))
     assert np.abs(at - kept[:, [U, V]]).max() < 1e-9

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -11,17 +11,31 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.media.warp import warp_nearest
-from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V, X, Y, Z
+from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V, X, Y, Z, contour_samples
 from jawusd.tracking.contour.scan import Scan
-
-if TYPE_CHECKING:
-    from jawusd.tracking.contour.solver import ContourSolver
 
 _AROUND_PX = 24  # drawn around the window, which follows the masks
 _LARGEST_ZOOM = 1.02  # of a picture against the drawn one
 _MOST_KEPT = 64  # drawings; every correction of cameras begins new ones
 
 _Kept = tuple[Array, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Contour:
+    """Which contour of a scan is sampled, and how; see `contour_samples`."""
+
+    scan: Scan
+    step_px: float
+    depth_tolerance_mm: float
+    towards_gum: Array | None
+
+    def samples(
+        self, matrix: Array, eye: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32]
+    ) -> tuple[Array, int]:
+        """Return the samples in pictures of the scan; arguments and result as of `contour_samples`."""
+        limits = (self.step_px, self.depth_tolerance_mm)
+        return contour_samples(self.scan, matrix, eye, labels, inverse_depth, *limits, self.towards_gum)
 
 
 class Drawing:
@@ -45,7 +59,7 @@ class Drawing:
         self._labels, self._inverse_depth = np.zeros(size, np.uint8), np.zeros(size, np.float32)
         scan.draw(self._matrix, self._inverse_depth, self._labels)
         self._px_per_mm = _px_per_mm(self._matrix, scan.centre)
-        self._contours: dict[ContourSolver, _Kept] = {}
+        self._contours: dict[Contour, _Kept] = {}
         self._probes = scan.probes[:: max(1, len(scan.probes) // 24)]
         drawn_at = np.column_stack([projected(self._matrix, self._probes), np.ones(len(self._probes))])
         self._least_squares = np.linalg.pinv(drawn_at)  # of affine maps from here, shape (3, n)
@@ -98,27 +112,24 @@ class Drawing:
         inverse_depth *= np.float32((self._matrix[2] @ centre) / (matrix[2] @ centre))
         return float(np.arctan2(to_drawn[0, 1] - to_drawn[1, 0], to_drawn[0, 0] + to_drawn[1, 1]))
 
-    def find_contour(self, solver: ContourSolver, arch: int) -> None:
-        """Find the contour of a solver's scan of this arch, as drawn, unless it is known."""
-        if solver not in self._contours:
-            drawn = self._matrix, self._eye, self._labels, self._inverse_depth
-            self._contours[solver] = solver.contour(arch, *drawn)
+    def find_samples(self, contour: Contour) -> None:
+        """Sample a contour as drawn, unless that was done before."""
+        if contour not in self._contours:
+            self._contours[contour] = contour.samples(self._matrix, self._eye, self._labels, self._inverse_depth)
 
-    def contour(
-        self, solver: ContourSolver, arch: int, matrix: Array, shape: tuple[int, int], turned_rad: float
-    ) -> _Kept:
-        """Return the contour of a solver's scan of this arch, at a pose near one that was shown.
+    def samples(self, contour: Contour, matrix: Array, shape: tuple[int, int], turned_rad: float) -> _Kept:
+        """Return the samples of a contour at a pose near one that was shown.
 
         Args:
-            solver: whose scan it is; the drawing may be of a thinned one.
+            contour: of this arch; the drawing may be of a scan with fewer faces.
             matrix, shape: as for the drawing; of the pose.
             turned_rad: as `show` returned it.
 
         Returns:
             As `contour_samples`; a copy.
         """
-        self.find_contour(solver, arch)
-        kept = self._contours[solver]
+        self.find_samples(contour)
+        kept = self._contours[contour]
         out = np.empty_like(kept[0])
         n, silhouettes = _moved(*kept, matrix, np.cos(turned_rad), np.sin(turned_rad), *shape, out)
         return out[:n], silhouettes

@@ -9,13 +9,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate_outline, scatter_of_tiles, search_edges
-from jawusd.tracking.contour.drawing import Drawings
+from jawusd.tracking.contour.drawing import Contour, Drawings
 from jawusd.tracking.contour.equations import (
     GingivalMarginTerm,
     NormalEquations,
@@ -27,7 +26,7 @@ from jawusd.tracking.contour.equations import (
     motion_about,
 )
 from jawusd.tracking.contour.rendering import Rendering
-from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples
+from jawusd.tracking.contour.samples import HABITS, LENGTH
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.sharing import Sharing
 from jawusd.tracking.contour.views import Drawn, View, present_masks
@@ -58,7 +57,9 @@ class ContourSolver:
         self.map: Mapper = Sharing(executor) if executor else map
         arms = np.array([[(scan.radius_mm / 2) ** 2] * 3 + [1.0] * 3 for scan in self.scans])
         self._start_strength = config.typical_noise_px3 / config.prediction_mm**2 * arms
-        self._towards_gum = _towards_gum(self.scans)
+        limits = (config.sample_step_px, config.depth_tolerance_mm)
+        towards_gum = _towards_gum(self.scans)
+        self.contours = tuple(Contour(scan, *limits, way) for scan, way in zip(self.scans, towards_gum, strict=True))
         thin = [scan.thin or scan for scan in self.scans]
         #: The same of scans with fewer faces; None where all have few.
         self.thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
@@ -78,6 +79,10 @@ class ContourSolver:
         Searches need it: they rank poses by what they leave uncovered, in small pictures, and in any order.
         """
         return ContourSolver(self.scans, replace(self.config, parallax_px=0.0), self._executor)
+
+    def rendering(self, views: Sequence[View]) -> Rendering:
+        """Return a rendering of both scans in the views of one instant, to be shared by all that align there."""
+        return Rendering(views, self.contours, self.drawings, self.config.redraw_px, self.map)
 
     def forget_drawings(self) -> None:
         """Draw all scans anew the next time: poses then depend on nothing that was aligned before."""
@@ -128,7 +133,7 @@ class ContourSolver:
     ) -> Solution:
         """Take one step per gate from the given poses."""
         poses = np.array(poses, np.float64)
-        rendering = rendering or Rendering(self, views)
+        rendering = rendering or self.rendering(views)
         pull = StartTerm(start, self._start_strength)
         all_terms: tuple[ResidualTerm, ...] = (SilhouetteTerm(), GingivalMarginTerm(), pull, *terms)
         iterations, left = 0, tuple(gates_px)
@@ -203,7 +208,7 @@ class ContourSolver:
 
     def _match(self, pose: Array, view: View, r: int, rendering: Rendering, c: int, reach: float) -> _Match:
         config, depths = self.config, rendering.depths[c]
-        samples, silhouettes = rendering.contour(self, r, c, pose)
+        samples, silhouettes = rendering.samples(self.contours[r], r, c, pose)
         visible = float(samples[:, LENGTH].sum())
         search_limits = (reach, config.overlap_tolerance_mm, config.normal_cosine)
         if view.edges is None:
@@ -217,13 +222,6 @@ class ContourSolver:
             weights[hidden] = 0.0
             samples[:, LENGTH] *= weights
         return samples, silhouettes, distances - samples[:, HABITS] @ view.habits[r], visible
-
-    def contour(
-        self, r: int, matrix: Array, eye: Array, labels: NDArray[np.uint8], depth: NDArray[np.float32]
-    ) -> tuple[Array, int]:
-        """Return the contour of an arch in pictures that `matrix` (3, 4) projects it to; see `contour_samples`."""
-        limits = (self.config.sample_step_px, self.config.depth_tolerance_mm)
-        return contour_samples(self.scans[r], matrix, eye, labels, depth, *limits, self._towards_gum[r])
 
     def _final_gate(self, distances: list[Array], gate: float) -> float:
         """Return the Tukey gate that suits the spread of the residuals (median absolute deviation)."""

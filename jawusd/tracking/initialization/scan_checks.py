@@ -14,7 +14,7 @@ from jawusd.geometry import anatomical_frame
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusion
 
-# Figures of 130 persons of `synthetic.population` as their scanners deliver them, a third without paint, of three other
+# Figures of 130 subjects of `tests/support` as their scanners deliver them, a third without paint, of three other
 # captures and of the scans of two patients (`tests/benchmarks/occlusion.py --persons 130`); the limits lie outside of
 # all of them: no valid bite is refused, and none is warned of but the underbites, 13 per cent of these persons.
 #

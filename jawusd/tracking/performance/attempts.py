@@ -102,7 +102,7 @@ class Attempts:
 
     def instant(self, views: Sequence[View]) -> Instant:
         """Return what attempts at these pictures share."""
-        return Instant(views, Rendering(self.instants.solver, views), present_masks(views))
+        return Instant(views, self.instants.solver.rendering(views), present_masks(views))
 
     def remember(self, fit: FrameFit) -> None:
         """Take a frame as an example of what is usual."""

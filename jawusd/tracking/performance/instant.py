@@ -64,7 +64,7 @@ class InstantSolver:
             outline_weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
             rendering: of these views, if there is one.
         """
-        rendering = rendering or Rendering(self.solver, views)
+        rendering = rendering or self.solver.rendering(views)
         pose, left, moved_mm = start, tuple(gates_px), np.inf
         while left:
             state = self.linearise(pose, views, use, rendering, left[0])

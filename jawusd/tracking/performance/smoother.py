@@ -10,7 +10,6 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.quality import correlation_px, residual_px
-from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.performance.attempts import MOST_UNSURE, Attempts, FrameFit, usual_residual_px
@@ -159,7 +158,7 @@ class Smoother:
         if not fit.use.any() or self._views is None:
             return fit
         views = state.corrected(self._views.at(frame))
-        rendering = Rendering(self._instants.solver, views)
+        rendering = self._instants.solver.rendering(views)
         gate = self._instants.config.final_gate_px[1]
         matched: list[Matched] | None = [] if self._unknowns.free_focal else None
         solution = self._instants.linearise(fit.pose, views, fit.use, rendering, gate, True, matched)

@@ -12,7 +12,6 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, score_px
-from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import present_masks
@@ -229,7 +228,7 @@ class _Look:
     ) -> None:
         self._instants, self._colours, self._pictures, self._whole = instants, colours, pictures, whole
         self.views = colours.views(pictures, before)
-        self._rendering = Rendering(instants.solver, self.views)
+        self._rendering = instants.solver.rendering(self.views)
         self.use = present_masks(self.views)
 
     def align(self, start: Pose, expected: Expected, gates_px: Sequence[float]) -> Aligned:

@@ -133,7 +133,7 @@ class PoseSearch:
 
     def look(self, views: Sequence[View]) -> Look:
         """Return the views of an instant with a rendering to share."""
-        return Look(views, Rendering(self._thin, views))
+        return Look(views, self._thin.rendering(views))
 
     def polished(self, solution: Solution, views: Sequence[View], look: Look, *, firm: bool) -> Solution:
         """Return the alignment with all faces of the scans, in views of its instant; hidden parts are as before."""

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import score_px
-from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
@@ -144,7 +143,7 @@ def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: C
 def _fits(record: FrameRecord, around: Sequence[Sequence[View]], solver: ContourSolver) -> Array:
     """Return the fit of all cameras' masks of every shift, at poses that the other cameras alone give, shape (C, 3)."""
     config, poses, views = solver.config, record.solution.poses, around[SHIFTS.index(0)]
-    rendering = Rendering(solver, views)
+    rendering = solver.rendering(views)
     out = np.full((len(views), len(SHIFTS)), np.nan)
     for c, view in enumerate(views):
         use = present_masks(views)
@@ -159,7 +158,7 @@ def _fits(record: FrameRecord, around: Sequence[Sequence[View]], solver: Contour
 
 def _judged(poses: Array, view: View, masks: Sequence[NDArray[np.uint8]], shown: Mask, solver: ContourSolver) -> Array:
     """Return how well each of several pairs of masks (2, h, w) of a view fits poses, shape (n,) [-]."""
-    rendering, out = Rendering(solver, [view]), np.empty(len(masks))
+    rendering, out = solver.rendering([view]), np.empty(len(masks))
     for k, pair in enumerate(masks):
         found = solver.solve(poses, [replace(view, masks=pair)], (), shown[:, None], rendering=rendering)
         uncovered = ((pair > 127) & (rendering.labels[0] != CROWN)).sum((1, 2))

@@ -17,9 +17,10 @@ from jawusd.evaluator.distances import carried
 from jawusd.fitting import FittingConfig
 from jawusd.fitting.coverage import shown_parameters
 from jawusd.fitting.data import TrainingData, displacement
-from jawusd.fitting.fit import fit_form
+from jawusd.fitting.fit import FORMS
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.geometry import make_transform, se3_exp, se3_log, so3_exp, so3_log
+from jawusd.paper.model import fit_paper
 from jawusd.paper.nlpca import Nlpca
 
 Array = np.ndarray
@@ -90,7 +91,11 @@ def ours(method: str, **config: object) -> Model:
     def fit(data: TrainingData) -> Fitted:
         shown = np.ones(3, dtype=bool) if method == "paper" else shown_parameters(data)[0]
         nets = NETS.setdefault(data.motion.tobytes(), {}) if method == "paper" else None
-        form = fit_form(data, shown, FittingConfig(method=method, starts=1, **config), nets)
+        chosen = FittingConfig(method=method, starts=1, **config)
+        if method == "paper":
+            form = fit_paper(data, shown, chosen.literal, 1, chosen.seed, nets)
+        else:
+            form = FORMS[method](data, shown, chosen)
 
         def rebuilt(M: Array, free: tuple[int, ...]) -> Array:
             d, T = data.metric.nearest(form.model, M)

@@ -24,13 +24,14 @@ from jawusd.synthetic.bite import Bite, build_bite
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.dentition import without_gum
 from jawusd.synthetic.person import draw_joint
-from jawusd.synthetic.population import Traits, draw_traits
 from jawusd.synthetic.soft_tissue import Face, palate, tongue
+from jawusd.synthetic.traits import Traits
 from subjects.annotator import FINER, Annotator, Hand, draw_annotator
 from subjects.redraw import write_mask
 from subjects.scanner import Scanner, draw_scanner, encoded, scanned
 from subjects.short_picks import TEETH_FROM, Drawn, ShortPick, pick_ends, pick_lines
 from subjects.short_take import Motion, draw_cameras, draw_motion
+from subjects.traits import draw_traits
 
 FPS = 24.0
 FIRST_FRAME = 12
