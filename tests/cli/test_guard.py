@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 
+import jawusd
 from jawusd.base import guard
 from jawusd.base.errors import ResourceError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and limits of Linux")
-BEGIN = "import os, resource, signal, sys, time; from jawusd import guard; guard.begin(); "
+BEGIN = "import os, resource, signal, sys, time; from jawusd.base import guard; guard.begin(); "
 
 
 def guarded(code, *words, **settings):
@@ -163,7 +164,7 @@ def test_keys_of_a_terminal_reach_the_command_once():
 
 def test_without_fork_a_second_python_is_the_child(tmp_path):
     (tmp_path / "sitecustomize.py").write_text("import os; del os.fork")
-    path = os.pathsep.join([str(tmp_path), str(Path(guard.__file__).parents[1])])
+    path = os.pathsep.join([str(tmp_path), str(Path(jawusd.__file__).parents[1])])
     line = [sys.executable, "-m", "jawusd", "info", str(tmp_path / "none.usda")]
     done = subprocess.run(line, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path})
     assert done.returncode == 8 and done.stderr.endswith("none.usda: there is no such file.\n")
