@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import CalibrationError
-from jawusd.capture.board_clips import BoardClip, sharpness
-from jawusd.capture.board_detection import corners_and_width, detector, shown_instead
+from jawusd.capture.board_detection import BoardClip, corners_and_width, detector, sharpness, shown_instead
 from jawusd.formats.capture import Boards
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT
 

@@ -16,7 +16,7 @@ from scipy.sparse import csr_matrix
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
-from jawusd.capture.first_guess import FirstGuess
+from jawusd.capture.initial_guess import FirstGuess
 from jawusd.geometry import hat, make_transform, so3_exp, so3_left_jacobian, so3_log
 
 _LENS = 6  # fx, fy, cx, cy, k1, k2

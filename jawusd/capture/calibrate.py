@@ -12,9 +12,15 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.capture.boards import Sightings, board_points, board_symmetries, find_boards
 from jawusd.capture.bundle import Bundle, adjust
-from jawusd.capture.first_guess import guess_cameras
-from jawusd.capture.scale import ScaleCheck, check_scale
-from jawusd.capture.shape import ShapeError, board_shape_error, expected_shape_error, mouth_centre
+from jawusd.capture.initial_guess import guess_cameras
+from jawusd.capture.scale import (
+    ScaleCheck,
+    ShapeError,
+    board_shape_error,
+    check_scale,
+    expected_shape_error,
+    mouth_centre,
+)
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from jawusd.base.errors import CaptureError, SyncError
-from jawusd.capture.light import Offset
+from jawusd.capture.signals import Offset
 from jawusd.formats.capture import Capture
 from jawusd.formats.timecode import frame_of_timecode
 from jawusd.media.clip import Clip

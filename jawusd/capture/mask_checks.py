@@ -1,4 +1,4 @@
-"""Do masks and calibration fit one another? Middles of masks must lie on each other's epipolar lines."""
+"""Check masks before tracking."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera, triangulate
 
+#: First and last frame with a mask of the upper and of the lower teeth, in a camera's own numbers; None without any.
+Ranges = tuple[tuple[int, int] | None, tuple[int, int] | None]
 #: The middle of all teeth pixels of one instant by camera [px], shape (2,).
 Middles = Mapping[str, Array]
 
@@ -19,6 +21,26 @@ Middles = Mapping[str, Array]
 _RAYS_MM = 15.0
 # Width of what the masks show of both rows at the depth where the rays meet; lips hide much, no mouth shows more [mm].
 _SEEN_MM = (10.0, 90.0)
+
+
+def exchanged_by_frames(
+    ranges: Mapping[str, Ranges], offsets: Mapping[str, int], first: int, stop: int
+) -> list[tuple[str, str]]:
+    """Return pairs of cameras whose masks begin and end with the take only if they are exchanged.
+
+    Args:
+        ranges: frames with masks, by camera.
+        offsets: reference frame minus own frame number, by camera.
+        first, stop: first frame of the take and one past its last, of the reference camera.
+    """
+
+    def fits(source: str, camera: str) -> bool:
+        shown = [own for own in ranges[source] if own is not None]
+        begin, end = min((own[0] for own in shown), default=stop), max((own[1] for own in shown), default=first)
+        return begin + offsets[camera] == first and end + offsets[camera] == stop - 1
+
+    wrong = [name for name in ranges if not fits(name, name)]
+    return [(a, b) for a, b in combinations(wrong, 2) if fits(a, b) and fits(b, a)]
 
 
 def middles_findings(cameras: Mapping[str, Camera], middles: Sequence[Sequence[Middles]]) -> Iterator[Finding]:

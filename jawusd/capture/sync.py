@@ -16,8 +16,16 @@ import numpy as np
 
 from jawusd.base.errors import SyncError
 from jawusd.capture.clocks import offsets_by_clock, refuse_other_rates
-from jawusd.capture.light import Offset, find_flashes, find_steps, match_steps, mean_brightness, on_grid
-from jawusd.capture.sound import RATE_HZ, match_sounds
+from jawusd.capture.signals import (
+    RATE_HZ,
+    Offset,
+    find_flashes,
+    find_steps,
+    match_sounds,
+    match_steps,
+    mean_brightness,
+    on_grid,
+)
 from jawusd.formats.capture import Capture
 from jawusd.formats.clip_source import ClipSource
 from jawusd.formats.light_curve import LightCurve

@@ -239,7 +239,7 @@ def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: SyncRe
         OutputError: the file cannot be written.
         MissingDependencyError: matplotlib is not installed.
     """
-    from jawusd.report.sync_plot import draw_sync
+    from jawusd.report.figures import draw_sync
 
     title, offsets = "the cameras could not be aligned", None
     if result is not None:

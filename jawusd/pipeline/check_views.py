@@ -175,7 +175,7 @@ def synchronisation(parts: Parts) -> Iterator[Finding]:
 
 def frames(parts: Parts) -> Iterator[Finding]:
     """Look whether the frames that the capture names exist."""
-    from jawusd.capture.mask_ranges import exchanged_by_frames
+    from jawusd.capture.mask_checks import exchanged_by_frames
 
     capture = parts.given
     count = _frame_count(parts, capture.reference)

@@ -13,8 +13,7 @@ from jawusd.geometry import Camera, transform_points
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from jawusd.segmentation.footage import ColourFootage, Pictures
-    from jawusd.segmentation.picture import PictureFrame
+    from jawusd.segmentation.picture import ColourFootage, PictureFrame, Pictures
     from jawusd.tracking.config import Mapper
     from jawusd.tracking.contour.scan import Scan
     from jawusd.tracking.region.picture import Cut, Picture

@@ -15,7 +15,7 @@ from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject
 
 if TYPE_CHECKING:
-    from jawusd.segmentation.footage import ColourFootage
+    from jawusd.segmentation.picture import ColourFootage
     from jawusd.tracking.contour.scan import Scan
     from jawusd.tracking.contour.views import View
     from jawusd.tracking.region.picture import Cut

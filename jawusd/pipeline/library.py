@@ -98,7 +98,7 @@ def plot_ranges(entries: Sequence[Entry], folder: Path, force: bool) -> list[Pat
         MissingDependencyError: matplotlib is not installed.
         OutputError: a file exists already, or cannot be written.
     """
-    from jawusd.report.ranges import RANGES, draw_ranges
+    from jawusd.report.figures import RANGES, draw_ranges
 
     for suffix in (".png", ".svg"):
         refuse_existing(folder / (RANGES + suffix), force)

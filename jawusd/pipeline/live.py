@@ -31,7 +31,7 @@ from jawusd.pipeline.state import no_progress
 
 if TYPE_CHECKING:
     from jawusd.media.live_source import LiveSource
-    from jawusd.segmentation.footage import Pictures
+    from jawusd.segmentation.picture import Pictures
     from jawusd.tracking.performance.attempts import FrameFit
     from jawusd.tracking.performance.coordinates import Pose
 

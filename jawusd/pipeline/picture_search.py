@@ -16,7 +16,7 @@ from jawusd.pipeline.segment_record import with_masks
 from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:
-    from jawusd.segmentation.footage import ColourFootage
+    from jawusd.segmentation.picture import ColourFootage
     from jawusd.segmentation.rows import Rows
 
 # Frames looked at for rows that are apart: every so-many-th, in parts of the take; starts tried in a part.

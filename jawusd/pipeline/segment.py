@@ -35,7 +35,7 @@ from jawusd.pipeline.track_pictures import searched_start
 
 if TYPE_CHECKING:
     from jawusd.segmentation.camera import CameraSegmenter, Segment
-    from jawusd.segmentation.footage import Pictures
+    from jawusd.segmentation.picture import Pictures
     from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
     from jawusd.tracking.contour.views import View
 
@@ -94,9 +94,9 @@ class _Segmentation:
         progress: Progress,
         pool: Executor,
     ) -> None:
-        from jawusd.segmentation.config import SegmentationConfig
+        from jawusd.segmentation.colours import SegmentationConfig
         from jawusd.segmentation.files import KeyMasks
-        from jawusd.segmentation.footage import ColourFootage
+        from jawusd.segmentation.picture import ColourFootage
         from jawusd.tracking.sequence.guided import GuidedTracker
 
         self._capture, self._folder, self._progress, self._pool = capture, folder, progress, pool
@@ -132,7 +132,7 @@ class _Segmentation:
 
     def run(self) -> dict[int, FrameEntry]:
         """Segment all frames that are not finished, and again those that drawn masks improve."""
-        from jawusd.segmentation.state import state_files
+        from jawusd.segmentation.colours import state_files
 
         start, poses = self._begun()
         if not self._guide:
@@ -206,7 +206,7 @@ class _Segmentation:
 
     def _track_to(self, start: int, end: int, step: int) -> None:
         """Track from the frame of the picks to one end of the take; frames finished before are skipped."""
-        from jawusd.segmentation.state import ColourStates
+        from jawusd.segmentation.colours import ColourStates
 
         done = start
         while done + step != end and done + step in self._journal.entries:

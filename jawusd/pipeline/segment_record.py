@@ -284,7 +284,7 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
     }
     write_text_atomic(folder / SUMMARY, json.dumps(summary, indent=1) + "\n")
     if doubtful:
-        from jawusd.segmentation.sheet import write_sheet
+        from jawusd.segmentation.files import write_sheet
 
         worst = [(row["camera"], row["own_frame"], row["reason"]) for row in doubtful[:_SHEET_FRAMES]]
         write_sheet(folder / SHEET, worst, videos, folder)
@@ -312,7 +312,7 @@ def delete_masks(folder: Path) -> None:
     """
     if not (folder / RECORD).is_file():
         return
-    from jawusd.segmentation.state import state_files
+    from jawusd.segmentation.colours import state_files
 
     for path in (*state_files(folder), *(folder / name for name in (RECORD, SUMMARY, SHEET, LEARNED))):
         path.unlink(missing_ok=True)

@@ -82,7 +82,7 @@ class VideoShot:
         Raises:
             CaptureError: no camera has a video, or one cannot be decoded.
         """
-        from jawusd.segmentation.footage import ColourFootage
+        from jawusd.segmentation.picture import ColourFootage
         from jawusd.tracking.region.performance import PictureShot, PictureTake
 
         videos = open_videos(capture)

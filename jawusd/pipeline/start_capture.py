@@ -212,7 +212,7 @@ def _named_as_calibrated(
 def _board(
     folder: Path, cameras: Sequence[CameraSketch], square_mm: float | None, calibrated: bool, out: CaptureStart
 ) -> BoardSketch | None:
-    from jawusd.capture.board_guess import BoardSeen, seen_board
+    from jawusd.capture.initial_guess import BoardSeen, seen_board
 
     clips = [camera.board for camera in cameras if camera.board is not None]
     if not clips:

@@ -18,7 +18,7 @@ from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import subject_of_capture
 
 if TYPE_CHECKING:
-    from jawusd.segmentation.footage import ColourFootage
+    from jawusd.segmentation.picture import ColourFootage
     from jawusd.tracking.region.picture_start import RowStart
 
 FEWEST_VIDEOS = 2
@@ -42,7 +42,7 @@ def track_videos(
         CaptureError: fewer than two cameras have a video, or one cannot be decoded.
         TrackingError: the teeth were not found.
     """
-    from jawusd.segmentation.footage import ColourFootage
+    from jawusd.segmentation.picture import ColourFootage
     from jawusd.tracking.contour.scan import prepare_scan
     from jawusd.tracking.region.picture_start import RowStart
     from jawusd.tracking.region.strained import footage_doubts

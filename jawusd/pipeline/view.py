@@ -114,7 +114,7 @@ def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
         RigError: there is no mesh that moves.
     """
     from jawusd.rig.geo import read_geometry, read_gum
-    from jawusd.viewer.decimate import for_view
+    from jawusd.viewer.viewed import for_view
 
     meshes = read_geometry(path, prim) | read_geometry(path, prim, placeholders=True)
     gum = read_gum(path, prim)

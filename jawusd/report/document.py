@@ -21,10 +21,9 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.facts import TracksFacts, model_facts, sync_facts, tracks_facts
-from jawusd.report.ranges import human_ranges
+from jawusd.report.figures import human_ranges, model_figure, tracking_figure
 from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
-from jawusd.report.timeline import model_figure, tracking_figure
 from jawusd.report.verdicts import MARKS, WORDS, BuildVerdict, in_short, judge, overall
 
 _LISTED = 60  # frames named one by one

@@ -1,22 +1,174 @@
-"""Both arches in one picture: colours, place and edges weighted against one another."""
+"""Arches."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.base.arrays import Mask
-from jawusd.segmentation.colours import ColourModel
-from jawusd.segmentation.config import SegmentationConfig
-from jawusd.segmentation.crowns import LOWER, OTHER, UPPER, Expectation
-from jawusd.segmentation.cut import cut_three_ways
+from jawusd.base.arrays import Array, Mask
+from jawusd.formats.mesh import Mesh, crown_face_mask
+from jawusd.geometry import Camera, transform_points
+from jawusd.meshes.raster import draw_depth_labels
+from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 
+OTHER, UPPER, LOWER = 0, 1, 2
+_TAU = _SIGMA = 0.35  # steps of the primal-dual iteration: their product times 8, the norm of the gradient, stays < 1
 _NEVER = 30.0  # log-odds that no colour overcomes
 _FEWEST_OPEN = 20  # pixels between the arches; with fewer the border stays
 _ARCH_BLUR_PX = 0.8  # softens the border between the arches to fractions of a pixel
+
+
+@dataclass(frozen=True, eq=False)
+class ScanSurface:
+    """Hold one arch ready to be drawn."""
+
+    vertices: Array  # scan coordinates [mm], shape (V, 3)
+    crown_faces: NDArray[np.int32]  # faces of the teeth, int32, shape (F, 3)
+    gum_faces: NDArray[np.int32]  # faces that only hide what lies behind them, int32, shape (G, 3)
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> ScanSurface:
+        """Split a teeth scan at the line where most corners of a face are tooth."""
+        crown = crown_face_mask(mesh)
+        return cls(mesh.vertices, mesh.faces[crown], mesh.faces[~crown])
+
+    def crown_points(self) -> Array:
+        """Return the vertices of the crowns [mm], shape (N, 3)."""
+        return self.vertices[np.unique(self.crown_faces)]
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Hold what is expected where in a picture; px are pixels of that picture."""
+
+    labels: NDArray[np.uint8]  # OTHER, UPPER or LOWER where that arch's crowns are nearest, shape (h, w)
+    # signed distance to the outline of each arch's visible crowns, positive inside, shape (2, h, w)
+    inside_px: NDArray[np.float32]
+
+
+def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> Expectation:
+    """Draw both arches in poses (2, 4, 4), T_world_upper and T_world_lower, as a pinhole camera sees them."""
+    labels = draw_crowns(scans, poses, camera)
+    return Expectation(labels, np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)]))
+
+
+def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> NDArray[np.uint8]:
+    """Return OTHER, UPPER or LOWER where that arch's crowns are nearest, shape (h, w)."""
+    width, height = camera.size_px
+    inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
+    for scan, pose, label in zip(scans, poses, (UPPER, LOWER), strict=True):
+        world = transform_points(pose, scan.vertices)
+        points = np.column_stack([camera.project_pinhole(world), camera.depth(world)]).astype(np.float32)
+        draw_depth_labels(points, scan.gum_faces, 0, 0, False, inverse_depth, labels, OTHER)
+        draw_depth_labels(points, scan.crown_faces, 0, 0, False, inverse_depth, labels, label)
+    return labels
+
+
+def _signed_distance(region: Mask) -> NDArray[np.float32]:
+    """Return the distance to the outline of a region, positive inside [px]; far outside where there is none."""
+    if not region.any():
+        return np.full(region.shape, -1e3, np.float32)
+    inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
+    outer = cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.where(region, inner - 0.5, 0.5 - outer)
+
+
+@numba.njit(nogil=True, cache=True)
+def _iterate(
+    cost: NDArray[np.float32],
+    edge: NDArray[np.float32],
+    u: NDArray[np.float32],
+    spans: NDArray[np.int64],
+    steps: int,
+) -> None:
+    """Run the first-order primal-dual iteration (Chambolle and Pock 2011) of the relaxed Potts energy.
+
+    cost (3, h, w), edge (2, h, w) weights of the links to the right and down; u (3, h, w) in and out; spans (h, 2)
+    columns of each row that are in play, all others stay as they are.
+    """
+    n, h, w = cost.shape
+    px, py = np.zeros_like(u), np.zeros_like(u)
+    bar = u.copy()
+    for _ in range(steps):
+        for k in range(n):
+            for y in range(h):
+                for x in range(spans[y, 0], spans[y, 1]):
+                    gx = bar[k, y, x + 1] - bar[k, y, x] if x + 1 < w else np.float32(0.0)
+                    gy = bar[k, y + 1, x] - bar[k, y, x] if y + 1 < h else np.float32(0.0)
+                    a = px[k, y, x] + np.float32(_SIGMA) * gx
+                    b = py[k, y, x] + np.float32(_SIGMA) * gy
+                    la, lb = edge[0, y, x], edge[1, y, x]
+                    px[k, y, x] = min(max(a, -la), la)
+                    py[k, y, x] = min(max(b, -lb), lb)
+        for y in range(h):
+            for x in range(spans[y, 0], spans[y, 1]):
+                v0 = v1 = v2 = np.float32(0.0)
+                for k in range(3):
+                    div = px[k, y, x] + py[k, y, x]
+                    if x > 0:
+                        div -= px[k, y, x - 1]
+                    if y > 0:
+                        div -= py[k, y - 1, x]
+                    v = u[k, y, x] + np.float32(_TAU) * (div - cost[k, y, x])
+                    if k == 0:
+                        v0 = v
+                    elif k == 1:
+                        v1 = v
+                    else:
+                        v2 = v
+                s0, s1, s2 = _to_simplex(v0, v1, v2)
+                bar[0, y, x] = 2 * s0 - u[0, y, x]
+                bar[1, y, x] = 2 * s1 - u[1, y, x]
+                bar[2, y, x] = 2 * s2 - u[2, y, x]
+                u[0, y, x], u[1, y, x], u[2, y, x] = s0, s1, s2
+
+
+@numba.njit(nogil=True, cache=True)
+def _to_simplex(a: np.float32, b: np.float32, c: np.float32) -> tuple[np.float32, np.float32, np.float32]:
+    """Return the nearest three shares that are not negative and sum to one."""
+    high = max(a, b, c)
+    low = min(a, b, c)
+    mid = a + b + c - high - low
+    t = (a + b + c - np.float32(1.0)) / np.float32(3.0)
+    if low - t < 0:
+        t = (high + mid - np.float32(1.0)) * np.float32(0.5)
+        if mid - t < 0:
+            t = high - np.float32(1.0)
+    zero = np.float32(0.0)
+    return max(a - t, zero), max(b - t, zero), max(c - t, zero)
+
+
+def cut_three_ways(
+    cost: NDArray[np.float32],
+    edge: NDArray[np.float32],
+    start: NDArray[np.float32],
+    free: Mask,
+    steps: int,
+) -> NDArray[np.float32]:
+    """Return the shares of the labels, not negative, sum 1, shape (3, h, w), of the cheapest cut.
+
+    The cost is that of the labels plus the weighted length of the borders between them: the convex relaxation of the
+    Potts model with separate labels (Zach et al. 2008), links to the right and down.
+
+    Args:
+        cost: cost of each label per pixel, shape (3, h, w).
+        edge: price of a border between a pixel and its right and lower neighbour, shape (2, h, w).
+        start: first guess of the shares, shape (3, h, w).
+        free: pixels whose label is open, shape (h, w); the others keep the first guess.
+    """
+    u = np.ascontiguousarray(start, np.float32).copy()
+    spans = np.zeros((cost.shape[1], 2), np.int64)
+    for y in np.flatnonzero(free.any(1)):
+        columns = np.flatnonzero(free[y])
+        spans[y] = columns[0], columns[-1] + 1
+    # Each border is one of two labels, and counts once.
+    half = np.ascontiguousarray(0.5 * edge, np.float32)
+    _iterate(np.ascontiguousarray(cost, np.float32), half, u, spans, steps)
+    return u
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Mask
-from jawusd.segmentation.colours import shadeless
-from jawusd.segmentation.config import SegmentationConfig
+from jawusd.segmentation.colours import SegmentationConfig, shadeless
 
 _EVEN = 1e-4  # variance of the logs that is added [-]: half an 8-bit step
 _FEWEST = 100  # fewest pixels that give the spread of colours

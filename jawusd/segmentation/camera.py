@@ -13,10 +13,8 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.media.pixels import ColourPicture
-from jawusd.segmentation.arches import Seeds, learn_colours
-from jawusd.segmentation.colours import ColourModel
-from jawusd.segmentation.config import SegmentationConfig
-from jawusd.segmentation.crowns import Expectation, ScanSurface, expect_crowns
+from jawusd.segmentation.arches import Expectation, ScanSurface, Seeds, expect_crowns, learn_colours
+from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.files import Key
 from jawusd.segmentation.learn import Example, cut_picture
 from jawusd.segmentation.picture import PictureFrame, Window

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Mask
-from jawusd.segmentation.arches import Seeds, cut_arches, part_arches
+from jawusd.segmentation.arches import Expectation, Seeds, cut_arches, part_arches
 from jawusd.segmentation.border import settle_borders
-from jawusd.segmentation.colours import ColourModel
-from jawusd.segmentation.config import SegmentationConfig
-from jawusd.segmentation.crowns import Expectation
+from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.picture import Window
 
 _FACTORS = (0.5, 2.0)  # tried on every number

@@ -9,9 +9,8 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.synthetic.anatomy import Occlusion
 from jawusd.synthetic.dental_arch import ArchLine, ArchShape, DentalArch
-from jawusd.synthetic.dentition import Seat, build, seats
+from jawusd.synthetic.dentition import Seat, Traits, build, seats
 from jawusd.synthetic.teeth import LOWER, UPPER
-from jawusd.synthetic.traits import Traits
 
 # Heights of the upper edges and cusps over the plane of the first incisors [mm].
 _UPPER_TIPS_MM = -np.array([0.0, 0.5, 0.2, 0.3, 0.4, 0.6, 1.0])

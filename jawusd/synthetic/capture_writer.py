@@ -18,13 +18,25 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
 from jawusd.media.video_writer import VideoWriter
 from jawusd.synthetic.anatomy import build_anatomy
-from jawusd.synthetic.masks import Outline, drawn_mask
+from jawusd.synthetic.annotations import Outline, SeenVertex, choose_picks, drawn_mask
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.picks import SeenVertex, choose_picks
 from jawusd.synthetic.render import Picture, Renderer
-from jawusd.synthetic.scene import Scene
-from jawusd.synthetic.studio import BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM, board, board_poses, build_cameras
-from jawusd.synthetic.take import FPS, LEAD, OPEN_HOLD, REST_HOLD, TAIL, Take, perform
+from jawusd.synthetic.take import (
+    BOARD_COLUMNS,
+    BOARD_ROWS,
+    FPS,
+    LEAD,
+    OPEN_HOLD,
+    REST_HOLD,
+    SQUARE_MM,
+    TAIL,
+    Scene,
+    Take,
+    board,
+    board_poses,
+    build_cameras,
+    perform,
+)
 
 Progress = Callable[[int, int], None]
 

@@ -1,12 +1,9 @@
-"""Arches of any person: every tooth with its own size, place and gum line, and three ways in which gum meets crown.
-
-Gum is a separate ridge that the crowns dip into ("dipping"), begins on every crown at its cervical line as one painted
-surface ("continuous"), or is left out of the scan ("crowns"). Built with the occlusal side up like `dental_arch`.
-"""
+"""Dentition."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -26,12 +23,62 @@ from jawusd.synthetic.dental_arch import (
 )
 from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
-from jawusd.synthetic.traits import ArchTraits, Gums, Traits
 
+Gums = Literal["dipping", "continuous", "crowns"]
+BITES = ("normal", "deep", "open", "edge to edge", "underbite", "large overjet", "crossbite")
 _AROUND = 36
 # Gum on a crown, from its cervical line down: distance outwards and height [mm].
 _COLLAR = np.array([[0.05, -0.03], [0.22, -0.2], [0.5, -0.8], [0.8, -2.2], [1.1, -4.5], [0.9, -7.0]])
 _BRACKET_MM = np.array([3.0, 3.0, 1.8])
+
+
+@dataclass(frozen=True, eq=False)
+class ArchTraits:
+    """What is peculiar to one arch; arrays hold first incisor to second molar, left then right, shape (2, 7)."""
+
+    width_scale: Array  # tooth widths over the mean ones
+    height_scale: Array  # crown heights over the mean ones: worn, short or long crowns
+    shift_mm: Array  # towards the facial side of where a tooth would stand in line
+    turn_rad: Array  # about the tooth's axis
+    rise_mm: Array  # of edges and cusps over the occlusal curve
+    overlap_mm: Array  # of a tooth with its mesial neighbour; negative for a gap
+    present: Array  # 1 or 0 for a missing tooth
+    brackets: bool  # on the facial faces of all teeth but the molars
+
+
+@dataclass(frozen=True, eq=False)
+class Traits:
+    """What distinguishes one mouth; lengths mm, angles rad, in a frame of x left, y up, z anterior."""
+
+    seed: int
+    overbite_mm: float  # wished height of the lower incisal edges over the upper ones
+    overjet_mm: float  # wished distance of the lower incisal edges behind the upper ones
+    buccal_mm: tuple[float, float]  # distance of the left and right lower back teeth inside the upper ones
+    quadratic_per_mm: float
+    quartic_per_mm3: float
+    cusp_slope: float  # drop of the cusps per mm
+    spee_mm: float  # depth of the occlusal curve
+    midline_mm: float  # of the lower arch to the left
+    skew: tuple[float, float]  # widening to the left, and forward lead of the left side, per mm
+    tilt: Array  # turn of the occlusal plane against the joint, shape (3, 3)
+    upper: ArchTraits
+    lower: ArchTraits
+    gums: Gums
+
+    @property
+    def bite(self) -> str:
+        """Return the kind of bite that was wished for, one of `BITES`."""
+        if min(self.buccal_mm) < 0.5:
+            return "crossbite"
+        if self.overjet_mm < -0.8:
+            return "underbite"
+        if self.overbite_mm < -0.5:
+            return "open"
+        if self.overjet_mm < 1.0 and self.overbite_mm < 1.0:
+            return "edge to edge"
+        if self.overjet_mm > 6.0:
+            return "large overjet"
+        return "deep" if self.overbite_mm > 4.5 else "normal"
 
 
 @dataclass(frozen=True, eq=False)

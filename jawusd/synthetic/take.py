@@ -1,4 +1,4 @@
-"""A performance in front of the cameras: jaw, head, lips, tongue and light at every instant of a take."""
+"""Take."""
 
 from __future__ import annotations
 
@@ -8,14 +8,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.geometry import make_transform, so3_exp
-from jawusd.synthetic.anatomy import Occlusion, lifted_bite
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
+from jawusd.synthetic.anatomy import Occlusion, PersonAnatomy, lifted_bite
+from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.exercises import schedule, smooth_noise, smoothed
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.soft_tissue import LipState
-from jawusd.synthetic.studio import T_WORLD_SCAN
+from jawusd.synthetic.render import LOWER_TEETH, UPPER_TEETH, Picture, Renderer
+from jawusd.synthetic.soft_tissue import Face, LipState, Surface, palate, tongue
+from jawusd.synthetic.surfaces import grid_faces
 
+#: The scan frame to the world (the frame of the first camera: x right, y down, z forward) with the head at rest.
+T_WORLD_SCAN = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, -14.0, 214.0])
+BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM = 9, 6, 8.0
+# Focal length over picture width, and per camera: direction from the mouth [deg left, deg up], radial and tangential
+# distortion, offset of the principal point and of the focal length in shares of the picture width.
+_FOCAL = 1.494
+_CAMERAS = (
+    ((0.0, 0.0), (-0.031, 0.012, 0.0003, -0.0004, 0.0), (0.0043, -0.0031), 1.000),
+    ((37.0, 9.0), (-0.027, 0.009, -0.0005, 0.0002, 0.0), (-0.0043, 0.0031), 1.005),
+    ((-38.0, -6.0), (-0.034, 0.015, 0.0002, 0.0005, 0.0), (0.0026, 0.0048), 0.994),
+)
 FPS = 24.0
 #: Frames before the first and after the last tracked one, which contain the flashes.
 LEAD, TAIL = 20, 16
@@ -29,6 +43,61 @@ _EXERCISES = (
     "open", "lateral", "protrude", "frontal border", "chew", "chew", "circumduct", "sagittal border",
     "lateral half open", "protrude half open", "speech", "open", "frontal border", "circumduct", "chew",
 )  # fmt: skip
+_ENAMEL = np.array([0.80, 0.745, 0.63])
+_GUM = np.array([0.56, 0.22, 0.21])
+# Canines are yellower, and enamel darkens towards the gum.
+_CANINE_TINT = np.array([0.975, 0.955, 0.91])
+
+
+def build_cameras(size_px: tuple[int, int]) -> list[Camera]:
+    """Return the three cameras; the world is the frame of the first one."""
+    width, height = size_px
+    target = (T_WORLD_SCAN @ [0.0, -14.0, -6.0, 1.0])[:3]
+    cameras = []
+    for k, ((left, up), distortion, shift, zoom) in enumerate(_CAMERAS):
+        a, b = np.deg2rad([left, up])
+        # The subject's left is on the right side of the first camera's picture.
+        turn = so3_exp([0.0, -a, 0.0]) @ so3_exp([-b, 0.0, 0.0])
+        T_world_cam = np.eye(4)
+        if k:
+            T_world_cam = make_transform(turn, target - turn @ [0.0, 0.0, 206.0 + 3.0 * k])
+        focal = _FOCAL * width * zoom
+        K = np.array(
+            [
+                [focal, 0.0, width / 2 - 0.5 + shift[0] * width],
+                [0.0, focal, height / 2 - 0.5 + shift[1] * width],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+        cameras.append(Camera(f"cam{k}", size_px, K, np.array(distortion), se3_inverse(T_world_cam)))
+    return cameras
+
+
+def board() -> Surface:
+    """Return the chessboard with a white rim, origin at its middle, x along the columns, facing -z."""
+    columns, rows = BOARD_COLUMNS + 3, BOARD_ROWS + 3
+    vertices, colors = [], []
+    for i in range(rows):
+        for j in range(columns):
+            x, y = np.array([j - columns / 2, i - rows / 2]) * SQUARE_MM
+            vertices += [[x + u, y + v, 0.0] for v in (0.0, SQUARE_MM) for u in (0.0, SQUARE_MM)]
+            rim = i in (0, rows - 1) or j in (0, columns - 1)
+            colors += [[0.03] * 3 if (i + j) % 2 == 0 and not rim else [0.85] * 3] * 4
+    quads = len(vertices) // 4
+    faces = (grid_faces(2, 2, closed=False)[None] + 4 * np.arange(quads)[:, None, None]).reshape(-1, 3)
+    n = len(vertices)
+    return Surface(np.array(vertices), faces.astype(np.int32), np.array(colors), np.zeros(n), np.zeros(n), np.zeros(n))
+
+
+def board_poses(n: int, rng: np.random.Generator) -> Array:
+    """Return n random poses T_world_board (n, 4, 4) near the place of the mouth, in view of all cameras."""
+    centre = (T_WORLD_SCAN @ [0.0, -12.0, -10.0, 1.0])[:3]
+    tilt = rng.uniform(-1.0, 1.0, (n, 3)) * np.deg2rad([24.0, 22.0, 14.0])
+    shift = rng.uniform(-1.0, 1.0, (n, 3)) * [14.0, 8.0, 18.0]
+    R = so3_exp(tilt)
+    # Every second pose is turned by 180 degrees.
+    R[1::2] = R[1::2] @ np.diag([-1.0, -1.0, 1.0])
+    return make_transform(R, centre + shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,3 +206,72 @@ def _tongue(controls: Array, rng: np.random.Generator) -> Array:
     room = smoothstep((controls[:, 0] - 0.12) / 0.3)
     raised = smoothstep((drift[:, 0] - 0.5) / 1.2) * room
     return np.stack([7.0 * raised, 9.0 * raised + 1.5 * room, 3.0 * drift[:, 1] * raised], -1)
+
+
+class Scene:
+    """All surfaces of one person, ready to be drawn."""
+
+    def __init__(self, person: Person, anatomy: PersonAnatomy, renderer: Renderer) -> None:
+        """Add the person's surfaces to the renderer."""
+        self._renderer = renderer
+        self.anatomy = anatomy
+        self._face = Face(person.joint.incisor)
+        for name, arch, label in (("upper", anatomy.upper, UPPER_TEETH), ("lower", anatomy.lower, LOWER_TEETH)):
+            crowns, gum = _arch_surfaces(arch)
+            renderer.add(f"{name} teeth", crowns, label)
+            renderer.add(f"{name} gum", gum)
+        face = self._face
+        vertices = face.posed(LipState(8.2, 8.2, 27.5, 0.0), np.eye(4))
+        renderer.add("face", Surface(vertices, face.faces, face.colors, face.gloss, face.skin, face.inside))
+        renderer.add("palate", palate())
+        renderer.add("tongue", tongue(0.0, 0.0, 0.0))
+
+    def pose(self, take: Take, index: int) -> dict[str, Array]:
+        """Shape lips and tongue for an instant of a take and return the surfaces' poses T_world_part, (4, 4) each."""
+        T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
+        self._renderer.move("face", self._face.posed(take.lips[index], T_jaw))
+        self._renderer.move("tongue", tongue(*take.tongue_mm[index]).vertices)
+        jaw = head @ T_jaw
+        return {
+            "upper teeth": head, "upper gum": head, "palate": head, "face": head,
+            "lower teeth": jaw, "lower gum": jaw, "tongue": jaw,
+        }  # fmt: skip
+
+    def draw(
+        self, camera: int, take: Take, index: int, poses: dict[str, Array], jitter_px: tuple[Array, Array] | None
+    ) -> Picture:
+        """Draw an instant; `poses` as returned by `pose` for it, `jitter_px` as for `Renderer.render`."""
+        return self._renderer.render(camera, poses, take.T_world_skull[index], float(take.light[index]), jitter_px)
+
+    def occluders(self, take: Take, index: int) -> list[Mesh]:
+        """Return everything that can hide a tooth at an instant, in world coordinates [mm]."""
+        T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
+        tongue_now = tongue(*take.tongue_mm[index])
+        parts = (
+            (head, self.anatomy.upper.mesh),
+            (head @ T_jaw, self.anatomy.lower.mesh),
+            (head, Mesh(self._face.posed(take.lips[index], T_jaw), self._face.faces)),
+            (head @ T_jaw, Mesh(tongue_now.vertices, tongue_now.faces)),
+        )
+        return [Mesh(transform_points(T, mesh.vertices), mesh.faces) for T, mesh in parts]
+
+
+def _arch_surfaces(arch: DentalArch) -> tuple[Surface, Surface]:
+    """Crowns and gum of an arch in natural colours."""
+    tooth = arch.tooth != 0
+    first_gum = int(np.argmin(tooth))
+    vertices, faces = arch.mesh.vertices, arch.mesh.faces
+    crown_faces = faces[faces[:, 0] < first_gum]
+    gum_faces = faces[faces[:, 0] >= first_gum] - first_gum
+    colors = np.tile(_ENAMEL, (first_gum, 1))
+    for k in np.unique(arch.tooth[:first_gum]):
+        own = arch.tooth[:first_gum] == k
+        height = np.abs(vertices[:first_gum][own, 1])
+        share = (height - height.min()) / np.ptp(height)  # 0 at the end towards the other jaw
+        colors[own] *= 1.0 - 0.16 * share[:, None] * np.array([0.6, 0.8, 1.3])
+        if abs(k) == 3:
+            colors[own] *= _CANINE_TINT
+    n, m = first_gum, len(vertices) - first_gum
+    crowns = Surface(vertices[:n], crown_faces, colors, np.full(n, 0.5), np.zeros(n), np.ones(n))
+    gum = Surface(vertices[n:], gum_faces, np.tile(_GUM, (m, 1)), np.full(m, 0.4), np.full(m, 0.3), np.ones(m))
+    return crowns, gum

@@ -14,17 +14,13 @@ from jawusd.base.errors import JawusdError
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import make_transform, transform_points
 from jawusd.geometry.se3 import se3_inverse
+from jawusd.viewer.capture_panels import ALL, FootagePanel, PicksPanel
 from jawusd.viewer.capture_scene import UP, CaptureScene
-from jawusd.viewer.footage_panel import ALL, FootagePanel
-from jawusd.viewer.picking_layout import PickingLayout, eye_to_see, hit_vertex, region_around
-from jawusd.viewer.picks import ARCHES
-from jawusd.viewer.picks_panel import PicksPanel
-from jawusd.viewer.scan_brush import BRUSHES
-from jawusd.viewer.scan_labels_panel import ScanLabelsPanel
+from jawusd.viewer.picking import ARCHES, PickingLayout, eye_to_see, hit_vertex, region_around
+from jawusd.viewer.scan_labels import BRUSHES, ScanLabelsPanel
 from jawusd.viewer.scene import PHONE
-from jawusd.viewer.uploads import limit_uploads
 from jawusd.viewer.viewed import Region, ViewedCapture
-from jawusd.viewer.widgets import begin_panel, errors_shown, guarded
+from jawusd.viewer.widgets import begin_panel, errors_shown, guarded, limit_uploads
 
 _PANEL_PX = 370
 _SLOW_S = 0.3  # a picture that takes longer is said to be loading

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import wxyz_from_matrix
 from jawusd.geometry.se3 import se3_inverse
-from jawusd.viewer.decimate import for_view
-from jawusd.viewer.picking_layout import FOV_RAD, PickingLayout
-from jawusd.viewer.picks import ARCHES, PickBook
-from jawusd.viewer.viewed import ViewedCapture
+from jawusd.viewer.picking import ARCHES, FOV_RAD, PickBook, PickingLayout
+from jawusd.viewer.viewed import ViewedCapture, for_view
 
 ENAMEL, GUM, BASE = (236, 229, 212), (196, 112, 108), (120, 135, 165)
 #: Colours of picks by arch, equal to those of the outlines; and of the one selected.

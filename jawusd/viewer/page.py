@@ -7,11 +7,9 @@ import viser
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import transform_point
-from jawusd.viewer.contact_panel import ContactPanel
-from jawusd.viewer.file_panel import FilePanel
-from jawusd.viewer.motion_panel import MotionPanel
+from jawusd.viewer.motion_panel import FilePanel, MotionPanel
 from jawusd.viewer.plots import VERMILION, bound_plot, posselt_plot, posselt_point
-from jawusd.viewer.pose_panel import PosePanel, verdict_html
+from jawusd.viewer.pose_panel import ContactPanel, PosePanel, verdict_html
 from jawusd.viewer.readouts import landmark_places, rest_places
 from jawusd.viewer.scene import FIRST_VIEW, JawScene
 from jawusd.viewer.session import Session

@@ -35,7 +35,7 @@ def test_imports_follow_the_layers():
         ("evaluator/rig.py", "import jawusd.fast", "Layers"),
         ("fast/rigid.py", "import jawusd.solvers", "Layers"),
         ("fast/rigid.py", "import jawusd.media", "The evaluator"),
-        ("segmentation/cut.py", "import jawusd.tracking", "Layers"),
+        ("segmentation/arches.py", "import jawusd.tracking", "Layers"),
         ("tracking/__init__.py", "import jawusd.segmentation", "Layers"),
         ("report/__init__.py", "import jawusd.fitting", "Layers"),
         ("viewer/page.py", "import jawusd.rig", "Layers"),

@@ -9,7 +9,7 @@ from jawusd.base.errors import CalibrationError
 from jawusd.capture.boards import Sightings, board_points, board_symmetries
 from jawusd.capture.bundle import _Problem
 from jawusd.capture.calibrate import calibrate_capture, calibrate_sightings
-from jawusd.capture.first_guess import guess_cameras
+from jawusd.capture.initial_guess import guess_cameras
 from jawusd.geometry import se3_inverse, triangulate
 
 CAMERAS = studio()

@@ -9,8 +9,7 @@ import pytest
 from scipy.signal import fftconvolve, resample_poly
 
 from jawusd.base.errors import CaptureError, SyncError
-from jawusd.capture.light import Step, match_steps, on_grid
-from jawusd.capture.sound import RATE_HZ, match_sounds
+from jawusd.capture.signals import RATE_HZ, Step, match_sounds, match_steps, on_grid
 from jawusd.capture.sync import align_videos, light_curve
 from jawusd.media.audio import Sound, read_sound
 from jawusd.media.timeline import Timeline

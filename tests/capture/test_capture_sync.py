@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jawusd.base.errors import SyncError
-from jawusd.capture.light import Step, find_steps, match_steps
+from jawusd.capture.signals import Step, find_steps, match_steps
 from jawusd.capture.sync import align_videos, estimate_offsets
 from jawusd.formats.capture import Capture
 from jawusd.media.video_writer import VideoWriter

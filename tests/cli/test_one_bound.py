@@ -35,7 +35,7 @@ from jawusd.formats.solved import SolvedJaw
 from jawusd.media.status_bar import StatusBar
 from jawusd.pipeline.library import retarget
 from jawusd.plugins import extension
-from jawusd.report.solve_figures import seen_figure
+from jawusd.report.solve_page import seen_figure
 from jawusd.report.verdicts import judge
 from jawusd.rig import load_rig
 from jawusd.rig.animation import write_animation
@@ -46,7 +46,7 @@ from jawusd.solvers import JawLayer
 from jawusd.viewer.pose_panel import verdict_html
 from jawusd.viewer.readouts import read_out
 from jawusd.viewer.session import Session
-from jawusd.viewer.solve_plot import solve_words
+from jawusd.viewer.take_plots import solve_words
 
 COUNT, TOLERANCE_MM, UNDECIDED_MM = 5000, 1.0, 1e-6
 ARRAYS = example_arrays() | {"tolerance_mm": np.array(TOLERANCE_MM)}

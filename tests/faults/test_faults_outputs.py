@@ -170,7 +170,7 @@ def test_no_other_place_of_the_package_replaces_or_makes_files():
         "jawusd/formats/atomic.py",
         "jawusd/cli/log.py",  # adds lines to a file that `destination` allows
         "jawusd/pipeline/segment_record.py",  # adds lines to its own record
-        "jawusd/viewer/file_panel.py",  # in a folder of its own, as are the next two
+        "jawusd/viewer/motion_panel.py",  # in a folder of its own, as are the next two
         "jawusd/imaging/redraw.py",
         "jawusd/plugins/extension.py",
         "jawusd/cameras/files.py",  # the name of a column

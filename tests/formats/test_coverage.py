@@ -5,7 +5,7 @@ from report_data import report_data
 
 from jawusd.formats.coverage import uncovered_percent, worst_frames
 from jawusd.pipeline.media import chosen_frames
-from jawusd.viewer.coverage import frames_to_inspect
+from jawusd.viewer.take_plots import frames_to_inspect
 
 
 def take():

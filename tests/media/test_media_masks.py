@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from subjects.redraw import write_mask
+from subjects.annotator import write_mask
 
 import jawusd
 from jawusd.base.errors import CaptureError

@@ -15,7 +15,7 @@ import trimesh
 from package_copy import ROOT
 
 from jawusd.base.errors import CaptureError
-from jawusd.capture.mask_ranges import exchanged_by_frames
+from jawusd.capture.mask_checks import exchanged_by_frames
 from jawusd.formats.capture import load_capture
 from jawusd.formats.finding import Finding
 from jawusd.media.video_writer import VideoWriter

@@ -29,7 +29,7 @@ from jawusd.pipeline.media import open_videos
 from jawusd.pipeline.meshes import load_labelled, registered_meshes
 from jawusd.pipeline.osc import OscSender
 from jawusd.pipeline.solve_pictures import PreparedTeeth
-from jawusd.segmentation.footage import ColourFootage
+from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.region.live import LiveTake
 
 EXAMPLE, FPS = ROOT / "examples" / "capture", 24.0

@@ -9,8 +9,7 @@ from jawusd.formats.capture import load_capture
 from jawusd.media.overlay import LOWER_COLOUR, UPPER_COLOUR
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth
 from jawusd.pipeline.segment_record import LEARNED, RECORD, with_masks, write_summary
-from jawusd.segmentation.files import mask_path, write_mask
-from jawusd.segmentation.sheet import write_sheet
+from jawusd.segmentation.files import mask_path, write_mask, write_sheet
 
 FRAMES = 4
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jawusd.report.ranges import ranges_figure
+from jawusd.report.figures import ranges_figure
 
 
 def test_bars_lie_where_the_ranges_do():

@@ -9,8 +9,7 @@ import pytest
 from report_data import FPS, report_data, solve_data
 
 from jawusd.base.errors import FormatError
-from jawusd.report.solve_figures import jaw_figure, seen_figure
-from jawusd.report.solve_page import solve_page, unseen_runs
+from jawusd.report.solve_page import jaw_figure, seen_figure, solve_page, unseen_runs
 
 
 def text_of(page):

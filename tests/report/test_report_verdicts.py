@@ -9,8 +9,7 @@ from report_data import experiments, report_data
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import RigFacts
 from jawusd.paper.figures import coverage_figure
-from jawusd.report.ranges import human_ranges
-from jawusd.report.timeline import tracking_figure
+from jawusd.report.figures import human_ranges, tracking_figure
 from jawusd.report.verdicts import BAD, GOOD, LOOK, judge, overall
 
 

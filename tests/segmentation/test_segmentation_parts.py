@@ -8,16 +8,12 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from jawusd.base.errors import CaptureError
 from jawusd.geometry import Camera
-from jawusd.segmentation.arches import Seeds, cut_arches, part_arches
+from jawusd.segmentation.arches import LOWER, UPPER, Expectation, Seeds, cut_arches, cut_three_ways, part_arches
 from jawusd.segmentation.border import settle_borders
-from jawusd.segmentation.colours import ColourModel
-from jawusd.segmentation.config import SegmentationConfig
-from jawusd.segmentation.crowns import LOWER, UPPER, Expectation
-from jawusd.segmentation.cut import cut_three_ways
+from jawusd.segmentation.colours import ColourModel, ColourStates, SegmentationConfig, state_files
 from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
 from jawusd.segmentation.learn import Example, learn_numbers
 from jawusd.segmentation.picture import PictureFrame, Window
-from jawusd.segmentation.state import ColourStates, state_files
 
 
 def exact_two_way_cut(cost, edge):

@@ -15,13 +15,11 @@ from jawusd.geometry import LANDMARKS, transform_point, transform_points
 from jawusd.media.video_writer import VideoWriter
 from jawusd.meshes.raster import draw_depth_labels
 from jawusd.synthetic.anatomy import build_anatomy
+from jawusd.synthetic.annotations import choose_picks
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.picks import choose_picks
 from jawusd.synthetic.render import Renderer
-from jawusd.synthetic.scene import Scene
-from jawusd.synthetic.studio import build_cameras
-from jawusd.synthetic.take import FPS, perform
+from jawusd.synthetic.take import FPS, Scene, build_cameras, perform
 
 ROWS = ("upper", "lower")
 EVERY = 28  # frames from one closing to the next

@@ -14,10 +14,17 @@ from jawusd.meshes import raster
 from jawusd.synthetic import render
 from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.scene import Scene
 from jawusd.synthetic.soft_tissue import Surface
-from jawusd.synthetic.studio import BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM, board, board_poses, build_cameras
-from jawusd.synthetic.take import perform
+from jawusd.synthetic.take import (
+    BOARD_COLUMNS,
+    BOARD_ROWS,
+    SQUARE_MM,
+    Scene,
+    board,
+    board_poses,
+    build_cameras,
+    perform,
+)
 
 SIZE = (480, 270)
 

@@ -6,12 +6,10 @@ import pytest
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_inverse, se3_log, transform_point, transform_points
 from jawusd.synthetic.anatomy import PersonAnatomy, build_anatomy
-from jawusd.synthetic.masks import Outline, drawn_mask
+from jawusd.synthetic.annotations import Outline, choose_picks, drawn_mask
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.picks import choose_picks
 from jawusd.synthetic.soft_tissue import Face, LipState, palate, tongue
-from jawusd.synthetic.studio import T_WORLD_SCAN, build_cameras
-from jawusd.synthetic.take import LEAD, TAIL, Take, perform
+from jawusd.synthetic.take import LEAD, T_WORLD_SCAN, TAIL, Take, build_cameras, perform
 
 PERSON = Person(0)
 

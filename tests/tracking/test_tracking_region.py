@@ -16,7 +16,7 @@ from jawusd.pipeline.media import open_footage
 from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.subject import subject_of_capture
-from jawusd.segmentation.footage import ColourFootage
+from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.contour.views import Drawn

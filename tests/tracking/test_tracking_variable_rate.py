@@ -8,7 +8,7 @@ import pytest
 from small_take import CAMERAS, FIRST, OFFSETS, ROWS, errors_mm, make_capture, source, track, write_masks
 
 from jawusd.media.video import Video
-from jawusd.segmentation.footage import ColourFootage
+from jawusd.segmentation.picture import ColourFootage
 
 COUNT = 8
 FPS = 25

@@ -14,7 +14,7 @@ from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.viewer.readouts import CONDYLES, INCISOR, landmark_places, rest_places
 from jawusd.viewer.scene import _OUTSIDE, PRESETS, preset_view
-from jawusd.viewer.uploads import MOST_BYTES
+from jawusd.viewer.widgets import MOST_BYTES
 
 
 @pytest.fixture

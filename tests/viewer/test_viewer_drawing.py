@@ -10,11 +10,11 @@ from example_rig import example_meshes, example_rig
 from jawusd.formats.keys import Key
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS
-from jawusd.viewer.decimate import for_view, is_solid
 from jawusd.viewer.motion import Clip
 from jawusd.viewer.plots import bound_plot, curve_plot, posselt_plot, posselt_point, with_playhead
 from jawusd.viewer.pose_panel import reading_html, slider_ends, verdict_html
 from jawusd.viewer.readouts import border_path, habitual_path, landmark_places, read_out, rest_places
+from jawusd.viewer.viewed import for_view, is_solid
 
 RIG = example_rig()
 

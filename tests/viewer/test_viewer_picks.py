@@ -9,9 +9,8 @@ from jawusd.formats.coverage import uncovered_percent
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, TRACKED, Tracks
 from jawusd.geometry import make_transform, random_rotation, transform_points
-from jawusd.viewer.coverage import CoveragePlot, frame_words, frames_to_inspect
-from jawusd.viewer.picking_layout import FOV_RAD, PickingLayout, eye_to_see, hit_vertex, region_around
-from jawusd.viewer.picks import PickBook
+from jawusd.viewer.picking import FOV_RAD, PickBook, PickingLayout, eye_to_see, hit_vertex, region_around
+from jawusd.viewer.take_plots import CoveragePlot, frame_words, frames_to_inspect
 
 
 def filled():

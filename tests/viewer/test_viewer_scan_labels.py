@@ -15,7 +15,7 @@ from jawusd.geometry import transform_point
 from jawusd.pipeline.meshes import load_labelled
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.view_capture import viewed_capture
-from jawusd.viewer.scan_brush import ScanBrush, surface_near
+from jawusd.viewer.scan_labels import ScanBrush, surface_near
 from jawusd.viewer.server import CaptureViewer
 
 

@@ -6,7 +6,7 @@ import pytest
 from quiet_page import QuietPage
 from viser import UploadedFile, _messages
 
-from jawusd.viewer.uploads import MOST_BYTES
+from jawusd.viewer.widgets import MOST_BYTES
 
 TABLE = b"frame,d1,d2,d3\n0,1,0,0\n9,9,0,0\n"
 

@@ -21,9 +21,8 @@ from jawusd.photographs.align import _AT_WIDTH_PX, _TURN_PX, _lower_incisor, _re
 from jawusd.photographs.contact import Contact
 from jawusd.photographs.solve import Bite, match, seen_outlines
 from jawusd.pipeline.photographs import drawn_over, read_drawing
-from jawusd.segmentation.colours import ColourModel
-from jawusd.segmentation.config import SegmentationConfig
-from jawusd.segmentation.crowns import ScanSurface, expect_crowns
+from jawusd.segmentation.arches import ScanSurface, expect_crowns
+from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.learn import cut_picture
 from jawusd.segmentation.picture import Window
 from jawusd.segmentation.rows import tooth_rows

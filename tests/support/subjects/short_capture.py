@@ -22,15 +22,12 @@ from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transf
 from jawusd.meshes.raster import draw_depth_labels
 from jawusd.synthetic.bite import Bite, build_bite
 from jawusd.synthetic.dental_arch import DentalArch
-from jawusd.synthetic.dentition import without_gum
+from jawusd.synthetic.dentition import Traits, without_gum
 from jawusd.synthetic.person import draw_joint
 from jawusd.synthetic.soft_tissue import Face, palate, tongue
-from jawusd.synthetic.traits import Traits
-from subjects.annotator import FINER, Annotator, Hand, draw_annotator
-from subjects.redraw import write_mask
+from subjects.annotator import FINER, Annotator, Hand, draw_annotator, write_mask
 from subjects.scanner import Scanner, draw_scanner, encoded, scanned
-from subjects.short_picks import TEETH_FROM, Drawn, ShortPick, pick_ends, pick_lines
-from subjects.short_take import Motion, draw_cameras, draw_motion
+from subjects.short_take import TEETH_FROM, Drawn, Motion, ShortPick, draw_cameras, draw_motion, pick_ends, pick_lines
 from subjects.traits import draw_traits
 
 FPS = 24.0

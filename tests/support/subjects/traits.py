@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from jawusd.geometry import so3_exp
-from jawusd.synthetic.traits import ArchTraits, Gums, Traits
+from jawusd.synthetic.dentition import ArchTraits, Gums, Traits
 
 #: Intended vertical and horizontal distance of the incisal edges [mm]; the settled bite may end elsewhere.
 OVERBITE_MM, OVERJET_MM = (-3.0, 8.0), (-3.0, 10.0)

@@ -1,12 +1,9 @@
-"""Start the calibration: intrinsics per camera, then the cameras' poses, from single views of the board.
-
-A detector may list a symmetric board's corners in another order in every picture. Each order is a board turned in its
-plane; the relative pose of two fixed cameras is the same in all views only where both list the same corner first, so
-the pose that most views agree on settles orders and finds views that were not simultaneous.
-"""
+"""Initial cameras for the bundle adjustment, from matched pixels or from boards."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -21,6 +18,11 @@ FEWEST_VIEWS = 6  # per camera; fewer leave focal length and distance exchangeab
 _SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # relative poses this close (share of the distance) agree
 _LEAST_AGREEMENT = 0.5  # of the views shared by two cameras
 _INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+_WIDTH_PX = 960  # large enough for boards that fill a fifth of the picture
+_FEWEST_PICTURES = 2  # that must agree
+_FEWEST_MARKERS = 4
+_FAMILIES = ("4X4", "5X5", "6X6", "7X7")
+_SIZES = (50, 100, 250, 1000)  # OpenCV's smaller dictionaries are the beginnings of the larger ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,3 +169,52 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
     near = strong[_alike(strong, flat[best])]
     gap = np.linalg.norm(near[:, None, :3] - near[None, :, :3], axis=(-1, -2)).sum(1)
     return near[int(np.argmin(gap))]
+
+
+@dataclass(frozen=True)
+class BoardSeen:
+    """Hold what board clips show: inner corners of a chessboard, or the dictionary of markers."""
+
+    pattern: str
+    cols: int | None = None
+    rows: int | None = None
+    dictionary: str | None = None
+
+
+def seen_board(pictures: Iterable[NDArray[np.uint8]]) -> BoardSeen | None:
+    """Return the board in most of some gray pictures (h, w); None if none is in two of them."""
+    boards: Counter[tuple[int, int]] = Counter()
+    markers: Counter[str] = Counter()
+    highest: dict[str, int] = {}
+    for picture in pictures:
+        small = _shrunk(picture)
+        for family, largest in _markers(small):
+            markers[family] += 1
+            highest[family] = max(largest, highest.get(family, 0))
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+        ok, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags=flags)
+        if ok:
+            boards[max(meta.shape), min(meta.shape)] += 1
+    family, times = markers.most_common(1)[0] if markers else ("", 0)
+    if times >= _FEWEST_PICTURES:
+        size = next(size for size in _SIZES if size > highest[family])
+        return BoardSeen("charuco", dictionary=f"DICT_{family}_{size}")
+    (cols, rows), times = boards.most_common(1)[0] if boards else ((0, 0), 0)
+    return BoardSeen("chessboard", cols, rows) if times >= _FEWEST_PICTURES else None
+
+
+def _shrunk(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = picture.shape
+    if width <= _WIDTH_PX:
+        return np.ascontiguousarray(picture)
+    size = (_WIDTH_PX, round(height * _WIDTH_PX / width))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _markers(picture: NDArray[np.uint8]) -> Iterable[tuple[str, int]]:
+    """Yield each family of markers seen, with the highest number."""
+    for family in _FAMILIES:
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}_{_SIZES[-1]}"))
+        numbers = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)[1]
+        if numbers is not None and len(numbers) >= _FEWEST_MARKERS:
+            yield family, int(numbers.max())
