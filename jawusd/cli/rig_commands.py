@@ -240,9 +240,14 @@ def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
     from dataclasses import asdict
 
     from jawusd.rig import Finding, find_nvidia_validator, nvidia_findings, validate_stage
+    from jawusd.rig.read import open_stage
+    from jawusd.rig.schema import rig_prims
 
     findings = [Finding(one.severity, one.kind, one.path or "", one.message) for one in changed]
     findings += validate_stage(path)
+    if not rig_prims(open_stage(path)):
+        words = "holds no active rig (no prim with JawRigAPI): the rules for rigs were not applied."
+        findings.append(Finding("info", "Rig", "/", words))
     nvidia = find_nvidia_validator()
     if nvidia is not None:
         findings += nvidia_findings(path, nvidia)

@@ -21,7 +21,6 @@ _PREFIX = "jawusd:"
 
 # UsdValidation takes validators written in Python from OpenUSD 26.05 on.
 _PLUGGABLE = UsdValidation is not None and hasattr(UsdValidation.ValidationRegistry, "RegisterStageValidator")
-_NO_RIG = "holds no active rig (no prim with JawRigAPI): only OpenUSD's own validators were run."
 _NO_STOCK = "OpenUSD's own validators were not run: usd-core is older than 26.5."
 
 
@@ -49,13 +48,12 @@ def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
         RigError: The file cannot be opened.
     """
     stage = open_stage(path)
-    none = [] if _rig_prims(stage) else [Finding("info", "Rig", "/", _NO_RIG)]
     if not register_validators():
         found = [finding for prim in _rig_prims(stage) for rule in RULES.values() for finding in rule(prim)]
         broken = [Finding("error", "CompositionError", "/", str(error)) for error in stage.GetCompositionErrors()]
-        return [*none, *broken, *found, Finding("info", "Stock", "/", _NO_STOCK)]
+        return [*broken, *found, Finding("info", "Stock", "/", _NO_STOCK)]
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    return [*none, *(_finding(error) for error in UsdValidation.ValidationContext(validators).Validate(stage))]
+    return [_finding(error) for error in UsdValidation.ValidationContext(validators).Validate(stage)]
 
 
 def _rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
