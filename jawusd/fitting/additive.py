@@ -1,24 +1,95 @@
-"""The best sum of three curves: log M = Phi1(d1) + Phi2(d2) + Phi3(d3), fitted jointly to the captured poses.
-
-The twist is taken about the incisal point p, (omega, s = omega x p + v), and one component of s of each curve is its
-parameter t itself (-s_y of Phi1, s_x of Phi2, s_z of Phi3), which makes the sum unique. All other components are
-smoothing splines, solved for together by least squares while the poses are projected onto the sum.
-"""
+"""Curves in se(3) whose parameter is millimetres at the lower incisal point."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 from scipy.interpolate import BSpline
 
 from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FittingError
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.models import AdditiveModel
-from jawusd.fitting.curves import MEASURED, Curve, in_millimetres
-from jawusd.fitting.data import TrainingData
-from jawusd.fitting.form import FittedForm
+from jawusd.fitting.data import PARAMETERS, FittedForm, TrainingData
 from jawusd.fitting.gauge_fit import fit_gauge, fit_path
+from jawusd.fitting.metric import velocity_of
 from jawusd.fitting.spline import choose_smoothing, ridge_solve, within
-from jawusd.geometry import se3_log
+from jawusd.geometry import se3_exp, se3_left_jacobian, se3_log
+
+#: A curve of some parameter t (n,): twists (n, 6) and their derivatives by t (n, 6); the twist is zero at t = 0.
+Curve = Callable[[Array], tuple[Array, Array]]
+
+KNOTS = 97
+#: Directions of the incisal displacement that opening, laterotrusion and protrusion measure.
+MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+# Share of the mandible's rms speed below which the incisal point counts as standing still or turning back
+_SLOWEST = 0.2
+_SHORTEST_MM = 0.01  # a curve shorter than this is a network that collapsed
+
+
+def in_millimetres(
+    curve: Curve, limits: tuple[float, float], root: Array, incisor: Array, axis: int
+) -> tuple[HermiteCurve, Mask]:
+    """Reparametrise a curve by d, the displacement of the incisal point along the curve's own axis [mm].
+
+    Where the incisal point stands still or turns back, d goes on growing with a fifth of the mandible's rms path, so
+    that every point of the curve has a parameter.
+
+    Args:
+        limits: interval of t that the data reach, containing 0.
+        root: L with |L^T xi| = rms displacement of the mandible under a small twist xi [mm], shape (6, 6).
+        incisor: incisal point at rest [mm], shape (3,).
+        axis: 0 opening, 1 laterotrusion, 2 protrusion.
+
+    Returns:
+        The curve over d, through zero at d = 0, and at which of its knots the incisal point advances steadily.
+
+    Raises:
+        FittingError: the curve does not move at all.
+    """
+    t = np.unique(np.append(np.linspace(*limits, KNOTS), 0.0))
+    twist, rate = curve(t)
+    advance, speed = _incisal_advance(twist, rate, incisor, MEASURED[axis])
+    zero = int(np.searchsorted(t, 0.0))
+    sense = 1.0 if advance[-1] >= advance[0] else -1.0
+    slowest = _SLOWEST * np.linalg.norm(rate @ root, axis=1)
+    steady = sense * speed > slowest
+    pace = np.where(steady, sense * speed, np.maximum(slowest, 1e-9))
+    walked = 0.5 * (pace[1:] + pace[:-1]) * np.diff(t)
+    step = np.where(steady[1:] & steady[:-1], sense * np.diff(advance), walked)
+    d = np.concatenate([[0.0], np.cumsum(step)])
+    d = sense * (d - d[zero])
+    if np.ptp(d) < _SHORTEST_MM:
+        raise FittingError(
+            f"what was learned of the {PARAMETERS[axis]} moves nothing: {np.ptp(d):.2g} mm along its whole range, at "
+            f"least {_SHORTEST_MM:g} mm are needed.",
+            hint="The networks of this start collapsed. Try another seed or more starts, or the model 'anchored'.",
+        )
+    order = np.argsort(d)
+    slopes = sense * rate / pace[:, None]
+    return HermiteCurve(d[order], twist[order], slopes[order]), steady[order]
+
+
+def straight(direction: Array, knots: Array) -> HermiteCurve:
+    """Return the straight curve d -> d * direction, twists per mm (6,), between two knots (2,) [mm]."""
+    return HermiteCurve(knots, knots[:, None] * direction, np.stack([direction, direction]))
+
+
+def translation(axis: int) -> Array:
+    """Return the twist per mm (6,) of a pure translation along the axis of a parameter."""
+    return np.concatenate([np.zeros(3), MEASURED[axis]])
+
+
+def _incisal_advance(twist: Array, rate: Array, incisor: Array, direction: Array) -> tuple[Array, Array]:
+    """Return how far the incisal point has moved along a direction (n,) [mm], and its speed by the parameter."""
+    M = se3_exp(twist)
+    point = M[:, :3, :3] @ incisor + M[:, :3, 3]
+    spatial = np.einsum("nij,nj->ni", se3_left_jacobian(twist), rate)
+    velocity = np.cross(spatial[:, :3], point) + spatial[:, 3:]
+    return (point - incisor) @ direction, velocity @ direction
+
 
 _PIECES = (8, 6, 6)  # polynomial pieces of the three curves
 _ROUNDS = 8
@@ -142,3 +213,53 @@ def _curve(basis: _Basis, turn: Array, glide: Array, incisor: Array, axis: int) 
         return twist(basis.columns(t), t), twist(basis.slopes(t), np.ones_like(t))
 
     return curve
+
+
+_LARGEST_CONDITION = 1e3
+
+
+def fit_pca(data: TrainingData, shown: Mask) -> FittedForm:
+    """Fit a linear subspace of se(3) through the closed bite to all frames.
+
+    The subspace holds the first principal components (as many as there are shown parameters) of log M; not centred, so
+    that d = 0 is the closed bite. Its basis is chosen by the incisal velocity: d2 and d3 move the incisal point purely
+    sideways and forward at first order, d1 along the mean opening direction of the take.
+
+    The note `singular_values_mm` holds those of the weighted twists, rms over the mandible.
+
+    Args:
+        shown: which parameters the data show, shape (3,); the others become translations without rotation.
+
+    Raises:
+        FittingError: the components do not move the incisal point in as many independent directions.
+    """
+    L = data.metric.twist_root()
+    twists = se3_log(data.motion)
+    weights = data.weights / data.weights.sum()
+    _, singular, Vt = np.linalg.svd((twists @ L) * np.sqrt(weights)[:, None], full_matrices=False)
+    basis = np.linalg.solve(L.T, Vt[: int(shown.sum())].T)
+    directions = _semantic_directions(basis, twists, weights, data.incisor, shown)
+    reach = np.linalg.lstsq(directions, twists.T, rcond=None)[0]
+    limits = np.stack([np.minimum(reach.min(1), -1.0), np.maximum(reach.max(1), 1.0)], axis=1)
+    d1, d2, d3 = (straight(directions[:, i], limits[i]) for i in range(3))
+    model = AdditiveModel((d1, d2, d3), data.incisor, limits)
+    return FittedForm(model, np.ones(len(data), dtype=bool), {"singular_values_mm": singular.tolist()})
+
+
+def _semantic_directions(basis: Array, twists: Array, weights: Array, incisor: Array, shown: Mask) -> Array:
+    """Return the twists per mm of d1, d2, d3 as columns, shape (6, 3)."""
+    measure = MEASURED[shown] @ velocity_of(incisor)
+    to_mm = measure @ basis
+    if np.linalg.cond(to_mm) > _LARGEST_CONDITION:
+        raise FittingError(
+            "the principal components do not move the incisal point in independent directions.",
+            hint="Check the units and the anatomical frame of the poses, or use the model 'anchored'.",
+        )
+    directions = np.stack([translation(axis) for axis in range(3)], axis=1)
+    directions[:, shown] = basis @ np.linalg.inv(to_mm)
+    if shown[0]:
+        # Along the habitual path: the mean motion per millimetre of opening over the take.
+        d = to_mm @ np.linalg.lstsq(basis, twists.T, rcond=None)[0]
+        habit = (d * weights) @ d[0] / ((weights * d[0]) @ d[0])
+        directions[:, 0] = directions[:, shown] @ habit
+    return directions

@@ -1,27 +1,152 @@
-"""The default model: rotation as a smooth function of where the lower incisal point is.
+"""The paths of the condyles, which extrapolate a fit beyond the captured poses.
 
-On the three-dimensional set of reachable poses the displacement u of the incisal point is itself a coordinate system,
-so omega = f(u), t = u + p - R(omega) p with f(0) = 0 describes any smooth three-parameter jaw. f is a smoothing
-polyharmonic spline; it is refitted while the captured poses are projected onto it, so that noise in u does not bias f.
-Where no poses were captured, predictions from the condyles' paths guide the spline weakly (see `condylar`).
+A condyle slides on its eminence with the disc between, so its height is a function of its forward slide at any opening;
+and its sideways movement of the difference of the two slides (Bennett) and the opening. These three equations, learned
+from the captured poses, fix the rotation for every position of the incisal point. They are coarser than the spline of
+`anchored` where there are poses, but wide open with the jaw to one side, which few takes contain, both condyles are on
+slopes that other exercises have measured.
+
+The point of the condyle that deviates least from one path, its kinematic centre (Yatabe et al. 1995, J Dent Res
+74:2006), is found near the landmark, which therefore need not be exact.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.models import AnchoredModel
-from jawusd.fitting.condylar import CondylarGuidance
-from jawusd.fitting.data import MODEL_SIGMA_MM, TrainingData
-from jawusd.fitting.form import FittedForm
+from jawusd.fitting.data import MODEL_SIGMA_MM, FittedForm, TrainingData, displacement
 from jawusd.fitting.gauge_fit import fit_gauge, fit_path
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve, within
-from jawusd.geometry import make_transform, so3_log
+from jawusd.geometry import make_transform, so3_exp, so3_log
+
+_SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # make the polynomials' arguments of order one
+_DEGREE = 4
+_RIDGE = 1e-3
+_RANGE_PERCENTILES = (0.5, 99.5)  # of the slides: beyond, the eminence is extrapolated linearly
+_LANDMARK_SIGMA_MM = 10.0  # how far the kinematic centre may be from the landmark
+_PATH_SIGMA_MM = 0.3  # how closely it keeps to its path
+_FRAMES_ALIKE = 25  # frames (a second of video) with the information of one independent frame
+_NEWTON_STEPS, _LARGEST_STEP_RAD, _SETTLED_MM = 15, 0.1, 1e-6
+_FARTHER_MM = 4.0  # by which slides may exceed the captured ones
+
+
+@dataclass(frozen=True)
+class CondylarGuidance:
+    """Hold the paths of the left and right condyle, anatomical frame."""
+
+    incisor: Array  # lower incisal point at rest [mm], shape (3,)
+    centres: Array  # kinematic centres at rest [mm], shape (2, 3)
+    slopes: Array  # polynomial coefficients of the height over the slide, shape (2, 4) [mm]
+    slide_range: Array  # captured slides [mm], shape (2, 2)
+    shift: Array  # coefficients of the sideways movement of the middle [mm], shape (5,)
+    misfit_mm: float  # rms residual of the three equations over the captured poses
+
+    @classmethod
+    def of_motion(cls, motion: Array, weights: Array, incisor: Array, condyles: Array) -> CondylarGuidance:
+        """Learn the paths from motions (N, 4, 4) with weights (N,), from condyle landmarks (2, 3) at rest [mm]."""
+        centres = np.stack([_kinematic_centre(motion, weights, condyle) for condyle in condyles])
+        moved = np.stack([displacement(motion, centre) for centre in centres], axis=1)
+        ranges = np.percentile(moved[:, :, 2], _RANGE_PERCENTILES, axis=0).T
+        slopes = np.stack([_height_over_slide(moved[:, side], weights) for side in (0, 1)])
+        opening = -displacement(motion, incisor)[:, 1]
+        columns = _shift_columns(moved[:, 0, 2] - moved[:, 1, 2], opening)[0]
+        shift = _ridge_fit(columns, moved[:, :, 0].mean(1), weights)
+        guidance = cls(incisor, centres, slopes, ranges, shift, 0.0)
+        residual = guidance._residual(motion[:, :3, :3], displacement(motion, incisor))[0]
+        misfit = np.sqrt(np.average((residual**2).mean(1), weights=weights))
+        return replace(guidance, misfit_mm=float(misfit))
+
+    def rotation(self, u: Array, start: Array) -> tuple[Array, Mask]:
+        """Return the rotations that satisfy the equations at incisal displacements u (N, 3) [mm].
+
+        Args:
+            start: rotation vectors to start from [rad], shape (N, 3).
+
+        Returns:
+            Rotation vectors (N, 3) [rad], and which of them converged with slides like the captured ones, shape (N,).
+        """
+        R = so3_exp(start)
+        for _ in range(_NEWTON_STEPS):
+            residual, slope, _ = self._residual(R, u)
+            step = np.linalg.solve(slope, -residual[..., None])[..., 0]
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            R = so3_exp(step * np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(length, 1e-12))) @ R
+        residual, _, slides = self._residual(R, u)
+        low, high = self.slide_range[:, 0] - _FARTHER_MM, self.slide_range[:, 1] + _FARTHER_MM
+        found = (np.abs(residual).max(1) < _SETTLED_MM) & np.all((slides > low) & (slides < high), axis=1)
+        return so3_log(R), found
+
+    def _residual(self, R: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Return the equations' residuals (N, 3) [mm], their derivatives by a spatial rotation (N, 3, 3), the slides.
+
+        The poses are rotations R (N, 3, 3) at incisal displacements u (N, 3) [mm].
+        """
+        arms = np.einsum("nij,kj->nki", R, self.centres - self.incisor)
+        moved = arms + (u + self.incisor)[:, None] - self.centres
+        # A spatial rotation w moves a condyle by w x arm, so its coordinate i by (arm x e_i) . w.
+        by_w = np.cross(arms[:, :, None, :], np.eye(3))
+        slides = moved[:, :, 2]
+        height, slope = self._eminence(slides)
+        columns, by_difference = _shift_columns(slides[:, 0] - slides[:, 1], -u[:, 1])
+        middle = moved[:, :, 0].mean(1) - columns @ self.shift
+        residual = np.column_stack([moved[:, :, 1] - height, middle])
+        heights_by_w = by_w[:, :, 1] - slope[:, :, None] * by_w[:, :, 2]
+        middle_by_w = by_w[:, :, 0].mean(1) - (by_difference @ self.shift)[:, None] * (by_w[:, 0, 2] - by_w[:, 1, 2])
+        return residual, np.concatenate([heights_by_w, middle_by_w[:, None]], axis=1), slides
+
+    def _eminence(self, slides: Array) -> tuple[Array, Array]:
+        """Return height and slope over the slides (N, 2), extrapolated linearly beyond the captured ones."""
+        inside = np.clip(slides, self.slide_range[:, 0], self.slide_range[:, 1])
+        powers = np.arange(1, _DEGREE + 1)
+        s = (inside / _SLIDE_SCALE_MM)[..., None]
+        slope = (self.slopes * powers * s ** (powers - 1)).sum(-1) / _SLIDE_SCALE_MM
+        return (self.slopes * s**powers).sum(-1) + slope * (slides - inside), slope
+
+
+def _kinematic_centre(motion: Array, weights: Array, condyle: Array) -> Array:
+    """Return the point near a condyle landmark whose height follows its slide most closely [mm], shape (3,).
+
+    Only its height and depth are searched: all points of the condylar axis behave alike.
+    """
+    root = np.sqrt(weights / _FRAMES_ALIKE)
+
+    def residual(offset: Array) -> Array:
+        moved = displacement(motion, condyle + [0.0, *offset])
+        coefficients = _height_over_slide(moved, weights)
+        left = (moved[:, 1] - _powers(moved[:, 2]) @ coefficients) * root
+        return np.concatenate([left / _PATH_SIGMA_MM, offset / _LANDMARK_SIGMA_MM])
+
+    return condyle + [0.0, *least_squares(residual, np.zeros(2), method="lm", diff_step=1e-4, x_scale=1.0).x]
+
+
+def _height_over_slide(moved: Array, weights: Array) -> Array:
+    return _ridge_fit(_powers(moved[:, 2]), moved[:, 1], weights)
+
+
+def _powers(slide: Array) -> Array:
+    return (slide / _SLIDE_SCALE_MM)[:, None] ** np.arange(1, _DEGREE + 1)
+
+
+def _shift_columns(difference: Array, opening: Array) -> tuple[Array, Array]:
+    """Return the regressors (N, 5) of the sideways movement, and their derivatives by the difference of the slides."""
+    d, o = difference / _SLIDE_SCALE_MM, opening / _OPENING_SCALE_MM
+    zero, one = np.zeros_like(d), np.ones_like(d)
+    columns = np.stack([d, d * np.abs(d), d * o, o, o * o], axis=1)
+    return columns, np.stack([one, 2 * np.abs(d), o, zero, zero], axis=1) / _SLIDE_SCALE_MM
+
+
+def _ridge_fit(columns: Array, values: Array, weights: Array) -> Array:
+    weighted = columns * weights[:, None]
+    penalty = _RIDGE * weights.sum() * np.eye(columns.shape[1])
+    return np.linalg.solve(weighted.T @ columns + penalty, weighted.T @ values)
+
 
 CENTRES = 80
 _ROUNDS = 4

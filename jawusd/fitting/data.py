@@ -7,16 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jawusd.base.arrays import Array, Mask
+from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.base.errors import FittingError
 from jawusd.evaluator.frames import motions_of_poses, poses_of_motions
+from jawusd.evaluator.models import JawModelForm
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, transform_points
+from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, so3_log, transform_points
 
 #: Tracks, or frame numbers (F,) and poses T_skull_mandible (F, 4, 4) with NaN where there is none.
 Source = Tracks | tuple[ArrayLike, ArrayLike]
 
+#: Names of d1, d2 and d3.
+PARAMETERS = ("opening", "laterotrusion", "protrusion")
 #: How far real jaws deviate from a three-parameter model: smaller tracking errors hardly matter [mm].
 MODEL_SIGMA_MM = 0.3
 _LARGEST_SIGMA_MM = 2.0  # frames less certain than this over the mandible (rms) are left out
@@ -238,3 +241,69 @@ def _mandible_sigma(T: Array, covariance: Array, anatomy: SubjectAnatomy) -> Arr
     M[:, :3, :3] = np.einsum("nii->n", second)[:, None, None] * np.eye(3) - second
     M[:, :3, 3:], M[:, 3:, :3], M[:, 3:, 3:] = hat(y), -hat(y), np.eye(3)
     return np.sqrt(np.maximum(np.einsum("nij,nji->n", M, covariance), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class FittedForm:
+    """Hold a fitted decoder."""
+
+    model: JawModelForm
+    kept: Mask  # training frames that were not trimmed, shape (N,)
+    notes: dict[str, object]  # JSON-able facts about the fit, for the header
+
+
+_FEWEST = 60  # poses needed to identify outliers
+_TRIALS, _SAMPLE = 300, 15  # random samples; each somewhat above the ten unknowns per component
+_CONSENSUS = 0.75  # share of the poses that must agree
+_REFITS = 3
+# A jaw deviates from the quadratic by a millimetre or two at its borders; smaller failures are trimmed by the smooth
+# models themselves [mm, rms over the mandible].
+_TIMES, _FLOOR_MM = 8.0, 6.0
+REASON = "far from the other poses' smooth motion"
+
+
+def screened(selection: Selection) -> Selection:
+    """Return the selection without its gross outliers."""
+    outliers = gross_outliers(selection.data)
+    if not outliers.any():
+        return selection
+    used = selection.used.copy()
+    used[np.flatnonzero(used)[outliers]] = False
+    excluded = {**selection.excluded, REASON: selection.data.frames[outliers].tolist()}
+    return replace(selection, data=selection.data.select(~outliers), used=used, excluded=excluded)
+
+
+def gross_outliers(data: TrainingData) -> Mask:
+    """Return which poses lie centimetres off the quadratic map of the majority, shape (N,); none of fewer than 60."""
+    count = len(data)
+    if count < _FEWEST:
+        return np.zeros(count, dtype=bool)
+    columns = _quadratic(data.displacement())
+    # |values|^2 is the mean squared displacement of the mandible by the rotation about the incisal point [mm^2].
+    values = so3_log(data.motion[:, :3, :3]) @ np.linalg.cholesky(data.metric.about(data.incisor))
+    rng = np.random.default_rng(0)
+    agreeing, best = np.ones(count, dtype=bool), np.inf
+    for _ in range(_TRIALS):
+        sample = rng.choice(count, _SAMPLE, replace=False)
+        residual = _residual(columns, values, sample)
+        spread = np.quantile(residual, _CONSENSUS)
+        if spread < best:
+            agreeing, best = residual <= 3 * spread, spread
+    for _ in range(_REFITS):
+        residual = _residual(columns, values, agreeing)
+        spread = np.quantile(residual, _CONSENSUS)
+        agreeing = residual <= 3 * spread
+    return residual > max(_TIMES * spread, _FLOOR_MM)
+
+
+def _quadratic(u: Array) -> Array:
+    """Return the ten monomials up to degree two of displacements (N, 3), scaled to their usual size, shape (N, 10)."""
+    x = (u - np.median(u, axis=0)) / np.maximum(np.percentile(np.abs(u), 75, axis=0), 1.0)
+    pairs = [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
+    return np.column_stack([np.ones(len(x)), x, *pairs])
+
+
+def _residual(columns: Array, values: Array, rows: Indices | Mask) -> Array:
+    """Return the residuals (N,) of a fit to some rows."""
+    solution = np.linalg.lstsq(columns[rows], values[rows], rcond=1e-8)[0]
+    return np.linalg.norm(values - columns @ solution, axis=1)

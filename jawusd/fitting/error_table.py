@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.models import JawModelForm
-from jawusd.fitting.data import TrainingData
-from jawusd.fitting.form import FittedForm
+from jawusd.fitting.data import FittedForm, TrainingData
 from jawusd.geometry import LANDMARKS, transform_point
 
 Refit = Callable[[TrainingData], FittedForm]

@@ -4,27 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Literal, get_args
+from functools import wraps
+from typing import Literal, ParamSpec, TypeVar, get_args
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError, FittingError
 from jawusd.evaluator import JawRig
-from jawusd.fitting.additive import fit_additive
-from jawusd.fitting.anatomy_gate import AnatomyWarning, check_anatomy
+from jawusd.evaluator.speeds import Speeds
+from jawusd.fitting.additive import fit_additive, fit_pca
 from jawusd.fitting.anchored import fit_anchored
-from jawusd.fitting.blas import one_blas_thread
 from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
-from jawusd.fitting.coverage import PARAMETERS, missing_movements, shown_parameters
-from jawusd.fitting.data import Selection, Source, SubjectAnatomy, TrainingData, select
+from jawusd.fitting.checks import AnatomyWarning, check_anatomy, missing_movements, shown_parameters
+from jawusd.fitting.data import (
+    PARAMETERS,
+    FittedForm,
+    Selection,
+    Source,
+    SubjectAnatomy,
+    TrainingData,
+    screened,
+    select,
+)
 from jawusd.fitting.error_table import ErrorTable, seen_errors, unseen_errors
-from jawusd.fitting.form import FittedForm
-from jawusd.fitting.pca import fit_pca
-from jawusd.fitting.screening import screened
 from jawusd.formats.model import JawModel
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 #: Called with the steps done and the steps in all.
 Progress = Callable[[int, int], None]
@@ -64,6 +74,20 @@ class FittingConfig:
             raise ValueError(f"trim_mad and alpha must be positive, got {self.trim_mad} and {self.alpha}")
         if self.starts < 1:
             raise ValueError(f"starts must be at least 1, got {self.starts}")
+
+
+def one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Run a function with one thread of OpenBLAS, MKL or BLIS, whatever the process has otherwise.
+
+    The matrices of a fit are so small that more threads save nothing. Apple's Accelerate has no such setting.
+    """
+
+    @wraps(function)
+    def limited(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        with threadpool_limits(limits=1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return limited
 
 
 #: The methods fitted here; `jawusd.paper.model.FORMS` adds the paper's own, which needs torch.
@@ -207,3 +231,23 @@ def _model(
     meta["ranges_mm"] = {name: [low, high] for name, (low, high) in zip(PARAMETERS, ends)}
     arrays = {**arrays, "residual_limit_mm": np.array(limit)}
     return JawModel(arrays, selection.frames, d, residual_mm, trained, meta)
+
+
+_FASTEST_MM_S2 = 3e4  # three times gravity: poses that jump, no motion
+
+
+def with_speeds(model: JawModel, fps: float) -> JawModel:
+    """Return a model with the speeds of its take at a rate [1/s].
+
+    Frames that took no part in the fit are left out. The model stays as it was if too few frames follow each other, or
+    if no jaw moves like this.
+    """
+    d = np.where(model.trained[:, None], model.d, np.nan)
+    gaps = np.flatnonzero(np.diff(model.frames) != 1) + 1
+    try:
+        speeds = Speeds.of_take(np.insert(d, gaps, np.nan, axis=0), fps)
+    except ValueError:
+        return model
+    if speeds.rms_mm_s2.max() > _FASTEST_MM_S2:
+        return model
+    return replace(model, arrays={**model.arrays, **speeds.arrays()})

@@ -18,7 +18,7 @@ from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.glide import GlideTable
 from jawusd.evaluator.models import AnchoredModel
 from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
-from jawusd.fitting.coverage import PARAMETERS
+from jawusd.fitting.data import PARAMETERS
 from jawusd.fitting.gauge_fit import SMALLEST_MINOR, smallest_minor
 from jawusd.formats.model import JawModel
 from jawusd.geometry.se3 import make_transform

@@ -5,23 +5,24 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FittingError
-from jawusd.fitting.blas import one_blas_thread
-from jawusd.fitting.coverage import FAR_MM, bound_not_reached, missing_movements, shown_parameters
-from jawusd.fitting.data import Source, SubjectAnatomy, TrainingData, select
-from jawusd.fitting.fit import FORMS, FittingConfig, Progress
-from jawusd.fitting.form import FittedForm
+from jawusd.fitting.checks import FAR_MM, bound_not_reached, missing_movements, shown_parameters
+from jawusd.fitting.data import FittedForm, Source, SubjectAnatomy, TrainingData, select
+from jawusd.fitting.fit import FORMS, FittingConfig, Progress, one_blas_thread
 from jawusd.formats.experiments import Coverage, Distances, Experiments
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_exp, se3_log, transform_point, transform_points
 from jawusd.paper.condyle_paths import condyle_paths, parameter_paths, path_distances, sagittal_section
 from jawusd.paper.model import COMPONENTS, PaperFit, fit_paper
-from jawusd.paper.nlpca import Nlpca
 from jawusd.paper.synthesis import Bounds, captured_reference, distance_to_nearest
+
+if TYPE_CHECKING:
+    from jawusd.paper.nlpca import Nlpca  # imports torch
 
 #: Models of the experiments by label.
 MODELS: dict[str, FittingConfig] = {
@@ -152,7 +153,7 @@ def _networks(
     data: TrainingData, config: FittingConfig, paper: FittedForm | None, notify: Callable[[int], None]
 ) -> list[Nlpca]:
     """Return networks of 1..5 components; the last is that of the paper's model, if there is one."""
-    from jawusd.paper.nlpca_training import train_nlpca  # imports torch
+    from jawusd.paper.nlpca import train_nlpca  # imports torch
 
     points = se3_log(data.motion) @ data.metric.twist_root()
     nets = []

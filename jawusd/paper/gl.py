@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import JawusdError, MissingDependencyError
-from jawusd.paper.pixel_counts import checked_screens
+from jawusd.paper.energy import checked_screens
 
 try:
     import moderngl

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,13 +24,14 @@ from jawusd.base.errors import FittingError
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting import fit
-from jawusd.fitting.curves import MEASURED, Curve, in_millimetres
-from jawusd.fitting.data import TrainingData
+from jawusd.fitting.additive import MEASURED, Curve, in_millimetres
+from jawusd.fitting.data import FittedForm, TrainingData
 from jawusd.fitting.error_table import pose_errors, summarise
 from jawusd.fitting.fit import FormFitter
-from jawusd.fitting.form import FittedForm
 from jawusd.geometry import se3_exp, se3_log
-from jawusd.paper.nlpca import Nlpca
+
+if TYPE_CHECKING:
+    from jawusd.paper.nlpca import Nlpca  # imports torch
 
 Groups = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
@@ -120,7 +122,7 @@ def fit_paper(
     Raises:
         FittingError: a parameter is not in the data, or no component moves the incisal point that way.
     """
-    from jawusd.paper.nlpca_training import train_nlpca  # imports torch, which takes two seconds
+    from jawusd.paper.nlpca import train_nlpca  # imports torch, which takes two seconds
 
     if not shown.all():
         raise FittingError(
@@ -162,7 +164,7 @@ def _network_sum(data: TrainingData, points: Array, root: Array, literal: bool, 
 
 
 def _part(net: Nlpca, components: Array, group: tuple[int, ...], seed: int, stages: int) -> _Part:
-    from jawusd.paper.nlpca_training import train_nlpca
+    from jawusd.paper.nlpca import train_nlpca
 
     if len(group) == 1:
         return _Part(group, None)

@@ -16,8 +16,7 @@ from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks, TracksMeta
 from jawusd.geometry import LANDMARKS, Camera, relative_pose, transform_point
-from jawusd.paper.energy import PaperEnergy, PaperScan, PixelCounter, paper_scan
-from jawusd.paper.pixel_counts import RasterCounter
+from jawusd.paper.energy import PaperEnergy, PaperScan, PixelCounter, RasterCounter, paper_scan
 from jawusd.paper.solver import PaperConfig, solve_paper
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.views import MaskViews, View

@@ -12,12 +12,9 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.photographs import AlignedPhoto, AlignedPhotos
 from jawusd.geometry import transform_point, transform_points
-from jawusd.photographs.contact import Contact
 from jawusd.photographs.drawing import Drawing
-from jawusd.photographs.lens import middle_of
-from jawusd.photographs.search import usual_bites
-from jawusd.photographs.solve import Aligner, Bite, Photo, match, seen_outlines
-from jawusd.photographs.start import Found, Rows, find_first, find_next
+from jawusd.photographs.search import Found, Rows, find_first, find_next, usual_bites
+from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, match, middle_of, seen_outlines
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan, prepare_scan
 
 # Sizes at which all photographs are aligned together, with the gates of the steps [mm].

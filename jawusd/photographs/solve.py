@@ -1,4 +1,4 @@
-"""Align both rows of teeth with the lines of photographs: one bite, a pose and a lens for each photograph."""
+"""The camera of a photograph that nobody calibrated: one focal length, the middle of the picture, one distortion."""
 
 from __future__ import annotations
 
@@ -7,14 +7,134 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array
-from jawusd.geometry import orthonormalise, so3_log, transform_point
-from jawusd.photographs.contact import Contact
+from jawusd.geometry import orthonormalise, so3_log, transform_point, transform_points
 from jawusd.photographs.crowns import Crowns, Outlines, draw_teeth, outlines_of
 from jawusd.photographs.drawing import Drawing, features, nearest
-from jawusd.photographs.lens import UNKNOWNS, PhotoPose, to_camera
 from jawusd.tracking.contour.equations import motion_about
+from jawusd.tracking.contour.scan import Scan
+from jawusd.tracking.initialization.occlusion import crown_surface
+
+#: Unknowns of a photograph: twist of the upper teeth about their centre [rad, mm], log focal length, distortion. With
+#: the focal length the distance changes so that the teeth stay as large: large steps of it are then harmless.
+UNKNOWNS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoPose:
+    """Hold where a photograph was taken and with what lens."""
+
+    T_cam_upper: Array  # shape (4, 4)
+    focal_px: float  # at the size of the picture
+    distortion: float  # k1 of x (1 + k1 r^2), r the distance from the middle over half the width of the picture
+
+    def stepped(self, centre: Array, step: Array) -> PhotoPose:
+        """Return the pose after a step (8,) of the unknowns; `centre` is that of the upper teeth, camera [mm]."""
+        pose = orthonormalise(motion_about(centre, step[:6]) @ self.T_cam_upper)
+        pose[2, 3] += centre[2] * np.expm1(step[6])
+        return PhotoPose(pose, self.focal_px * float(np.exp(step[6])), self.distortion + float(step[7]))
+
+    def scaled(self, factor: float) -> PhotoPose:
+        """Return the pose for the picture shrunk by a factor."""
+        return replace(self, focal_px=self.focal_px * factor)
+
+    def opencv_k1(self, size_px: tuple[int, int]) -> float:
+        """Return the distortion as OpenCV's k1, of directions instead of half widths."""
+        return self.distortion * (2.0 * self.focal_px / size_px[0]) ** 2
+
+    def camera_matrix(self, size_px: tuple[int, int]) -> Array:
+        """Return the projection without distortion from camera [mm] to homogeneous px, shape (3, 3)."""
+        u, v = middle_of(size_px)
+        return np.array([[self.focal_px, 0.0, u], [0.0, self.focal_px, v], [0.0, 0.0, 1.0]])
+
+    def pixels(self, points: Array, size_px: tuple[int, int]) -> Array:
+        """Return where points in camera coordinates (N, 3) [mm] are seen [px], shape (N, 2)."""
+        flat = self.focal_px * points[:, :2] / points[:, 2:]
+        return flat * (1.0 + self.distortion * _radius2(flat, size_px))[:, None] + middle_of(size_px)
+
+    def slopes(
+        self, points: Array, directions: Array, size_px: tuple[int, int], distance_mm: float
+    ) -> tuple[Array, Array]:
+        """Return the derivative along image directions by the camera point (N, 3) [px/mm] and by the lens (N, 2).
+
+        The lens columns are log focal length, with the distance of the teeth, and distortion. `directions` are unit
+        vectors, shape (N, 2).
+        """
+        flat = self.focal_px * points[:, :2] / points[:, 2:]
+        r2 = _radius2(flat, size_px)
+        along = (directions * flat).sum(1)
+        # d(distorted)/d(flat) is symmetric: (1 + k r2) I + 2 k flat flat^T / half^2
+        bent = directions * (1.0 + self.distortion * r2)[:, None]
+        bent += flat * (2.0 * self.distortion * along / (0.5 * size_px[0]) ** 2)[:, None]
+        by_point = np.column_stack([bent * self.focal_px, -(bent * flat).sum(1)]) / points[:, 2:]
+        by_focal = (bent * flat).sum(1) + by_point[:, 2] * distance_mm
+        return by_point, np.column_stack([by_focal, along * r2])
+
+
+def middle_of(size_px: tuple[int, int]) -> Array:
+    """Return the middle of a picture [px], shape (2,)."""
+    return 0.5 * (np.array(size_px, np.float64) - 1.0)
+
+
+def to_camera(pose: PhotoPose, T_upper_lower: Array, points: Array, arch: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return scan points (N, 3) of both arches in upper scan and in camera coordinates [mm], shape (N, 3) each."""
+    in_upper = np.where(arch[:, None] == 1, transform_points(T_upper_lower, points), points)
+    return in_upper, transform_points(pose.T_cam_upper, in_upper)
+
+
+def _radius2(flat: Array, size_px: tuple[int, int]) -> Array:
+    return np.asarray((flat**2).sum(1) / (0.5 * size_px[0]) ** 2, np.float64)
+
+
+# How far apart or into one another the nearest parts of two scanned rows are when the teeth are together [mm].
+_SIGMA_MM = 0.15
+_SHARE = 0.04  # of the lower crowns on a side: what touches there
+_REACH_MM = 3.0  # farther inside, a point is past the base of a crown
+
+
+class Contact:
+    """Draw both rows together until they touch on the left and on the right."""
+
+    def __init__(self, scans: Sequence[Scan]) -> None:
+        """Prepare the surfaces of the upper and the lower crowns."""
+        self._upper, self._lower = (crown_surface(scan) for scan in scans)
+        self._tree = cKDTree(self._upper.points)
+        centred = self._lower.points - scans[1].centre
+        # The longest axis of a row runs from left to right, unless half of it is missing: then either half is a side.
+        across = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+        self._sides = [across > np.percentile(across, 60), across < np.percentile(across, 40)]
+
+    def equations(self, T_upper_lower: Array, centre: Array) -> tuple[Array, Array, Array]:
+        """Return slopes (N, 6) by a twist of the bite about `centre`, distances [mm] and weights [1/mm^2]."""
+        points = transform_points(T_upper_lower, self._lower.points)
+        away, normals = self._signed(points)
+        slopes, residuals, weights = [], [], []
+        for side in self._sides:
+            own = np.flatnonzero(side)
+            touching = own[np.argsort(away[own])[: max(1, int(_SHARE * len(own)))]]
+            slopes.append(np.hstack([np.cross(points[touching] - centre, normals[touching]), normals[touching]]))
+            residuals.append(away[touching])
+            weights.append(np.full(len(touching), _SIGMA_MM**-2 / len(touching)))
+        return np.vstack(slopes), np.concatenate(residuals), np.concatenate(weights)
+
+    def depth_mm(self, T_upper_lower: Array) -> float:
+        """Return how deep crowns run into one another where they do so most, but for a speck [mm]."""
+        away, _ = self._signed(transform_points(T_upper_lower, self._lower.points))
+        return max(0.0, -float(np.percentile(away, 0.2)))
+
+    def _signed(self, points: Array) -> tuple[Array, Array]:
+        """Return distances from the upper crowns, negative inside [mm], shape (N,), and the normals there (N, 3)."""
+        distance, index = self._tree.query(points)
+        normals = self._upper.normals[index]
+        off = points - self._upper.points[index]
+        behind = np.einsum("ij,ij->i", off, normals)
+        inside = (behind < -0.7 * distance) & (distance < _REACH_MM) & ~self._upper.border[index]
+        # Close by, the plane is a better surface than its nearest piece.
+        away = np.where(distance < 1.0, behind, np.where(inside, -distance, distance))
+        return away, normals
+
 
 # What is known beforehand, with standard deviations: telephones are held 80 to 200 mm from the teeth, macro lenses 200
 # to 400 [log]; distortion [-].

@@ -59,7 +59,7 @@ def bake_subject(
     Raises:
         RigError, OutputError: the rig cannot be written.
     """
-    from jawusd.fitting.speeds import with_speeds
+    from jawusd.fitting.fit import with_speeds
     from jawusd.meshes.decimation import bone_proxy_of, proxy_of
     from jawusd.meshes.mesh_cleaning import manifold
     from jawusd.rig.bake import bake_rig

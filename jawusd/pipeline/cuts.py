@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jawusd.segmentation.picture import ColourFootage, PictureFrame, Pictures
     from jawusd.tracking.config import Mapper
     from jawusd.tracking.contour.scan import Scan
-    from jawusd.tracking.region.picture import Cut, Picture
+    from jawusd.tracking.region.appearance import Cut, Picture
 
 _WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # resolution at the teeth, and what is looked at around them
 
@@ -61,7 +61,7 @@ class Cutter:
         return (self.cut(pictures) for _, pictures in footage.walk(frames))
 
     def _one(self, name: str, pictures: Pictures, around: Array) -> Picture | None:
-        from jawusd.tracking.region.picture import Picture
+        from jawusd.tracking.region.appearance import Picture
 
         image = pictures[name]
         window = None if image is None else self._frames[name].window(image, around, _MARGIN_MM)

@@ -105,7 +105,7 @@ def fit_subject(
         FittingError: the poses cannot carry a model.
     """
     from jawusd.fitting import FittingConfig, fit_model
-    from jawusd.fitting.speeds import with_speeds
+    from jawusd.fitting.fit import with_speeds
     from jawusd.paper.model import FORMS
 
     registration = motion.meta.get("registration") if isinstance(motion, Tracks) else None

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jawusd.segmentation.picture import ColourFootage
     from jawusd.tracking.contour.scan import Scan
     from jawusd.tracking.contour.views import View
-    from jawusd.tracking.region.picture import Cut
+    from jawusd.tracking.region.appearance import Cut
     from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 # Change of the jaw's motion from frame to frame [mm] after which the frames before are looked at again, and distance of

@@ -23,7 +23,7 @@ from jawusd.pipeline.subject import subject_of_capture
 if TYPE_CHECKING:
     from jawusd.tracking.config import Mapper
     from jawusd.tracking.performance.coordinates import Pose
-    from jawusd.tracking.region.picture import Cut
+    from jawusd.tracking.region.appearance import Cut
 
 
 @dataclass(frozen=True)

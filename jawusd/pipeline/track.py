@@ -140,7 +140,7 @@ def first_pass(
     """
     from jawusd.paper.take import track_capture_paper
     from jawusd.tracking import track_capture
-    from jawusd.tracking.region.strained import widen_strained
+    from jawusd.tracking.region.condyle_fusion import widen_strained
 
     with naming_file(capture.folder / "capture.toml"):
         cameras, (meshes, findings) = load_cameras(capture), load_labelled(capture)

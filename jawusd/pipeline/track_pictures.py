@@ -45,8 +45,7 @@ def track_videos(
     from jawusd.segmentation.picture import ColourFootage
     from jawusd.tracking.contour.scan import prepare_scan
     from jawusd.tracking.region.picture_start import RowStart
-    from jawusd.tracking.region.strained import footage_doubts
-    from jawusd.tracking.region.take import TakeFacts, tracks_of
+    from jawusd.tracking.region.take import TakeFacts, footage_doubts, tracks_of
 
     cameras, videos = open_footage(capture)
     if len(videos) < FEWEST_VIDEOS:

@@ -25,13 +25,18 @@ from model import SEED_TRAINING, TRAINING, Subject, row  # noqa: E402
 from jawusd.evaluator import JawRig  # noqa: E402
 from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
 from jawusd.fitting.anchored import fit_anchored  # noqa: E402
-from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses, select_tracks  # noqa: E402
-from jawusd.fitting.form import FittedForm  # noqa: E402
+from jawusd.fitting.data import (  # noqa: E402
+    FittedForm,
+    SubjectAnatomy,
+    TrainingData,
+    select_poses,
+    select_tracks,
+)
 from jawusd.formats.capture import load_capture  # noqa: E402
 from jawusd.formats.tracks import load_tracks  # noqa: E402
 from jawusd.geometry import LANDMARKS, make_transform, se3_exp, se3_log, so3_exp, transform_point  # noqa: E402
 from jawusd.paper.model import fit_paper  # noqa: E402
-from jawusd.paper.nlpca_training import train_nlpca  # noqa: E402
+from jawusd.paper.nlpca import train_nlpca  # noqa: E402
 from jawusd.pipeline.meshes import load_meshes  # noqa: E402
 from jawusd.pipeline.subject import subject_of_capture  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402

@@ -31,8 +31,7 @@ from jawusd.media.pictures import read_gray, read_picture
 from jawusd.meshes.meshio import load_mesh
 from jawusd.photographs import align_photographs
 from jawusd.photographs.align import _line_distances, _lower_incisor, _refined, _rms
-from jawusd.photographs.contact import Contact
-from jawusd.photographs.solve import Bite
+from jawusd.photographs.solve import Bite, Contact
 from jawusd.pipeline.photographs import drawn_over, read_drawing
 
 COLOUR = 1  # cv2.IMREAD_COLOR

@@ -37,8 +37,7 @@ from jawusd.tracking import track_capture
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.views import MaskViews
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
-from jawusd.tracking.performance.shot import solve_capture
-from jawusd.tracking.performance.take import Shot, solve_performance
+from jawusd.tracking.performance.shot import Shot, solve_capture, solve_performance
 
 FOCAL_OFF = 1.08
 PX_PER_MM = 7.2

@@ -16,7 +16,7 @@ from jawusd.cli.main import app
 from jawusd.formats.model import load_model
 from jawusd.formats.poses import write_poses
 from jawusd.geometry import LANDMARKS, make_transform
-from jawusd.paper import nlpca_training, synthesis
+from jawusd.paper import nlpca, synthesis
 from jawusd.pipeline.report import TABLE_FILE
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
@@ -144,8 +144,8 @@ def test_each_mistake_is_one_clear_error(given, tmp_path, arguments, code, words
 @pytest.mark.slow
 def test_report_draws_and_prints_the_experiments(given, tmp_path, monkeypatch):
     """In this process, so that networks can be trained for a tenth of their time."""
-    train = nlpca_training.train_nlpca
-    monkeypatch.setattr(nlpca_training, "train_nlpca", lambda *a, **k: train(*a, **(k | {"stages": 2})))
+    train = nlpca.train_nlpca
+    monkeypatch.setattr(nlpca, "train_nlpca", lambda *a, **k: train(*a, **(k | {"stages": 2})))
     monkeypatch.setattr(synthesis, "POSES", 200)
     monkeypatch.setattr(synthesis, "_BATCH", 800)
     out = tmp_path / "figures"

@@ -9,14 +9,13 @@ from scipy.optimize import approx_fprime
 from jawusd.base.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
-from jawusd.fitting.curves import in_millimetres
+from jawusd.fitting.additive import fit_pca, in_millimetres
 from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.fitting.metric import MandibleMetric
-from jawusd.fitting.pca import fit_pca
 from jawusd.geometry import make_transform, mandible_metric, se3_exp, se3_log
-from jawusd.paper import nlpca_training
+from jawusd.paper import nlpca
 from jawusd.paper.model import fit_paper
-from jawusd.paper.nlpca_training import train_nlpca
+from jawusd.paper.nlpca import train_nlpca
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 
@@ -164,7 +163,7 @@ def published(data):
         return train_nlpca(*given, **options | {"stages": 4})
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nlpca_training, "train_nlpca", shorter)
+        patch.setattr(nlpca, "train_nlpca", shorter)
         fits = {literal: fit_paper(few, ALL_SHOWN, literal, starts=2, seed=0, nets=nets) for literal in (False, True)}
     return few, fits
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from jawusd.fitting.anchored import fit_anchored
-from jawusd.fitting.condylar import CondylarGuidance
+from jawusd.fitting.anchored import CondylarGuidance, fit_anchored
 from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.geometry import make_transform, so3_exp, so3_log
 from jawusd.synthetic.exercises import record

@@ -6,8 +6,7 @@ import pytest
 from jawusd.base.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
-from jawusd.fitting.anatomy_gate import check_anatomy
-from jawusd.fitting.coverage import bound_not_reached, missing_movements, shown_parameters
+from jawusd.fitting.checks import bound_not_reached, check_anatomy, missing_movements, shown_parameters
 from jawusd.fitting.data import SubjectAnatomy, select_poses, select_tracks
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import landmark_frame, make_transform, random_rotation, se3_exp, so3_exp, transform_points

@@ -12,8 +12,8 @@ from shapely import MultiPoint, Point, Polygon
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting import gauge_fit
+from jawusd.fitting.additive import straight
 from jawusd.fitting.bounds import alpha_shape, fit_slice_hull, valid_box
-from jawusd.fitting.curves import straight
 from jawusd.fitting.gauge_fit import SMALLEST_MINOR, fit_gauge, fit_path, path_gauge, smallest_minor
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve, within

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from jawusd.fitting import FittingConfig, fit_model
-from jawusd.fitting.data import SubjectAnatomy, select_poses
-from jawusd.fitting.screening import REASON, gross_outliers, screened
+from jawusd.fitting.data import REASON, SubjectAnatomy, gross_outliers, screened, select_poses
 from jawusd.geometry import make_transform, se3_exp
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person

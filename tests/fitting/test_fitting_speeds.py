@@ -5,7 +5,7 @@ import pytest
 from example_rig import example_rig
 
 from jawusd.evaluator import JawRig, Speeds
-from jawusd.fitting.speeds import with_speeds
+from jawusd.fitting.fit import with_speeds
 from jawusd.formats.model import JawModel
 
 FPS = 30.0

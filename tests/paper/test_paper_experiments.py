@@ -8,16 +8,15 @@ import shapely
 import trimesh
 
 from jawusd.fitting import FittingConfig
-from jawusd.fitting.coverage import PARAMETERS
-from jawusd.fitting.data import SubjectAnatomy, select_poses
+from jawusd.fitting.data import PARAMETERS, SubjectAnatomy, select_poses
 from jawusd.formats.experiments import TABLE_COLUMNS, CondylePath, save_table
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import TRACKED, Tracks
 from jawusd.geometry import make_transform, se3_exp, transform_point, transform_points
-from jawusd.paper import nlpca_training, synthesis
+from jawusd.paper import nlpca, synthesis
 from jawusd.paper.condyle_paths import condyle_paths, path_distances, principal_opening, sagittal_section
 from jawusd.paper.experiments import MODELS, run_experiments
-from jawusd.paper.nlpca_training import train_nlpca
+from jawusd.paper.nlpca import train_nlpca
 from jawusd.paper.synthesis import BOX, POLYGONS, SLICES, Bounds, captured_reference, distance_to_nearest
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
@@ -52,7 +51,7 @@ def quick():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthesis, "POSES", 200)
         patch.setattr(synthesis, "_BATCH", 800)
-        patch.setattr(nlpca_training, "train_nlpca", lambda *a, **k: train_nlpca(*a, **(k | {"stages": 2})))
+        patch.setattr(nlpca, "train_nlpca", lambda *a, **k: train_nlpca(*a, **(k | {"stages": 2})))
         yield
 
 

@@ -9,7 +9,7 @@ import pytest
 from jawusd.base.errors import MissingDependencyError
 from jawusd.geometry import make_transform, se3_exp
 from jawusd.meshes import raster
-from jawusd.paper.pixel_counts import RasterCounter
+from jawusd.paper.energy import RasterCounter
 
 moderngl = pytest.importorskip("moderngl", reason="moderngl is not installed")
 gl = importlib.import_module("jawusd.paper.gl")

@@ -8,11 +8,8 @@ from closed_mouth import FOCAL, SIZE, VIEWS, Mouth, search_little
 from jawusd.base.errors import TrackingError
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_point
 from jawusd.photographs import align, read_lines
-from jawusd.photographs.contact import Contact
-from jawusd.photographs.lens import UNKNOWNS, PhotoPose
-from jawusd.photographs.search import usual_bites
-from jawusd.photographs.solve import Aligner, Bite, Photo
-from jawusd.photographs.start import Rows
+from jawusd.photographs.search import Rows, usual_bites
+from jawusd.photographs.solve import UNKNOWNS, Aligner, Bite, Contact, Photo, PhotoPose
 from jawusd.tracking.contour.scan import prepare_scan
 
 

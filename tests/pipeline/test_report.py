@@ -82,7 +82,7 @@ def test_a_placeholder_is_not_shown_as_a_mandible(built):
 @pytest.mark.slow
 def test_the_experiments_of_a_build_go_into_its_report(built, monkeypatch):
     """With the paper's networks, which a build leaves out; how long they are trained is nothing to a report."""
-    monkeypatch.setattr("jawusd.paper.nlpca_training._STAGES", (60, 100))
+    monkeypatch.setattr("jawusd.paper.nlpca._STAGES", (60, 100))
     tracks = load_tracks(built / "tracks.npz")
     sure = {name: 1e-6 * getattr(tracks, f"covariance_{name}") for name in ("upper", "lower", "relative")}
     save_tracks(built / "tracks.npz", replace(tracks, **{f"covariance_{name}": value for name, value in sure.items()}))

@@ -16,7 +16,7 @@ from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.track import first_pass, track_lines, track_summary
 from jawusd.pipeline.track_pictures import track_videos
-from jawusd.tracking.region.strained import footage_doubts
+from jawusd.tracking.region.take import footage_doubts
 
 EXAMPLE = ROOT / "examples" / "capture"
 

@@ -10,7 +10,7 @@ from subjects.traits import draw_traits
 
 from jawusd.geometry import make_transform, random_rotation, se3_inverse, so3_exp, transform_point
 from jawusd.meshes.raster import draw_depth_labels, project
-from jawusd.photographs import align, search, start
+from jawusd.photographs import align, search
 from jawusd.synthetic.bite import build_bite
 from jawusd.synthetic.dentition import without_gum
 
@@ -75,8 +75,8 @@ def search_little(monkeypatch):
     monkeypatch.setattr(search, "_YAW", np.radians([-50.0, 0.0, 50.0]))
     monkeypatch.setattr(search, "_PITCH", np.radians([0.0]))
     monkeypatch.setattr(search, "_ROLL", np.radians([0.0]))
-    monkeypatch.setattr(start, "_CANDIDATES", 3)
-    monkeypatch.setattr(start, "_FINALISTS", 1)
-    monkeypatch.setattr(start, "_UP_MM", (0.0,))
-    monkeypatch.setattr(start, "_SLIDES", 2)
+    monkeypatch.setattr(search, "_CANDIDATES", 3)
+    monkeypatch.setattr(search, "_FINALISTS", 1)
+    monkeypatch.setattr(search, "_UP_MM", (0.0,))
+    monkeypatch.setattr(search, "_SLIDES", 2)
     monkeypatch.setattr(align, "_STAGES", ((0.25, (2.5, 2.0, 2.0, 1.5)), (0.5, (1.5, 1.2, 1.0, 1.0, 1.0))))

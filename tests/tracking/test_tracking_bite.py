@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jawusd.tracking.contour.equations import NormalEquations, OutlineSums, Solution, motion_about
-from jawusd.tracking.region.bite import BiteTerm
+from jawusd.tracking.region.jaw_priors import BiteTerm
 
 POINTS = np.array([[0.0, -3.0, 20.0], [18.0, -2.0, -10.0], [-18.0, -2.0, -10.0]])
 UP = np.array([0.0, 1.0, 0.0])

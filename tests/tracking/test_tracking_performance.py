@@ -22,9 +22,9 @@ from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
+from jawusd.tracking.performance.shot import Shot, solve_performance
 from jawusd.tracking.performance.single_start import SingleStart
 from jawusd.tracking.performance.smoother import Smoother
-from jawusd.tracking.performance.take import Shot, solve_performance
 
 COUNT = 26
 HIDDEN = range(12, 16)  # lips closed

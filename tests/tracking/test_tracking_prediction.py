@@ -8,7 +8,7 @@ from example_model import LANDMARKS_ANATOMICAL, example_arrays, example_meta
 
 from jawusd.evaluator import JawRig
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
-from jawusd.tracking.performance.prediction import KNOWN, Prediction
+from jawusd.tracking.performance.motion import KNOWN, Prediction
 
 BOTH = np.ones(2, bool)
 

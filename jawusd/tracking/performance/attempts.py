@@ -15,8 +15,8 @@ from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, CROWN
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.performance.coordinates import Pose
-from jawusd.tracking.performance.focal import Growth
 from jawusd.tracking.performance.instant import Expected, InstantSolver
+from jawusd.tracking.performance.views import Growth
 
 #: How unsure head and jaw are at most, standard deviations [rad, mm, mm]: after many frames without teeth.
 MOST_UNSURE = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]

@@ -15,7 +15,7 @@ from jawusd.tracking.initialization.reacquire import shift_to_masks
 from jawusd.tracking.performance.attempts import Attempts, FrameFit, Instant, nothing_seen
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected
-from jawusd.tracking.performance.prediction import STEADY, Prediction
+from jawusd.tracking.performance.motion import STEADY, Prediction
 
 _KEPT_JAWS = 12  # jaw parameters kept to start from after a loss
 _APART_MM = 3.0  # of the lower incisal point between two of them: within the solver's basin of each other

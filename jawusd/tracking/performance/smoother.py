@@ -14,12 +14,11 @@ from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.performance.attempts import MOST_UNSURE, Attempts, FrameFit, usual_residual_px
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates
-from jawusd.tracking.performance.focal import growth_of
 from jawusd.tracking.performance.instant import InstantSolver
-from jawusd.tracking.performance.instants import Views
 from jawusd.tracking.performance.motion import Motion, head_bends, measured_motion
 from jawusd.tracking.performance.system import TakeSystem
 from jawusd.tracking.performance.unknowns import DRAWN, HabitPrior, TakeState, Unknowns
+from jawusd.tracking.performance.views import Views, growth_of
 
 # How often outlines are matched anew; a third time changes less than a hundredth of a millimetre.
 _ROUNDS = 2

@@ -16,8 +16,8 @@ from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
-from jawusd.tracking.performance.focal import PRIOR_LOG_FOCAL, with_focal
 from jawusd.tracking.performance.instant import bound_equations
+from jawusd.tracking.performance.views import PRIOR_LOG_FOCAL, with_focal
 
 _HABITS = 3  # of an arch, as in `OutlineSums`
 

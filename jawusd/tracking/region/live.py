@@ -18,10 +18,9 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver
-from jawusd.tracking.performance.prediction import STEADY
-from jawusd.tracking.region.learned import CORRELATION_PX, LearnedColours
+from jawusd.tracking.performance.motion import STEADY
+from jawusd.tracking.region.appearance import CORRELATION_PX, Cut, LearnedColours
 from jawusd.tracking.region.pace import BRIEF
-from jawusd.tracking.region.picture import Cut
 from jawusd.tracking.region.rig_tracker import RigTracker
 
 _FACES = 3_000

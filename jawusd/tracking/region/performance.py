@@ -20,12 +20,11 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver
-from jawusd.tracking.performance.prediction import KNOWN, STEADY
+from jawusd.tracking.performance.motion import KNOWN, STEADY
 from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother
 from jawusd.tracking.performance.unknowns import HabitPrior
-from jawusd.tracking.region.learned import LearnedColours
-from jawusd.tracking.region.picture import Cut
+from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.rig_tracker import RigTracker
 
 #: Cuts the pictures of a range of frames by cameras, of the capture or with other focal lengths, at a size that suits

@@ -17,14 +17,13 @@ from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import present_masks
 from jawusd.tracking.performance.attempts import MOST_UNSURE, FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Pose
-from jawusd.tracking.performance.focal import growth_of
 from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
-from jawusd.tracking.performance.prediction import Prediction
+from jawusd.tracking.performance.motion import Prediction
 from jawusd.tracking.performance.single_start import spread_out
-from jawusd.tracking.region.learned import CORRELATION_PX, FIRST_RATES, RATES, LearnedColours
+from jawusd.tracking.performance.views import growth_of
+from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
 from jawusd.tracking.region.pace import THOROUGH, Pace
-from jawusd.tracking.region.picture import Cut, Picture
-from jawusd.tracking.region.starts import head_shifts, likeliest
+from jawusd.tracking.region.search import head_shifts, likeliest
 
 # Variance of the borders of colours times the length over which they err alike [px^3]: as for both arches alone.
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX

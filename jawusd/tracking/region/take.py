@@ -1,31 +1,133 @@
-"""The tracks of a take that was followed by the colours of its pictures."""
+"""What colours show of cameras and scans: knocked cameras, wrong focal lengths, scans mirrored or of another size."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from jawusd.base.arrays import Array
+from jawusd.base.arrays import Array, Mask
+from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import LOST, TRACKED, LostReason, Tracks, TracksMeta
 from jawusd.geometry import Camera
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
-from jawusd.tracking.contour.quality import matched_px
+from jawusd.tracking.contour.quality import matched_px, score_px
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
+from jawusd.tracking.initialization.magnification import measure_magnification
+from jawusd.tracking.region.appearance import CORRELATION_PX
 from jawusd.tracking.region.condyle_fusion import CondyleFusion
-from jawusd.tracking.region.learned import CORRELATION_PX
-from jawusd.tracking.region.take_checks import camera_findings, scan_findings
 from jawusd.tracking.region.tracker import RegionPose
 from jawusd.tracking.sequence.closed_bite import observe_bite
 from jawusd.tracking.sequence.extrinsics import Extrinsics
+from jawusd.tracking.sequence.mirror_check import mirror_findings
 from jawusd.tracking.sequence.nuisance import Hand, TakeEquations, corrected_pose
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
+from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings
 from jawusd.tracking.sequence.time_checks import time_findings
+
+# Share of a camera's contour that fits over that of the camera with most, below which it sees the teeth elsewhere. It
+# was 0.65 and more in 8 takes of 7 mouths (false alarms: at most 31 %, 95 %), and 0.05 to 0.08 in 3 of these with a
+# camera turned by 0.6 degrees.
+_LEAST_SHARE = 0.3
+# Standard deviation of the lower teeth beyond which a frame is uninformative [mm], and the shares of such frames above
+# which a take is doubtful, and unusable.
+_UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
+_MOST = 0.6  # share of frames; a run of good frames this long suggests trimming the ends of the take
+
+
+def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list[Finding]:
+    """Return a warning for each camera whose pictures fit the teeth far less than those of the others.
+
+    Kind: "camera_rarely_used", with its share of the contour in sight that fits.
+    """
+    shares = []
+    for solution in solutions:
+        seen = solution.visible_px.sum(0)
+        shares.append(np.where(seen > 0, score_px(solution).sum(0) / np.maximum(seen, 1.0), np.nan))
+    known = np.array(shares)
+    seen_at_all = np.isfinite(known).any(0)
+    share = np.zeros(len(names))
+    share[seen_at_all] = np.nanmedian(known[:, seen_at_all], axis=0)
+    return [
+        Finding(
+            "camera_rarely_used",
+            "warning",
+            f"{share[c]:.0%} of the teeth's outlines fit its pictures, {share.max():.0%} those of the camera that sees "
+            f"them best; {_LEAST_SHARE:.0%} of that at least is usual. It adds little to the tracks.",
+            value=round(float(share[c]), 3),
+            limit=round(float(_LEAST_SHARE * share.max()), 3),
+            camera=name,
+            hint="Check that the video is this camera's, its calibration (was it knocked?) and its time offset.",
+        )
+        for c, name in enumerate(names)
+        if share[c] < _LEAST_SHARE * share.max()
+    ]
+
+
+def scan_findings(
+    names: Sequence[str],
+    scans: Sequence[Scan],
+    left: Array,
+    looks: Iterable[tuple[Array, Sequence[View]]],
+    config: TrackingConfig,
+) -> list[Finding]:
+    """Return what some frames show about the scans and of focal lengths; see `lens_findings` and `mirror_findings`.
+
+    Args:
+        left: unit vector in scan coordinates, shape (3,).
+        looks: T_world_upper and T_world_lower (2, 4, 4) of a frame, and its views, one per camera.
+    """
+
+    def shown(views: Sequence[View]) -> Mask:
+        return np.tile([view.edges is not None for view in views], (2, 1))
+
+    instants = [(poses, views, shown(views)) for poses, views in looks]
+    thin = [scan.thin or scan for scan in scans]
+    hands = mirror_findings(thin, left, instants, config)
+    found = measure_magnification(thin, instants, replace(config, correlation_px=CORRELATION_PX))
+    return hands if found is None else hands + lens_findings(names, found, OF_COLOURS)
+
+
+def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
+    """Return the longest run of frames, first and one past the last."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
+    runs = ends.reshape(-1, 2)
+    if len(runs) == 0:
+        return 0, 0
+    first, last = runs[np.argmax(np.ptp(runs, axis=1))].tolist()
+    return first, last
+
+
+def footage_doubts(tracks: Tracks) -> list[Finding]:
+    """Return a warning if the jaw is lost, or not known to a millimetre, in too many frames that colours alone showed.
+
+    Kind: "footage_doubtful" [%].
+    """
+    sigma_mm = tracks.sigma_mm[:, :3].mean(1)
+    bad = ~(sigma_mm <= _UNKNOWN_MM)  # NaN where an arch is lost
+    share = float(bad.mean())
+    if share <= _FEW:
+        return []
+    judgement = "is not usable as it is" if share > _MANY else "is doubtful in parts"
+    message = (
+        f"the footage {judgement}: in {bad.sum()} of {len(bad)} frames the jaw is lost, or its teeth are not known to "
+        f"{_UNKNOWN_MM:g} mm; at most {_FEW:.0%} of the frames is usual"
+    )
+    worst = int(np.argmax(np.where(np.isfinite(sigma_mm), sigma_mm, np.inf)))
+    hint = "Look at the overlay, light the mouth better, or draw masks (`jawusd segment`)."
+    first, last = _longest_run(~bad)
+    if last - first >= _MOST * len(bad):
+        kept = f"[{tracks.frames[first]}, {tracks.frames[last - 1] + 1}]"
+        hint = f"If the others are dark, as in light flashes, write frames = {kept} in capture.toml. {hint}"
+    value, limit = round(100 * share, 1), 100 * _FEW
+    return [Finding("footage_doubtful", "warning", message, value, limit, frame=int(tracks.frames[worst]), hint=hint)]
+
 
 #: How borders of colours lie beside the teeth's edges: up to half a pixel inside, as teeth darken towards them; where
 #: the gum line is found was learned on the way.

@@ -16,8 +16,7 @@ from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, relative_covariance, residual_px, twist_covariance
 from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
 from jawusd.tracking.contour.views import View
-from jawusd.tracking.region.learned import CORRELATION_PX, FIRST_RATES, RATES, LearnedColours
-from jawusd.tracking.region.picture import Cut, Picture
+from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
 from jawusd.tracking.region.search import Look, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 

@@ -26,7 +26,7 @@ from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import LANDMARKS, transform_points
 from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.subject import subject_of_capture
-from jawusd.tracking.region.learned import LearnedColours
+from jawusd.tracking.region.appearance import LearnedColours
 from jawusd.tracking.region.view import RegionView
 
 MOST = 3.0  # bound of log ratios, that of learned colours

@@ -15,7 +15,7 @@ import numpy as np
 from jawusd.base.errors import FittingError
 from jawusd.evaluator.distances import carried
 from jawusd.fitting import FittingConfig
-from jawusd.fitting.coverage import shown_parameters
+from jawusd.fitting.checks import shown_parameters
 from jawusd.fitting.data import TrainingData, displacement
 from jawusd.fitting.fit import FORMS
 from jawusd.fitting.metric import MandibleMetric

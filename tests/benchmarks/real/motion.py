@@ -11,7 +11,7 @@ from models import FOLDS, FREE, MODELS, components, errors_or_reason
 from report import Origin, bars, curves, table, title
 from sources import CHEWING, OPTOTRAK
 
-from jawusd.fitting.coverage import missing_movements, shown_parameters
+from jawusd.fitting.checks import missing_movements, shown_parameters
 from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses
 from jawusd.formats.markers import read_markers
 from jawusd.formats.rigid_bodies import read_body

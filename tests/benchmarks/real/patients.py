@@ -18,8 +18,7 @@ from jawusd.media.pictures import read_gray, read_picture
 from jawusd.meshes.meshio import load_mesh
 from jawusd.photographs import PhotoAlignment, align_photographs
 from jawusd.photographs.align import _AT_WIDTH_PX, _TURN_PX, _lower_incisor, _refined
-from jawusd.photographs.contact import Contact
-from jawusd.photographs.solve import Bite, match, seen_outlines
+from jawusd.photographs.solve import Bite, Contact, match, seen_outlines
 from jawusd.pipeline.photographs import drawn_over, read_drawing
 from jawusd.segmentation.arches import ScanSurface, expect_crowns
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
