@@ -88,7 +88,7 @@ def take_up_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[T
     Raises:
         FormatError: the file of the poses is damaged.
     """
-    from jawusd.tracking.sequence.combined import combine
+    from jawusd.tracking.sequence.smoothing import combine
 
     folder = auto_masks_folder(capture)
     if folder is None:

@@ -187,8 +187,8 @@ def model_pass(
         offsets: frame offset by camera.
         tracks: the first pass.
     """
+    from jawusd.tracking.sequence.kinematic_prior import weigh_with_model
     from jawusd.tracking.sequence.model_refinement import refine_tracks
-    from jawusd.tracking.sequence.model_weighting import weigh_with_model
 
     jaw = JawRig(model.arrays, model.meta)
     if not any(camera.masks for camera in capture.cameras):

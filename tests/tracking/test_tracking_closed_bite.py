@@ -14,11 +14,12 @@ from jawusd.tracking.sequence.closed_bite import (
     _BITE_MM,
     _NEW_PER_FRAME,
     STEADY,
+    RestFrames,
     closed_bite,
     registration_findings,
     registration_unknown,
+    rest_frames,
 )
-from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 
 POINT = np.array([3.0, -4.0, 20.0])
 REST = RestFrames((0, 1, 2, 3), True, POINT, POINT + (0, -5, 0), False)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jawusd.tracking.sequence.frame_shifts import SHIFTS, FrameShifts
+from jawusd.tracking.sequence.time_checks import SHIFTS, FrameShifts
 
 FRAMES = np.arange(40, 52)
 

@@ -8,9 +8,9 @@ from small_take import make_capture, track, write_masks
 
 from jawusd.base.errors import OutputError
 from jawusd.formats.tracks import LostReason
-from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
-from jawusd.tracking.sequence import packed_records, passes
-from jawusd.tracking.sequence.packed_records import PackedRecords
+from jawusd.tracking.contour import frame_record
+from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss, PackedRecords
+from jawusd.tracking.sequence import passes
 
 FRAMES = 4
 
@@ -68,7 +68,7 @@ def test_a_record_that_is_set_again_takes_the_place_of_the_one_looked_up(records
 
 
 def test_long_takes_are_kept_in_a_file_and_read_back_alike(records, monkeypatch):
-    monkeypatch.setattr(packed_records, "_IN_MEMORY", 1000)
+    monkeypatch.setattr(frame_record, "_IN_MEMORY", 1000)
     packed = PackedRecords()
     for frame in range(40 * FRAMES):
         packed[frame] = records[sorted(records)[frame % FRAMES]]

@@ -10,8 +10,7 @@ from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import transform_point, transform_points
 from jawusd.tracking.contour.scan import prepare_scan
-from jawusd.tracking.initialization.pick_cameras import fitted_camera, shifted, zoomed
-from jawusd.tracking.initialization.pick_causes import Setting
+from jawusd.tracking.initialization.pick_causes import Setting, fitted_camera, shifted, zoomed
 from jawusd.tracking.initialization.pick_checks import pick_findings
 
 SCANS = [prepare_scan(mesh, name) for mesh, name in zip(MESHES, ("upper", "lower"), strict=True)]

@@ -23,7 +23,7 @@ from jawusd.tracking.contour.quality import (
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, working_size
-from jawusd.tracking.initialization.reacquire import shift_to_masks
+from jawusd.tracking.initialization.pose_search import shift_to_masks
 from jawusd.tracking.sequence.history import History, MotionPredictor, SearchAllowance
 
 CONFIG = TrackingConfig()

@@ -13,10 +13,10 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
-from jawusd.tracking.initialization import searched_start
+from jawusd.tracking.initialization import start as take_start
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.initialization.mixups import possible_mixups
+from jawusd.tracking.initialization.start_causes import possible_mixups
 from jawusd.tracking.initialization.start_search import Found
 
 FRAMES = 5
@@ -73,7 +73,7 @@ class _FoundBefore:
 
 def _searched(footage, search):
     search.sources = footage.sources
-    return searched_start.search_start(search, footage)
+    return take_start.search_start(search, footage)
 
 
 def test_first_frame_that_fits_beyond_doubt_is_taken(footage):
@@ -129,7 +129,7 @@ def test_poor_poses_accuse_no_masks(footage, monkeypatch):
     def accuse(footage, solver, poses, frame):
         return possible_mixups(footage.sources)[0] if frame == search.asked[0] else None
 
-    monkeypatch.setattr(searched_start, "likely_mixup", accuse)
+    monkeypatch.setattr(take_start, "likely_mixup", accuse)
     search = _FoundBefore([0.1, 0.5])
     assert _searched(footage, search).frame == search.asked[1]
     search = _FoundBefore([0.5])

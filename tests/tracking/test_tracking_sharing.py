@@ -6,15 +6,15 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from jawusd.tracking.contour import sharing
-from jawusd.tracking.contour.sharing import Sharing
+from jawusd.tracking.contour import solver
+from jawusd.tracking.contour.solver import Sharing
 
 PATIENCE_S = 60
 
 
 @pytest.fixture
 def pool(monkeypatch):
-    monkeypatch.setattr(sharing.os, "cpu_count", lambda: 3)
+    monkeypatch.setattr(solver.os, "cpu_count", lambda: 3)
     with ThreadPoolExecutor(2) as pool:
         yield pool
 

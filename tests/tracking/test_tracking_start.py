@@ -31,8 +31,8 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
-from jawusd.tracking.initialization import searched_start, start_search
 from jawusd.tracking.initialization import start as take_start
+from jawusd.tracking.initialization import start_search
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
 from jawusd.tracking.initialization.pose_search import (
     Grid,
@@ -63,7 +63,7 @@ def short_search(monkeypatch):
     """Search few orientations, on one frame."""
     turns = np.radians([-18.0, 0.0, 18.0])
     monkeypatch.setattr(start_search, "_GRID", Grid(turns, turns, turns, (10.0, 8.0, 12.0)))
-    monkeypatch.setattr(searched_start, "FRAMES_TRIED", 1)
+    monkeypatch.setattr(take_start, "FRAMES_TRIED", 1)
     monkeypatch.setattr(start_search, "_FINALISTS", 2)
 
 
@@ -122,7 +122,7 @@ def test_two_cameras_are_enough(pictures, short_search):
 
 
 def test_masks_of_something_else_are_refused_with_what_was_tried(tmp_path, short_search, monkeypatch):
-    monkeypatch.setattr(searched_start, "refuse_by_cause", lambda *arguments: "No mistake explains it.")
+    monkeypatch.setattr(take_start, "refuse_by_cause", lambda *arguments: "No mistake explains it.")
     folder = write_masks(tmp_path / "take", FRAMES)
     for k, path in enumerate(sorted(folder.rglob("*.png"))):
         picture = np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
@@ -305,7 +305,7 @@ def test_picks_far_off_are_helped_by_a_search_everywhere(pictures, short_search)
     search = StartSearch(MESHES, ContourSolver(SCANS, TrackingConfig()), np.eye(4))
     off = make_transform(np.eye(3), [14.0, 0, -14.0]) @ truth
     assert search.near(footage, FIRST + START, off).fit < 0.1
-    found = searched_start.search_around(search, footage, FIRST + START, off)
+    found = take_start.search_around(search, footage, FIRST + START, off)
     assert max(vertex_error_mm(MESHES[r], found.poses[r], truth[r]) for r in (0, 1)) < 0.1 and found.fit > 0.3
 
 

@@ -6,7 +6,7 @@ from small_take import CAMERAS, OFFSETS
 
 from jawusd.base.errors import TrackingError
 from jawusd.formats.capture_parts import CameraSource, Masks
-from jawusd.tracking.initialization import mixups, start_causes
+from jawusd.tracking.initialization import start_causes
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_causes import refuse_lone_arch
 from jawusd.tracking.initialization.start_search import Found
@@ -26,9 +26,9 @@ def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, w
         named = [source.masks.upper.parts[0] for source in footage.sources]
         return np.array([0.01, without, 0.02]) if named == ["cam0", "cam2", "cam1"] else np.array([0.01, 0.3, 0.02])
 
-    monkeypatch.setattr(mixups, "_uncovered_shares", shares)
+    monkeypatch.setattr(start_causes, "_uncovered_shares", shares)
     footage = Footage(sources, TABLE, OFFSETS, (0, 10))
-    found = mixups.likely_mixup(footage, None, np.stack([np.eye(4)] * 2), 3)
+    found = start_causes.likely_mixup(footage, None, np.stack([np.eye(4)] * 2), 3)
     assert (found is not None) == accused
     assert not accused or "cam1 and cam2 are exchanged" in found.finding
 

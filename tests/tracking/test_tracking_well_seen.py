@@ -10,9 +10,8 @@ from small_take import FIRST, START, errors_mm, make_capture, track, write_masks
 from jawusd.formats.tracks import LOST, TRACKED, LostReason
 from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.frame_record import FrameRecord
-from jawusd.tracking.sequence import well_seen
-from jawusd.tracking.sequence.passes import Passes
-from jawusd.tracking.sequence.well_seen import give_up_poorly_seen, nearest_well_seen
+from jawusd.tracking.sequence import passes
+from jawusd.tracking.sequence.passes import Passes, give_up_poorly_seen, nearest_well_seen
 
 FRAMES = 10
 OFF_MM = 2.5  # farther than the gates, so that a contour near by is taken for the teeth's
@@ -112,7 +111,7 @@ def test_a_few_frames_do_not_tell_what_is_usual():
 
 def test_a_take_gives_up_what_is_poorly_seen(records, monkeypatch):
     _, capture = records
-    monkeypatch.setattr(well_seen, "_POOR_SHARE", 2.0)  # so that every frame counts as one
-    monkeypatch.setattr(well_seen, "_POOR_RESIDUAL", 0.0)
+    monkeypatch.setattr(passes, "_POOR_SHARE", 2.0)  # so that every frame counts as one
+    monkeypatch.setattr(passes, "_POOR_RESIDUAL", 0.0)
     tracks = track(capture)
     assert (tracks.status == LOST).all() and (tracks.lost_reason == LostReason.LOW_SCORE).all()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import Executor
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor, wait
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,7 +16,6 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate_outline, scatter_of_tiles, search_edges
-from jawusd.tracking.contour.drawing import Contour, Drawings
 from jawusd.tracking.contour.equations import (
     GingivalMarginTerm,
     NormalEquations,
@@ -25,10 +26,9 @@ from jawusd.tracking.contour.equations import (
     StartTerm,
     motion_about,
 )
-from jawusd.tracking.contour.rendering import Rendering
+from jawusd.tracking.contour.rendering import Contour, Drawings, Rendering
 from jawusd.tracking.contour.samples import HABITS, LENGTH
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
-from jawusd.tracking.contour.sharing import Sharing
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
 _ROUGH_FACES = 6_000  # of a crown row in trials: a third of a thinned scan's
@@ -248,3 +248,46 @@ def _towards_gum(scans: Sequence[Scan]) -> list[Array | None]:
         return [None, None]
     up = bite_normal(scans[0].crown_vertices(), scans[1].crown_vertices())
     return [None if gum else way * up for gum, way in zip(shown, (1.0, -1.0), strict=True)]
+
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+class Sharing:
+    """Map as `Executor.map` does, with one thread to wake for each further core instead of one for each item.
+
+    Tasks of the tracker take about a millisecond, and to wake a thread and wait for it a tenth of that.
+    """
+
+    def __init__(self, executor: Executor) -> None:
+        """Take the threads to share with."""
+        self._executor = executor
+        self._helpers = (os.cpu_count() or 1) - 1
+
+    def __call__(self, function: Callable[[_Item], _Result], items: Iterable[_Item], /) -> list[_Result]:
+        """Return the results in the order of the items; after an error, which is raised, no further task is begun."""
+        left = deque(enumerate(items))
+        results: dict[int, _Result] = {}
+
+        def work() -> None:
+            while left:
+                try:
+                    k, item = left.popleft()
+                except IndexError:  # another thread took the last one
+                    return
+                try:
+                    results[k] = function(item)
+                except BaseException:
+                    left.clear()
+                    raise
+
+        helpers = [self._executor.submit(work) for _ in range(min(len(left) - 1, self._helpers))]
+        try:
+            work()
+        finally:
+            begun = [helper for helper in helpers if not helper.cancel()]
+            wait(begun)
+        for helper in begun:
+            helper.result()
+        return [results[k] for k in sorted(results)]

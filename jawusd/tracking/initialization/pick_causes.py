@@ -1,7 +1,6 @@
-"""Which mistake in scans, calibration, masks or picks explains why picks or masks contradict one another?
+"""Mistakes in scans, calibration, masks or picks that can make picks and masks contradict one another.
 
-Each mistake that can be undone is undone in turn; the one is named after which all picks agree and the masks lie on
-the scans as the picks place them.
+Each mistake carries the inputs with that mistake undone, so that `pick_checks` can test whether they agree.
 """
 
 from __future__ import annotations
@@ -9,49 +8,35 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import combinations, islice
+from itertools import combinations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.optimize import least_squares
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Pick
-from jawusd.geometry import Camera, transform_points
-from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
-from jawusd.tracking.initialization.bootstrap import TOLERANCE_MM, picked_size, picks_miss_mm, pose_from_picks
-from jawusd.tracking.initialization.pick_cameras import fitted_camera
+from jawusd.geometry import Camera, rigid_fit, se3_exp, transform_points, triangulate
+from jawusd.tracking.initialization.bootstrap import picked_size
 
-_CLOSE_MM = 1.0  # mask pixels this near to a projected crown point count as covered
-ON = 0.85  # share of a camera's masks on the scans, from which they count as placed rightly
-# A mistake is believed if undoing it leaves less than this share of the doubt that is left as given; one that tracking
-# makes up for, which is a warning, also if picks that had to be left out fit then.
-_PROOF, _PROOF_BY_PICKS = 0.5, 0.75
-# What weighs as much as one another: share of masks off the scans, and distance of the picks from their vertices [mm].
-_OFF, _MISS_MM = 0.05, 0.3
-_UNSEEN = 0.25  # share off the scans that a camera without masks at the instant counts as: it may be elsewhere
-_SURE = 1.0  # doubt that an exchange leaves, below which nothing else is looked for
-_ALIKE = 0.15  # doubt by which a mistake may be worse than the likeliest one and still be named beside it
-_MOST_TRIED = 400  # mistakes: all of 15 cameras; those of 64 are 6,000, which would take most of an hour
-# Size of the scans by the picks, less 1, from which it may be a mistake.
-_SIZE_SHARE = 0.02
-
-#: Pixels of the masks of both arches at the instant of the picks, shape (N, 2) each, N = 0 without a mask; by the
-#: camera whose masks they are, and the camera by whose frame numbers they are taken.
-Seen = Callable[[str, str], tuple[Array, Array]]
+_SIZE_SHARE = 0.02  # deviation from 1 of the scan size by the picks, from which the size may be a mistake
+# Prior standard deviations of a camera's errors: shift over the picture width, relative focal length. And of a click
+# [mm].
+_SHIFT, _FOCAL, _CLICK_MM = 0.05, 0.1, 0.3
+_MOST_ZOOM = np.log(2.0)  # limit of the logarithm of the focal length factor: random clicks would make it overflow
+_STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # scale of the pose unknowns, about their usual error [rad, mm]
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Hold everything that places the scans in the pictures, as given or with a mistake undone.
+    """Everything that places the scans in the pictures, as given or with a mistake undone.
 
     Attributes:
-        picks: on both arches.
-        vertices: of both scans, which the picks name [mm].
+        picks: on the upper and lower arch.
+        vertices: of both scans, as the picks index them [mm].
         crowns: some points of both scans' crowns [mm].
         cameras: by name.
-        sources: the camera whose masks are taken for each camera, itself if not named.
-        exchanged: cameras in which the arches' masks are exchanged.
+        sources: the camera whose masks are used for each camera; by default its own.
+        exchanged: cameras in which the masks of the two arches are exchanged.
     """
 
     picks: tuple[Sequence[Pick], Sequence[Pick]]
@@ -63,124 +48,19 @@ class Setting:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """Hold how well picks and masks agree with a setting."""
-
-    poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
-    wrong: Mapping[str, list[int]]  # picks left out, by arch
-    miss_mm: float  # rms distance of the picks, those left out counting as just too far
-    on: Mapping[str, float]  # share of each camera's masks that lies on the scans, without cameras that have none
-    unseen: int  # cameras without masks at this instant
-
-    @property
-    def doubt(self) -> float:
-        """Return how badly everything fits: 0.2 to 1.5 where nothing is wrong."""
-        off = np.array([1.0 - on for on in self.on.values()] + [_UNSEEN] * self.unseen)
-        return float(off.mean() if self.on else 0.0) / _OFF + self.miss_mm / _MISS_MM
-
-    @property
-    def left_out(self) -> int:
-        """Return how many picks were left out."""
-        return sum(len(numbers) for numbers in self.wrong.values())
-
-    @property
-    def placed(self) -> bool:
-        """Tell whether the masks of all cameras lie on the scans."""
-        return all(on >= ON for on in self.on.values())
-
-    @property
-    def good(self) -> bool:
-        """Tell whether nothing is left to be explained."""
-        return self.placed and not self.left_out
-
-
-def evidence(setting: Setting, seen: Sequence[Seen], masked: Sequence[str]) -> Evidence:
-    """Place the scans by the picks of a setting and look where the masks of `masked` cameras lie.
-
-    `seen` gives the masks once per guess of the time offsets; the best one counts for each camera.
-
-    Raises:
-        TrackingError: the picks contradict one another.
-    """
-    poses, wrong, misses = [], {}, []
-    for picks, vertices, name in zip(setting.picks, setting.vertices, ARCH_NAMES, strict=True):
-        pose, wrong[name] = pose_from_picks(picks, vertices, setting.cameras, name)
-        misses.append(np.minimum(picks_miss_mm(picks, vertices, setting.cameras, pose), TOLERANCE_MM))
-        poses.append(pose)
-    rms = float(np.sqrt(np.mean(np.concatenate(misses) ** 2)))
-    on = _covered(setting, poses, seen, masked)
-    return Evidence(np.stack(poses), wrong, rms, on, len(masked) - len(on))
-
-
-def _covered(setting: Setting, poses: Sequence[Array], seen: Sequence[Seen], masked: Sequence[str]) -> dict[str, float]:
-    """Return which share of each camera's masks lies on the scans, at its best guess of the time offsets."""
-    on = {}
-    for name in masked:
-        camera = setting.cameras[name]
-        points = [transform_points(pose, own) for pose, own in zip(poses, setting.crowns, strict=True)]
-        depth = float(np.mean([camera.depth(own.mean(0)) for own in points]))
-        if not all((camera.depth(own) > 0).all() for own in points):
-            on[name] = 0.0
-            continue
-        trees = [cKDTree(camera.project_pinhole(own)) for own in points]
-        reach_px = _CLOSE_MM * float(camera.K[0, 0]) / depth
-        source, arches = setting.sources.get(name, name), (1, 0) if name in setting.exchanged else ARCHES
-        shares = []
-        for guess in seen:
-            pixels = [camera.undistort_pixels(own) if len(own) else own for own in guess(source, name)]
-            near = [trees[arches[arch]].query(pixels[arch])[0] < reach_px for arch in ARCHES if len(pixels[arch])]
-            shares += [float(np.mean([own.mean() for own in near]))] if near else []
-        if shares:
-            on[name] = max(shares)
-    return on
-
-
-@dataclass(frozen=True, eq=False)
 class Mistake:
-    """Hold a mistake and the setting with it undone."""
+    """A possible mistake, and the setting with it undone."""
 
     kind: str
     message: str
     hint: str
     setting: Setting
-    correctable: bool = False  # by the tracker, if the picks do not contradict one another
+    correctable: bool = False  # tracking estimates it, provided that the picks agree with one another
     camera: str | None = None
 
 
-def explanation(
-    given: Setting, found: Evidence | None, seen: Sequence[Seen], masked: Sequence[str]
-) -> tuple[Mistake, Evidence] | None:
-    """Return the mistake that explains best why a setting does not fit, and the evidence with it undone; else None.
-
-    `found` is the evidence as everything is given, None if the picks contradict one another.
-    """
-    allowed = 0 if found is None else found.left_out
-    tried: list[tuple[Mistake, Evidence]] = []
-    for mistake in islice(_mistakes(given), _MOST_TRIED):
-        if mistake.camera is not None and any(not m.correctable and e.doubt < _SURE for m, e in tried):
-            break  # those of single cameras, which take longest, come last
-        try:
-            undone = evidence(mistake.setting, seen, masked)
-        except TrackingError:
-            continue
-        if undone.left_out <= allowed and undone.placed:
-            tried.append((mistake, undone))
-    if not tried:
-        return None
-    mistake, undone = min(tried, key=lambda one: one[1].doubt)
-    if found is not None:
-        by_picks = mistake.correctable and undone.left_out < found.left_out
-        if undone.doubt > (_PROOF_BY_PICKS if by_picks else _PROOF) * found.doubt:
-            return None
-    alike = [other for other, left in tried if other is not mistake and left.doubt < undone.doubt + _ALIKE]
-    if mistake.correctable and alike:
-        said = "; or else ".join(one.message for one in (mistake, *(one for one in alike if one.correctable)))
-        mistake = replace(mistake, message=said)
-    return mistake, undone
-
-
-def _mistakes(given: Setting) -> Iterator[Mistake]:
-    """Yield every mistake that can be undone."""
+def possible_mistakes(given: Setting) -> Iterator[Mistake]:
+    """Yield every mistake that can be undone; those of single cameras, which take longest, come last."""
     yield Mistake(
         "scans_mirrored",
         "the scans are mirrored: left and right are exchanged",
@@ -194,7 +74,7 @@ def _mistakes(given: Setting) -> Iterator[Mistake]:
         yield Mistake(
             "scan_size",
             f"the picks show teeth {abs(1.0 / size - 1.0):.1%} {'smaller' if size > 1.0 else 'larger'} than the scans: "
-            "the scale of the scans is wrong, or the calibration's lengths",
+            "the scale of the scans or of the calibration is wrong",
             "Check the scans' unit and scaling, and the square size of the calibration board.",
             _with_scans(given, np.full(3, 1.0 / size)),
             True,
@@ -203,7 +83,7 @@ def _mistakes(given: Setting) -> Iterator[Mistake]:
 
 
 def _exchanged_scans(given: Setting) -> Iterator[Mistake]:
-    """Yield the exchange of the two scans, if the picks' vertices are there then."""
+    """Yield the exchange of the two scans, if all picked vertices exist after it."""
     vertices = given.vertices[::-1]
     if all(pick.vertex < len(own) for own, picks in zip(vertices, given.picks, strict=True) for pick in picks):
         yield Mistake(
@@ -277,7 +157,7 @@ def _with_views(given: Setting, renamed: Callable[[list[str]], list[str]]) -> tu
 
 
 def _wrong_lenses(given: Setting) -> Iterator[Mistake]:
-    """Yield cameras whose pictures may be shifted or scaled against their calibration."""
+    """Yield cameras whose pictures may be shifted or scaled relative to their calibration."""
     for name, camera in given.cameras.items():
         for zooms in (False, True):
             fitted = fitted_camera(given.picks, given.vertices, given.cameras, name, zooms)
@@ -294,3 +174,95 @@ def _wrong_lenses(given: Setting) -> Iterator[Mistake]:
             message = f"the calibration of camera {name} contradicts the picks, and agrees {cause}"
             hint = "Calibrate it again, with the lens and mode of the recording."
             yield Mistake(kind, message, hint, setting, True, name)
+
+
+def shifted(camera: Camera, shift_px: Array) -> Camera:
+    """Return a camera with its principal point moved by some pixels, shape (2,)."""
+    K = camera.K.copy()
+    K[:2, 2] += shift_px
+    return replace(camera, K=K)
+
+
+def zoomed(camera: Camera, factor: float) -> Camera:
+    """Return a camera with its focal length multiplied by a factor."""
+    K = camera.K.copy()
+    K[[0, 1], [0, 1]] *= factor
+    return replace(camera, K=K)
+
+
+def fitted_camera(
+    picks: Sequence[Sequence[Pick]],
+    vertices: Sequence[Array],
+    cameras: Mapping[str, Camera],
+    name: str,
+    zooms: bool,
+) -> Camera | None:
+    """Return a camera with the principal point, or focal length, that fits the picks best.
+
+    None if no pick is seen by that camera, or the picks of an arch lie on a line. `picks` and `vertices` are those of
+    the upper and the lower scan. The poses of the scans are fitted as well.
+    """
+    if all(view.camera != name for own in picks for pick in own for view in pick.views):
+        return None
+    given = cameras[name]
+    width = float(given.size_px[0])
+
+    def changed(x: Array) -> Camera:
+        if not zooms:
+            return shifted(given, x[:2] * _SHIFT * width)
+        return zoomed(given, float(np.exp(np.clip(x[0] * _FOCAL, -_MOST_ZOOM, _MOST_ZOOM))))
+
+    placed = [_placed(own, points, cameras) for own, points in zip(picks, vertices, strict=True)]
+    starts = [start for start in placed if start is not None]
+    if len(starts) < len(placed):
+        return None
+    sights = [_sights(own, points) for own, points in zip(picks, vertices, strict=True)]
+
+    def residuals(x: Array) -> Array:
+        """Return pick errors over that of a click, and the change of the camera over its prior deviation."""
+        table = {**cameras, name: changed(x)}
+        out = [x[:2]]
+        for k, (start, seen) in enumerate(zip(starts, sights, strict=True)):
+            T = se3_exp(x[2 + 6 * k : 8 + 6 * k] * _STEP)
+            about, middle, views = seen
+            everything = transform_points(start, middle + transform_points(T, about))
+            for camera_name, which, pixels in views:
+                camera, placed = table[camera_name], everything[which]
+                mm_per_px = camera.depth(placed) / float(camera.K[0, 0])
+                out.append(((camera.project(placed) - pixels) * mm_per_px[:, None] / _CLICK_MM).ravel())
+        return np.concatenate(out)
+
+    found = least_squares(residuals, np.zeros(14), method="lm", max_nfev=250)
+    return changed(found.x)
+
+
+def _sights(picks: Sequence[Pick], vertices: Array) -> tuple[Array, Array, list[tuple[str, list[int], Array]]]:
+    """Return the picked points of a scan and their pixels.
+
+    Returns:
+        the points relative to their mean (P, 3), the mean (3,), and for each camera the indices of the points it saw
+        and their pixels (N, 2).
+    """
+    points = np.stack([vertices[pick.vertex] for pick in picks])
+    middle = points.mean(axis=0)
+    seen: dict[str, list[tuple[int, list[float]]]] = {}
+    for k, pick in enumerate(picks):
+        for view in pick.views:
+            seen.setdefault(view.camera, []).append((k, [view.x, view.y]))
+    views = [(name, [k for k, _ in own], np.array([pixel for _, pixel in own])) for name, own in seen.items()]
+    return points - middle, middle, views
+
+
+def _placed(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera]) -> Array | None:
+    """Return T_world_scan (4, 4) from the triangulated picks; None if they lie on a line."""
+    places = [
+        triangulate(
+            np.stack([cameras[view.camera].projection_matrix() for view in pick.views]),
+            np.stack([cameras[view.camera].undistort_pixels([view.x, view.y]) for view in pick.views]),
+        )
+        for pick in picks
+    ]
+    try:
+        return rigid_fit(np.stack([vertices[pick.vertex] for pick in picks]), np.stack(places))
+    except ValueError:
+        return None

@@ -1,26 +1,52 @@
-"""Do picks agree with one another and with the masks? If not, the mistake that explains it is named."""
+"""Check that picks agree with one another and with the masks, and name the mistake that explains it if they do not.
+
+Each mistake that can be undone is undone in turn. A mistake is reported if all picks agree once it is undone, and the
+masks then lie on the scans where the picks place them.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 
+import numpy as np
+from scipy.spatial import cKDTree
+
+from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.formats.finding import Finding, Severity
-from jawusd.tracking.initialization.pick_causes import ON, Evidence, Mistake, Seen, Setting, evidence, explanation
+from jawusd.geometry import transform_points
+from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
+from jawusd.tracking.initialization.bootstrap import TOLERANCE_MM, picks_miss_mm, pose_from_picks
+from jawusd.tracking.initialization.pick_causes import Mistake, Setting, possible_mistakes
 
-# Doubt of what is given from which a mistake is looked for. Of 60 valid persons with picks (`tests/benchmarks/
-# population.py`, seeds 0 to 39 and 300 to 329) one exceeds it, at 1.95; no mistake was named for any of them.
-_DOUBTFUL = 1.7
+_CLOSE_MM = 1.0  # mask pixels this near to a projected crown point count as covered
+_ON = 0.85  # share of a camera's masks on the scans from which the masks count as correctly placed
+# Misfit as given from which a mistake is looked for; exceeded by 1 of 60 valid persons.
+_SUSPECT_MISFIT = 1.7
+# Share of the given misfit that may remain for a mistake to be believed. The second holds for mistakes that tracking
+# corrects, which are only warnings, if rejected picks then fit.
+_PROOF, _PROOF_BY_PICKS = 0.5, 0.75
+_OFF, _MISS_MM = 0.05, 0.3  # share of masks off the scans, and rms pick error [mm], that add the same misfit
+_UNSEEN = 0.25  # assumed share off the scans of a camera without masks at this instant: it may show something else
+_SURE = 1.0  # misfit below which an exchange is accepted without testing mistakes of single cameras
+_ALIKE = 0.15  # extra misfit up to which other mistakes are named beside the likeliest one
+_MOST_TRIED = 400  # mistakes: all of 15 cameras; the 6,000 of 64 cameras would take most of an hour
 _FEWEST = 3  # picks on an arch
+
+#: Pixels of the masks of both arches at the instant of the picks, shape (N, 2) each, N = 0 without a mask. Arguments:
+#: the camera whose masks are read, and the camera whose frame numbers are used.
+Seen = Callable[[str, str], tuple[Array, Array]]
 
 
 def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], frame: int) -> Iterator[Finding]:
-    """Yield what is wrong or doubtful about the picks of a frame, and about all that they show to be wrong.
+    """Yield findings about the picks of a frame, and about other inputs that the picks contradict.
 
     Args:
-        given: everything as the capture has it.
-        seen: the masks, once per guess of the time offsets.
+        given: the inputs as the capture has them.
+        seen: the masks, once per candidate for the time offsets.
         masked: cameras that have masks.
         frame: of the picks, for the findings.
 
@@ -29,58 +55,163 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
     """
     found, problem = None, None
     try:
-        found = evidence(given, seen, masked)
+        found = _evidence(given, seen, masked)
     except TrackingError as error:
         problem = error
     cause = None
-    if found is None or not found.good or found.doubt > _DOUBTFUL:
-        with contextlib.suppress(TrackingError):  # a pick that cannot be
-            cause = explanation(given, found, seen, masked) if _can_be(given) else None
+    if found is None or not found.good or found.misfit > _SUSPECT_MISFIT:
+        with contextlib.suppress(TrackingError):  # an invalid pick
+            cause = _explanation(given, found, seen, masked) if _valid(given) else None
     if cause is not None:
         yield _explained(*cause, found, frame)
-        yield from _left_out(cause[1], frame)
+        yield from _rejected(cause[1], frame)
         return
     if found is None:
         raise problem or TrackingError("the picks contradict one another", frame=frame)
-    yield from _left_out(found, frame)
+    yield from _rejected(found, frame)
     for name, share in found.on.items():
-        if share < ON:
-            message = f"{share:.0%} of its masks lie on the scans as the picks place them, {ON:.0%} or more are usual"
+        if share < _ON:
+            message = f"{share:.0%} of its masks lie on the scans as the picks place them; {_ON:.0%} or more is usual"
             hint = "Check picks, masks, calibration and time offsets of this camera."
-            yield Finding("masks_off_picks", "warning", message, share, ON, camera=name, frame=frame, hint=hint)
+            yield Finding("masks_off_picks", "warning", message, share, _ON, camera=name, frame=frame, hint=hint)
 
 
-def _explained(mistake: Mistake, undone: Evidence, found: Evidence | None, frame: int) -> Finding:
-    """Return the mistake as a finding, with the evidence; a warning if tracking makes up for it."""
-    as_given = "the picks contradict one another" if found is None else _said(found)
-    message = f"{mistake.message}; as given {as_given}, with that undone {_said(undone)}"
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """How well picks and masks agree with a setting."""
+
+    poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
+    wrong: Mapping[str, list[int]]  # numbers of the rejected picks, by arch
+    miss_mm: float  # rms error of the picks, clipped at the rejection limit
+    on: Mapping[str, float]  # share of each camera's masks that lies on the scans; cameras without masks are missing
+    unseen: int  # number of cameras without masks at this instant
+
+    @property
+    def misfit(self) -> float:
+        """The total disagreement: 0.2 to 1.5 for correct inputs."""
+        off = np.array([1.0 - on for on in self.on.values()] + [_UNSEEN] * self.unseen)
+        return float(off.mean() if self.on else 0.0) / _OFF + self.miss_mm / _MISS_MM
+
+    @property
+    def rejected(self) -> int:
+        """The number of rejected picks."""
+        return sum(len(numbers) for numbers in self.wrong.values())
+
+    @property
+    def placed(self) -> bool:
+        """Whether the masks of all cameras lie on the scans."""
+        return all(on >= _ON for on in self.on.values())
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing remains to be explained."""
+        return self.placed and not self.rejected
+
+
+def _evidence(setting: Setting, seen: Sequence[Seen], masked: Sequence[str]) -> _Evidence:
+    """Place the scans by the picks of a setting, and measure how well the masks of `masked` cameras agree.
+
+    `seen` provides the masks once per candidate for the time offsets; the best one counts for each camera.
+
+    Raises:
+        TrackingError: the picks contradict one another.
+    """
+    poses, wrong, misses = [], {}, []
+    for picks, vertices, name in zip(setting.picks, setting.vertices, ARCH_NAMES, strict=True):
+        pose, wrong[name] = pose_from_picks(picks, vertices, setting.cameras, name)
+        misses.append(np.minimum(picks_miss_mm(picks, vertices, setting.cameras, pose), TOLERANCE_MM))
+        poses.append(pose)
+    rms = float(np.sqrt(np.mean(np.concatenate(misses) ** 2)))
+    on = _covered(setting, poses, seen, masked)
+    return _Evidence(np.stack(poses), wrong, rms, on, len(masked) - len(on))
+
+
+def _covered(setting: Setting, poses: Sequence[Array], seen: Sequence[Seen], masked: Sequence[str]) -> dict[str, float]:
+    """Return the share of each camera's masks that lies on the scans, for its best candidate of the time offsets."""
+    on = {}
+    for name in masked:
+        camera = setting.cameras[name]
+        points = [transform_points(pose, own) for pose, own in zip(poses, setting.crowns, strict=True)]
+        depth = float(np.mean([camera.depth(own.mean(0)) for own in points]))
+        if not all((camera.depth(own) > 0).all() for own in points):
+            on[name] = 0.0
+            continue
+        trees = [cKDTree(camera.project_pinhole(own)) for own in points]
+        reach_px = _CLOSE_MM * float(camera.K[0, 0]) / depth
+        source, arches = setting.sources.get(name, name), (1, 0) if name in setting.exchanged else ARCHES
+        shares = []
+        for guess in seen:
+            pixels = [camera.undistort_pixels(own) if len(own) else own for own in guess(source, name)]
+            near = [trees[arches[arch]].query(pixels[arch])[0] < reach_px for arch in ARCHES if len(pixels[arch])]
+            shares += [float(np.mean([own.mean() for own in near]))] if near else []
+        if shares:
+            on[name] = max(shares)
+    return on
+
+
+def _explanation(
+    given: Setting, found: _Evidence | None, seen: Sequence[Seen], masked: Sequence[str]
+) -> tuple[Mistake, _Evidence] | None:
+    """Return the mistake that best explains the misfit, and the evidence with it undone; None if no mistake does.
+
+    `found` is the evidence for the inputs as given, None if the picks contradict one another.
+    """
+    allowed = 0 if found is None else found.rejected
+    tried: list[tuple[Mistake, _Evidence]] = []
+    for mistake in islice(possible_mistakes(given), _MOST_TRIED):
+        if mistake.camera is not None and any(not m.correctable and e.misfit < _SURE for m, e in tried):
+            break  # mistakes of single cameras come last and take longest
+        try:
+            undone = _evidence(mistake.setting, seen, masked)
+        except TrackingError:
+            continue
+        if undone.rejected <= allowed and undone.placed:
+            tried.append((mistake, undone))
+    if not tried:
+        return None
+    mistake, undone = min(tried, key=lambda one: one[1].misfit)
+    if found is not None:
+        by_picks = mistake.correctable and undone.rejected < found.rejected
+        if undone.misfit > (_PROOF_BY_PICKS if by_picks else _PROOF) * found.misfit:
+            return None
+    alike = [other for other, left in tried if other is not mistake and left.misfit < undone.misfit + _ALIKE]
+    if mistake.correctable and alike:
+        causes = "; or else ".join(one.message for one in (mistake, *(one for one in alike if one.correctable)))
+        mistake = replace(mistake, message=causes)
+    return mistake, undone
+
+
+def _explained(mistake: Mistake, undone: _Evidence, found: _Evidence | None, frame: int) -> Finding:
+    """Return the finding that reports a mistake: a warning if tracking corrects it, otherwise an error."""
+    as_given = "the picks contradict one another" if found is None else _summary(found)
+    message = f"{mistake.message}; as given {as_given}, with that undone {_summary(undone)}"
     severity: Severity = "warning" if mistake.correctable and found is not None else "error"
     return Finding(
         mistake.kind,
         severity,
         message,
-        value=None if found is None else round(found.doubt, 2),
+        value=None if found is None else round(found.misfit, 2),
         camera=mistake.camera,
         frame=frame,
         hint=mistake.hint,
     )
 
 
-def _said(found: Evidence) -> str:
+def _summary(found: _Evidence) -> str:
     worst = f" and {min(found.on.values()):.0%} or more of each camera's masks lie on the scans" if found.on else ""
     return f"the picks agree to {found.miss_mm:.1f} mm{worst}"
 
 
-def _left_out(found: Evidence, frame: int) -> Iterator[Finding]:
+def _rejected(found: _Evidence, frame: int) -> Iterator[Finding]:
     for arch, numbers in found.wrong.items():
         for number in numbers:
-            message = f"pick {number} on the {arch} teeth does not fit the others and is left out"
+            message = f"pick {number} on the {arch} teeth does not fit the others and is ignored"
             hint = "Check its vertex, pixels and camera names."
             yield Finding("pick_wrong", "warning", message, frame=frame, hint=hint)
 
 
-def _can_be(given: Setting) -> bool:
-    """Tell whether there are enough picks of vertices and cameras that exist."""
+def _valid(given: Setting) -> bool:
+    """Return whether there are enough picks, all on existing vertices and cameras."""
     for picks, vertices in zip(given.picks, given.vertices, strict=True):
         cameras = [{view.camera for view in pick.views} for pick in picks]
         known = all(len(own) >= 2 and own <= set(given.cameras) for own in cameras)

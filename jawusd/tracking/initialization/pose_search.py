@@ -1,7 +1,7 @@
 """Brute-force search for the pose of one arch: orientations one by one, all translations at once.
 
-For one orientation, small translations hardly do more than shift the picture of the arch. How well it fits its mask at
-every shift is a correlation, which the fast Fourier transform gives for all shifts together; the objective of a
+For one orientation, a small translation mostly shifts the picture of the arch. How well it fits its mask at every
+shift is a correlation, which the fast Fourier transform computes for all shifts together. The objective of a
 translation is the sum over the cameras.
 """
 
@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from jawusd.base.arrays import Array
+from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, so3_exp, transform_points
+from jawusd.geometry import make_transform, so3_exp, transform_point, transform_points
+from jawusd.meshes.raster import unpack_bits
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.scan import CROWN, Scan, prepare_scan
 from jawusd.tracking.contour.views import View
@@ -179,3 +180,39 @@ def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
     points = transform_points(T_anatomical_scan, crowns)
     front = points[points[:, 2] > points[:, 2].max() - 15.0]  # incisors to first premolars: what cameras see
     return make_transform(np.eye(3), -front.mean(0)) @ T_anatomical_scan
+
+
+def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], use: Mask) -> Array:
+    """Return the translation across the line of sight that brings the crowns' middle onto that of their masks [mm].
+
+    Lips hide the back teeth, and others in every view, so the depth found would be wrong by a centimetre or two: it
+    is left alone. Across, the result is good to a few millimetres: enough for a search to start from.
+
+    `pose` is T_world_scan, `use` tells the masks to be used, shape (2, C). Zero without a mask.
+    """
+    centre = np.append(transform_point(pose, scan.centre), 1.0)
+    H, g, sight = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    for view in (view for view, used in zip(views, use[arch], strict=True) if used):
+        height, width = view.masks.shape[1:]
+        # Three pictures wide and high: what is to be brought near may lie off the picture.
+        bits = scan.silhouette(view.matrix @ view.T_delay[arch] @ pose, (3 * height, 3 * width), -width, -height)
+        crowns, mask = unpack_bits(bits, 3 * width), view.masks[arch] > 127
+        depth = view.matrix[2] @ centre
+        if depth <= 0 or not crowns.any() or not mask.any():
+            continue
+        pixel = view.matrix[:2] @ centre / depth
+        slope = (view.matrix[:2, :3] - pixel[:, None] * view.matrix[2, :3]) / depth
+        miss = _middle(mask) - (_middle(crowns) - [width, height])
+        H += slope.T @ slope
+        g += slope.T @ miss
+        sight += (centre[:3] - view.eye) / np.linalg.norm(centre[:3] - view.eye)
+    if not sight.any():
+        return np.zeros(3)
+    across = np.linalg.svd(sight[None])[2][1:]  # two directions normal to the mean line of sight
+    return across.T @ np.linalg.solve(across @ H @ across.T, across @ g)
+
+
+def _middle(picture: Mask) -> Array:
+    """Return the mean position (x, y) of the set pixels, shape (2,)."""
+    rows, columns = np.nonzero(picture)
+    return np.array([columns.mean(), rows.mean()])

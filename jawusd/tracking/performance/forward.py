@@ -11,7 +11,7 @@ from jawusd.base.arrays import Array
 from jawusd.geometry import transform_points
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.views import View
-from jawusd.tracking.initialization.reacquire import shift_to_masks
+from jawusd.tracking.initialization.pose_search import shift_to_masks
 from jawusd.tracking.performance.attempts import Attempts, FrameFit, Instant, nothing_seen
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected

@@ -22,13 +22,11 @@ from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.region.appearance import CORRELATION_PX
 from jawusd.tracking.region.condyle_fusion import CondyleFusion
 from jawusd.tracking.region.tracker import RegionPose
-from jawusd.tracking.sequence.closed_bite import observe_bite
+from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.mirror_check import mirror_findings
 from jawusd.tracking.sequence.nuisance import Hand, TakeEquations, corrected_pose
-from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
-from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings
+from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings, mirror_findings
 from jawusd.tracking.sequence.time_checks import time_findings
 
 # Share of a camera's contour that fits over that of the camera with most, below which it sees the teeth elsewhere. It

@@ -1,9 +1,9 @@
-"""What frames with the teeth together say: how far the scans' registration is off, and the steady error of a take.
+"""Frames with the teeth together: the registration error of the scans, and the constant error of a take.
 
-The scans come in occlusion, so a closed bite shows T_upper_lower = identity, but for three things: the registration of
-the scans may be off, outlines drawn alike in every frame shift both arches steadily, and single frames vary. All have
-known spreads, so what is measured is shared out among them by linear least squares. Registrations are nearly always
-good to some hundredths of a millimetre, but bad ones are off by a lot: a Student distribution, by reweighting (Lange,
+The scans are exported in occlusion, so a closed bite shows T_upper_lower = identity up to three errors: the scans'
+registration, outlines drawn with the same bias in every frame, and the noise of single frames. Each has a known
+spread, so linear least squares divides the measured deviation among them. Most registrations are accurate to some
+hundredths of a millimetre, but outliers are large: they follow a Student distribution, fitted by reweighting (Lange,
 Little & Taylor 1989).
 """
 
@@ -22,11 +22,74 @@ from jawusd.formats.finding import Finding, Severity
 from jawusd.formats.tracks import LOST, Registration
 from jawusd.geometry import relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.contour.equations import translation
-from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import TakeEquations, pose_response
-from jawusd.tracking.sequence.rest_frames import RestFrames
+
+# Teeth held together rest: slower than this against one another [mm/frame at the teeth], and no farther from the
+# closest frame [mm].
+_STILL_MM, _SAME_BITE_MM = 0.12, 0.2
+_LONGEST_REST = 24  # frames used on either side: later ones tell nothing new
+
+
+@dataclass(frozen=True, eq=False)
+class RestFrames:
+    """Say where the teeth are together, and what to do about it.
+
+    Attributes:
+        frames: numbers of the frames.
+        named: whether the capture names one of them.
+        point, lower: amid the teeth, and amid the lower crowns, scan coordinates [mm], shape (3,).
+        apply: whether the lower scan is moved to where it belongs.
+    """
+
+    frames: tuple[int, ...]
+    named: bool
+    point: Array
+    lower: Array
+    apply: bool
+
+
+def rest_frames(
+    records: Mapping[int, FrameRecord], named: int | None, up: Array, point: Array, probes: Array
+) -> tuple[int, ...]:
+    """Return the frames in which the teeth rest together, around a named one or where the mouth is closed farthest.
+
+    Args:
+        named: frame the capture names; None searches.
+        up: from the lower to the upper teeth, unit vector in scan axes, shape (3,).
+        point, probes: amid the teeth, shape (3,), and spread over the lower ones, shape (N, 3), scan coordinates [mm].
+    """
+    relative = {frame: relative_pose(*records[frame].solution.poses) for frame in whole_frames(records)}
+    if named is None:
+        closed = {f: float((T[:3, :3] @ point + T[:3, 3] - point) @ up) for f, T in relative.items()}
+        ranked = sorted(closed, key=lambda f: -closed[f])
+        named = next((f for f in ranked if _still(relative, f, f + 1, probes)), None)
+    if named is None or named not in relative:
+        return ()
+    out = [named]
+    for step in (1, -1):
+        frame = named
+        while abs(frame + step - named) <= _LONGEST_REST and _still(relative, frame, frame + step, probes):
+            frame += step
+            if _moved_mm(relative[frame], relative[named], probes) > _SAME_BITE_MM:
+                break
+            out.append(frame)
+    return tuple(sorted(out))
+
+
+def _still(relative: Mapping[int, Array], frame: int, other: int, probes: Array) -> bool:
+    if frame not in relative or other not in relative:
+        return False
+    return _moved_mm(relative[frame], relative[other], probes) < _STILL_MM
+
+
+def _moved_mm(one: Array, other: Array, probes: Array) -> float:
+    """Return how far two poses (4, 4) of the lower arch are apart, on average over points (N, 3) [mm]."""
+    gap = probes @ (one - other)[:3, :3].T + (one - other)[:3, 3]
+    return float(np.linalg.norm(gap, axis=1).mean())
+
 
 # Spread of the closed bite about the scans' own: of a good registration together with how firmly people bite [mm], and
 # the same at the ends of an arch as a turn [rad].

@@ -25,7 +25,7 @@ from jawusd.tracking.contour.quality import (
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
-from jawusd.tracking.initialization.reacquire import shift_to_masks
+from jawusd.tracking.initialization.pose_search import shift_to_masks
 from jawusd.tracking.sequence.history import History
 
 _FEWEST_MASKS = 2  # one view leaves the depth to the outline's width, which a wrong mask shares

@@ -26,6 +26,7 @@ from jawusd.tracking.contour.quality import (
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.closed_bite import (
     ClosedBite,
+    RestFrames,
     check_registration,
     closed_bite,
     registration_findings,
@@ -34,7 +35,6 @@ from jawusd.tracking.sequence.closed_bite import (
 )
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, interpolation_covariance, pose_response
-from jawusd.tracking.sequence.rest_frames import RestFrames
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
 #: What else is known of poses, told once all are measured: takes poses (F, 2, 4, 4), NaN where lost, the covariances of

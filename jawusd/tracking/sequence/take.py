@@ -15,26 +15,27 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks, TracksMeta
 from jawusd.geometry import Camera
 from jawusd.tracking.config import FOR_TAKES, TrackingConfig
-from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
+from jawusd.tracking.contour.frame_record import FrameRecord, PackedRecords, whole_frames
 from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
 from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.initialization.start import find_start, quoting
-from jawusd.tracking.sequence.camera_use import use_of_cameras
-from jawusd.tracking.sequence.closed_bite import observe_bite
+from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.delays import BRIDGE_FRAMES, bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.frame_shifts import frame_shifts
-from jawusd.tracking.sequence.mirror_check import mirror_findings
 from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, Hand, Nuisances, TakeEquations
-from jawusd.tracking.sequence.packed_records import PackedRecords
-from jawusd.tracking.sequence.passes import Passes, Progress
-from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
+from jawusd.tracking.sequence.passes import Passes, Progress, give_up_poorly_seen
 from jawusd.tracking.sequence.results import assemble, outline_variance
-from jawusd.tracking.sequence.take_checks import lens_findings, misfit_findings, motion_findings, search_findings
-from jawusd.tracking.sequence.time_checks import time_findings
-from jawusd.tracking.sequence.well_seen import give_up_poorly_seen
+from jawusd.tracking.sequence.take_checks import (
+    lens_findings,
+    mirror_findings,
+    misfit_findings,
+    motion_findings,
+    search_findings,
+    use_of_cameras,
+)
+from jawusd.tracking.sequence.time_checks import frame_shifts, time_findings
 
 _SETTLED_REST = 6  # frames with the teeth together among those on which nuisances are settled
 # A moved camera would only hide these.

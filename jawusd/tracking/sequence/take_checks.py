@@ -1,24 +1,24 @@
-"""What a tracked take says of calibration and masks: lenses, scan sizes, moved cameras, searches given up.
+"""Findings of a tracked take about its inputs: calibration, scans, masks, cameras, and abandoned searches.
 
-False alarms: none of 17 valid synthetic persons carried any of these findings (`tests/benchmarks/population.py
---persons 8 --seed 1` and `--persons 9 --seed 9`), which bounds the rate of all kinds together to 16 % (95 %); those of
-focal lengths and sizes at 4 standard deviations. At 3, as now, none of 12 others (`--persons 12 --seed 200`) carried
-them; lens distortion at 3 was a false alarm on one of these.
+False-alarm rates come from `tests/benchmarks/population.py`; docs/explanation/constants.md lists them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import LOST
+from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 from jawusd.tracking.contour.quality import residual_px, score_px
-from jawusd.tracking.contour.scan import ARCH_NAMES
-from jawusd.tracking.initialization.magnification import Magnification
+from jawusd.tracking.contour.scan import ARCH_NAMES, Scan, mirrored
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.initialization.magnification import Instant, Magnification
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.history import SearchAllowance
 
@@ -265,3 +265,93 @@ def search_findings(searches: SearchAllowance, records: Mapping[int, FrameRecord
             hint="Look at the masks of the lost frames: rows or cameras may be exchanged there.",
         )
     ]
+
+
+_HALF = 0.5  # of a camera's masks: with fewer used, the camera contradicts the others more often than not
+
+
+def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -> list[Finding]:
+    """Return a warning for each camera whose masks were used in none of the frames, or in few of those that have some.
+
+    Kinds: "camera_not_used", with the number of frames that have masks; "camera_rarely_used", with the used share.
+    """
+    frames = sorted(records)
+    present = np.array([np.isfinite(records[frame].coverage) for frame in frames])  # (F, 2, C)
+    used = np.array([records[frame].used for frame in frames])
+    out = []
+    for c, name in enumerate(names):
+        seen, taken = present[..., c], used[..., c]
+        with_masks, with_use = int(seen.any(1).sum()), int(taken.any(1).sum())
+        if not with_masks:
+            out.append(
+                Finding(
+                    "camera_not_used",
+                    "warning",
+                    f"used in 0 of {len(frames)} frames: it has no masks from frame {frames[0]} to {frames[-1]}.",
+                    value=0,
+                    camera=name,
+                    hint="Check `frames`, the numbers of its masks and its time offset.",
+                )
+            )
+        elif not with_use or taken.sum() < _HALF * seen.sum():
+            out.append(
+                Finding(
+                    "camera_rarely_used" if with_use else "camera_not_used",
+                    "warning",
+                    f"used in {with_use} of {len(frames)} frames: of its {int(seen.sum())} masks "
+                    f"{int((seen & ~taken).sum())} fit neither the scans nor the other cameras' masks.",
+                    value=round(float(taken.sum() / seen.sum()), 3),
+                    limit=_HALF,
+                    camera=name,
+                    hint="Check that they are this camera's, its calibration and its time offset.",
+                )
+            )
+    return out
+
+
+_FRAMES = 4  # that are aligned anew, twice: a second or two
+# Contour that fits the mirror images over that which fits the scans. As given, it was 0.18 to 0.49 in takes of four
+# mouths, and up to 0.98 in one whose arches are symmetric but for the triangles, where it does not matter.
+_LEAST_RATIO = 1.15
+
+
+def mirror_findings(
+    scans: Sequence[Scan], left: Array, instants: Iterable[Instant], config: TrackingConfig
+) -> list[Finding]:
+    """Return a warning if more of the contour fits with left and right of the scans exchanged. Kind: "scans_mirrored".
+
+    Args:
+        scans: upper and lower.
+        left: unit vector to the left in scan coordinates, shape (3,).
+        instants: some frames of the take, aligned.
+    """
+    ratio = mirror_ratio(scans, left, instants, config)
+    if not ratio > _LEAST_RATIO:
+        return []
+    return [
+        Finding(
+            "scans_mirrored",
+            "warning",
+            f"mirrored, the scans fit {ratio:.2f} times as much of the outlines: their left and right are exchanged",
+            value=round(ratio, 2),
+            limit=_LEAST_RATIO,
+            hint="Export them again without mirroring; one axis may have been negated.",
+        )
+    ]
+
+
+def mirror_ratio(scans: Sequence[Scan], left: Array, instants: Iterable[Instant], config: TrackingConfig) -> float:
+    """Return how much contour fits with the scans mirrored, over that with the scans as given; NaN without any.
+
+    Arguments as for `mirror_findings`.
+    """
+    middle = np.mean([scan.centre for scan in scans], axis=0)
+    pair = [ContourSolver(own, config) for own in (scans, [mirrored(scan, middle, left) for scan in scans])]
+    shares = []
+    chosen = list(instants)
+    for k in np.unique(np.linspace(0, len(chosen) - 1, _FRAMES).astype(int)) if chosen else ():
+        poses, views, use = chosen[k]
+        found = [solver.solve(poses, views, config.wide_gates_px, use) for solver in pair]
+        shares.append([score_px(one).sum() / max(one.visible_px.sum(), 1.0) for one in found])
+    given, other = np.median(shares, axis=0) if shares else (np.nan, np.nan)
+    return float(other / given) if given > 0 else float("nan")
