@@ -7,6 +7,7 @@ translation and quaternion, which readers interpolate linearly and by slerp.
 from __future__ import annotations
 
 import json
+import math
 import os
 import struct
 from collections.abc import Mapping, Sequence
@@ -109,6 +110,18 @@ def save_glb(
     if channels:
         document["animations"] = [{"name": name, "channels": channels, "samplers": samplers, "extras": dict(extras)}]
     write_bytes_atomic(path, _container(document, bytes(builder.data)))
+
+
+def frame_rate(path: str | os.PathLike[str]) -> float | None:
+    """Return the frames per second that a .glb of `save_glb` notes with its animation; None for other files."""
+    try:
+        with open(path, "rb") as file:
+            magic, length = struct.unpack("<4s8xI4x", file.read(20))
+            document = json.loads(file.read(length)) if magic == b"glTF" else {}
+        fps = float(document["animations"][0]["extras"]["fps"])
+    except (OSError, ValueError, TypeError, LookupError, RecursionError, struct.error):
+        return None
+    return fps if 0 < fps < math.inf else None
 
 
 class _Builder:

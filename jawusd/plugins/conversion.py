@@ -11,6 +11,7 @@ from pathlib import Path
 
 from jawusd.base.errors import FormatError, MissingDependencyError
 from jawusd.base.inputs import check_input
+from jawusd.formats.gltf import frame_rate
 
 #: Files that Blender reads for jawusd.
 SUFFIXES = (".fbx", ".glb", ".gltf")
@@ -27,7 +28,7 @@ def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps:
     Args:
         path: An .fbx, .glb or .gltf file.
         folder: Where the stage is written.
-        fps: Frames per second of files that do not say, as glTF ones.
+        fps: Frames per second of files that do not say, as glTF ones of other programs.
 
     Raises:
         MissingDependencyError: There is no Blender.
@@ -37,7 +38,7 @@ def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps:
     check_input(path)
     if not path.is_file():
         raise FormatError("there is no such file.", path=path)
-    command = [*_blender(path), "--", str(path.resolve()), str(target), repr(fps)]
+    command = [*_blender(path), "--", str(path.resolve()), str(target), repr(frame_rate(path) or fps)]
     # plugins of this process are not meant for Blender's own OpenUSD
     alone = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
     try:

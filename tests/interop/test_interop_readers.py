@@ -1,5 +1,6 @@
 """Programs that never heard of jawusd read its rigs: other OpenUSD versions, tinyusdz, three.js, NVIDIA's validator."""
 
+import json
 import shutil
 import subprocess
 
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry import Camera, make_transform
+from jawusd.plugins.extension import copy_scripts
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.cameras import write_cameras
 from jawusd.rig.glb import write_glb
@@ -65,6 +67,20 @@ def test_every_openusd_shows_the_same_poses(folder, name):
         assert landmark_distance(np.array(found["poses"]), poses) < 1e-6
         np.testing.assert_allclose(found["d"], example_motion()[1][list(SHOWN)], atol=1e-12)
         assert found["table"] == 33**3 * 6 and "JawRigAPI" in found["schemas"]
+
+
+@pytest.mark.parametrize("name", ["usd2411", "usd255", "usd2611"])
+def test_the_single_file_reader_reads_usd_with_every_openusd(folder, tmp_path, name):
+    reader, *_ = copy_scripts(tmp_path)
+    d = [[0.0, 0.0, 0.0], [20.0, 1.0, 0.5], [20.0, 7.6, 9.2]]
+    code = f"import sys, json; sys.path.insert(0, {str(reader.parent)!r}); import jawusd_reader as r; "
+    code += f"rig = r.load({str(folder / 'actor.usda')!r}); d = json.loads({json.dumps(d)!r}); "
+    code += "found = [[rig.pose(*x) for x in d], [rig.project(*x) for x in d], 'numpy' in sys.modules]; "
+    code += "print('RESULT', json.dumps(found))"
+    poses, inside, numpy_loaded = run([environment(name) / "bin" / "python", "-c", code])
+    np.testing.assert_allclose(poses, example_rig().pose(d), atol=1e-9)
+    np.testing.assert_allclose(inside, example_rig().project(d), atol=1e-5)
+    assert not numpy_loaded
 
 
 @pytest.mark.parametrize("name", ["usd2411", "usd255"])

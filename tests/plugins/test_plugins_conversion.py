@@ -1,10 +1,13 @@
 """FBX and glTF without Blender, or with something else in its place: one clear message each."""
 
+import math
 import sys
 
+import numpy as np
 import pytest
 
 from jawusd.base.errors import FormatError, MissingDependencyError
+from jawusd.formats.gltf import Node, frame_rate, save_glb
 from jawusd.plugins.conversion import converted
 
 
@@ -56,3 +59,18 @@ def test_blender_is_given_the_files_and_the_rate(take, tmp_path, program, monkey
     program(f'echo "$2 $3 $5 [$PXR_PLUGINPATH_NAME]" > {tmp_path}/given; echo stage > "$4"')
     assert converted(take, tmp_path, 29.97).read_text() == "stage\n"
     assert (tmp_path / "given").read_text() == f"-- {take} 29.97 []\n"
+
+
+def test_a_glb_of_jawusd_is_read_at_its_own_rate(tmp_path, program):
+    poses = np.stack([np.eye(4), np.eye(4)])
+    node = Node("Mandible", np.eye(4), [], np.array([0.0, 0.1]), poses)
+    for fps, wanted in ((30.0, 30.0), (0.0, None), (math.nan, None), ("fast", None), (None, None)):
+        save_glb(tmp_path / "take.glb", "x", {}, [node], "jawusd", {"fps": fps})
+        assert frame_rate(tmp_path / "take.glb") == wanted
+        program(f'echo "$5" > {tmp_path}/given; echo stage > "$4"')
+        converted(tmp_path / "take.glb", tmp_path, 24.0)
+        assert (tmp_path / "given").read_text() == f"{wanted or 24.0}\n"
+    whole = (tmp_path / "take.glb").read_bytes()
+    for damaged in (b"", b"glTF", whole[:40], b"x" + whole[1:]):
+        (tmp_path / "other.glb").write_bytes(damaged)
+        assert frame_rate(tmp_path / "other.glb") is None
