@@ -29,6 +29,7 @@ _MODELS = {
     "OPENCV": ("fxfy", 4),
     "FULL_OPENCV": ("fxfy", 8),
 }
+_COUNTED = re.compile(r"^# Number of images: (\d+)", re.MULTILINE)
 _POINTS = re.compile(r"(?:\S+ \S+ -?\d+(?: |$))+")
 
 
@@ -55,6 +56,13 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
         images.append((file, Camera(file, size, K, distortion, make_transform(matrix_from_wxyz(q), t))))
     if not images:
         raise CalibrationError("holds no images.", path=path)
+    counted = _COUNTED.search(read_text(path, MOST_BYTES))
+    if counted is not None and int(counted[1]) > len(images):
+        raise CalibrationError(
+            f"is cut off: {len(images)} of {counted[1]} images that its header counts.",
+            path=path,
+            hint='Write the model again; of one that was shortened by hand, correct "# Number of images".',
+        )
     return cameras_of_images(path, images)
 
 

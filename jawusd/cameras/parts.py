@@ -26,7 +26,7 @@ _LARGEST_DEFECT = 1e-3
 _MOVED_RAD, _MOVED_SHARE = 1e-3, 1e-3
 _LARGEST_ERROR_PX = 0.05  # of a lens written with other coefficients
 _MODEL_KEYS = ("distortion_model", "distortion_type", "lens_model", "camera_model", "model_type", "projection_model")
-_FLAG_KEYS = ("fisheye", "fisheye_model", "is_fisheye", "use_fisheye")
+_FLAG_KEYS = ("fisheye", "fisheye_model", "is_fisheye", "use_fisheye", "xi")  # xi: omnidirectional
 # Names of OpenCV's radial-tangential model with up to eight coefficients, in ROS, Kalibr, camodocal and others.
 _READ_MODELS = {"plumb_bob", "rational_polynomial", "radtan", "radial_tangential", "brown", "brown_conrady", "opencv"}
 _READ_MODELS |= {"pinhole", "perspective", "standard", "none", "no_distortion", "frame", "full_opencv", ""}

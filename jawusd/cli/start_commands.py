@@ -76,7 +76,7 @@ def cameras(
         Path,
         typer.Argument(
             help="TOML (aniposelib, Pose2Sim, Caliscope), Metashape XML, RealityScan CSV or XMP, COLMAP, "
-            "transforms.json, OpenCV YAML, Nuke script of 3DEqualizer, or a USD stage.",
+            "transforms.json, OpenCV YAML, XML or JSON, Nuke script of 3DEqualizer, or a USD stage.",
             show_default=False,
         ),
     ],

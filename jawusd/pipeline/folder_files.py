@@ -109,7 +109,7 @@ def _files(folder: Path) -> Iterable[PurePath]:
 
 def _parted(path: PurePath) -> list[str]:
     """Return the words of a path, those written as one taken apart."""
-    whole = rf"(?:{_PART})+"
+    whole = rf"(?:{_PART})+\d*"
     return [part for word in words(path) for part in (re.findall(_PART, word) if re.fullmatch(whole, word) else [word])]
 
 

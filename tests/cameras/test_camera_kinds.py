@@ -194,7 +194,7 @@ def test_cameras_of_a_stage_with_equal_names_are_named_by_their_paths(tmp_path):
 
 YAML_MODELS = ["equidistant", "fisheye", "omni-radtan", "inverse_brown_conrady"]
 YAML_MODELS = [f"distortion_model: {model}" for model in YAML_MODELS]
-YAML_MODELS += ['model_type: "KANNALA_BRANDT"', "fisheye_model: 1", "camera_model: omni"]
+YAML_MODELS += ['model_type: "KANNALA_BRANDT"', "fisheye_model: 1", "camera_model: omni", "xi: 1.2"]
 
 
 @pytest.mark.parametrize("model", YAML_MODELS)
@@ -294,6 +294,17 @@ def test_images_of_a_camera_with_different_lenses_are_refused(tmp_path):
     again = text[1].replace(" 1 a/1.png", " 2 a/2.png")
     (tmp_path / "images.txt").write_text("\n".join([*text, again, ""]))
     with pytest.raises(CalibrationError, match="camera a has different lenses in its images"):
+        load_cameras_file(tmp_path)
+
+
+def test_images_that_are_fewer_than_the_header_counts_are_named(tmp_path):
+    colmap(tmp_path, [""] * 3)
+    text = (tmp_path / "images.txt").read_text()
+    for count in (3, 2, 4):
+        (tmp_path / "images.txt").write_text(f"# Number of images: {count}, mean observations per image: 0\n{text}")
+        if count <= 3:
+            same(load_cameras_file(tmp_path))
+    with pytest.raises(CalibrationError, match=r"images\.txt: is cut off: 3 of 4 images"):
         load_cameras_file(tmp_path)
 
 

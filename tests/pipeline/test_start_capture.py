@@ -187,6 +187,7 @@ ARCHES = {
     "capitals": (["UPPERJAWSCAN.STL", "LOWERJAWSCAN.STL"], "01"),
     "adjectives": (["maxillaryscan.stl", "mandibularscan.stl"], "01"),
     "arches": (["x_upperarch.obj", "x_lowerarch.obj"], "01"),
+    "numbered": (["upperjaw1.ply", "lowerjaw1.ply"], "01"),
     "teeth": (["upperteeth.ply", "lowerteeth.ply"], "01"),
     "Medit": (["case-maxilla.stl", "case-mandible.stl"], "01"),
     "Medit, one word": (["maxillascan.ply", "mandiblescan.ply"], "01"),
