@@ -19,7 +19,7 @@ PAGES = {
     ),
     "library": (
         "A folder of actors, and motion of one person for another.",
-        ["jawusd.library.transport", "jawusd.library.personal", "jawusd.library.timing"],
+        ["jawusd.library.personal", "jawusd.library.timing"],
     ),
     "pipeline": (
         "The stages wired together: what the commands call. Heavy packages are loaded by the functions that need them.",

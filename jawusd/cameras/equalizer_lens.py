@@ -25,7 +25,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, FormatError
 from jawusd.cameras.nuke_script import NukeNode, steady_values
 from jawusd.formats.text import read_text
-from jawusd.geometry.lens_fit import opencv_lens
+from jawusd.geometry.camera import opencv_lens
 
 Size = tuple[int, int]
 

@@ -15,7 +15,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.base.tables import read_text
 from jawusd.geometry import Camera, make_transform, rigidity_defect
-from jawusd.geometry.lens_fit import opencv_radial
+from jawusd.geometry.camera import opencv_radial
 
 Size = tuple[int, int]
 

@@ -147,7 +147,7 @@ def library(
     apart_mm: dict[str, float] = {}
     if like is not None:
         from jawusd.formats.landmarks import load_landmarks
-        from jawusd.library.transport import landmark_distance_mm
+        from jawusd.library.personal import landmark_distance_mm
 
         wanted = load_landmarks(like).landmarks
         apart_mm = {entry.path: landmark_distance_mm(entry.landmarks(), wanted) for entry in entries}
@@ -174,7 +174,7 @@ def _library_lines(opened: Library, entries: Sequence[Entry], apart_mm: Mapping[
 
 def _compare(first: Entry, second: Entry, as_json: bool) -> None:
     from jawusd.library.index import PARAMETERS
-    from jawusd.library.transport import landmark_distance_mm
+    from jawusd.library.personal import landmark_distance_mm
 
     def numbers(entry: Entry) -> dict[str, float]:
         ends = {f"{key}_{end}": entry.ranges_mm[key][i] for key in PARAMETERS for i, end in enumerate(("min", "max"))}

@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator import sections
 from jawusd.evaluator.arrays import RigArrays
 from jawusd.evaluator.batching import as_floats, as_keys, as_rows, in_chunks, pairs_in_chunks
-from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.bounds import Ranges, SliceHull, denormalized, normalized
 from jawusd.evaluator.clamping import Inside, kept_inside
 from jawusd.evaluator.interpolation import interpolated
 from jawusd.evaluator.search import nearest_distance
-from jawusd.evaluator.sections import Ranges
 
 
 class RigAuthoring(RigArrays):
@@ -110,12 +108,12 @@ class RigAuthoring(RigArrays):
             Shares, shape (..., 3): 1 is the full range.
         """
         rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(lambda d: sections.normalized(self.bound, self.d_range, d), rows).reshape(*batch, 3)
+        return in_chunks(lambda d: normalized(self.bound, self.d_range, d), rows).reshape(*batch, 3)
 
     def denormalized(self, shares: ArrayLike) -> Array:
         """Return the jaw parameters [mm], shape (..., 3), of shares (..., 3): the inverse of `normalized`."""
         rows, batch = as_rows(shares, (3,), "shares")
-        return in_chunks(lambda n: sections.denormalized(self.bound, self.d_range, n), rows).reshape(*batch, 3)
+        return in_chunks(lambda n: denormalized(self.bound, self.d_range, n), rows).reshape(*batch, 3)
 
     def captured_distance(self, d: ArrayLike) -> Array:
         """Return the distance [mm] (...) of d (..., 3) [mm] to the nearest captured pose, in d; inf without any."""

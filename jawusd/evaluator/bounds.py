@@ -1,18 +1,21 @@
-"""The slice hull: which jaw parameters are anatomically possible, as a smooth signed distance in mm.
+"""The bounds: which jaw parameters are anatomically possible.
 
-Every opening d1 has a convex section in (d2, d3), the half-planes ``n_k . (d2, d3) <= h_k(d1)``; d1 itself is limited
-to the captured openings. The half-spaces are joined by a soft maximum,
+The slice hull is a smooth signed distance in mm. Every opening d1 has a convex section in (d2, d3), the half-planes
+``n_k . (d2, d3) <= h_k(d1)``; d1 itself is limited to the captured openings. The half-spaces are joined by a soft
+maximum,
 
     v_k = n_k . (d2, d3) - h_k(d1),   v_low = d1_first - d1,   v_high = d1 - d1_last,
     distance(d) = softness log sum exp(v / softness) - offset_mm,
 
-which is negative inside, close to the distance in mm near the boundary, and smooth everywhere.
+which is negative inside, close to the distance in mm near the boundary, and smooth everywhere. The bound of the paper
+is two outlines, in (d1, d2) and in (d1, d3), both of which must contain d (Yang et al. 2019).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -204,3 +207,87 @@ class SliceHull:
         total = v.sum(axis=1)
         v /= total[:, None]
         return peak + self.softness_mm * np.log(total) - self.offset_mm, v
+
+
+# A range shorter than this counts as this long, which keeps normalising invertible where a section closes.
+SMALLEST_REACH_MM = 0.5
+
+
+class Ranges(NamedTuple):
+    """How far d2 and d3 can each go alone [mm], each of shape (...); NaN where they cannot."""
+
+    d2_min: Array
+    d2_max: Array
+    d3_min: Array
+    d3_max: Array
+
+
+def normalized(bound: SliceHull, d_range: Array, d: Array) -> Array:
+    """Return d (n, 3) [mm] as shares of the full opening and of the reach to its side at that opening."""
+    return d / _scale(bound, d_range, d[:, 0], d)
+
+
+def denormalized(bound: SliceHull, d_range: Array, shares: Array) -> Array:
+    """Return the d (n, 3) [mm] of shares (n, 3), the inverse of `normalized`."""
+    return shares * _scale(bound, d_range, shares[:, 0] * d_range[0, 1], shares)
+
+
+def _scale(bound: SliceHull, d_range: Array, d1: Array, sides: Array) -> Array:
+    """Return what one unit means [mm], shape (n, 3), by opening d1 (n,) and by the signs of ``sides`` (n, 3)."""
+    knots = bound.supports.knots
+    on_path = np.zeros((len(d1), 3))
+    on_path[:, 0] = np.clip(d1, knots[0], knots[-1])
+    scale = np.full((len(d1), 3), d_range[0, 1])
+    for axis in (1, 2):
+        low, high = bound.chord(on_path, axis)
+        reach = np.where(sides[:, axis] < 0, -low, high)
+        scale[:, axis] = np.where(reach > SMALLEST_REACH_MM, reach, SMALLEST_REACH_MM)
+    scale[np.isnan(d1)] = np.nan
+    return scale
+
+
+@dataclass(frozen=True)
+class PolygonBound:
+    """The two alpha shapes of a rig.
+
+    Attributes:
+        opening_lateral: Edges of the outlines in (d1, d2) [mm], start and end, shape (e, 2, 2).
+        opening_protrusion: Edges of the outlines in (d1, d3) [mm], shape (f, 2, 2).
+    """
+
+    opening_lateral: Array
+    opening_protrusion: Array
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> PolygonBound:
+        """Build the bound from the named arrays of a rig."""
+        return cls(
+            _edges(arrays["polygon_d1d2"], arrays["polygon_d1d2_counts"]),
+            _edges(arrays["polygon_d1d3"], arrays["polygon_d1d3_counts"]),
+        )
+
+    def signed_distance(self, d: Array) -> Array:
+        """Return how far outside the worse of the two outlines d (n, 3) lies [mm], shape (n,); negative inside."""
+        lateral = _distance_to_edges(d[:, [0, 1]], self.opening_lateral)
+        return np.maximum(lateral, _distance_to_edges(d[:, [0, 2]], self.opening_protrusion))
+
+
+def _edges(vertices: Array, counts: Array) -> Array:
+    """Return the edges (e, 2, 2) of closed rings given one after the other."""
+    rings = np.split(vertices, np.cumsum(counts)[:-1].astype(int))
+    return np.concatenate([np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings])
+
+
+def _distance_to_edges(points: Array, edges: Array) -> Array:
+    """Return the distance (n,) of points (n, 2) to the edges, negative inside by the even-odd rule; NaN for NaN."""
+    start, along = edges[:, 0], edges[:, 1] - edges[:, 0]
+    x, y = points[:, 0, None], points[:, 1, None]
+    rx, ry = x - start[:, 0], y - start[:, 1]
+    length_squared = np.maximum(np.einsum("ei,ei->e", along, along), np.finfo(float).tiny)
+    s = np.clip((rx * along[:, 0] + ry * along[:, 1]) / length_squared, 0.0, 1.0)
+    distance = np.sqrt(np.min((rx - s * along[:, 0]) ** 2 + (ry - s * along[:, 1]) ** 2, axis=1))
+    # a ray to +x crosses an edge whose ends lie on both sides of it, if the point is left of the edge
+    crosses = (edges[:, 0, 1] > y) != (edges[:, 1, 1] > y)
+    left = (rx * along[:, 1] < ry * along[:, 0]) == (along[:, 1] > 0)
+    inside = np.count_nonzero(crosses & left, axis=1) % 2 == 1
+    return np.where(inside, -distance, distance)

@@ -1,13 +1,19 @@
-"""Piecewise cubic curves with given values and slopes, the building block of additive models and of bounds."""
+"""Piecewise cubic curves with given values and slopes, and the tooth-glide surface, a sum of products of two of them.
+
+Curves are the building block of additive models and of bounds.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator.curve_formula import cubic
+from jawusd.base.errors import EvaluatorError
+from jawusd.evaluator.curve_formula import catmull_rom, cubic
 
 
 @dataclass(frozen=True)
@@ -58,3 +64,79 @@ class HermiteCurve:
     def _locate(self, x: Array) -> tuple[Array, Array]:
         interval = self.knots.searchsorted(x, side="right")
         return self.coefficients[interval], (x - self.starts[interval])[:, None]
+
+
+_REST_MM = 1e-6
+
+
+def flat_ended(knots: Array, values: Array) -> HermiteCurve:
+    """Return the curve through values (n, k) at knots (n,) with Catmull-Rom slopes, flat at both ends."""
+    slopes = np.zeros_like(values)
+    slopes[1:-1] = catmull_rom(values[:-2], values[2:], (knots[2:] - knots[:-2])[:, None])
+    return HermiteCurve(knots, values, slopes)
+
+
+class GlideTable:
+    """The surface over d2 and d3.
+
+    Attributes:
+        knots: Of d2 and of d3 [mm], each rising.
+        factors: Values of a_r at the knots of d2, shape (n2, r), and of b_r at those of d3, shape (n3, r).
+        starts: Where the polynomials of each interval count from, the outer ones first and last, (n2 + 1,), (n3 + 1,).
+        coefficients: Of the powers 0..3 of d2 and of d3 less their starts, by cell, (n2 + 1, n3 + 1, 4, 4).
+    """
+
+    def __init__(self, knots: tuple[Array, Array], factors: tuple[Array, Array]) -> None:
+        self.knots, self.factors = knots, factors
+        side, front = (flat_ended(k, f) for k, f in zip(knots, factors))
+        self.starts = side.starts, front.starts
+        self.coefficients = np.ascontiguousarray(np.einsum("ipr,jqr->ijpq", side.coefficients, front.coefficients))
+        self._rising = knots[0].tolist(), knots[1].tolist()
+        self._first = side.starts.tolist(), front.starts.tolist()
+        self._cells = [list(row) for row in self.coefficients]
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> GlideTable | None:
+        """Pick the surface out of the named arrays of a model; None if it has none.
+
+        Raises:
+            EvaluatorError: It is not 0 at the closed bite.
+        """
+        if "glide_d2" not in arrays:
+            return None
+        knots, factors = (
+            tuple(np.asarray(arrays[f"glide_{d}{part}"], dtype=float) for d in ("d2", "d3"))
+            for part in ("", "_factors")
+        )
+        table = cls((knots[0], knots[1]), (factors[0], factors[1]))
+        rest = table.at_floats(0.0, 0.0)[0]
+        if abs(rest) > _REST_MM:
+            raise EvaluatorError(
+                f'"glide_d2_factors" and "glide_d3_factors" give {rest:g} mm at the closed bite, not 0.'
+            )
+        return table
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the surface's arrays by their names in a rig."""
+        (k2, k3), (f2, f3) = self.knots, self.factors
+        return {"glide_d2": k2, "glide_d2_factors": f2, "glide_d3": k3, "glide_d3_factors": f3}
+
+    def at_floats(self, d2: float, d3: float) -> tuple[float, float, float]:
+        """Return the drop [mm] at d2, d3 [mm], and its derivatives by both."""
+        i, j = bisect_right(self._rising[0], d2), bisect_right(self._rising[1], d3)
+        s, t = d2 - self._first[0][i], d3 - self._first[1][j]
+        powers = np.array(((1.0, s, s * s, s * s * s), (0.0, 1.0, 2.0 * s, 3.0 * s * s)))
+        a, b = powers.dot(self._cells[i][j]).tolist()
+        down = ((a[3] * t + a[2]) * t + a[1]) * t + a[0]
+        return down, ((b[3] * t + b[2]) * t + b[1]) * t + b[0], (3.0 * a[3] * t + 2.0 * a[2]) * t + a[1]
+
+    def at_arrays(self, d2: Array, d3: Array) -> tuple[Array, Array, Array]:
+        """Return the drop [mm] at d2, d3 [mm], any shape, and its derivatives by both."""
+        i, j = self.knots[0].searchsorted(d2, side="right"), self.knots[1].searchsorted(d3, side="right")
+        s, t = d2 - self.starts[0][i], d3 - self.starts[1][j]
+        c = self.coefficients[i, j]
+        x, y = s[..., None], t[..., None]
+        a = ((c[..., 3, :] * x + c[..., 2, :]) * x + c[..., 1, :]) * x + c[..., 0, :]
+        b = (3.0 * c[..., 3, :] * x + 2.0 * c[..., 2, :]) * x + c[..., 1, :]
+        down, down_2 = (((p[..., 3:] * y + p[..., 2:3]) * y + p[..., 1:2]) * y + p[..., :1] for p in (a, b))
+        return down[..., 0], down_2[..., 0], (3.0 * a[..., 3] * t + 2.0 * a[..., 2]) * t + a[..., 1]

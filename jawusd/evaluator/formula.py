@@ -3,7 +3,7 @@
 Each function takes numbers that know ``+ - * /`` (floats, numpy arrays, torch tensors, values of an ONNX
 graph) and, where a formula needs more, an `Operations` object for that kind of number. The torch layer, the
 ONNX exporter and the single-file reader are built from `MODELS` and `BoundFormula`;
-`jawusd.evaluator.derivatives` is the one other statement, with derivatives, for floats, compiled code and numpy.
+`jawusd.evaluator.gauge` is the one other statement, with derivatives, for floats, compiled code and numpy.
 
 This file imports nothing but the standard library, `jawusd.evaluator.operations` and `jawusd.geometry.rodrigues`: all
 three are copied into the reader, which runs in Python 3.9.
@@ -56,7 +56,7 @@ class GaugeNumbers(NamedTuple):
         drop: Coefficients of drop, 4.
         softness_mm: Radius of the softened absolute value and ramp.
         fade_mm: Opening over which the glide surface fades out.
-        glide: What `derivatives.Elementary.glide` takes: the table of the glide surface; None without one.
+        glide: What `gauge.Elementary.glide` takes: the table of the glide surface; None without one.
     """
 
     path_x: Sequence[float]

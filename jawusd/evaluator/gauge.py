@@ -1,28 +1,198 @@
-"""The gauge over batches: jaw parameters to the displacement of the incisal point and back.
+"""The gauge: jaw parameters to the displacement of the incisal point and back, with derivatives.
 
-The formulas are those of `jawusd.evaluator.formula`. ``u(0) = 0`` by construction.
+The formulas of `jawusd.evaluator.formula`, differentiated by hand. The functions take ``+ - * /`` and an `Elementary`
+for the rest, so that they run on floats, arrays and tensors, and compiled: `jawusd.fast` compiles them unchanged, which
+is why they use tuples instead of lists. A suffix names the variable of a derivative: ``rho_2`` is the derivative of rho
+by d2. `Gauge` applies them to batches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Generic, NamedTuple
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator import derivatives
-from jawusd.evaluator.derivatives import (
-    ARRAYS,
-    INVERSE_ITERATIONS,
-    INVERSE_STEP_MM,
-    INVERSE_TOLERANCE_MM,
-    LEAST_INVERSE_SLOPE,
-    MOST_DOUBLINGS,
-    PATIENCE,
+from jawusd.evaluator.curves import GlideTable
+from jawusd.evaluator.formula import (
+    ARCH_BOW_MM,
+    DROP_BEND,
+    DROP_SATURATION_MM2,
+    FADE_SOFTNESS_MM,
+    LIMIT_SOFTNESS_MM,
+    GaugeNumbers,
 )
-from jawusd.evaluator.formula import GaugeNumbers
-from jawusd.evaluator.glide import GlideTable
+from jawusd.geometry.rodrigues import N, Triple
+
+INVERSE_TOLERANCE_MM = 1e-13
+INVERSE_ITERATIONS = 120
+PATIENCE = 8  # iterations after which Newton counts as stalled: without a bracket steps double, with one it is halved
+INVERSE_STEP_MM = 20.0
+LEAST_INVERSE_SLOPE = 0.2  # a slope near or below zero leads away from the root
+MOST_DOUBLINGS = 64
+
+
+class Elementary(NamedTuple, Generic[N]):
+    """The functions of a kind of number."""
+
+    sqrt: Callable[[N], N]
+    exp: Callable[[N], N]
+    clip: Callable[[N, float, float], N]
+    glide: Callable[[object, N, N], Triple[N]]  # the table of a gauge, d2, d3 -> drop [mm], and its slopes by both
+
+
+def _clip_float(x: float, low: float, high: float) -> float:
+    return low if x < low else high if x > high else x
+
+
+def _clip_array(x: Array, low: float, high: float) -> Array:
+    return np.minimum(np.maximum(x, low), high)
+
+
+def _glide_floats(table: object, d2: float, d3: float) -> Triple[float]:
+    return table.at_floats(d2, d3) if isinstance(table, GlideTable) else (0.0, 0.0, 0.0)
+
+
+def _glide_arrays(table: object, d2: Array, d3: Array) -> Triple[Array]:
+    return table.at_arrays(d2, d3) if isinstance(table, GlideTable) else (np.zeros(1), np.zeros(1), np.zeros(1))
+
+
+FLOATS: Elementary[float] = Elementary(math.sqrt, math.exp, _clip_float, _glide_floats)
+ARRAYS: Elementary[Array] = Elementary(np.sqrt, np.exp, _clip_array, _glide_arrays)
+
+
+def path(gauge: GaugeNumbers, d1: N, f: Elementary[N]) -> tuple[N, N, N, N]:
+    """Return gx, gz [mm] and their slopes gx_1, gz_1 at opening d1 [mm] (Horner's scheme for both)."""
+    scale = gauge.path_scale_mm
+    inside = f.clip(d1, gauge.low_mm, gauge.high_mm)
+    s, beyond = inside / scale, d1 - inside
+    x1, x2, x3, x4, x5 = gauge.path_x
+    a4 = x5 * s + x4
+    a3 = a4 * s + x3
+    a2 = a3 * s + x2
+    a1 = a2 * s + x1
+    gx_1 = ((((x5 * s + a4) * s + a3) * s + a2) * s + a1) / scale
+    z1, z2, z3, z4, z5 = gauge.path_z
+    b4 = z5 * s + z4
+    b3 = b4 * s + z3
+    b2 = b3 * s + z2
+    b1 = b2 * s + z1
+    gz_1 = ((((z5 * s + b4) * s + b3) * s + b2) * s + b1) / scale
+    return a1 * s + gx_1 * beyond, b1 * s + gz_1 * beyond, gx_1, gz_1
+
+
+def arch(gauge: GaugeNumbers, d1: N, d2: N, f: Elementary[N]) -> tuple[N, N, N]:
+    """Return rho [mm], rho_1 and rho_2 of a lateral excursion d2 [mm] at opening d1 [mm]."""
+    sqrt = f.sqrt
+    scale, e, square = gauge.path_scale_mm, gauge.softness_mm, LIMIT_SOFTNESS_MM * LIMIT_SOFTNESS_MM
+    rise, stop = d1 - gauge.low_mm, d1 - gauge.high_mm
+    rise_root, stop_root = sqrt(rise * rise + square), sqrt(stop * stop + square)
+    t = (gauge.low_mm + 0.5 * (rise + rise_root - stop - stop_root)) / scale
+    t_1 = 0.5 * (rise / rise_root - stop / stop_root) / scale
+    side_root = sqrt(d2 * d2 + e * e)
+    side, side_2 = side_root - e, d2 / side_root
+    c0, c1, c2, c3, c4, c5, c6 = gauge.arch
+    by_side, by_d2, bow = (c2 * t + c1) * t + c0, c4 * t + c3, (c6 * t + c5) / ARCH_BOW_MM
+    rho = side * by_side + d2 * (by_d2 + d2 * bow)
+    rho_1 = (side * (2.0 * c2 * t + c1) + d2 * (c4 + d2 * (c6 / ARCH_BOW_MM))) * t_1
+    return rho, rho_1, side_2 * by_side + by_d2 + 2.0 * d2 * bow
+
+
+def drop(gauge: GaugeNumbers, d2: N, d3: N, f: Elementary[N]) -> tuple[N, N, N]:
+    """Return drop [mm], drop_2 and drop_3 at d2, d3 [mm]."""
+    sqrt = f.sqrt
+    e = gauge.softness_mm
+    side_root, front_root = sqrt(d2 * d2 + e * e), sqrt(d3 * d3 + e * e)
+    side, front = side_root - e, 0.5 * (d3 + front_root - e)
+    v, w = 1.0 + side * side / DROP_SATURATION_MM2, 1.0 + front * front / DROP_SATURATION_MM2
+    side_bend, front_bend = DROP_BEND * side / sqrt(v), DROP_BEND * front / sqrt(w)
+    c0, c1, c2, c3 = gauge.drop
+    down = (c0 + c2 * side_bend) * side + (c1 + c3 * front_bend) * front
+    down_2 = (c0 + c2 * side_bend * (1.0 + v) / v) * (d2 / side_root)
+    down_3 = (c1 + c3 * front_bend * (1.0 + w) / w) * 0.5 * (1.0 + d3 / front_root)
+    table, table_2, table_3 = f.glide(gauge.glide, d2, d3)
+    return down + table, down_2 + table_2, down_3 + table_3
+
+
+def fade(gauge: GaugeNumbers, d1: N, f: Elementary[N]) -> tuple[N, N]:
+    """Return the share of the glide surface felt at opening d1 [mm], and its slope."""
+    root = f.sqrt(d1 * d1 + FADE_SOFTNESS_MM * FADE_SOFTNESS_MM)
+    x = 0.5 * (d1 + root - FADE_SOFTNESS_MM) / gauge.fade_mm
+    share = f.exp(-x * x)
+    return share, share * x * (1.0 + d1 / root) / -gauge.fade_mm
+
+
+def displacement(
+    gauge: GaugeNumbers, d1: N, d2: N, d3: N, f: Elementary[N]
+) -> tuple[Triple[N], tuple[N, N, N, N, N, N]]:
+    """Return u [mm] of d [mm], and of its derivatives those that vary: x_1; y_1, y_2, y_3; z_1, z_2.
+
+    The others are ``x_2 = z_3 = 1`` and ``x_3 = 0``.
+    """
+    gx, gz, gx_1, gz_1 = path(gauge, d1, f)
+    rho, rho_1, rho_2 = arch(gauge, d1, d2, f)
+    down, down_2, down_3 = drop(gauge, d2, d3, f)
+    share, share_1 = fade(gauge, d1, f)
+    u = gx + d2, -(d1 + down * share), gz + rho + d3
+    return u, (gx_1, -(1.0 + down * share_1), -down_2 * share, -down_3 * share, gz_1 + rho_1, rho_2)
+
+
+def opening_equation(gauge: GaugeNumbers, u: Triple[N], d1: N, f: Elementary[N]) -> tuple[N, N, N, N]:
+    """Return what is left of the inverse gauge once d1 [mm] is given: an equation in one unknown.
+
+    Returns:
+        d2, d3 [mm] that fit u's x and z at d1, the remainder ``d1 + drop fade + y`` [mm], zero at the solution, and
+        its slope by d1.
+    """
+    gx, gz, gx_1, gz_1 = path(gauge, d1, f)
+    d2 = u[0] - gx
+    rho, rho_1, rho_2 = arch(gauge, d1, d2, f)
+    d3 = u[2] - gz - rho
+    down, down_2, down_3 = drop(gauge, d2, d3, f)
+    share, share_1 = fade(gauge, d1, f)
+    d3_1 = -gz_1 - rho_1 + rho_2 * gx_1
+    return d2, d3, d1 + down * share + u[1], 1.0 + down * share_1 + (down_3 * d3_1 - down_2 * gx_1) * share
+
+
+def inverse(gauge: GaugeNumbers, u: Triple[float], f: Elementary[float]) -> Triple[float]:
+    """Return the d [mm] of one u [mm]: Newton on `opening_equation` within a bracket; NaN if it does not converge."""
+    low, high, d1 = -math.inf, math.inf, -u[1]
+    for iteration in range(INVERSE_ITERATIONS):
+        d2, d3, remainder, slope = opening_equation(gauge, u, d1, f)
+        step = -remainder / (slope if slope > LEAST_INVERSE_SLOPE else 1.0)
+        step = min(max(step, -INVERSE_STEP_MM), INVERSE_STEP_MM)
+        if abs(step) <= INVERSE_TOLERANCE_MM * (1.0 + abs(d1)):
+            return d1, d2, d3
+        if remainder < 0.0:
+            low = d1
+        elif remainder > 0.0:
+            high = d1
+        late = max(iteration - PATIENCE, 0)
+        if low == -math.inf or high == math.inf:
+            d1 += min(max(step * 2.0 ** min(late, MOST_DOUBLINGS), -INVERSE_STEP_MM), INVERSE_STEP_MM)
+        elif d1 + step <= low or d1 + step >= high or late % 2 == 1:
+            d1 = 0.5 * (low + high)
+        else:
+            d1 += step
+    return math.nan, math.nan, math.nan
+
+
+def spline_input(
+    gauge: GaugeNumbers, scales: Sequence[float], u: Triple[N], f: Elementary[N]
+) -> tuple[Triple[N], tuple[N, N]]:
+    """Return the argument q of the spline at u [mm], and the slopes of the path there, see `gradient_by_u`."""
+    opening = -u[1]
+    gx, gz, gx_1, gz_1 = path(gauge, opening, f)
+    return (opening / scales[0], (u[0] - gx) / scales[1], (u[2] - gz) / scales[2]), (gx_1, gz_1)
+
+
+def gradient_by_u(by_q: Triple[N], scales: Sequence[float], slopes: tuple[N, N]) -> Triple[N]:
+    """Return a gradient by u from one by q, see `spline_input`."""
+    opening, side, front = by_q[0] / scales[0], by_q[1] / scales[1], by_q[2] / scales[2]
+    return side, side * slopes[0] + front * slopes[1] - opening, front
 
 
 @dataclass(frozen=True)
@@ -90,25 +260,25 @@ class Gauge:
 
     def path(self, d1: Array) -> tuple[Array, Array, Array, Array]:
         """Return gx, gz [mm] and their slopes at the openings d1 [mm], each of the shape of d1."""
-        return derivatives.path(self.numbers, d1, ARRAYS)
+        return path(self.numbers, d1, ARRAYS)
 
     def arch(self, d1: Array, d2: Array) -> tuple[Array, Array, Array]:
         """Return rho(d2, d1) [mm] and its derivatives by d1 and by d2."""
-        return derivatives.arch(self.numbers, d1, d2, ARRAYS)
+        return arch(self.numbers, d1, d2, ARRAYS)
 
     def drop(self, d2: Array, d3: Array) -> tuple[Array, Array, Array]:
         """Return drop(d2, d3) [mm] and its derivatives by d2 and by d3."""
-        return derivatives.drop(self.numbers, d2, d3, ARRAYS)
+        return drop(self.numbers, d2, d3, ARRAYS)
 
     def displacement(self, d: Array) -> Array:
         """Return the displacement u [mm] of the incisal point, anatomical frame, shape (n, 3), for d (n, 3)."""
         d1, d2, d3 = d.T
-        return np.stack(derivatives.displacement(self.numbers, d1, d2, d3, ARRAYS)[0], axis=-1)
+        return np.stack(displacement(self.numbers, d1, d2, d3, ARRAYS)[0], axis=-1)
 
     def displacement_jacobian(self, d: Array) -> tuple[Array, Array]:
         """Return u (n, 3) [mm] and du/dd, shape (n, 3, 3), for d (n, 3) [mm]."""
         d1, d2, d3 = d.T
-        u, (x_1, y_1, y_2, y_3, z_1, z_2) = derivatives.displacement(self.numbers, d1, d2, d3, ARRAYS)
+        u, (x_1, y_1, y_2, y_3, z_1, z_2) = displacement(self.numbers, d1, d2, d3, ARRAYS)
         jacobian = np.zeros((len(d), 3, 3))
         jacobian[:, 0, 0], jacobian[:, 0, 1] = x_1, 1.0
         jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = y_1, y_2, y_3
@@ -120,19 +290,19 @@ class Gauge:
 
         For a given d1 the other two follow in closed form, so this is a root search in one variable: Newton with the
         analytic slope, kept inside the tightest bracket seen so far. Rows that do not converge come back as NaN. One
-        row goes through `derivatives.inverse`, the same search in floats.
+        row goes through `inverse`, the same search in floats.
         """
         finite = np.isfinite(u).all(axis=1)
         if len(u) == 1 and finite.all():
             x, y, z = u[0].tolist()
-            return np.array([derivatives.inverse(self.numbers, (x, y, z), derivatives.FLOATS)])
+            return np.array([inverse(self.numbers, (x, y, z), FLOATS)])
         d1 = -u[:, 1]
         low, high = np.full(len(u), -np.inf), np.full(len(u), np.inf)
         d = np.full(u.shape, np.nan)
         active = np.flatnonzero(finite)
         for iteration in range(INVERSE_ITERATIONS):
             x = d1[active]
-            d2, d3, remainder, slope = derivatives.opening_equation(self.numbers, tuple(u[active].T), x, ARRAYS)
+            d2, d3, remainder, slope = opening_equation(self.numbers, tuple(u[active].T), x, ARRAYS)
             step = -remainder / np.where(slope > LEAST_INVERSE_SLOPE, slope, 1.0)
             step = np.clip(step, -INVERSE_STEP_MM, INVERSE_STEP_MM)
             done = np.abs(step) <= INVERSE_TOLERANCE_MM * (1.0 + np.abs(x))

@@ -13,10 +13,9 @@ import numpy as np
 from jawusd.base.arrays import Array, Indices
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks, usable_rows
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.distances import distance_residual, landmark_vectors
-from jawusd.evaluator.encoding import Encoder
-from jawusd.evaluator.frames import RigFrames
+from jawusd.evaluator.encoding import Encoder, distance_residual, landmark_vectors
 from jawusd.evaluator.models import JawModelForm
+from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.nearest import Pull, Vector, lowest_in_valley, nearest_in_valley
 from jawusd.evaluator.operations import triple
 from jawusd.evaluator.solver import Residual, minimise

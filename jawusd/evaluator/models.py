@@ -21,11 +21,16 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.derivatives import ARRAYS, gradient_by_u, spline_input
-from jawusd.evaluator.gauge import Gauge
-from jawusd.evaluator.motions import anchored_motions, motions_from_twists
+from jawusd.evaluator.gauge import ARRAYS, Gauge, gradient_by_u, spline_input
+from jawusd.evaluator.motions import (
+    SingleAdditive,
+    SingleAnchored,
+    SingleForm,
+    anchored_motions,
+    motion_matrix,
+    motions_from_twists,
+)
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED
-from jawusd.evaluator.single import SingleAdditive, SingleAnchored, SingleForm, motion_matrix
 from jawusd.geometry.se3 import se3_left_jacobian, se3_left_jacobian_inverse
 from jawusd.geometry.so3 import so3_left_jacobian, so3_left_jacobian_inverse
 

@@ -1,19 +1,34 @@
-"""Many rigid motions at once, column by column: several times faster than products of small matrices."""
+"""Rigid motions of the mandible: for batches, for one pose in plain floats, and their frames.
+
+A call on one pose through the array functions spends nearly all its time starting numpy operations on three numbers.
+DCC callbacks and face solvers evaluate single poses, so the models of `jawusd.evaluator.models` have a second form in
+floats; tests compare the two.
+
+A motion (R, t) in floats is twelve numbers: the rows of ``R - I``, then the displacement [mm] of a point p, the anchor:
+``u = R p + t - p``.
+"""
 
 from __future__ import annotations
+
+from bisect import bisect_right
+from typing import Protocol
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.geometry.rodrigues import Triple, apply_series, dot, turning
-from jawusd.geometry.so3 import angle_coefficients
+from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.formula import GaugeNumbers
+from jawusd.evaluator.gauge import FLOATS, displacement, gradient_by_u, spline_input
+from jawusd.geometry.rodrigues import Triple, angle_coefficients, apply_series, dot, turning
+from jawusd.geometry.se3 import se3_adjoint, se3_inverse
+from jawusd.geometry.so3 import batched_angle_coefficients
 
 
 def motions_from_twists(twists: Array) -> Array:
     """Return the motions (n, 4, 4) of twists (omega [rad], v [mm]), shape (n, 6): what `geometry.se3_exp` does."""
     wx, wy, wz, vx, vy, vz = twists.T
     omega = wx, wy, wz
-    a, b, c = angle_coefficients(dot(omega, omega))
+    a, b, c = batched_angle_coefficients(dot(omega, omega))
     M = _with_rotation(omega, a, b)
     M[:, 0, 3], M[:, 1, 3], M[:, 2, 3] = apply_series(omega, (vx, vy, vz), b, c)
     return M
@@ -28,7 +43,7 @@ def anchored_motions(omega: Array, moved: Array, anchor: Array) -> Array:
         anchor: The point [mm], shape (3,).
     """
     wx, wy, wz = omega.T
-    a, b, _ = angle_coefficients(dot((wx, wy, wz), (wx, wy, wz)))
+    a, b, _ = batched_angle_coefficients(dot((wx, wy, wz), (wx, wy, wz)))
     M = _with_rotation((wx, wy, wz), a, b)
     M[:, :3, 3] = moved - (M[:, :3, :3].reshape(-1, 3) @ anchor).reshape(-1, 3)
     return M
@@ -41,3 +56,198 @@ def _with_rotation(omega: Triple[Array], a: Array, b: Array) -> Array:
         M[:, i, 0], M[:, i, 1], M[:, i, 2] = row
     M.reshape(-1, 16)[:, ::5] += 1.0
     return M
+
+
+Vector = tuple[float, float, float]
+Motion = tuple[float, ...]
+
+
+class SingleForm(Protocol):
+    """A model for one finite d."""
+
+    anchor: Vector
+
+    def motion(self, d1: float, d2: float, d3: float) -> Motion:
+        """Return M(d)."""
+        ...
+
+
+class SingleAnchored:
+    """`AnchoredModel` for one finite d or u; the anchor is the incisal point.
+
+    Args:
+        gauge: Map between d and u.
+        incisor: The incisal point at rest [mm], shape (3,).
+        scales: Lengths dividing the sheared displacement [mm], shape (3,).
+        centres: Spline centres, shape (m, 3).
+        weights: Of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
+        offset: Value of the bare spline at u = 0 [rad], shape (3,).
+    """
+
+    def __init__(
+        self, gauge: GaugeNumbers, incisor: Array, scales: Array, centres: Array, weights: Array, offset: Array
+    ) -> None:
+        self._gauge = gauge
+        self._scales: Vector = tuple(scales.tolist())
+        self.anchor: Vector = tuple(incisor.tolist())
+        self._offset: Vector = tuple(offset.tolist())
+        count = len(centres)
+        self._linear = weights[count:].tolist()
+        self._kernel = np.ascontiguousarray(weights[:count])
+        # sums over the centres of W_i and of W_i c_i, per output
+        moments = np.concatenate([weights[:count], (weights[:count, :, None] * centres[:, None, :]).reshape(-1, 9)], 1)
+        self._moments = np.ascontiguousarray(moments.T)
+        # |q - c|^2 as one product with (q, |q|^2, 1)
+        squared = np.einsum("ij,ij->i", centres, centres)
+        self._distances = np.column_stack([-2.0 * centres, np.ones(count), squared])
+
+    def motion(self, d1: float, d2: float, d3: float) -> Motion:
+        """Return M(d)."""
+        u, _ = displacement(self._gauge, d1, d2, d3, FLOATS)
+        q, _ = spline_input(self._gauge, self._scales, u, FLOATS)
+        omega, _ = self._rotation(q)
+        return _motion(omega, u)
+
+    def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
+        """Return R (1, 3, 3), t (1, 3) and S (1, 6, 3) for one row d (1, 3)."""
+        d1, d2, d3 = d[0].tolist()
+        u, (x_1, y_1, y_2, y_3, z_1, z_2) = displacement(self._gauge, d1, d2, d3, FLOATS)
+        return self._derivative(u, np.array(((x_1, 1.0, 0.0), (y_1, y_2, y_3), (z_1, z_2, 1.0))))
+
+    def chart_derivative(self, u: Array) -> tuple[Array, Array, Array]:
+        """Return R (1, 3, 3), t (1, 3) and S (1, 6, 3) by u for one row u (1, 3)."""
+        x, y, z = u[0].tolist()
+        return self._derivative((x, y, z), np.eye(3))
+
+    def _derivative(self, u: Vector, by_d: Array) -> tuple[Array, Array, Array]:
+        q, slopes = spline_input(self._gauge, self._scales, u, FLOATS)
+        omega, r = self._rotation(q)
+        sums = self._moments.dot(r).tolist()
+        omega_u = []
+        for k in range(3):  # 3 sum W r (q - c) plus the linear terms, per output
+            a, b, c = (3.0 * (sums[k] * q[i] - sums[3 + 3 * k + i]) + self._linear[i][k] for i in range(3))
+            omega_u.append(gradient_by_u((a, b, c), self._scales, slopes))
+        M = motion_matrix(_motion(omega, u), self.anchor)
+        _, second, third = angle_coefficients(omega[0] * omega[0] + omega[1] * omega[1] + omega[2] * omega[2])
+        turn = np.array(omega_u).dot(by_d)
+        S = np.empty((1, 6, 3))
+        spin = S[0, :3] = turn + np.array(turning(omega, second, third)).dot(turn)
+        px, py, pz = (a + b for a, b in zip(u, self.anchor))
+        S[0, 3:] = by_d + np.array(((0.0, -pz, py), (pz, 0.0, -px), (-py, px, 0.0))).dot(spin)
+        return M[None, :3, :3], M[None, :3, 3], S
+
+    def _rotation(self, q: Vector) -> tuple[Vector, Array]:
+        """Return the rotation vector [rad] and the distances to the centres (m,), from the spline's argument."""
+        q0, q1, q2 = q
+        squared = self._distances.dot(np.array((q0, q1, q2, q0 * q0 + q1 * q1 + q2 * q2, 1.0)))
+        np.abs(squared, squared)  # may round to just below zero at a centre
+        r = np.sqrt(squared)
+        squared *= r
+        kx, ky, kz = squared.dot(self._kernel).tolist()
+        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = self._linear
+        ox, oy, oz = self._offset
+        return (
+            kx + q0 * ax + q1 * bx + q2 * cx - ox,
+            ky + q0 * ay + q1 * by + q2 * cy - oy,
+            kz + q0 * az + q1 * bz + q2 * cz - oz,
+        ), r
+
+
+class SingleAdditive:
+    """`AdditiveModel` for one finite d; the anchor is the origin of the anatomical frame."""
+
+    anchor: Vector = (0.0, 0.0, 0.0)
+
+    def __init__(self, curves: tuple[HermiteCurve, HermiteCurve, HermiteCurve]) -> None:
+        self._curves = [_SingleCurve(curve) for curve in curves]
+
+    def motion(self, d1: float, d2: float, d3: float) -> Motion:
+        """Return M(d)."""
+        first, second, third = self._curves
+        return motion_of_twist(*(first(d1) + second(d2) + third(d3)).tolist())
+
+
+class _SingleCurve:
+    """`HermiteCurve.value` at one parameter."""
+
+    def __init__(self, curve: HermiteCurve) -> None:
+        self._knots = curve.knots.tolist()
+        self._coefficients = list(curve.coefficients.transpose(0, 2, 1).copy())
+
+    def __call__(self, x: float) -> Array:
+        interval = bisect_right(self._knots, x)
+        s = x - self._knots[max(interval - 1, 0)]
+        return self._coefficients[interval].dot(np.array((1.0, s, s * s, s * s * s)))
+
+
+def motion_of_twist(wx: float, wy: float, wz: float, vx: float, vy: float, vz: float) -> Motion:
+    """Return the motion exp(omega, v) of a twist, omega = w [rad] and v [mm]."""
+    omega = wx, wy, wz
+    a, b, c = angle_coefficients(wx * wx + wy * wy + wz * wz)
+    x, y, z = turning(omega, a, b)
+    return *x, *y, *z, *apply_series(omega, (vx, vy, vz), b, c)
+
+
+def motion_matrix(motion: Motion, anchor: Vector = (0.0, 0.0, 0.0)) -> Array:
+    """Return a motion as a transform (4, 4)."""
+    a, b, c, d, e, f, g, h, i, x, y, z = motion
+    px, py, pz = anchor
+    x, y, z = x - (a * px + b * py + c * pz), y - (d * px + e * py + f * pz), z - (g * px + h * py + i * pz)
+    return np.array(((1.0 + a, b, c, x), (d, 1.0 + e, f, y), (g, h, 1.0 + i, z), (0.0, 0.0, 0.0, 1.0)))
+
+
+def _motion(omega: Vector, u: Vector) -> Motion:
+    x, y, z = omega
+    a, b, _ = angle_coefficients(x * x + y * y + z * z)
+    first, second, third = turning(omega, a, b)
+    return *first, *second, *third, *u
+
+
+class RigFrames:
+    """``T_skull_mandible = T_skull_anatomical M T_anatomical_mandible_rest``, see `jawusd.evaluator.models` for M.
+
+    Attributes:
+        T_anatomical_skull: Shape (4, 4).
+        T_skull_anatomical: Its inverse.
+        T_anatomical_mandible_rest: Mandible to anatomical coordinates with the teeth together, shape (4, 4).
+        T_mandible_anatomical_rest: Its inverse.
+        adjoint: Ad(T_skull_anatomical), twists from the anatomical to the skull frame, shape (6, 6).
+    """
+
+    def __init__(self, T_anatomical_skull: Array, T_rest: Array, anchor: Vector) -> None:
+        """Take the anchor [mm] of the motions that `pose` is given, anatomical frame."""
+        self.T_anatomical_skull = T_anatomical_skull
+        self.T_skull_anatomical = se3_inverse(T_anatomical_skull)
+        self.T_anatomical_mandible_rest = T_anatomical_skull @ T_rest
+        self.T_mandible_anatomical_rest = se3_inverse(self.T_anatomical_mandible_rest)
+        self.adjoint = se3_adjoint(self.T_skull_anatomical)
+        # L M Q as one matrix product over all motions: rows of 16 times the Kronecker product of L^T and Q
+        self._to_pose = np.kron(self.T_skull_anatomical.T, self.T_anatomical_mandible_rest)
+        self._to_motion = np.kron(T_anatomical_skull.T, self.T_mandible_anatomical_rest)
+        # the same for the twelve numbers of one motion, ``M - I = (R - I, u - (R - I) p)``, and a one for the rest
+        entries = self._to_pose.reshape(4, 4, 16)[:3]
+        turn = entries[:, :3] - np.multiply.outer(anchor, entries[:, 3]).swapaxes(0, 1)
+        self._single_to_pose = np.concatenate([turn.reshape(9, 16), entries[:, 3], T_rest.reshape(1, 16)])
+
+    def pose(self, motion: Motion) -> Array:
+        """Return the pose T_skull_mandible (4, 4) of one motion of `jawusd.evaluator.motions`."""
+        return np.array((*motion, 1.0)).dot(self._single_to_pose).reshape(4, 4)
+
+    def poses(self, M: Array) -> Array:
+        """Return the poses T_skull_mandible of motions, both of shape (n, 4, 4)."""
+        return (M.reshape(-1, 16) @ self._to_pose).reshape(-1, 4, 4)
+
+    def motions(self, T_skull_mandible: Array) -> tuple[Array, Array]:
+        """Return rotation (n, 3, 3) and translation (n, 3) [mm] of the motions of poses (n, 4, 4)."""
+        M = (T_skull_mandible.reshape(-1, 16) @ self._to_motion).reshape(-1, 4, 4)
+        return M[:, :3, :3], M[:, :3, 3]
+
+
+def motions_of_poses(T_skull_mandible: Array, T_anatomical_skull: Array, T_rest: Array) -> Array:
+    """Return the motions ``M = A T rest^-1 A^-1`` away from the closed bite of poses, both of shape (..., 4, 4)."""
+    return T_anatomical_skull @ T_skull_mandible @ se3_inverse(T_anatomical_skull @ T_rest)
+
+
+def poses_of_motions(motion: Array, T_anatomical_skull: Array, T_rest: Array) -> Array:
+    """Return the poses T_skull_mandible of motions away from the closed bite, both of shape (..., 4, 4)."""
+    return se3_inverse(T_anatomical_skull) @ motion @ T_anatomical_skull @ T_rest

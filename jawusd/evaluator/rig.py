@@ -12,14 +12,12 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
-from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.bounds import PolygonBound, SliceHull
 from jawusd.evaluator.contact import ContactField, TouchingTeeth
-from jawusd.evaluator.distances import carried, handle_vectors, point_velocities
-from jawusd.evaluator.encoding import Encoder, Encoding, whitening_of
-from jawusd.evaluator.frames import RigFrames
+from jawusd.evaluator.encoding import Encoder, Encoding, carried, handle_vectors, point_velocities, whitening_of
 from jawusd.evaluator.kernels import Kernels, NumpyKernels, RigParts
 from jawusd.evaluator.models import FORMS
-from jawusd.evaluator.polygons import PolygonBound
+from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.search import BoundedSearch, IkResult
 from jawusd.evaluator.speeds import Speeds
 from jawusd.evaluator.verdicts import Limits, Verdicts, is_inside, too_fast

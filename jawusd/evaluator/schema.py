@@ -72,7 +72,7 @@ ARRAYS: dict[str, ArraySpec] = {
 }
 
 
-#: Arrays of anchored models whose glide surface was measured on scans: all or none; see `jawusd.evaluator.glide`.
+#: Arrays of anchored models whose glide surface was measured on scans: all or none; see `jawusd.evaluator.curves`.
 GLIDE_ARRAYS: dict[str, ArraySpec] = {
     "glide_d2": ArraySpec("jaw:model:glideD2", ("glide knots of d2",), ANCHORED),
     "glide_d2_factors": ArraySpec("jaw:model:glideD2Factors", ("glide knots of d2", "glide factors"), ANCHORED),

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array, Indices
 from jawusd.evaluator.batching import as_rows, in_chunks
-from jawusd.evaluator.motions import motions_from_twists
-from jawusd.evaluator.single import motion_matrix, motion_of_twist
+from jawusd.evaluator.motions import motion_matrix, motion_of_twist, motions_from_twists
 
 _SINGLE_LIMIT_MM = 1e4
 

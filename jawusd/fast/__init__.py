@@ -1,4 +1,9 @@
-"""The rig's functions compiled with numba: the same results to 1e-10, several times faster."""
+"""A rig's hot functions compiled with numba: the same results to 1e-10, 6 to 40 times faster.
+
+Poses, twists, margins, their derivatives, encoding and `validate` are compiled. Searches along the bound (`ik`,
+`project`, `interpolate`, `encode(inside=True)`) run in numpy as in `jawusd.evaluator`. Imports only `base`, `geometry`
+and `evaluator`.
+"""
 
 from jawusd.base.errors import MissingDependencyError
 
@@ -14,10 +19,10 @@ __all__ = ["accelerate"]
 
 
 def accelerate(rig: JawRig) -> JawRig:
-    """Return the rig with its most used functions compiled: the same results to 1e-10.
+    """Return the rig with its hot functions compiled: the same results to 1e-10.
 
-    The first use after an installation compiles for some 20 seconds; the code is kept on disk. Where no folder can be
-    written every process compiles, and a RuntimeWarning says so.
+    The first use after installation compiles for some 20 seconds; the code is cached on disk. Without a writable cache
+    folder every process compiles again, after a RuntimeWarning.
     """
     if isinstance(rig.kernels, CompiledKernels):
         return rig

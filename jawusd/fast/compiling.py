@@ -1,4 +1,4 @@
-"""Compile functions for given argument types, and keep the machine code on disk where a folder can be written."""
+"""Compile functions for given argument types, and cache the machine code on disk where that is possible."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ import numba
 F = TypeVar("F")
 
 _in_memory = partial(numba.njit, nogil=True, error_model="numpy")
-_kept: list[bool] = []  # whether code is kept, known once a function was compiled
+_cacheable: list[bool] = []  # empty until the first function is compiled
 
 
 def compiled(signature: str) -> Callable[[F], F]:
     """Return a decorator that compiles a function for the argument types of a signature.
 
-    Where no cache can be written the code stays in memory, and one RuntimeWarning says so.
+    Without a writable cache the code stays in memory, after one RuntimeWarning.
     """
 
     def compile_function(function: F) -> F:
-        if not _kept or _kept[0]:
+        if not _cacheable or _cacheable[0]:
             try:
                 made = cast("F", _in_memory(signature, cache=True)(function))
-            except (OSError, RuntimeError) as error:  # no folder to write, or the disk is full
-                if not _kept or _kept[0]:
-                    _warn(error)
+            except (OSError, RuntimeError) as error:  # no writable folder, or the disk is full
+                _cacheable[:] = [False]
+                _warn(error)
             else:
-                _kept[:] = [True]
+                _cacheable[:] = [True]
                 return made
         return cast("F", _in_memory(signature)(function))
 
@@ -37,10 +37,9 @@ def compiled(signature: str) -> Callable[[F], F]:
 
 
 def _warn(error: Exception) -> None:
-    _kept[:] = [False]
     warnings.warn(
-        f"jawusd.fast cannot keep its compiled code on disk ({error}), and compiles for some 20 seconds in every "
-        "process. Set NUMBA_CACHE_DIR to a folder that can be written.",
+        f"jawusd.fast cannot cache its compiled code on disk ({error}): every process compiles for some 20 seconds. "
+        "Set NUMBA_CACHE_DIR to a writable folder.",
         RuntimeWarning,
-        stacklevel=3,
+        stacklevel=4,
     )

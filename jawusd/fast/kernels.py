@@ -1,97 +1,195 @@
-"""`jawusd.evaluator.kernels.Kernels`, compiled."""
+"""The kernels of a rig, compiled: functions over rows, and the class that calls them.
+
+The functions release the GIL and keep no state, so any number of threads may call them at once. Argument types are
+fixed (C-contiguous, writable float64 arrays): other types raise a TypeError instead of compiling a second version. The
+machine code is cached on disk where that is writable. The cache depends on the date of this file only: after changing
+another module of this package, delete it (``rm -r jawusd/fast/__pycache__``).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator.batching import usable_rows
-from jawusd.evaluator.kernels import RigParts
+from jawusd.evaluator.batching import LARGEST
+from jawusd.evaluator.kernels import NumpyKernels, RigParts
 from jawusd.evaluator.verdicts import Limits, Verdicts
-from jawusd.fast import rows
-from jawusd.fast.descent import PARAMETERS, POINT
-from jawusd.fast.packing import packed_bound, packed_model
+from jawusd.fast.compiling import compiled
+from jawusd.fast.encoding import encoding_scratch, judge
+from jawusd.fast.hull import hull_scratch, signed_distance, signed_distance_gradient
+from jawusd.fast.motion import logarithm, logarithm_derivative, pose, scratch
+from jawusd.fast.packing import ADJOINT, packed_bound, packed_model
+from jawusd.fast.rigid import device
 
 
-class CompiledKernels:
-    """The rows of a rig in machine code: the same results as in numpy, to 1e-10."""
+@device
+def usable(d1: float, d2: float, d3: float) -> bool:
+    """Return whether d is finite and below `LARGEST`; other rows give NaN."""
+    return abs(d1) < LARGEST and abs(d2) < LARGEST and abs(d3) < LARGEST
+
+
+@compiled("f8[:,::1](f8[::1], f8, f8, f8)")
+def single_pose(model: Array, d1: float, d2: float, d3: float) -> Array:
+    """Return T_skull_mandible (4, 4) of one d [mm]."""
+    out = np.empty((4, 4))
+    pose(model, d1, d2, d3, scratch(model), out)
+    return out
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[:,:,::1])")
+def poses(model: Array, d: Array, out: Array) -> None:
+    """Write the poses (n, 4, 4) of d (n, 3) [mm] to out."""
+    w = scratch(model)
+    for row in range(len(d)):
+        if usable(d[row, 0], d[row, 1], d[row, 2]):
+            pose(model, d[row, 0], d[row, 1], d[row, 2], w, out[row])
+        else:
+            out[row] = np.nan
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[:,::1])")
+def twists(model: Array, d: Array, out: Array) -> None:
+    """Write the twists (n, 6), skull frame, of d (n, 3) [mm] to out."""
+    w = scratch(model)
+    for row in range(len(d)):
+        out[row] = np.nan
+        if not usable(d[row, 0], d[row, 1], d[row, 2]):
+            continue
+        logarithm(model, d[row, 0], d[row, 1], d[row, 2], w)
+        for i in range(6):
+            total = 0.0
+            for k in range(6):
+                total += model[ADJOINT + 6 * i + k] * w.twist[k]
+            out[row, i] = total
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[:,:,::1])")
+def jacobians(model: Array, d: Array, out: Array) -> None:
+    """Write the derivatives (n, 6, 3) of the twists by d (n, 3) [mm] to out."""
+    w = scratch(model)
+    for row in range(len(d)):
+        out[row] = np.nan
+        if not usable(d[row, 0], d[row, 1], d[row, 2]):
+            continue
+        logarithm_derivative(model, d[row, 0], d[row, 1], d[row, 2], w)
+        for i in range(6):
+            for axis in range(3):
+                total = 0.0
+                for k in range(6):
+                    total += model[ADJOINT + 6 * i + k] * w.twist_d[k, axis]
+                out[row, i, axis] = total
+
+
+@compiled("f8(f8[::1], f8, f8, f8)")
+def single_margin(bound: Array, d1: float, d2: float, d3: float) -> float:
+    """Return the margin [mm] of one d [mm]."""
+    return -signed_distance(bound, d1, d2, d3, hull_scratch(bound))[0]
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[::1])")
+def margins(bound: Array, d: Array, out: Array) -> None:
+    """Write the margins (n,) [mm] of d (n, 3) [mm] to out."""
+    v = hull_scratch(bound)
+    for row in range(len(d)):
+        out[row] = np.nan
+        if usable(d[row, 0], d[row, 1], d[row, 2]):
+            out[row] = -signed_distance(bound, d[row, 0], d[row, 1], d[row, 2], v)[0]
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[:,::1])")
+def margin_gradients(bound: Array, d: Array, out: Array) -> None:
+    """Write the derivatives (n, 3) of the margins by d (n, 3) [mm] to out."""
+    v = hull_scratch(bound)
+    for row in range(len(d)):
+        if usable(d[row, 0], d[row, 1], d[row, 2]):
+            signed_distance_gradient(bound, d[row, 0], d[row, 1], d[row, 2], v, out[row])
+            for i in range(3):
+                out[row, i] = -out[row, i]
+        else:
+            out[row] = np.nan
+
+
+@compiled("void(f8[::1], f8[::1], f8[:,:,::1], b1, f8, f8, f8[:,::1])")
+def judge_rows(
+    model: Array,
+    bound: Array,
+    T: Array,
+    judging: bool,
+    residual_limit_mm: float,
+    margin_limit_mm: float,
+    out: Array,
+) -> None:
+    """Write d, residual, margin [mm] and reason (n, 6) of poses T (n, 4, 4), see `encoding.judge`.
+
+    Encoding and judging share one function because it takes a tenth of the whole compile time.
+    """
+    e, v = encoding_scratch(model), hull_scratch(bound)
+    for row in range(len(T)):
+        why, residual, margin = judge(model, bound, T[row], judging, residual_limit_mm, margin_limit_mm, e, v)
+        out[row, 0], out[row, 1], out[row, 2] = e.x[0], e.x[1], e.x[2]
+        out[row, 3], out[row, 4], out[row, 5] = residual, margin, why
+
+
+class CompiledKernels(NumpyKernels):
+    """The kernels of a rig in machine code, to 1e-10; searches along the bound are those of `NumpyKernels`."""
 
     def __init__(self, parts: RigParts) -> None:
-        self._model = packed_model(parts.model, parts.frames, parts.vectors())
-        self._hull = packed_bound(parts.bound)
+        super().__init__(parts)
+        self._packed_model = packed_model(parts.model, parts.frames, parts.vectors())
+        self._packed_bound = packed_bound(parts.bound)
 
     def pose(self, d1: float, d2: float, d3: float) -> Array:
         """Return T_skull_mandible (4, 4) of one d [mm]."""
-        return rows.single_pose(self._model, d1, d2, d3)
+        return single_pose(self._packed_model, d1, d2, d3)
 
     def margin(self, d1: float, d2: float, d3: float) -> float:
         """Return the margin [mm] of one d [mm]."""
-        return rows.single_margin(self._hull, d1, d2, d3)
+        return single_margin(self._packed_bound, d1, d2, d3)
 
     def poses(self, d: Array) -> Array:
         """Return the poses T_skull_mandible (n, 4, 4) of d (n, 3) [mm]."""
         out = np.empty((len(d), 4, 4))
-        rows.poses(self._model, _owned(d), out)
+        poses(self._packed_model, _owned(d), out)
         return out
 
     def twists(self, d: Array) -> Array:
         """Return the twists (n, 6), skull frame, of d (n, 3) [mm]."""
         out = np.empty((len(d), 6))
-        rows.twists(self._model, _owned(d), out)
+        twists(self._packed_model, _owned(d), out)
         return out
 
     def jacobians(self, d: Array) -> Array:
         """Return the derivatives (n, 6, 3) of the twists by d (n, 3) [mm]."""
         out = np.empty((len(d), 6, 3))
-        rows.jacobians(self._model, _owned(d), out)
+        jacobians(self._packed_model, _owned(d), out)
         return out
 
     def margins(self, d: Array) -> Array:
         """Return the margins (n,) [mm] of d (n, 3) [mm]."""
         out = np.empty(len(d))
-        rows.margins(self._hull, _owned(d), out)
+        margins(self._packed_bound, _owned(d), out)
         return out
 
     def margin_gradients(self, d: Array) -> Array:
         """Return the derivatives (n, 3) of the margins by d (n, 3) [mm]."""
         out = np.empty((len(d), 3))
-        rows.margin_gradients(self._hull, _owned(d), out)
+        margin_gradients(self._packed_bound, _owned(d), out)
         return out
 
     def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
         out = np.empty((len(T), 6))
-        rows.judgements(self._model, self._hull, _owned(T), False, 0.0, 0.0, out)
+        judge_rows(self._packed_model, self._packed_bound, _owned(T), False, 0.0, 0.0, out)
         return out[:, :3], out[:, 3]
 
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
         """Return verdicts on poses T_skull_mandible (n, 4, 4)."""
         out = np.empty((len(T), 6))
-        rows.judgements(self._model, self._hull, _owned(T), True, limits.residual_mm, limits.margin_mm, out)
-        why = out[:, 5]  # `logical_not` takes a third of the time of `== 0`
-        return Verdicts(np.logical_not(why), why.astype(np.uint8), out[:, 3], out[:, 4], out[:, :3])
-
-    def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
-        """Return verdicts on d (n, 3) [mm]."""
-        d = usable_rows(d)  # NaN where not finite: they are part of the verdicts
-        residual_mm, margin_mm, reason = np.empty(len(d)), np.empty(len(d)), np.empty(len(d), dtype=np.uint8)
-        rows.parameter_judgements(self._hull, _owned(d), limits.margin_mm, residual_mm, margin_mm, reason)
-        return Verdicts(np.logical_not(reason), reason, residual_mm, margin_mm, d)
-
-    def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
-        """Return the points (n, 3) [mm] inside nearest to those wanted, and the squared distances (n,)."""
-        return self._descended(POINT, np.empty((4, 0)), wanted[:, :, None], start)
-
-    def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
-        """Return the d (n, 3) [mm] inside that carry vectors nearest to targets, and the squared distances (n,)."""
-        return self._descended(PARAMETERS, np.ascontiguousarray(vectors), targets, start)
-
-    def _descended(self, chart: int, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
-        found, cost = np.array(start, order="C"), np.empty(len(start))
-        rows.descents(self._model, self._hull, chart, vectors, _owned(targets), found, cost)
-        return found, cost
+        judge_rows(self._packed_model, self._packed_bound, _owned(T), True, limits.residual_mm, limits.margin_mm, out)
+        reason = out[:, 5]  # `logical_not` takes a third of the time of `== 0`
+        return Verdicts(np.logical_not(reason), reason.astype(np.uint8), out[:, 3], out[:, 4], out[:, :3])
 
 
 def _owned(values: Array) -> Array:
-    """Return the values, copied unless they are contiguous, aligned and writable, as compiled code takes them."""
+    """Return the values, copied unless they are contiguous, aligned and writable as compiled code requires."""
     return values if values.flags.carray else np.array(values, order="C")

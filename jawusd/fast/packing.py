@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.frames import RigFrames
-from jawusd.evaluator.glide import GlideTable
+from jawusd.evaluator.curves import GlideTable, HermiteCurve
 from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
+from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED, KINDS
 
 # the model, every kind

@@ -11,8 +11,8 @@ import numba
 from numba.extending import register_jitable
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator import derivatives
-from jawusd.evaluator.derivatives import Elementary
+from jawusd.evaluator import gauge
+from jawusd.evaluator.gauge import Elementary
 from jawusd.geometry import rodrigues
 from jawusd.geometry.rodrigues import angle_coefficients, apply_series, dot, turning
 
@@ -27,9 +27,9 @@ summing = numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "cont
 # be addresses in the machine code, which then cannot be kept on disk.
 for _function in (
     *(rodrigues.angle_series, rodrigues.angle_quotients, rodrigues.angle_coefficients, rodrigues.cross, rodrigues.dot),
-    *(rodrigues.apply_series, rodrigues.turning, derivatives.path, derivatives.arch, derivatives.drop),
-    *(derivatives.fade, derivatives.displacement, derivatives.opening_equation, derivatives.inverse),
-    *(derivatives.spline_input, derivatives.gradient_by_u),
+    *(rodrigues.apply_series, rodrigues.turning, gauge.path, gauge.arch, gauge.drop),
+    *(gauge.fade, gauge.displacement, gauge.opening_equation, gauge.inverse),
+    *(gauge.spline_input, gauge.gradient_by_u),
 ):
     register_jitable(forceinline=True, nogil=True, error_model="numpy")(_function)
 

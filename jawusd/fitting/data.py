@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.base.errors import FittingError
-from jawusd.evaluator.frames import motions_of_poses, poses_of_motions
 from jawusd.evaluator.models import JawModelForm
+from jawusd.evaluator.motions import motions_of_poses, poses_of_motions
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, so3_log, transform_points

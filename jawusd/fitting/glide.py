@@ -14,8 +14,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.curves import GlideTable
 from jawusd.evaluator.gauge import Gauge
-from jawusd.evaluator.glide import GlideTable
 from jawusd.evaluator.models import AnchoredModel
 from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
 from jawusd.fitting.data import PARAMETERS

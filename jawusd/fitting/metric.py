@@ -12,8 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator.distances import carried, landmark_vectors
-from jawusd.evaluator.encoding import nearest_in_chart
+from jawusd.evaluator.encoding import carried, landmark_vectors, nearest_in_chart
 from jawusd.evaluator.models import JawModelForm
 from jawusd.geometry import hat, make_transform
 

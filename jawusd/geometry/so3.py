@@ -33,7 +33,7 @@ def vee(W: ArrayLike) -> Array:
     )
 
 
-def angle_coefficients(squared: Array) -> tuple[Array, Array, Array]:
+def batched_angle_coefficients(squared: Array) -> tuple[Array, Array, Array]:
     """Return a, b and c of `jawusd.geometry.rodrigues` at squared angles [rad^2] of any shape."""
     if np.ndim(squared) == 0 and squared < np.inf:  # one rotation, in floats: numpy takes most of its time for calls
         a, b, c = map(np.asarray, rodrigues.angle_coefficients(float(squared)))
@@ -62,7 +62,7 @@ def _series(w: Array, first: Array | float, second: Array | float) -> Array:
 def so3_exp(w: ArrayLike) -> Array:
     """Map rotation vectors (..., 3) [rad] to rotation matrices (..., 3, 3) (Rodrigues' formula)."""
     w = np.asarray(w, dtype=np.float64)
-    a, b, _ = angle_coefficients(np.einsum("...i,...i->...", w, w))
+    a, b, _ = batched_angle_coefficients(np.einsum("...i,...i->...", w, w))
     return _series(w, a, b)
 
 
@@ -80,7 +80,7 @@ def so3_log(R: ArrayLike) -> Array:
 def so3_left_jacobian(w: ArrayLike) -> Array:
     """Return J (..., 3, 3) with ``exp(w + dw) = exp(J dw) exp(w)`` to first order, for w (..., 3) [rad]."""
     w = np.asarray(w, dtype=np.float64)
-    _, b, c = angle_coefficients(np.einsum("...i,...i->...", w, w))
+    _, b, c = batched_angle_coefficients(np.einsum("...i,...i->...", w, w))
     return _series(w, b, c)
 
 

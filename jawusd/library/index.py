@@ -21,7 +21,7 @@ from jawusd.base.npz import check_format
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.geometry import LANDMARKS, landmark_frame, transform_points
-from jawusd.library.transport import Donor, condylar_distance_mm, condyle_incisor_mm
+from jawusd.library.personal import Donor, condylar_distance_mm, condyle_incisor_mm
 
 FAMILY, VERSION = "jawusd-library", 1
 INDEX_FILE = "library.json"

@@ -1,7 +1,12 @@
-"""Motion for a person without a capture: that of the persons of a library, carried over and averaged.
+"""Motion for a person without a capture: that of the library's persons, transferred and averaged.
 
-The weight of a library person falls with the distance between the landmarks. How fast, and the error to be expected,
-follow from leaving each person of the library out in turn and predicting it from the others.
+Motion is transferred by the five landmarks: joints and teeth shape the motion, size scales it. The displacement of each
+landmark is scaled laterally by the ratio of the distances between the condyles, and in the sagittal plane by the ratio
+of the distances from the condyles to the incisal point. The pose is the rigid motion nearest to the displaced
+landmarks.
+
+The weight of a library person falls with the distance between the landmarks. The bandwidth and the expected error come
+from leave-one-out: each person of the library is predicted from the others.
 """
 
 from __future__ import annotations
@@ -14,8 +19,55 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FittingError
-from jawusd.geometry import LANDMARKS, rigid_fit, transform_points
-from jawusd.library.transport import Donor, displacements, landmark_distance_mm
+from jawusd.evaluator import JawRig
+from jawusd.geometry import LANDMARKS, landmark_frame, rigid_fit, transform_points
+
+
+@dataclass(frozen=True, eq=False)
+class Donor:
+    """One person of a library."""
+
+    name: str  # of the person, for reports
+    rig: JawRig  # the person's rig
+
+    @property
+    def landmarks(self) -> Array:
+        """The landmarks with the teeth together, skull frame [mm], shape (5, 3), in the order of `LANDMARKS`."""
+        return transform_points(self.rig.T_rest, self.rig.landmarks)
+
+
+def condylar_distance_mm(landmarks: Array) -> float:
+    """Return the distance [mm] between the condyle centres of landmarks (5, 3)."""
+    return float(np.linalg.norm(landmarks[3] - landmarks[4]))
+
+
+def condyle_incisor_mm(landmarks: Array) -> float:
+    """Return the distance [mm] from the middle between the condyles to the incisal point of landmarks (5, 3)."""
+    return float(np.linalg.norm(landmarks[0] - landmarks[3:5].mean(axis=0)))
+
+
+def landmark_distance_mm(a: Array, b: Array) -> float:
+    """Return the rms distance [mm] that the best rigid fit leaves between two persons' landmarks (5, 3) [mm]."""
+    left = transform_points(rigid_fit(a, b), a) - b
+    return float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def displacements(donor: Donor, target: Array, shares: Array) -> Array:
+    """Return how the target's landmarks move when a donor's motion is carried over, target's frame [mm], (K, 5, 3).
+
+    Args:
+        target: the other person's landmarks with the teeth together [mm], shape (5, 3).
+        shares: parameters as shares of the ranges, see `JawRig.normalized`, shape (K, 3).
+    """
+    rest = donor.landmarks
+    d = donor.rig.denormalized(shares)
+    moved = transform_points(donor.rig.pose(d), donor.rig.landmarks) - rest
+    width = condylar_distance_mm(target) / condylar_distance_mm(rest)
+    reach = condyle_incisor_mm(target) / condyle_incisor_mm(rest)
+    axes = landmark_frame(target)[:3, :3]  # rows: left, up and anterior in the target's frame
+    to_target = axes.T @ np.diag([width, reach, reach]) @ axes @ rigid_fit(rest, target)[:3, :3]
+    return moved @ to_target.T
+
 
 # Landmark distances [mm] at which a person's weight falls to exp(-1/2); inf: equal weights.
 BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)

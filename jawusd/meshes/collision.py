@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
+from jawusd.geometry.points import welded
 from jawusd.geometry.se3 import se3_inverse
-from jawusd.geometry.welding import welded
 from jawusd.meshes.solid import DistanceGrid, distance_grid, outer_faces
 
 #: Surfaces farther apart than this count as this far apart [mm].

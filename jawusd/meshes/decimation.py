@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.formats.mesh import GUM, TOOTH, Mesh, crown_face_mask
-from jawusd.geometry.welding import welded
+from jawusd.geometry.points import welded
 from jawusd.meshes.mesh_cleaning import manifold
 
 

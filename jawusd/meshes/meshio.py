@@ -21,7 +21,7 @@ from jawusd.formats.mesh_data import NO_COLOUR, MeshData
 from jawusd.formats.mesh_obj import read_obj
 from jawusd.formats.mesh_ply import read_ply
 from jawusd.formats.mesh_stl import read_stl
-from jawusd.geometry.welding import welded
+from jawusd.geometry.points import welded
 
 # People who read scans with this module label them next; scripts outside the package import both from here.
 __all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.distances import carried
-from jawusd.evaluator.polygons import PolygonBound
+from jawusd.evaluator.bounds import PolygonBound, SliceHull
+from jawusd.evaluator.encoding import carried
 from jawusd.fitting.bounds import PLANES, alpha_shapes, fit_slice_hull, valid_box
 from jawusd.fitting.metric import MandibleMetric
 

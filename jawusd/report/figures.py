@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import shown
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.frames import motions_of_poses
+from jawusd.evaluator.motions import motions_of_poses
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.coverage import used_coverage
 from jawusd.formats.light_curve import LightCurve

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.frames import motions_of_poses
+from jawusd.evaluator.motions import motions_of_poses
 from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import transform_points

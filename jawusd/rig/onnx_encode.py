@@ -11,7 +11,7 @@ from onnx import TensorProto, helper
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.distances import landmark_vectors
+from jawusd.evaluator.encoding import landmark_vectors
 from jawusd.geometry.rodrigues import Triple, cross, dot
 from jawusd.rig.onnx_graph import Graph, Value
 from jawusd.rig.onnx_model import decode_motion, images

@@ -7,8 +7,7 @@ try:
 except ModuleNotFoundError as error:
     raise MissingDependencyError("jawusd.solvers needs torch.", hint="pip install 'jawusd[build]'") from error
 
-from jawusd.solvers.face_model import jaw_pose_from_axis_angle
-from jawusd.solvers.layer import JawLayer
-from jawusd.solvers.temporal import TemporalPrior
+from jawusd.solvers.layer import JawLayer, TemporalPrior
+from jawusd.solvers.motion import jaw_pose_from_axis_angle
 
 __all__ = ["JawLayer", "TemporalPrior", "jaw_pose_from_axis_angle"]

@@ -13,18 +13,19 @@ import torch
 from torch import Tensor
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator import derivatives
-from jawusd.evaluator.derivatives import (
+from jawusd.evaluator.formula import AnchoredNumbers
+from jawusd.evaluator.gauge import (
     INVERSE_ITERATIONS,
     INVERSE_STEP_MM,
     LEAST_INVERSE_SLOPE,
     MOST_DOUBLINGS,
     PATIENCE,
     Elementary,
+    displacement,
     gradient_by_u,
+    opening_equation,
     spline_input,
 )
-from jawusd.evaluator.formula import AnchoredNumbers
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.evaluator.operations import triple
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED
@@ -108,7 +109,7 @@ class AnchoredMotion(MotionModule):
         """Return d (n, 3) [mm] of u (n, 3) [mm], and dd/du (n, 3, 3); NaN where the search does not converge."""
         gauge = self._anchored_numbers().gauge
         d = self._inverse(x)
-        _, (x_1, y_1, y_2, y_3, z_1, z_2) = derivatives.displacement(gauge, d[:, 0], d[:, 1], d[:, 2], TENSORS)
+        _, (x_1, y_1, y_2, y_3, z_1, z_2) = displacement(gauge, d[:, 0], d[:, 1], d[:, 2], TENSORS)
         one, zero = torch.ones_like(x_1), torch.zeros_like(x_1)
         rows = ((x_1, one, zero), (y_1, y_2, y_3), (z_1, z_2, one))
         return d, inverse(torch.stack([torch.stack(row, dim=1) for row in rows], dim=1))
@@ -125,7 +126,7 @@ class AnchoredMotion(MotionModule):
         low, high = torch.full_like(d1, -torch.inf), torch.full_like(d1, torch.inf)
         wanted = triple(u.unbind(dim=1))
         for iteration in range(_STEPS_CAPTURED if capturing() else INVERSE_ITERATIONS):
-            _, _, remainder, slope = derivatives.opening_equation(gauge, wanted, d1, TENSORS)
+            _, _, remainder, slope = opening_equation(gauge, wanted, d1, TENSORS)
             step = -remainder / torch.where(slope > LEAST_INVERSE_SLOPE, slope, torch.ones_like(slope))
             step = step.clamp(-INVERSE_STEP_MM, INVERSE_STEP_MM)
             moving = step.abs() > tolerance * (1.0 + d1.abs())
@@ -135,7 +136,7 @@ class AnchoredMotion(MotionModule):
             d1 = torch.where(moving, _next_opening(d1, step, low, high, iteration), d1)
         else:
             d1 = torch.where(moving, torch.nan, d1) if not capturing() else d1
-        d2, d3, _, _ = derivatives.opening_equation(gauge, wanted, d1, TENSORS)
+        d2, d3, _, _ = opening_equation(gauge, wanted, d1, TENSORS)
         return torch.stack([d1, d2, d3], dim=1)
 
 

@@ -1,24 +1,98 @@
-"""A jaw rig as a torch module: poses, margins, encoding, and priors on jaw poses that other solvers can add."""
+"""A jaw rig as a torch module: poses, margins, clearances, encoding, and priors that other solvers can add."""
 
 from __future__ import annotations
 
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.contact import Meeting
-from jawusd.evaluator.distances import landmark_vectors
+from jawusd.evaluator.contact import ContactField, Meeting
+from jawusd.evaluator.encoding import landmark_vectors
+from jawusd.evaluator.speeds import Speeds
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.solvers.charts import chart_of
-from jawusd.solvers.clearance import Clearances
 from jawusd.solvers.encoding import nearest
 from jawusd.solvers.hull import Hull
 from jawusd.solvers.interior import Interior
 from jawusd.solvers.solution import attached, solved
-from jawusd.solvers.temporal import TemporalPrior
+
+_CORNERS = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+
+
+class Clearances(nn.Module):
+    """A field over d, all of it in buffers.
+
+    Args:
+        field: The field of a rig.
+    """
+
+    first: Tensor
+    step: Tensor
+    last: Tensor
+    values: Tensor
+
+    def __init__(self, field: ContactField) -> None:
+        super().__init__()
+        last = np.array(field.values.shape, dtype=np.float64) - 1.0
+        for name, value in (("first", field.first_mm), ("step", field.step_mm), ("last", last)):
+            self.register_buffer(name, torch.tensor(value))
+        self.register_buffer("values", torch.tensor(field.values.ravel()))
+
+    def forward(self, d: Tensor) -> Tensor:
+        """Return the clearances (n,) [mm] at d (n, 3) [mm]; NaN for NaN."""
+        place = torch.minimum(torch.clamp((d - self.first) / self.step, min=0.0), self.last)
+        cell = torch.minimum(torch.nan_to_num(place.detach()).floor(), self.last - 1.0)
+        share = place - cell
+        counts, low = self.last.long() + 1, cell.long()
+        found = torch.zeros_like(d[:, 0])
+        for i, j, k in _CORNERS:
+            row = ((low[:, 0] + i) * counts[1] + low[:, 1] + j) * counts[2] + low[:, 2] + k
+            a, b, c = (share[:, axis] if far else 1.0 - share[:, axis] for axis, far in enumerate((i, j, k)))
+            found = found + self.values[row] * a * b * c
+        return found
+
+
+class TemporalPrior(nn.Module):
+    """The squared Mahalanobis lengths of velocity and acceleration of d, zero for a jaw at rest.
+
+    Both are taken as normal with mean zero; the inverses of their covariances are buffers, float64.
+
+    Args:
+        speeds: How fast the jaw moves: `JawRig.speeds`, or `Speeds.of_take`.
+    """
+
+    velocity: Tensor
+    acceleration: Tensor
+
+    def __init__(self, speeds: Speeds) -> None:
+        super().__init__()
+        for name, covariance in (("velocity", speeds.velocity), ("acceleration", speeds.acceleration)):
+            self.register_buffer(name, torch.linalg.inv(torch.tensor(covariance)))
+
+    def forward(self, d: Tensor, fps: float) -> Tensor:
+        """Return the prior (...), of about 3 for motion like the take's, for d (..., F, 3) [mm] at a rate [1/s].
+
+        Half the mean squared Mahalanobis length of the velocities, plus that of the accelerations.
+
+        Raises:
+            ValueError: fewer than three frames.
+            TypeError: another type of number than the prior's.
+        """
+        if d.ndim < 2 or d.shape[-1] != 3 or d.shape[-2] < 3:
+            raise ValueError(f"the shape of d must end in (F, 3) with three frames or more, got {tuple(d.shape)}")
+        if d.dtype != self.velocity.dtype:
+            raise TypeError(f"d is {d.dtype}, the prior computes in {self.velocity.dtype}. Convert one of them.")
+        velocity = (d[..., 1:, :] - d[..., :-1, :]) * fps
+        acceleration = (velocity[..., 1:, :] - velocity[..., :-1, :]) * fps
+        lengths = [
+            ((change @ precision) * change).sum(dim=-1).mean(dim=-1)
+            for change, precision in ((velocity, self.velocity), (acceleration, self.acceleration))
+        ]
+        return 0.5 * (lengths[0] + lengths[1])
 
 
 class JawLayer(nn.Module):

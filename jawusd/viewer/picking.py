@@ -16,7 +16,7 @@ from jawusd.base.arrays import Array
 from jawusd.formats.capture import Bootstrap, Pick, PickView
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, so3_exp, transform_point, transform_points
-from jawusd.geometry.rays import meet_triangles
+from jawusd.geometry.points import meet_triangles
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.viewed import Region
 

@@ -29,8 +29,7 @@ from scipy.signal import find_peaks  # noqa: E402
 from jawusd.evaluator import JawRig  # noqa: E402
 from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
 from jawusd.geometry import landmark_frame, make_transform, rigid_fit, transform_points  # noqa: E402
-from jawusd.library.personal import Learned, leave_one_out, personal_motion  # noqa: E402
-from jawusd.library.transport import Donor, landmark_distance_mm  # noqa: E402
+from jawusd.library.personal import Donor, Learned, landmark_distance_mm, leave_one_out, personal_motion  # noqa: E402  # noqa: E402
 from jawusd.pipeline.library import fit_personal, retarget  # noqa: E402
 from jawusd.pipeline.subject import Subject  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402

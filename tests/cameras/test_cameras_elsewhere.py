@@ -18,7 +18,7 @@ from jawusd.cameras.colmap_write import save_colmap
 from jawusd.cameras.files import calibration_files, load_cameras_file
 from jawusd.cli.main import app
 from jawusd.geometry import Camera, make_transform
-from jawusd.geometry.lens_fit import opencv_radial
+from jawusd.geometry.camera import opencv_radial
 from jawusd.rig.cameras import read_cameras, write_camera_stage
 
 SIZE = (1920, 1080)

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.glide import GlideTable
+from jawusd.evaluator.curves import GlideTable
 
 BOX = [0.0, -10.0, -3.0], [40.0, 10.0, 9.0]
 

@@ -14,7 +14,7 @@ from example_model import example_arrays, example_meta, touching_arrays
 from scipy.optimize import least_squares
 
 from jawusd.evaluator import JawRig, Reason
-from jawusd.fast import accelerate, rows
+from jawusd.fast import accelerate, kernels
 from jawusd.fast.kernels import CompiledKernels
 from jawusd.geometry.se3 import se3_exp, transform_points
 
@@ -255,7 +255,7 @@ def test_results_do_not_share_memory(fast):
 def test_compiled_functions_refuse_other_types(fast):
     """Or they would be compiled anew, for seconds, inside somebody's playback."""
     with pytest.raises(TypeError):
-        rows.poses(fast.kernels._model, np.zeros((2, 3), dtype=np.float32), np.empty((2, 4, 4)))
+        kernels.poses(fast.kernels._packed_model, np.zeros((2, 3), dtype=np.float32), np.empty((2, 4, 4)))
 
 
 def test_rig_pickles_and_evaluates_in_threads(kind, fast):

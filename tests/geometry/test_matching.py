@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jawusd.geometry.matching import match_points
+from jawusd.geometry.points import match_points
 
 
 def shape(seed, count=400):

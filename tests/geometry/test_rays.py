@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jawusd.geometry.rays import meet_triangles
+from jawusd.geometry.points import meet_triangles
 
 
 def test_lines_meet_planes_where_linear_equations_say():

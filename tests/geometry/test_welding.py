@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jawusd.geometry.welding import welded
+from jawusd.geometry.points import welded
 
 
 @pytest.mark.parametrize("count", [0, 1, 500])

@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jawusd.base.errors import FittingError
 from jawusd.geometry import make_transform, random_rotation, rigid_fit, so3_exp, transform_points
-from jawusd.library.personal import leave_one_out, personal_motion
-from jawusd.library.transport import Donor, displacements, landmark_distance_mm
+from jawusd.library.personal import Donor, displacements, landmark_distance_mm, leave_one_out, personal_motion
 
 D = np.array([[0.0, 0, 0], [20, 2, 1], [8, -4, 0.5], [38, 0, 0], [3, 1, 3]])
 

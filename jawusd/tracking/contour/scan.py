@@ -14,7 +14,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.geometry import transform_point
-from jawusd.geometry.welding import welded
+from jawusd.geometry.points import welded
 from jawusd.meshes.decimation import decimated_scan
 from jawusd.meshes.raster import draw_depth_labels, draw_silhouette, project, words_for
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments

@@ -13,7 +13,7 @@ import model_peers
 import numpy as np
 
 from jawusd.base.errors import FittingError
-from jawusd.evaluator.distances import carried
+from jawusd.evaluator.encoding import carried
 from jawusd.fitting import FittingConfig
 from jawusd.fitting.checks import shown_parameters
 from jawusd.fitting.data import TrainingData, displacement

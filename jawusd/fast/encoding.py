@@ -1,0 +1,314 @@
+"""Compiled: the nearest parameters of a pose, by the damped Gauss-Newton of `jawusd.evaluator.solver`, and verdicts.
+
+For one row. A `Problem` names the chart of the unknowns x [mm] and has the homogeneous vectors (4, m) and their targets
+(3, m) [mm].
+"""
+
+from __future__ import annotations
+
+from math import isfinite, isnan, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.evaluator.batching import LARGEST
+from jawusd.evaluator.formula import ON_BOUND_MM
+from jawusd.evaluator.nearest import (
+    ITERATIONS,
+    LARGEST_DAMPING,
+    LEAST_STIFFNESS,
+    SMALLEST_DAMPING,
+    START_DAMPING,
+    TOLERANCE_MM,
+)
+from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Reason
+from jawusd.fast.hull import signed_distance
+from jawusd.fast.motion import (
+    Scratch,
+    displaced,
+    motion,
+    motion_by_displacement,
+    motion_derivative,
+    parameters_at,
+    scratch,
+)
+from jawusd.fast.packing import (
+    ANCHORED_KIND,
+    FROM_CLOSED,
+    GRID,
+    INCISOR,
+    KIND,
+    STARTS,
+    TO_ANATOMICAL,
+    VECTORS,
+)
+from jawusd.fast.rigid import Vector, device, solve
+
+PARAMETERS, DISPLACEMENT = 0, 1  # charts: x is d, or the incisal displacement u
+
+_NOT_FINITE, _NOT_RIGID = Reason.NOT_FINITE.value, Reason.NOT_RIGID.value
+_OFF_MODEL, _OUTSIDE_BOUNDS = Reason.OFF_MODEL.value, Reason.OUTSIDE_BOUNDS.value
+
+
+class Problem(NamedTuple):
+    """A least-squares problem."""
+
+    chart: int
+    vectors: Array
+    target: Array
+
+
+class Normal(NamedTuple):
+    """Memory for the normal equations of one search."""
+
+    A: Array
+    g: Array
+    A_trial: Array
+    g_trial: Array
+    damped: Array
+    step: Array
+    trial: Array
+
+
+@device
+def normal_scratch() -> Normal:
+    """Return the memory for the normal equations of one search."""
+    return Normal(
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty(3),
+    )
+
+
+@device
+def equations(model: Array, problem: Problem, x: Array, w: Scratch, A: Array, g: Array) -> float:
+    """Return the squared residual at x; write the normal equations' A (3, 3) and gradient g (3,)."""
+    A[:, :] = 0.0
+    g[:] = 0.0
+    cost = 0.0
+    if problem.chart == DISPLACEMENT:
+        motion_by_displacement(model, x[0], x[1], x[2], w)
+    else:
+        motion_derivative(model, x[0], x[1], x[2], w)
+    M, S = w.M, w.S
+    for j in range(problem.target.shape[1]):
+        p0, p1, p2 = problem.vectors[0, j], problem.vectors[1, j], problem.vectors[2, j]
+        h = problem.vectors[3, j]
+        y0 = M[0, 0] * p0 + M[0, 1] * p1 + M[0, 2] * p2 + M[0, 3] * h
+        y1 = M[1, 0] * p0 + M[1, 1] * p1 + M[1, 2] * p2 + M[1, 3] * h
+        y2 = M[2, 0] * p0 + M[2, 1] * p1 + M[2, 2] * p2 + M[2, 3] * h
+        r0, r1, r2 = y0 - problem.target[0, j], y1 - problem.target[1, j], y2 - problem.target[2, j]
+        cost += r0 * r0 + r1 * r1 + r2 * r2
+        # a vector (b, h) moves by w x image + v h under the spatial velocity (w, v)
+        a0, b0, c0 = _velocity(S, 0, y0, y1, y2, h)
+        a1, b1, c1 = _velocity(S, 1, y0, y1, y2, h)
+        a2, b2, c2 = _velocity(S, 2, y0, y1, y2, h)
+        g[0] += a0 * r0 + b0 * r1 + c0 * r2
+        g[1] += a1 * r0 + b1 * r1 + c1 * r2
+        g[2] += a2 * r0 + b2 * r1 + c2 * r2
+        A[0, 0] += a0 * a0 + b0 * b0 + c0 * c0
+        A[0, 1] += a0 * a1 + b0 * b1 + c0 * c1
+        A[0, 2] += a0 * a2 + b0 * b2 + c0 * c2
+        A[1, 1] += a1 * a1 + b1 * b1 + c1 * c1
+        A[1, 2] += a1 * a2 + b1 * b2 + c1 * c2
+        A[2, 2] += a2 * a2 + b2 * b2 + c2 * c2
+    A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
+    return cost
+
+
+@device
+def _velocity(S: Array, k: int, y0: float, y1: float, y2: float, h: float) -> Vector:
+    w0, w1, w2 = S[0, k], S[1, k], S[2, k]
+    return w1 * y2 - w2 * y1 + h * S[3, k], w2 * y0 - w0 * y2 + h * S[4, k], w0 * y1 - w1 * y0 + h * S[5, k]
+
+
+@device
+def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> None:
+    """Move x (3,) to the minimum; NaN if the residual at the start is not finite."""
+    cost = equations(model, problem, x, w, n.A, n.g)
+    if not isfinite(cost):
+        x[:] = np.nan
+        return
+    damping = START_DAMPING
+    for _ in range(ITERATIONS):
+        _damp(n.A, damping, n.damped)
+        solve(n.damped, n.g, n.step)
+        for i in range(3):
+            n.trial[i] = x[i] - n.step[i]
+        if _settled(n.step) or damping >= LARGEST_DAMPING:
+            x[:] = n.trial  # the last step is free and doubles the digits
+            return
+        trial_cost = equations(model, problem, n.trial, w, n.A_trial, n.g_trial)
+        if trial_cost <= cost:
+            cost = trial_cost
+            x[:], n.A[:], n.g[:] = n.trial, n.A_trial, n.g_trial
+            damping = max(damping * 0.1, SMALLEST_DAMPING)
+        else:
+            damping *= 10.0
+
+
+@device
+def _settled(step: Array) -> bool:
+    return max(abs(step[0]), abs(step[1]), abs(step[2])) <= TOLERANCE_MM
+
+
+@device
+def _damp(A: Array, damping: float, out: Array) -> None:
+    amount = damping * ((A[0, 0] + A[1, 1] + A[2, 2]) / 3.0) + LEAST_STIFFNESS
+    out[:] = A
+    for i in range(3):
+        out[i, i] += amount
+
+
+class Encoding(NamedTuple):
+    """Memory for encoding one pose after another."""
+
+    w: Scratch
+    n: Normal
+    target: Array
+    x: Array
+    product: Array
+
+
+@device
+def encoding_scratch(model: Array) -> Encoding:
+    """Return the memory for encoding."""
+    return Encoding(scratch(model), normal_scratch(), np.empty((3, 4)), np.empty(3), np.empty((4, 4)))
+
+
+@device
+def encode(model: Array, T: Array, e: Encoding) -> float:
+    """Write the d [mm] whose pose is nearest to T (4, 4) to e.x and return the residual [mm]."""
+    vectors = model[VECTORS : VECTORS + 16].reshape(4, 4)
+    M = e.w.M
+    _motion_of_pose(model, T, e.product, M)
+    for i in range(3):
+        for j in range(4):
+            total = 0.0
+            for k in range(4):
+                total += M[i, k] * vectors[k, j]
+            e.target[i, j] = total
+    p0, p1, p2 = model[INCISOR], model[INCISOR + 1], model[INCISOR + 2]
+    for i in range(3):
+        e.x[i] = M[i, 0] * p0 + M[i, 1] * p1 + M[i, 2] * p2 + M[i, 3] - model[INCISOR + i]
+    if model[KIND] == ANCHORED_KIND:
+        # searching over the displacement avoids the gauge; the nearest pose does not depend on the chart
+        descend(model, Problem(DISPLACEMENT, vectors, e.target), e.x, e.w, e.n)
+        u = (e.x[0], e.x[1], e.x[2])
+        displaced(model, u, e.w)
+        e.x[0], e.x[1], e.x[2] = parameters_at(model, u)
+        if isnan(e.x[0]):
+            return np.nan
+    else:
+        _nearest_start(model, e.x)
+        descend(model, Problem(PARAMETERS, vectors, e.target), e.x, e.w, e.n)
+        motion(model, e.x[0], e.x[1], e.x[2], e.w)
+    return _residual_mm(vectors, e)
+
+
+@device
+def _motion_of_pose(model: Array, T: Array, half: Array, M: Array) -> None:
+    """Write the first three rows of L^-1 T Q^-1 to M."""
+    for i in range(4):
+        for k in range(4):
+            total = 0.0
+            for j in range(4):
+                total += T[i, j] * model[FROM_CLOSED + 4 * j + k]
+            half[i, k] = total
+    for i in range(3):
+        for k in range(4):
+            total = 0.0
+            for j in range(4):
+                total += model[TO_ANATOMICAL + 4 * i + j] * half[j, k]
+            M[i, k] = total
+
+
+@device
+def _nearest_start(model: Array, x: Array) -> None:
+    """Replace the incisal displacement x by the d of the grid point with the nearest displacement."""
+    count = int(model[STARTS])
+    at = model[GRID + 3 * count :]
+    best, least = 0, np.inf
+    for i in range(count):
+        a, b, c = at[3 * i] - x[0], at[3 * i + 1] - x[1], at[3 * i + 2] - x[2]
+        square = a * a + b * b + c * c
+        if square < least:
+            best, least = i, square
+    for i in range(3):
+        x[i] = model[GRID + 3 * best + i]
+
+
+@device
+def _residual_mm(vectors: Array, e: Encoding) -> float:
+    """Return the distance [mm] between the images under the motion in e.w and their targets."""
+    total = 0.0
+    for i in range(3):
+        for j in range(4):
+            image = e.w.M[i, 3] * vectors[3, j]
+            for k in range(3):
+                image += e.w.M[i, k] * vectors[k, j]
+            total += (image - e.target[i, j]) ** 2
+    return sqrt(total)
+
+
+@device
+def _finite(T: Array) -> bool:
+    """Return whether all entries of T (4, 4) are finite and below `LARGEST`."""
+    for i in range(4):
+        for k in range(4):
+            if not abs(T[i, k]) < LARGEST:  # also false for NaN
+                return False
+    return True
+
+
+@device
+def _rigid(T: Array) -> bool:
+    """Return whether T (4, 4) is rigid to the evaluator's tolerance, see `geometry.rigidity_defect`."""
+    defect = max(abs(T[3, 0]), abs(T[3, 1]), abs(T[3, 2]), abs(T[3, 3] - 1.0))
+    for i in range(3):
+        for k in range(i, 3):
+            total = T[i, 0] * T[k, 0] + T[i, 1] * T[k, 1] + T[i, 2] * T[k, 2] - (1.0 if i == k else 0.0)
+            defect = max(defect, abs(total))
+    x = T[1, 1] * T[2, 2] - T[1, 2] * T[2, 1]
+    y = T[1, 2] * T[2, 0] - T[1, 0] * T[2, 2]
+    z = T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0]
+    return defect <= RIGID_TOLERANCE and T[0, 0] * x + T[0, 1] * y + T[0, 2] * z >= 0.0
+
+
+@device
+def judge(
+    model: Array,
+    bound: Array,
+    T: Array,
+    judging: bool,
+    residual_limit: float,
+    margin_limit: float,
+    e: Encoding,
+    v: Array,
+) -> tuple[int, float, float]:
+    """Return reason, residual and margin [mm] of a pose T (4, 4), its d in e.x: `evaluator.verdicts.judge`.
+
+    Without `judging`, only d and the residual are computed, and the reason is 0 for every rigid pose.
+    """
+    e.x[:] = np.nan
+    if not _finite(T):
+        return _NOT_FINITE, np.nan, np.nan
+    if not _rigid(T):
+        return _NOT_RIGID, np.nan, np.nan
+    residual = encode(model, T, e)
+    if not judging:
+        return 0, residual, np.nan
+    out, _, _ = signed_distance(bound, e.x[0], e.x[1], e.x[2], v)
+    reason = 0 if residual <= residual_limit else _OFF_MODEL
+    return reason | _outside(-out, margin_limit), residual, -out
+
+
+@device
+def _outside(margin: float, margin_limit: float) -> int:
+    """Return the reason code of a margin [mm], 0 if it is within the limit."""
+    return 0 if margin >= margin_limit - ON_BOUND_MM else _OUTSIDE_BOUNDS
