@@ -1,4 +1,7 @@
-"""Poses of both arches from masks in several views."""
+"""Track the poses of both dental arches from masks or pictures of several cameras.
+
+Rooms, each importing only those before it: `contour`, `initialization`, `sequence` and `performance`, `region`.
+"""
 
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.sequence.take import track_capture

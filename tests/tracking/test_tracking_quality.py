@@ -261,7 +261,7 @@ def test_working_size_follows_resolution_and_never_enlarges():
     camera = CAMERAS[0]  # 6.25 px/mm at the origin
     assert working_size(camera, np.zeros(3), 3.125) == (320, 200)
     assert working_size(camera, np.zeros(3), 20.0) == camera.size_px
-    with pytest.raises(TrackingError, match="camera cam0: the teeth lie 100 mm behind it"):
+    with pytest.raises(TrackingError, match="camera cam0: the teeth are 100 mm behind this camera"):
         working_size(camera, camera.centre_world() + se3_inverse(camera.T_cam_world)[:3, 2] * -100, 3.0)
 
 

@@ -1,1 +1,4 @@
-"""Align scans with masks at one instant: contour samples, correspondences, normal equations, quality."""
+"""Align both scans with the masks of one instant: contour samples, correspondences, normal equations, quality.
+
+Imports no other room of tracking, only `config`.
+"""

@@ -1,6 +1,6 @@
-"""Match contour samples with mask edges along their normals and sum up normal equations.
+"""Match contour samples with mask edges along their normals, and sum the normal equations.
 
-Every compiled function here releases the GIL and keeps no state.
+The compiled functions release the GIL and are stateless.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def _at(picture: NDArray[np.float32], x: float, y: float) -> float:
 
 @numba.njit(nogil=True, cache=True)
 def _nearest_edge(mask: NDArray[np.uint8], x: float, y: float, nx: float, ny: float, reach: float) -> float:
-    """Return the signed distance [px] along the normal to the nearest way out of the mask.
+    """Return the signed distance [px] along the normal to the nearest edge where the mask ends.
 
-    NaN where there is none within reach; positive infinity where all of the reach lies inside the mask.
+    NaN if there is none within reach; positive infinity if the whole reach lies inside the mask.
     """
     start = _sample(mask, x, y)
     outer = inner = start
@@ -94,13 +94,13 @@ def search_edges(
 
     Args:
         samples: shape (n, COLUMNS).
-        mask, other_mask: of this and of the other arch, 255 = teeth, shape (h, w).
+        mask, other_mask: of this arch and of the other, 255 = teeth, shape (h, w).
         other_inverse_depth: rendered inverse depth of the other arch's scan [1/mm], 0 = empty, shape (h, w).
-        reach_px: search distance on either side.
-        tolerance_mm: depth difference between the arches that counts as real.
-        cos_limit: least cosine between the sample's normal and the mask's own at the edge.
-        out: receives, shape (n,): the distance, positive outwards; NaN where the sample is hidden, or no edge or only
-            another object's edge is near; +inf where the whole reach lies inside the mask.
+        reach_px: search distance in both directions.
+        tolerance_mm: depth difference from which one arch hides the other.
+        cos_limit: least cosine between the sample's normal and the mask's normal at the edge.
+        out: receives the distances, positive outwards, shape (n,). NaN if the sample is hidden, or no edge of its own
+            object is near; +inf if the whole reach lies inside the mask.
     """
     for s in range(len(samples)):
         sample = samples[s]
@@ -115,17 +115,17 @@ def search_edges(
             gx = _sample(mask, ex + 1, ey) - _sample(mask, ex - 1, ey)
             gy = _sample(mask, ex, ey + 1) - _sample(mask, ex, ey - 1)
             if -(gx * nx + gy * ny) < cos_limit * np.sqrt(gx * gx + gy * gy):
-                continue  # runs across the contour: a lip or a neighbouring tooth
+                continue  # crosses the contour: a lip or a neighbouring tooth
             if _sample(other_mask, ex + 2 * nx, ey + 2 * ny) > _EDGE:
                 other = _at(other_inverse_depth, ex + 2 * nx, ey + 2 * ny)
                 if other == 0.0 or other * (1 - 0.25 * tolerance_mm * own) > own:
-                    continue  # this edge is made by the other arch, which lies in front
+                    continue  # the edge belongs to the other arch, which is in front
         out[s] = d
 
 
 @numba.njit(nogil=True, cache=True)
 def _slope(sample: Array, pose: Array, matrix: Array, centre: Array, jacobian: Array) -> None:
-    """Write how far a sample moves along its normal [px] per unit of a left twist about a world point."""
+    """Write the motion of a sample along its normal [px] per unit of a left twist about a world point."""
     a = pose[0, 0] * sample[X] + pose[0, 1] * sample[Y] + pose[0, 2] * sample[Z] + pose[0, 3]
     b = pose[1, 0] * sample[X] + pose[1, 1] * sample[Y] + pose[1, 2] * sample[Z] + pose[1, 3]
     c = pose[2, 0] * sample[X] + pose[2, 1] * sample[Y] + pose[2, 2] * sample[Z] + pose[2, 3]
@@ -164,15 +164,15 @@ def accumulate(
     twist (omega, v) of the arch about `centre` (Drummond & Cipolla 2002 use the same point-to-edge distances).
 
     Args:
-        samples, distances: as `search_edges` takes and writes them, shapes (n, COLUMNS) and (n,).
+        samples, distances: input and output of `search_edges`, shapes (n, COLUMNS) and (n,).
         gate_px: residual beyond which the Tukey weight is zero.
         score_gate_px: residual beyond which a sample adds nothing to the score.
-        pull: weight at the gate of samples deep inside the mask; 0 leaves them out.
+        pull: weight at the gate of samples deep inside the mask; 0 ignores them.
         pose: scan to world, shape (4, 4).
         matrix: world [mm] to homogeneous px, shape (3, 4).
-        centre: point the twist turns about, world coordinates [mm], shape (3,).
-        precision, gradient: added to, shapes (6, 6) and (6,); see `OutlineSums`.
-        habit_slope, habit_distance, habit_weight: added to, shapes (K, 6), (K,), (K, K).
+        centre: centre of the twist in the world [mm], shape (3,).
+        precision, gradient: incremented, shapes (6, 6) and (6,); see `OutlineSums`.
+        habit_slope, habit_distance, habit_weight: incremented, shapes (K, 6), (K,), (K, K).
 
     Returns:
         The sums weight, square, matched_px and score_px of `OutlineSums`.
@@ -229,15 +229,15 @@ def accumulate_outline(
     silhouette: OutlineSums,
     margin: OutlineSums,
 ) -> None:
-    """Write the sums of one arch in one view, of the silhouette and of the gingival margin behind it.
+    """Write the sums of one arch in one view, separately for silhouette and gingival margin.
 
     Args:
-        r, c: arch and view: the places in the sums, which are zero there.
+        r, c: arch and view; the sums must be zero there.
         samples, distances: as for `accumulate`.
-        silhouettes: how many of the samples are silhouette.
+        silhouettes: number of silhouette samples, which come first.
         limits: gate, score gate and pull, as for `accumulate`.
         where: pose, matrix and centre, as for `accumulate`.
-        silhouette, margin: receive.
+        silhouette, margin: receive the sums.
     """
     for k in range(2):
         sums = silhouette if k == 0 else margin
@@ -262,18 +262,17 @@ def scatter_of_tiles(
     shape: tuple[int, int],
     tile_px: int,
 ) -> tuple[Array, Array]:
-    """Return the sums over picture tiles of s s^T, shape (6, 6); s is the sum of w J d over the samples in the tile.
+    """Return the sum over picture tiles of s s^T, shape (6, 6); s is the sum of w J d over the samples in the tile.
 
-    The second takes the share of gum line in place of d: how a gum line drawn a pixel off in one place moves the arch.
+    The second result uses the gum share in place of d: the effect of a gum line drawn one pixel off in one place.
 
-    Errors of the outline move together over some length of contour; within a tile they add up before they are
-    squared. Over the normal matrix this tells how much less a pixel of contour says than independent errors would
-    (cluster-robust covariance, Liang & Zeger 1986).
+    Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The
+    ratio to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).
 
     Args:
         samples, distances, gate_px, pose, matrix, centre: as for `accumulate`.
         shape: (h, w) of the picture.
-        tile_px: side of the square tiles, longer than the errors' correlation.
+        tile_px: side of the square tiles, longer than the correlation length.
     """
     across = shape[1] // tile_px + 1
     sums = np.zeros(((shape[0] // tile_px + 1) * across, 6))

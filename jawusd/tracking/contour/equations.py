@@ -1,8 +1,8 @@
 """The normal equations of one Gauss-Newton step, and the terms that add to them.
 
-Unknown are the left twists (omega [rad], v [mm]) of both arches about their centres. Whatever constrains the two poses
-is a `ResidualTerm`: the outline against the masks, the pull towards the start, the jaw model of the person. A new
-kind of measurement is a new class with `accumulate`, handed to `ContourSolver.solve`.
+The unknowns are the left twists (omega [rad], v [mm]) of both arches about their centres. Each constraint on the two
+poses is a `ResidualTerm`: outlines against masks, the prior at the start pose, the jaw model. To add a kind of
+measurement, write a class with `accumulate` and pass it to `ContourSolver.solve`.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from jawusd.geometry import make_transform, se3_exp, se3_inverse, se3_log
 
 
 def translation(t: Array) -> Array:
-    """Return the motion by a vector [mm], shape (3,), as a transform (4, 4)."""
+    """Return the translation by a vector [mm], shape (3,), as a transform (4, 4)."""
     return make_transform(np.eye(3), t)
 
 
 def motion_about(centre: Array, twist: Array) -> Array:
-    """Return the motion of a twist, shape (..., 6), about a world point (3,), shape (..., 4, 4)."""
+    """Return the transform of a twist (..., 6) about a world point (3,), shape (..., 4, 4)."""
     motion = se3_exp(twist)
     motion[..., :3, 3] += centre - motion[..., :3, :3] @ centre
     return motion
@@ -38,8 +38,8 @@ def twist_between(start: Array, end: Array, centre: Array) -> Array:
 class OutlineSums(NamedTuple):
     """Sums over matched contour samples per arch and view; w weight, d distance to the mask edge [px], J slope.
 
-    The habits of whoever drew the masks shift the outline by h . (edge px, gum px, gum mm), the last three columns h of
-    a sample: free edges, the gum line in the picture, and the gum line along the crown's surface.
+    The habits of the annotator shift the outline by h . (edge px, gum px, gum mm), with the last three columns h of a
+    sample: at free edges, at the gum line in the picture, and at the gum line along the crown surface.
 
     Attributes:
         precision: sum w J^T J, shape (2, C, 6, 6).
@@ -63,43 +63,43 @@ class OutlineSums(NamedTuple):
 
     @classmethod
     def zeros(cls, cameras: int) -> OutlineSums:
-        """Return empty sums for so many views."""
+        """Return zero sums for a number of views."""
         shapes: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (3, 6), (3,), (3, 3), (), (), (), ())
         return cls(*(np.zeros((2, cameras, *shape)) for shape in shapes))
 
     def plus(self, other: OutlineSums) -> OutlineSums:
-        """Return the sums over the samples of both."""
+        """Return the sums over both sets of samples."""
         return OutlineSums(*(ours + theirs for ours, theirs in zip(self, other, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Hold poses with their linearised residuals: the state of an iteration, and the outcome of an alignment."""
+    """Poses with their linearised residuals: the state of an iteration, and the result of an alignment."""
 
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4)
     silhouette: OutlineSums  # sums over the matched samples of silhouettes and borders of the scans
     gingival_margin: OutlineSums  # sums over the matched samples of the crown-gum line
-    centres: Array  # points the twists turn about, world coordinates [mm], shape (2, 3)
-    scatters: Array  # sums over picture tiles of the squared score of `scatter_of_tiles`, per arch, shape (2, 6, 6)
-    gum_scatters: Array  # the same of a pixel of gum line in place of the residual, shape (2, 6, 6)
+    centres: Array  # centres of the twists in the world [mm], shape (2, 3)
+    scatters: Array  # first result of `scatter_of_tiles`, summed over views, per arch, shape (2, 6, 6)
+    gum_scatters: Array  # second result of `scatter_of_tiles`, likewise, shape (2, 6, 6)
     visible_px: Array  # contour length that could have been matched, per arch and view [px], shape (2, C)
-    iterations: int  # how many linearised steps were taken
+    iterations: int  # number of linearised steps
 
     @property
     def outline(self) -> OutlineSums:
-        """The sums over all matched contour samples; not kept, as every frame of a take keeps its solution."""
+        """The sums over all matched contour samples; computed on demand, since every frame stores its solution."""
         return self.silhouette.plus(self.gingival_margin)
 
 
 class NormalEquations:
-    """Sum up precision and right side of both arches' twists, in named blocks.
+    """Normal equations of both arches' twists, in named blocks.
 
     Attributes:
         matrix: precision, arches in the order (upper, lower), shape (12, 12); `upper`, `lower` and `coupling` are
             views of its blocks.
         right: right side, shape (12,).
-        outline_weight: what a squared pixel of distance times a pixel of contour counts, per arch [1/px^3], shape (2,):
-            1, or the inverse of outline variance times correlation length if other terms are log-likelihoods.
+        outline_weight: weight of the outline sums per arch [1/px^3], shape (2,): 1, or the inverse of outline variance
+            times correlation length if other terms are log-likelihoods.
     """
 
     def __init__(self, outline_weight: Array | None = None) -> None:
@@ -118,16 +118,16 @@ class NormalEquations:
 
     @property
     def coupling(self) -> Array:
-        """The precision that couples upper (arches) and lower arch (columns), shape (6, 6)."""
+        """The precision that couples the upper arch (rows) and the lower arch (columns), shape (6, 6)."""
         return self.matrix[:6, 6:]
 
     def add(self, arch: int, precision: Array, right: Array) -> None:
-        """Add what constrains one arch alone, shapes (6, 6) and (6,)."""
+        """Add a constraint on one arch, shapes (6, 6) and (6,)."""
         (self.upper, self.lower)[arch][:] += precision
         self.right[6 * arch : 6 * arch + 6] += right
 
     def add_joint(self, precision: Array, right: Array) -> None:
-        """Add what constrains both arches together, shapes (12, 12) and (12,)."""
+        """Add a joint constraint on both arches, shapes (12, 12) and (12,)."""
         self.matrix += precision
         self.right += right
 
@@ -137,7 +137,7 @@ class NormalEquations:
 
 
 class ResidualTerm(Protocol):
-    """Constrain the poses of both arches."""
+    """A constraint on the poses of both arches."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the term's linearised residuals at the poses of a state."""
@@ -145,7 +145,7 @@ class ResidualTerm(Protocol):
 
 
 class SilhouetteTerm:
-    """Draw the silhouettes of the crowns onto the edges of their masks."""
+    """Pulls the silhouettes of the crowns to the edges of their masks."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the sums over the matched silhouette samples of all views."""
@@ -153,7 +153,7 @@ class SilhouetteTerm:
 
 
 class GingivalMarginTerm:
-    """Draw the crown-gum lines onto the edges of their masks."""
+    """Pulls the crown-gum lines to the edges of their masks."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the sums over the matched samples of the gingival margin of all views."""
@@ -167,13 +167,13 @@ def _add_outline(sums: OutlineSums, equations: NormalEquations) -> None:
 
 @dataclass(frozen=True, eq=False)
 class StartTerm:
-    """Pull weakly towards the start, which keeps motions finite that the masks leave free."""
+    """A weak prior at the start pose, which bounds motions that the masks do not constrain."""
 
     start: Array  # T_world_upper and T_world_lower, shape (2, 4, 4)
     strength: Array  # precision of every component of the twists, in units of the outline sums, shape (2, 6)
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the pull at the state's poses."""
+        """Add the prior, linearised at the poses of a state."""
         for arch, weight in enumerate(equations.outline_weight):
             away = twist_between(self.start[arch], state.poses[arch], state.centres[arch])
             strength = weight * self.strength[arch]

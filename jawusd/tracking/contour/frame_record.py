@@ -1,4 +1,4 @@
-"""The result of one frame, why an arch was lost in it, and a compact store for the records of a whole take."""
+"""Results of single frames, reasons for lost arches, and a compact store for the frames of a whole take."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from jawusd.tracking.contour.quality import residual_px, score_px
 
 
 class Loss(NamedTuple):
-    """Name the check an arch failed, with the figure found and its limit in the unit of `LostReason`."""
+    """The check an arch failed, with the measured value and its limit in the unit of `LostReason`."""
 
     reason: LostReason
     value: float
     limit: float
 
 
-#: Of an arch that is not lost, or whose loss has no recorded reason.
+#: For an arch that is not lost, or whose loss has no recorded reason.
 NO_LOSS = Loss(LostReason.NONE, np.nan, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
-    """Hold what is known about one instant."""
+    """The result of one frame."""
 
-    solution: Solution  # the alignment; its poses of lost arches mean nothing
+    solution: Solution  # the alignment; poses of lost arches are invalid
     status: NDArray[np.int8]  # of both arches, as in `Tracks`, shape (2,)
     used: Mask  # masks that took part, shape (2, C)
     coverage: Array  # E_SP over mask pixels, shape (2, C); NaN without a mask
@@ -50,12 +50,12 @@ def whole_frames(records: Mapping[int, FrameRecord]) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class FrameSummary:
-    """Hold what the frames after an instant need to know about it.
+    """The part of a frame's result that later frames need.
 
     Attributes:
         poses: T_world_upper and T_world_lower, shape (2, 4, 4).
         status, used, coverage: as in `FrameRecord`.
-        score_px: contour that fits per arch and view, shape (2, C).
+        score_px: matched contour per arch and view [px], shape (2, C).
         residual_px: standard deviation of the residuals per arch, shape (2,).
     """
 
@@ -68,32 +68,32 @@ class FrameSummary:
 
     @classmethod
     def of(cls, record: FrameRecord) -> FrameSummary:
-        """Return what to keep of a frame."""
+        """Return the summary of a record."""
         solution = record.solution
         seen = (record.status, record.used, record.coverage)
         return cls(solution.poses, *seen, score_px(solution), residual_px(solution))
 
 
 _KEPT_FRAMES = 32
-_IN_MEMORY = 16 << 20  # bytes before there is a file: takes of a minute or two need none
-# Of a sum per arch and view; the first is a symmetric 6 x 6 matrix.
+_IN_MEMORY = 16 << 20  # bytes kept in memory before a file is used: enough for a minute or two
+# Shapes of the sums per arch and view; the first is a symmetric 6 x 6 matrix.
 _SUM_SHAPES = tuple(table.shape[2:] for table in OutlineSums.zeros(1))
 _LOWER = np.tril_indices(6)
-_MIRROR = np.empty((6, 6), np.int64)  # of a whole matrix, where its entries lie in the lower half
+_MIRROR = np.empty((6, 6), np.int64)  # index into the lower triangle for every entry of the full matrix
 _MIRROR[_LOWER] = _MIRROR[_LOWER[::-1]] = np.arange(len(_LOWER[0]))
 
 
 class PackedRecords(MutableMapping[int, FrameRecord]):
-    """Map frames to their records; each is packed when it is set and unpacked when it is looked up.
+    """A mapping of frames to records that packs them into a temporary file, so that long takes need little memory.
 
-    Poses and figures keep double precision. Sums over samples have single precision: they are sums of thousands of
-    distances known to a hundredth of a pixel. For one thread.
+    Poses and quality figures keep double precision. Sums over samples are stored in single precision: they are sums of
+    thousands of distances that are accurate to 0.01 px. Not thread-safe.
     """
 
     def __init__(self) -> None:
         self._store = _Store()
         self._places: dict[int, int] = {}
-        self._unpacked: dict[int, FrameRecord] = {}  # those looked up last: mostly frames beside one another
+        self._unpacked: dict[int, FrameRecord] = {}  # cache of the records last used: mostly neighbouring frames
 
     def __getitem__(self, frame: int) -> FrameRecord:
         if frame not in self._unpacked:
@@ -112,7 +112,7 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
         self._unpacked.pop(frame, None)
 
     def __contains__(self, frame: object) -> bool:
-        return frame in self._places  # by default, the record would be unpacked
+        return frame in self._places  # the default would unpack the record
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._places)
@@ -121,7 +121,7 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
         return len(self._places)
 
     def kept(self, frames: Iterable[int]) -> PackedRecords:
-        """Return the same records of some frames."""
+        """Return a mapping with some of the frames, sharing their storage."""
         out = PackedRecords()
         out._store = self._store
         out._places = {frame: self._places[frame] for frame in frames}
@@ -129,18 +129,18 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
 
 
 class _Store:
-    """Keep packed records one behind the other; what is replaced stays, for copies of the mapping may hold it."""
+    """An append-only file of packed records; replaced records stay, because other mappings may share them."""
 
     def __init__(self) -> None:
-        self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115  # open as long as this object is used
+        self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115  # open as long as this object exists
         self._end = 0
         weakref.finalize(self, self._file.close)
 
     def add(self, figures: Array, sums: NDArray[np.float32]) -> int:
-        """Write a record; return its place.
+        """Append a record; return its offset.
 
         Raises:
-            OutputError: the folder for such files is full.
+            OutputError: the temporary folder is full.
         """
         place = self._end
         try:
@@ -149,14 +149,14 @@ class _Store:
                 self._end += self._file.write(part.tobytes())
         except OSError as error:
             raise OutputError(
-                f"a long take cannot be kept there while it is tracked: {error.strerror}.",
+                f"cannot write the temporary file of a long take: {error.strerror}.",
                 path=tempfile.gettempdir(),
-                hint="Make room, or name another folder in TMPDIR.",
+                hint="Free disk space, or set TMPDIR to another folder.",
             ) from error
         return place
 
     def read(self, place: int) -> tuple[Array, NDArray[np.float32]]:
-        """Return the record at a place."""
+        """Return the record at an offset."""
         self._file.seek(place)
         figures, sums = np.frombuffer(self._file.read(16), np.int64).tolist()
         return (
@@ -179,7 +179,7 @@ def _packed(record: FrameRecord) -> tuple[Array, NDArray[np.float32]]:
 
 
 def _unpacked(figures: Array, sums: NDArray[np.float32]) -> FrameRecord:
-    # Besides poses, centres, status, losses and iterations there are three figures per arch and view.
+    # Poses, centres, status, losses and iterations have fixed sizes; three more arrays have an entry per arch and view.
     views = (len(figures) - 2 * 16 - 2 * 3 - 2 - 2 * 3 - 1) // (2 * 3)
     of_figures, of_sums = _places(views)
     poses, centres, visible, status, used, coverage, losses, iterations = _split(figures, of_figures)
@@ -201,7 +201,7 @@ _Places = list[tuple["slice[int, int, int]", tuple[int, ...]]]
 
 @lru_cache(maxsize=8)
 def _places(views: int) -> tuple[_Places, _Places]:
-    """Return where the arrays of figures and of sums lie in a packed record, and their shapes."""
+    """Return slices and shapes of the arrays in a packed record, of figures and of sums."""
     half = (len(_LOWER[0]),)
     figures = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
     sums = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]

@@ -1,7 +1,7 @@
-"""The crown-gum line of a scan as 3-D segments, where the crown runs on below the gum surface.
+"""The crown-gum line of a scan as 3-D segments, where the crown continues below the gum surface.
 
-Painted scans often carry whole crowns that dip into a separate gum surface. The border a camera sees is then the curve
-in which the two surfaces cut each other, which is no edge of either mesh.
+Painted scans often contain whole crowns that dip into a separate gum surface. The visible border is then the curve
+in which the two surfaces intersect, which is not an edge of either mesh.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Indices, Mask
 
-_SHORTEST_MM = 1e-3  # shorter pieces carry no direction
+_SHORTEST_MM = 1e-3  # shorter segments have no reliable direction
 
 
 def crown_gum_segments(
     vertices: Array, crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32]
 ) -> tuple[Array, Array]:
-    """Return the segments in which crown triangles cut gum triangles, and the way across them on the crown.
+    """Return the segments in which crown triangles intersect gum triangles, and directions across them on the crown.
 
-    End points [mm] have shape (S, 2, 3), the unit vectors in the crown's triangles perpendicular to the segments
-    (S, 3). Pieces shorter than 1 um are left out.
+    End points [mm] have shape (S, 2, 3). The unit vectors across lie in the crown triangles and are perpendicular to
+    the segments, shape (S, 3). Segments shorter than 1 um are dropped.
     """
     if not len(crown_faces) or not len(gum_faces):
         return np.zeros((0, 2, 3)), np.zeros((0, 3))
@@ -53,7 +53,7 @@ def _cells(low: Array, high: Array, cell: float) -> NDArray[np.int64]:
 
 @numba.njit(nogil=True, cache=True)
 def _box(triangle: Array, low: Array, cell: float, count: Indices, first: Indices, last: Indices) -> None:
-    """Write the first and last grid cell that the bounding box of a triangle meets."""
+    """Write the first and last grid cell that the bounding box of a triangle overlaps."""
     for k in range(3):
         a = min(triangle[0, k], triangle[1, k], triangle[2, k])
         b = max(triangle[0, k], triangle[1, k], triangle[2, k])
@@ -92,7 +92,7 @@ def _grid(triangles: Array, low: Array, cell: float, count: Indices) -> tuple[In
 def _cut(
     crown: Array, gum: Array, low: Array, cell: float, count: Indices, starts: Indices, items: Indices
 ) -> tuple[Array, Indices]:
-    """Return the segments common to crown and gum triangles, and their crown triangles; each pair is tested once."""
+    """Return the intersections of crown and gum triangles, and their crown triangles; each pair is tested once."""
     first = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
     first_g = np.empty(3, np.int64)
@@ -110,7 +110,7 @@ def _cut(
                     for q in range(starts[c], starts[c + 1]):
                         g = items[q]
                         _box(gum[g], low, cell, count, first_g, last_g)
-                        # Both boxes may share many cells; the pair belongs to the lowest one.
+                        # Both boxes may share many cells; the pair is tested in the lowest one.
                         if (
                             i != max(first[0], first_g[0])
                             or j != max(first[1], first_g[1])
@@ -131,7 +131,7 @@ def _cut(
 
 @numba.njit(nogil=True, cache=True)
 def _common_segment(a: Array, b: Array, points: Array) -> bool:
-    """Write the two ends of the segment common to two triangles; tell whether there is one."""
+    """Write the ends of the segment in which two triangles intersect; return whether there is one."""
     n = 0
     for e in range(3):
         if _pierce(a[e], a[(e + 1) % 3], b, points[n]):
@@ -155,7 +155,7 @@ def _common_segment(a: Array, b: Array, points: Array) -> bool:
 
 @numba.njit(nogil=True, cache=True)
 def _pierce(p: Array, q: Array, triangle: Array, out: Array) -> bool:
-    """Write the point in which segment pq passes through a triangle (Moeller & Trumbore 1997); tell whether it does."""
+    """Write the point where segment pq crosses a triangle (Moeller & Trumbore 1997); return whether it does."""
     dx, dy, dz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     ax, ay, az = triangle[1, 0] - triangle[0, 0], triangle[1, 1] - triangle[0, 1], triangle[1, 2] - triangle[0, 2]
     bx, by, bz = triangle[2, 0] - triangle[0, 0], triangle[2, 1] - triangle[0, 1], triangle[2, 2] - triangle[0, 2]

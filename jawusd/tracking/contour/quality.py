@@ -15,14 +15,14 @@ from jawusd.tracking.contour.equations import NormalEquations, ResidualTerm, Sol
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
-# How far the gum line is drawn off by at one tooth apart from the next, standard deviation [px].
+# Standard deviation of the gum-line error that is independent between teeth [px].
 _GUM_BY_TOOTH_PX = 0.3
 # E[w d^2] / E[w] of a unit normal residual under the Tukey weight at 4.685 standard deviations, by quadrature.
 _TUKEY_VARIANCE = 0.828
 
 
 def score_px(solution: Solution) -> Array:
-    """Return the contour length that fits its mask edges, closeness counted, per arch and view [px], shape (2, C)."""
+    """Return the matched contour length, weighted by closeness, per arch and view [px], shape (2, C)."""
     return solution.silhouette.score_px + solution.gingival_margin.score_px
 
 
@@ -32,14 +32,14 @@ def matched_px(solution: Solution) -> Array:
 
 
 def residual_px(solution: Solution) -> Array:
-    """Return the standard deviation of the matched residuals per arch [px], shape (2,); NaN without a match."""
+    """Return the standard deviation of the matched residuals per arch [px], shape (2,); NaN without matches."""
     with np.errstate(invalid="ignore", divide="ignore"):
         weight, square = _weight_and_square(solution)
         return np.sqrt(square.sum(1) / weight.sum(1) / _TUKEY_VARIANCE)
 
 
 def view_residual_px(solution: Solution) -> Array:
-    """Return the standard deviation of the matched residuals per arch and view [px], shape (2, C); NaN without any."""
+    """Return the standard deviation of the residuals per arch and view [px], shape (2, C); NaN without matches."""
     weight, square = _weight_and_square(solution)
     out = np.full(weight.shape, np.nan)
     np.divide(square, weight * _TUKEY_VARIANCE, out=out, where=weight > 0)
@@ -47,7 +47,7 @@ def view_residual_px(solution: Solution) -> Array:
 
 
 def _weight_and_square(solution: Solution) -> tuple[Array, Array]:
-    """Return these two of the sums over all matched samples: adding up all of them takes several times as long."""
+    """Return the weight and square sums over all matched samples, without adding the other sums."""
     edge, gum = solution.silhouette, solution.gingival_margin
     return edge.weight + gum.weight, edge.square + gum.square
 
@@ -55,7 +55,7 @@ def _weight_and_square(solution: Solution) -> tuple[Array, Array]:
 def uncovered_px(
     scans: Sequence[Scan], poses: Array, views: Sequence[View], in_threads: Mapper = map
 ) -> tuple[Array, Array]:
-    """Return E_SP of paper eq. 8, the mask pixels that the projected crowns leave uncovered, and all mask pixels.
+    """Return E_SP of eq. 8 of the paper, the mask pixels not covered by the projected crowns, and all mask pixels.
 
     Both are counts per arch and view, shape (2, C).
     """
@@ -73,16 +73,15 @@ def uncovered_px(
 
 
 def coverage_error(uncovered: Array, total: Array) -> Array:
-    """Return the share of every mask that stays uncovered, NaN without a mask, from what `uncovered_px` returned."""
+    """Return the uncovered share of every mask from the results of `uncovered_px`, NaN without a mask."""
     return np.where(total > 0, uncovered / np.maximum(total, 1), np.nan)
 
 
 def arch_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], uncovered_price: float) -> Array:
-    """Return how much of an arch's visible contour fits its masks, less the price of uncovered mask, shape (2,) [-].
+    """Return the matched share of each arch's visible contour, less the penalty for uncovered mask, shape (2,) [-].
 
-    The median over the views, so that one spoiled mask of three does not count; -inf where nothing is visible.
-
-    The price of an uncovered pixel is given in px of contour [1/px].
+    The median over the views, so that one wrong mask of three is ignored; -inf where nothing is visible.
+    `uncovered_price` is the penalty of an uncovered pixel in px of contour [1/px].
     """
     uncovered, _ = uncovered_px(scans, solution.poses, views)
     shares = (score_px(solution) - uncovered_price * uncovered) / np.maximum(solution.visible_px, 1.0)
@@ -100,10 +99,10 @@ def twist_covariance(solution: Solution, arch: int, sigma_px: float, correlation
     Args:
         arch: 0 upper, 1 lower.
         sigma_px: standard deviation of the mask outline.
-        correlation_px: contour length l over which the outline's errors move together: n pixels of contour hold n / l
+        correlation_px: correlation length l of outline errors along the contour: n pixels of contour contain n / l
             independent measurements.
 
-    Infinite on the diagonal where the masks leave a motion free.
+    Infinite on the diagonal if the masks do not constrain a motion.
     """
     H = solution.outline.precision[arch].sum(0)
     free = np.diag(np.full(6, np.inf))
@@ -118,10 +117,10 @@ def twist_covariance(solution: Solution, arch: int, sigma_px: float, correlation
 def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, correlation_px: float) -> Array | None:
     """Return the covariance of both arches' left twists about the world origin given masks and prior, shape (12, 12).
 
-    None where masks and prior leave a motion free.
+    None if masks and prior do not constrain a motion.
 
     Args:
-        prior: what else is known of the two poses, as log-likelihood.
+        prior: a further constraint on the two poses, as log-likelihood.
         sigma_px, correlation_px: as for `twist_covariance`, the former per arch, shape (2,).
     """
     equations = NormalEquations()
@@ -141,10 +140,10 @@ def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, c
 
 
 def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
-    """Return the contour length over which outline errors move together, as this frame shows it, shape (2,).
+    """Return the correlation length of outline errors along the contour, estimated from one frame [px], shape (2,).
 
-    tr(H^-1 S) / (6 sigma^2) with the scatter S of tiles is that length, but for the configured factor; NaN without a
-    match in every direction.
+    It is tr(H^-1 S) / (6 sigma^2) times the configured factor, with the scatter S of tiles; NaN if the matches do not
+    constrain every motion.
     """
     out = np.full(2, np.nan)
     sigma = residual_px(solution)
@@ -157,7 +156,7 @@ def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
 
 
 def crown_sigma_mm(scan: Scan, solution: Solution, arch: int, config: TrackingConfig) -> float:
-    """Return the rms standard deviation of the position of crown vertices [mm]; infinite if the masks leave it free."""
+    """Return the rms position uncertainty of crown vertices [mm]; infinite if the masks do not constrain it."""
     sigma = float(residual_px(solution)[arch])
     covariance = twist_covariance(solution, arch, sigma, config.correlation_px)
     if not np.isfinite(covariance).all():
@@ -170,7 +169,7 @@ def relative_covariance(T_world_upper: Array, covariance_upper: Array, covarianc
     """Return the covariance of the left twist of T_upper_lower about the skull origin, shape (..., 6, 6).
 
     T_true = T_u^-1 exp(x_l - x_u) T_u T to first order, so the twist is Ad(T_u^-1)(x_l - x_u); the arches' errors are
-    independent because no mask edge counts for both.
+    independent because no mask edge is matched by both.
     """
     A = se3_adjoint(se3_inverse(T_world_upper))
     return A @ (covariance_upper + covariance_lower) @ np.swapaxes(A, -1, -2)

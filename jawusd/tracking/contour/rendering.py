@@ -16,16 +16,16 @@ from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
-_AROUND_PX = 24  # drawn around the window, which follows the masks
-_LARGEST_ZOOM = 1.02  # of a picture against the drawn one
-_MOST_KEPT = 64  # drawings; every correction of cameras begins new ones
+_AROUND_PX = 24  # margin drawn around the window, since the window follows the masks
+_LARGEST_ZOOM = 1.02  # change of scale up to which a drawing is warped
+_MOST_KEPT = 64  # drawings; every camera correction adds new ones
 
 _Kept = tuple[Array, int]
 
 
 @dataclass(frozen=True, eq=False)
 class Contour:
-    """Which contour of a scan is sampled, and how; see `contour_samples`."""
+    """The scan and parameters of a contour; see `contour_samples`."""
 
     scan: Scan
     step_px: float
@@ -35,19 +35,19 @@ class Contour:
     def samples(
         self, matrix: Array, eye: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32]
     ) -> tuple[Array, int]:
-        """Return the samples in pictures of the scan; arguments and result as of `contour_samples`."""
+        """Return the samples in a drawing of the scan; arguments and result as for `contour_samples`."""
         limits = (self.step_px, self.depth_tolerance_mm)
         return contour_samples(self.scan, matrix, eye, labels, inverse_depth, *limits, self.towards_gum)
 
 
 class Drawing:
-    """Hold a scan drawn for one camera; pictures of it that has moved are this one warped.
+    """A scan drawn for one camera, which is warped to show small motions.
 
-    What of a scan is seen, and where its outline runs, depends on where the eye is in the scan's coordinates alone.
+    Visibility and outline of a scan depend only on the position of the eye in scan coordinates.
     """
 
     def __init__(self, scan: Scan, matrix: Array, eye: Array, shape: tuple[int, int]) -> None:
-        """Draw.
+        """Draw the scan.
 
         Args:
             scan: of one arch.
@@ -67,11 +67,11 @@ class Drawing:
         self._least_squares = np.linalg.pinv(drawn_at)  # of affine maps from here, shape (3, n)
 
     def shows(self, matrix: Array, eye: Array, shape: tuple[int, int], parallax_px: float) -> bool:
-        """Tell whether this drawing also shows the scan in another pose.
+        """Return whether this drawing can be warped to another pose.
 
         Args:
-            matrix, eye, shape: as for the drawing.
-            parallax_px: how far near and far parts may have moved against each other.
+            matrix, eye, shape: as for the constructor.
+            parallax_px: allowed motion between near and far parts.
         """
         centre, radius_mm = self._scan.centre, self._scan.radius_mm
         before, now = self._eye - centre, eye - centre
@@ -97,13 +97,13 @@ class Drawing:
         return np.column_stack([back, -back @ shift])
 
     def show(self, matrix: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32]) -> float:
-        """Write the pictures at a pose that the drawing shows; return by how much the scan has turned in them [rad].
+        """Write the drawing warped to a pose; return the rotation of the scan in the picture [rad].
 
         Args:
-            matrix: as for the drawing.
-            labels, inverse_depth: receive what is seen at every pixel of the window, and how near it is [1/mm].
+            matrix: as for the constructor.
+            labels, inverse_depth: receive the label and the inverse depth [1/mm] of every pixel of the window.
         """
-        if (_shifted(matrix, _AROUND_PX) == self._matrix).all():  # as drawn, or of a smaller window
+        if (_shifted(matrix, _AROUND_PX) == self._matrix).all():  # the same pose, possibly a smaller window
             window = tuple(slice(_AROUND_PX, _AROUND_PX + side) for side in labels.shape)
             labels[:], inverse_depth[:] = self._labels[window], self._inverse_depth[window]
             return 0.0
@@ -115,17 +115,17 @@ class Drawing:
         return float(np.arctan2(to_drawn[0, 1] - to_drawn[1, 0], to_drawn[0, 0] + to_drawn[1, 1]))
 
     def find_samples(self, contour: Contour) -> None:
-        """Sample a contour as drawn, unless that was done before."""
+        """Sample a contour in this drawing, unless it is cached."""
         if contour not in self._contours:
             self._contours[contour] = contour.samples(self._matrix, self._eye, self._labels, self._inverse_depth)
 
     def samples(self, contour: Contour, matrix: Array, shape: tuple[int, int], turned_rad: float) -> _Kept:
-        """Return the samples of a contour at a pose near one that was shown.
+        """Return the samples of a contour at a pose close to the one last shown.
 
         Args:
             contour: of this arch; the drawing may be of a scan with fewer faces.
-            matrix, shape: as for the drawing; of the pose.
-            turned_rad: as `show` returned it.
+            matrix, shape: as for the constructor, at that pose.
+            turned_rad: result of `show`.
 
         Returns:
             As `contour_samples`; a copy.
@@ -138,22 +138,23 @@ class Drawing:
 
 
 class Drawings:
-    """Keep the last drawing of every arch for every camera, from instant to instant."""
+    """A cache of the last drawing of every arch in every camera."""
 
     def __init__(self, scans: Sequence[Scan], parallax_px: float) -> None:
-        """Keep nothing yet; `parallax_px` as `Drawing.shows` takes it."""
+        """Start empty; `parallax_px` as for `Drawing.shows`."""
         self._scans, self._parallax_px = scans, parallax_px
         self._kept: dict[tuple[int, int, bytes], Drawing] = {}
 
     def of(
         self, arch: int, view: int, camera: Array, T_world_scan: Array, matrix: Array, shape: tuple[int, int]
     ) -> Drawing:
-        """Return a drawing that shows an arch in a pose.
+        """Return a drawing that can show an arch in a pose.
 
-        Safe to call from several threads for different arches or views.
+        Thread-safe for different arches or views.
 
         Args:
-            view: number of the view, of those of its instant.
+            arch: 0 upper, 1 lower.
+            view: index of the view.
             camera: camera centre in the world [mm], shape (3,).
             T_world_scan: the pose, shape (4, 4).
             matrix: projection from scan coordinates [mm] to homogeneous px of the window, shape (3, 4).
@@ -167,12 +168,12 @@ class Drawings:
         return kept
 
     def forget_old(self) -> None:
-        """Let go of all if there are too many."""
+        """Clear the cache if it is full."""
         if len(self._kept) > _MOST_KEPT:
             self.forget()
 
     def forget(self) -> None:
-        """Let go of all."""
+        """Clear the cache."""
         self._kept.clear()
 
 
@@ -180,7 +181,7 @@ class Drawings:
 def _moved(
     samples: Array, silhouettes: int, matrix: Array, cos: float, sin: float, height: int, width: int, out: Array
 ) -> tuple[int, int]:
-    """Write samples as they lie at another pose, those within the window; return how many, and how many silhouettes."""
+    """Write the samples at another pose that lie in the window; return their number, and that of silhouettes."""
     n, first = 0, 0
     for s in range(len(samples)):
         x, y, z = samples[s, X], samples[s, Y], samples[s, Z]
@@ -201,7 +202,7 @@ def _moved(
 
 
 def _shifted(matrix: Array, px: float) -> Array:
-    """Return a projection (3, 4) to pixels that count from so many further up and left."""
+    """Return a projection (3, 4) with the pixel origin moved up and left by `px`."""
     out = matrix.copy()
     out[:2] += px * matrix[2]
     return out
@@ -215,32 +216,33 @@ def _px_per_mm(matrix: Array, point: Array) -> float:
 
 
 def projected(matrix: Array, points: Array) -> Array:
-    """Return where a projection (3, 4) shows points (n, 3) [px], shape (n, 2)."""
+    """Return the pixels of points (n, 3) under a projection (3, 4), shape (n, 2)."""
     h = points @ matrix[:, :3].T + matrix[:, 3]
     return np.asarray(h[:, :2] / h[:, 2:])
 
 
-_CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])  # of a ball, that show its motion
+# Points of a unit ball whose projections reveal motion.
+_CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
 
 
 class Rendering:
-    """Keep pictures and contours of both scans in every view of one instant, made again only after they have moved.
+    """Pictures and contours of both scans in every view of one instant, redrawn only after they have moved.
 
-    Until then the points of a contour move with the scan. That its outline runs through other points then, as it turns,
-    is of second order.
+    In between, the points of a contour move with the scan. The error is of second order: a turned outline runs through
+    other points.
     """
 
     def __init__(
         self, views: Sequence[View], contours: Sequence[Contour], drawings: Drawings, redraw_px: float, map: Mapper
     ) -> None:
-        """Show nothing yet.
+        """Start without pictures.
 
         Args:
             views: of the instant.
-            contours: of the upper and lower arch, found while drawing.
-            drawings: where drawings of earlier instants are kept.
-            redraw_px: by how much an arch may move before it is drawn again.
-            map: shares the drawing among threads.
+            contours: of the upper and lower arch, sampled while drawing.
+            drawings: cache shared between instants.
+            redraw_px: motion after which an arch is drawn again.
+            map: distributes the drawing among threads.
         """
         self._contours, self._drawings, self._redraw_px, self._map = contours, drawings, redraw_px, map
         self._views = views
@@ -252,7 +254,7 @@ class Rendering:
         self.depths = [np.zeros(shape, np.float32) for shape in shapes]
 
     def update(self, poses: Array) -> None:
-        """Show the scans anew whose projection has moved by more than the allowed pixels."""
+        """Redraw the scans whose projection has moved by more than the allowed distance."""
 
         def show(task: tuple[int, int]) -> None:
             self._show(*task, poses[task[0]])
@@ -262,10 +264,10 @@ class Rendering:
         list(self._map(show, tasks))
 
     def samples(self, contour: Contour, r: int, c: int, pose: Array) -> tuple[Array, int]:
-        """Return the samples of a contour in a view, moved to a pose near the one the view shows it in.
+        """Return the samples of a contour in a view, moved to a pose close to the drawn one.
 
         Args:
-            contour: of the arch; the pictures may be of a scan with fewer faces.
+            contour: of the arch; the drawing may be of a scan with fewer faces.
             r, c: arch and view.
             pose: T_world_arch at the view's instant, shape (4, 4).
 
@@ -289,6 +291,6 @@ class Rendering:
         T_world_scan = view.T_delay[r] @ pose
         matrix = view.matrix @ T_world_scan
         drawing = self._drawings.of(r, c, view.eye, T_world_scan, matrix, labels.shape)
-        drawing.find_samples(self._contours[r])  # here, where threads draw several views side by side
+        drawing.find_samples(self._contours[r])  # here, because threads run this for several views in parallel
         at = projected(view.matrix @ pose, self._corners[r])
         self._shown[r, c] = (at, drawing, drawing.show(matrix, labels, depth))

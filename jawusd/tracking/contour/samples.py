@@ -1,6 +1,6 @@
 """Points on the visible contour of a projected scan: silhouette edges, scan borders and the gingival margin.
 
-Every compiled function here releases the GIL and keeps no state.
+The compiled functions release the GIL and are stateless.
 """
 
 from __future__ import annotations
@@ -12,23 +12,21 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.tracking.contour.scan import CROWN, GUM, Faces, Scan
 
-# Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the picture, contour length it
-# stands for [px], inverse depth [1/mm]; then how the habits of whoever drew the mask shift its outline along the
-# normal: share of a free edge and of gum line [-], and pixels per mm of gum line moved along the crown's surface.
+# Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the picture, represented contour
+# length [px], inverse depth [1/mm]; then the effect of annotator habits on the outline along the normal: share of free
+# edge and of gum line [-], and pixels per mm by which the gum line is moved along the crown surface.
 X, Y, Z, U, V, NX, NY, LENGTH, INVERSE_DEPTH, EDGE_SHARE, GUM_SHARE, GUM_SLOPE = range(12)
 COLUMNS = 12
 HABITS = slice(EDGE_SHARE, COLUMNS)  # an outline shifts by samples[:, HABITS] @ (edge px, gum px, gum mm)
 
-# How far from visible gum an outline counts as gum line at all, and in full [mm]: nearer than the first, brushes of
-# half a millimetre blur the two.
+# Distance from visible gum at which an outline starts to count as gum line, and counts fully [mm]: brushes half a
+# millimetre wide blur the two.
 _GUM_FAR_MM, _GUM_NEAR_MM = 1.0, 0.55
-# Cosine to the direction of the gum from which outlines of crowns without gum begin to count as gum line, and count in
-# full [-]: only free edges are none for sure, since papillae hide the sides. Chosen on the first 8 such persons of
-# `tests/benchmarks/population.py --seed 9300`: with sides as edges (0.3, 0.6) NEES was 1.24, 1.51 and 1.40 (upper,
-# lower, relative), with these 1.16, 1.11 and 1.13, of the same errors.
+# For scans without gum: cosine to the gum direction at which an outline starts to count as gum line, and counts fully
+# [-]. Only the biting edges surely are not, since papillae hide the sides of crowns.
 _LEAST_FACING, _FULL_FACING = -0.6, -0.2
-# How far a sample reaches for others that lie outside of it, how far outside, for itself and per px along the outline,
-# these must lie, and how far the two must face the same way (cosine).
+# Two samples belong to the same outline within this distance [px] and with at least this cosine between normals. The
+# inner one is dropped if the other lies farther out by the offset [px] plus the slope times their distance along it.
 _BESIDE_PX, _OUTSIDE_PX, _OUTSIDE_SLOPE, _SAME_WAY = 1.5, 0.05, 0.35, 0.3
 
 
@@ -44,18 +42,17 @@ def contour_samples(
 ) -> tuple[Array, int]:
     """Return the contour points at which the picture changes from crown to anything else, shape (n, COLUMNS).
 
-    Those of the silhouette come first, then those of the gingival margin; the second result counts the first.
+    Silhouette samples come first, then those of the gingival margin; the second result is the number of the first.
 
     Args:
         matrix: projection from scan coordinates [mm] to homogeneous px of the region, shape (3, 4).
         eye: camera centre in scan coordinates [mm], shape (3,).
-        labels: what is seen at every pixel of the region: CROWN, GUM or 0, shape (h, w).
-        inverse_depth: its inverse depth [1/mm], shape (h, w).
+        labels: visible label of every pixel of the region: CROWN, GUM or 0, shape (h, w).
+        inverse_depth: inverse depth [1/mm], shape (h, w).
         step_px: largest distance between samples.
-        depth_tolerance_mm: how much nearer the surface just inside the contour may be before the contour counts as
-            hidden behind it.
-        towards_gum: unit vector in scan coordinates, shape (3,), for scans that end at the gum without showing it:
-            outlines that face this way are gum line.
+        depth_tolerance_mm: how much nearer the surface just inside the contour may be before it hides the contour.
+        towards_gum: unit vector in scan coordinates, shape (3,), for scans without gum: outlines facing this direction
+            are gum line.
     """
     gum = np.zeros(3) if towards_gum is None else towards_gum
     tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges, scan.gingival_margin, scan.margin_directions)
@@ -82,7 +79,7 @@ def _samples(
     tolerance_mm: float,
     towards_gum: Array,
 ) -> tuple[Array, int]:
-    """Return what `contour_samples` does, of the tables of a scan."""
+    """Implement `contour_samples` on the tables of a scan."""
     px_per_mm = _px_per_mm(matrix, centre)
     candidates = _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, labels.shape)
     facing = _in_picture(matrix, towards_gum)
@@ -103,7 +100,7 @@ def _px_per_mm(matrix: Array, point: Array) -> float:
 
 @numba.njit(nogil=True, cache=True)
 def _in_picture(matrix: Array, direction: Array) -> Array:
-    """Return how far a direction (3,) of the scan points right and down in the picture, shape (2,)."""
+    """Return the components of a scan direction (3,) to the right and down in the picture, shape (2,)."""
     away = matrix[2, :3] / np.sqrt((matrix[2, :3] ** 2).sum())
     out = np.empty(2)
     for k in range(2):
@@ -131,7 +128,7 @@ def _silhouette(
     step_px: float,
     shape: tuple[int, int],
 ) -> Array:
-    """Sample the edges between faces turned to and away from the eye, and all borders, inside the region."""
+    """Sample edges between front and back faces, and all borders, inside the region."""
     front = np.empty(len(faces), np.bool_)
     for f in range(len(faces)):
         front[f] = planes[f, 0] * eye[0] + planes[f, 1] * eye[1] + planes[f, 2] * eye[2] > planes[f, 3]
@@ -160,7 +157,7 @@ def _silhouette(
         if k in (i, j):
             k = faces[f, 2]
         uk, vk, wk = _pixel(matrix, vertices[k, 0], vertices[k, 1], vertices[k, 2])
-        if nx * (uk - ui) + ny * (vk - vi) > 0:  # outward is away from the face's third corner
+        if nx * (uk - ui) + ny * (vk - vi) > 0:  # the normal points away from the face's third corner
             nx = -nx
             ny = -ny
         pieces = max(1, int(np.ceil(length / step_px)))
@@ -177,7 +174,7 @@ def _silhouette(
             sample[NX], sample[NY] = nx, ny
             sample[LENGTH] = length / pieces
             sample[INVERSE_DEPTH] = 1.0 / w
-            # Where the crown ends, it runs into gum, or was cut off with it.
+            # A border of the crown lies at the gum, or was cut off there.
             sample[GUM_SHARE] = 1.0 if g < 0 else 0.0
             sample[GUM_SLOPE] = _border_slope(vertices, i, j, k, sample, matrix, w) if g < 0 else 0.0
             n += 1
@@ -186,7 +183,7 @@ def _silhouette(
 
 @numba.njit(nogil=True, cache=True)
 def _border_slope(vertices: Array, i: int, j: int, k: int, sample: Array, matrix: Array, w: float) -> float:
-    """Return by how many pixels a border ij moves along its normal per mm in its triangle, away from corner k."""
+    """Return the motion of a border ij along its normal per mm within its triangle, away from corner k [px/mm]."""
     ex, ey, ez = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
     tx, ty, tz = sample[X] - vertices[k, 0], sample[Y] - vertices[k, 1], sample[Z] - vertices[k, 2]
     along = (tx * ex + ty * ey + tz * ez) / max(ex * ex + ey * ey + ez * ez, 1e-18)
@@ -197,7 +194,7 @@ def _border_slope(vertices: Array, i: int, j: int, k: int, sample: Array, matrix
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _shift_px(sample: Array, matrix: Array, w: float, tx: float, ty: float, tz: float) -> float:
-    """Return how far a sample moves along its normal [px] if its point moves by (tx, ty, tz) [mm]."""
+    """Return the motion of a sample along its normal [px] if its point moves by (tx, ty, tz) [mm]."""
     depth = matrix[2, 0] * tx + matrix[2, 1] * ty + matrix[2, 2] * tz
     across = matrix[0, 0] * tx + matrix[0, 1] * ty + matrix[0, 2] * tz - sample[U] * depth
     down = matrix[1, 0] * tx + matrix[1, 1] * ty + matrix[1, 2] * tz - sample[V] * depth
@@ -219,7 +216,7 @@ def _visible(
     px_per_mm: float,
     facing_gum: Array,
 ) -> Array:
-    """Keep samples whose own surface is visible on the inner side, with no crown on the outer; tell edge from gum."""
+    """Keep samples with their own surface visible on the inner side and no crown outside; classify edge and gum."""
     out = np.empty_like(samples)
     height, width = labels.shape
     shows_gum = facing_gum[0] == 0.0 and facing_gum[1] == 0.0
@@ -251,14 +248,14 @@ def _visible(
 
 @numba.njit(nogil=True, cache=True)
 def _outermost(samples: Array, shape: tuple[int, int]) -> Array:
-    """Leave out samples that lie inside of the outline by less than the pixel that `_visible` can tell.
+    """Drop samples that lie inside the outline by less than the pixel that `_visible` resolves.
 
-    Where a rounded edge has many small faces, or noise, several lines of them turn away from the eye within a pixel.
-    Only the outermost is the outline; with the others, it lies 0.03 to 0.05 px inside of where it is seen.
+    At a rounded edge with small or noisy faces, several silhouette lines can lie within a pixel. Only the outermost is
+    the outline; the others would bias it inwards by 0.03 to 0.05 px.
     """
     rows, columns = int(shape[0] / _BESIDE_PX) + 3, int(shape[1] / _BESIDE_PX) + 3
-    last = np.full((rows, columns), -1, np.int32)  # sample of every cell
-    before = np.empty(len(samples), np.int32)  # in the same cell
+    last = np.full((rows, columns), -1, np.int32)  # last sample of every cell
+    before = np.empty(len(samples), np.int32)  # previous sample of the same cell
     for s in range(len(samples)):
         j, i = int(samples[s, V] / _BESIDE_PX) + 1, int(samples[s, U] / _BESIDE_PX) + 1
         before[s] = last[j, i]
@@ -274,7 +271,7 @@ def _outermost(samples: Array, shape: tuple[int, int]) -> Array:
 
 @numba.njit(nogil=True, cache=True)
 def _has_one_outside(samples: Array, s: int, last: NDArray[np.int32], before: NDArray[np.int32]) -> bool:
-    """Tell whether another sample of the same outline lies outside of one."""
+    """Return whether another sample of the same outline lies outside of sample s."""
     u, v, nx, ny = samples[s, U], samples[s, V], samples[s, NX], samples[s, NY]
     j, i = int(v / _BESIDE_PX) + 1, int(u / _BESIDE_PX) + 1
     for row in range(j - 1, j + 2):
@@ -292,19 +289,19 @@ def _has_one_outside(samples: Array, s: int, last: NDArray[np.int32], before: ND
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _nearer(seen: float, own: float, tolerance_mm: float) -> bool:
-    """Tell whether an inverse depth lies more than the tolerance in front of another one."""
+    """Return whether the seen inverse depth is in front of another one by more than the tolerance."""
     return seen * (1.0 - tolerance_mm * own) > own
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _gum_distance_px(labels: NDArray[np.uint8], u: float, v: float, reach_px: float) -> float:
-    """Return how far the nearest pixel lies that shows gum [px]; the reach if none is nearer."""
+    """Return the distance to the nearest pixel with gum [px], at most the reach."""
     i = pixel_of(u)
     j = pixel_of(v)
     height, width = labels.shape
     n = int(reach_px)
     best = reach_px * reach_px
-    for dy in range(n + 1):  # from the pixel outwards, until nothing nearer can follow
+    for dy in range(n + 1):  # outwards, until no nearer pixel can follow
         if dy * dy >= best:
             break
         for y in (j - dy, j + dy):
@@ -331,8 +328,8 @@ def _gingival_margin(
     inverse_depth: NDArray[np.float32],
     tolerance_mm: float,
 ) -> Array:
-    """Sample the gingival margin where crown is seen on one side and gum on the other; outward is towards the gum."""
-    reach = 1.5  # px: the nearest pixels that surely belong to one side
+    """Sample the gingival margin where crown is visible on one side and gum on the other; normals point to the gum."""
+    reach = 1.5  # px: the nearest pixels that lie entirely on one side
     out = np.empty((len(segments), COLUMNS))
     height, width = labels.shape
     n = 0
@@ -364,7 +361,7 @@ def _gingival_margin(
         out[n, X], out[n, Y], out[n, Z], out[n, U], out[n, V] = x, y, z, u, v
         out[n, NX], out[n, NY], out[n, LENGTH], out[n, INVERSE_DEPTH] = nx / reach, ny / reach, length, 1.0 / w
         out[n, EDGE_SHARE], out[n, GUM_SHARE] = 0.0, 1.0
-        # Whichever way along the surface the gum lies, it is the way of the normal in the picture.
+        # Positive towards the gum, like the normal, whichever way the direction points.
         out[n, GUM_SLOPE] = abs(_shift_px(out[n], matrix, w, directions[s, 0], directions[s, 1], directions[s, 2]))
         n += 1
     return out[:n]

@@ -1,4 +1,4 @@
-"""A teeth scan prepared for tracking: crowns with an edge table, gum as occluder, the crown-gum line."""
+"""A teeth scan prepared for tracking: crowns with an edge table, gum as occluder, and the crown-gum line."""
 
 from __future__ import annotations
 
@@ -19,66 +19,66 @@ from jawusd.meshes.decimation import decimated_scan
 from jawusd.meshes.raster import draw_depth_labels, draw_silhouette, project, words_for
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments
 
-#: Vertex indices of faces, or other tables of indices that compiled code reads.
+#: Vertex indices of faces, or other index tables for compiled code.
 Faces = NDArray[np.int32]
 
 ARCHES = (0, 1)
 ARCH_NAMES = ("upper", "lower")
 CROWN, GUM = 1, 2  # labels of a drawn scan; 0 is empty
 
-_PROBES = 300  # enough for a mean over the crowns to one per cent
-# Crown faces above which most steps use a thinned scan, and how many that one keeps: thinning from 20,000 to 5,000
-# costs 0.002 mm at 1 px of mask noise, and time goes with the faces.
+_PROBES = 300  # vertices: enough for a mean over the crowns to one per cent
+# Crown faces above which most steps use a decimated scan, and crown faces of that: the loss of accuracy is below
+# 0.002 mm, and time is proportional to the faces.
 _DENSE_FACES, _THIN_FACES = 60_000, 20_000
-_GUM_SHARE = 0.02  # gum faces for each crown face below which they are remains of what was cut away
-_FEWEST_CROWN_FACES = 100  # fewer cannot show a contour in several directions
+_GUM_SHARE = 0.02  # gum faces per crown face below which they are leftovers of removed gum
+_FEWEST_CROWN_FACES = 100  # fewer have no contour in several directions
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Hold one arch ready for projection."""
+    """One arch, ready for projection."""
 
     name: str  # "upper" or "lower"
     vertices: Array  # welded vertices in scan coordinates [mm], float64, shape (V, 3)
     vertices_single: NDArray[np.float32]  # the same in float32 for the rasteriser
-    crown_faces: Faces  # faces to be matched, int32, shape (F, 3)
-    gum_faces: Faces  # faces that only hide what lies behind them, int32, shape (G, 3)
+    crown_faces: Faces  # faces whose contour is matched, int32, shape (F, 3)
+    gum_faces: Faces  # faces that only occlude, int32, shape (G, 3)
     planes: Array  # normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used
     edges: Faces  # vertex, vertex, face, other face or -1 at a border, int32, shape (E, 4)
-    gingival_margin: Array  # segments of the crown-gum line that are no mesh edges [mm], shape (S, 2, 3)
+    gingival_margin: Array  # segments of the crown-gum line that are not mesh edges [mm], shape (S, 2, 3)
     margin_directions: Array  # unit vectors on the crown across these segments, shape (S, 3)
-    probes: Array  # some vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
+    probes: Array  # vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
     centre: Array  # centroid of the crown vertices [mm], shape (3,)
     radius_mm: float  # largest distance of a crown vertex from the centre
-    # whether labels or paint told crown from gum; otherwise the whole scan counts as crown. Painted crowns are wound
-    # outwards, so faces turned away need not be drawn
+    # whether labels or paint separate crown from gum; otherwise the whole scan counts as crown. Painted crowns are
+    # wound outwards, so back faces need not be drawn
     painted: bool
-    # the same arch with fewer faces, for all but the last steps; None where this one is thin enough
+    # the same arch with fewer faces, for all but the last steps; None if this one has few enough
     thin: Scan | None = None
 
     @property
     def shows_gum(self) -> bool:
-        """Tell whether gum lies around the crowns."""
+        """Whether the scan contains gum around the crowns."""
         return len(self.gum_faces) > _GUM_SHARE * len(self.crown_faces)
 
     def crown_vertices(self, limit: int | None = None) -> Array:
-        """Return the vertices of the crowns [mm], shape (N, 3), at most about `limit` of them."""
+        """Return the vertices of the crowns [mm], about `limit` of them at most, shape (N, 3)."""
         points = self.vertices[np.unique(self.crown_faces)]
         return points if limit is None else points[:: max(1, len(points) // limit)]
 
     def silhouette(self, matrix: Array, shape: tuple[int, int], left: int = 0, top: int = 0) -> NDArray[np.uint64]:
-        """Return the pixels that the crowns cover in a picture of (h, w), as bit rows.
+        """Return the pixels covered by the crowns in a picture of (h, w), as packed bits.
 
         Args:
             matrix: projection from scan coordinates [mm] to homogeneous px, shape (3, 4).
-            left, top: pixel at the picture's first column and row.
+            left, top: pixel coordinates of the picture's first column and row.
         """
         bits = np.zeros((shape[0], words_for(shape[1])), np.uint64)
         draw_silhouette(self._projected(matrix), self.crown_faces, left, top, shape[1], self.painted, bits)
         return bits
 
     def draw(self, matrix: Array, depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> None:
-        """Draw inverse depth [1/mm] and CROWN or GUM into pictures (h, w) of zeros; `matrix` as for `silhouette`."""
+        """Draw inverse depth [1/mm] and labels into zeroed pictures (h, w); `matrix` as for `silhouette`."""
         points = self._projected(matrix)
         draw_depth_labels(points, self.crown_faces, 0, 0, self.painted, depth, labels, CROWN)
         draw_depth_labels(points, self.gum_faces, 0, 0, False, depth, labels, GUM)
@@ -90,12 +90,12 @@ class Scan:
 
 
 def probe_points(scans: Sequence[Scan]) -> Array:
-    """Return a dozen points of each arch, which show any motion of it, scan coordinates [mm], shape (2, 12, 3)."""
+    """Return twelve points spread over each arch, in scan coordinates [mm], shape (2, 12, 3)."""
     return np.stack([scan.probes[np.linspace(0, len(scan.probes) - 1, 12).astype(int)] for scan in scans])
 
 
 def teeth_centre(scans: Sequence[Scan], poses: Array) -> Array:
-    """Return the point amid both arches in the world [mm], shape (3,), at T_world_scan (2, 4, 4)."""
+    """Return the centre of both arches in the world [mm], shape (3,), at T_world_scan (2, 4, 4)."""
     return np.mean([transform_point(pose, scan.centre) for pose, scan in zip(poses, scans, strict=True)], axis=0)
 
 
@@ -103,8 +103,8 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
     """Split a teeth scan into crowns and gum and build the tables of the contour search.
 
     Args:
-        mesh: the teeth scan; its labels, else its paint say what is crown, see `formats.mesh.tooth_labels`. Without
-            either the whole scan counts as crown.
+        mesh: the teeth scan. Crowns are found from its labels, or else its paint (see `formats.mesh.tooth_labels`);
+            without either, the whole scan counts as crown.
         name: "upper" or "lower", for messages.
 
     Raises:
@@ -121,7 +121,7 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
     if len(crown_faces) < _FEWEST_CROWN_FACES:
         raise TrackingError(
             f"{name} teeth scan: {len(crown_faces)} tooth faces, at least {_FEWEST_CROWN_FACES} are needed",
-            hint="Check the scan file, and with jawusd scans what is taken for crown.",
+            hint="Check the scan file, and which faces `jawusd scans` labels as crown.",
         )
     scan = _with_tables(name, vertices, crown_faces, gum_faces, painted)
     if len(crown_faces) <= _DENSE_FACES:
@@ -130,17 +130,17 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
 
 
 def thinned(scan: Scan, crown_faces: int) -> Scan:
-    """Return the same arch with about so many crown faces, or as it is if it has no more."""
+    """Return the arch decimated to about `crown_faces` crown faces; unchanged if it has no more."""
     if len(scan.crown_faces) <= crown_faces:
         return scan
     parts = decimated_scan(scan.vertices, scan.crown_faces, scan.gum_faces, crown_faces)
     thin = _with_tables(scan.name, *parts, scan.painted)
-    # Steps turn about the centre, so both must have the same.
+    # Twists are about the centre, so both scans must share it.
     return replace(thin, probes=scan.probes, centre=scan.centre, radius_mm=scan.radius_mm)
 
 
 def mirrored(scan: Scan, point: Array, normal: Array) -> Scan:
-    """Return the mirror image of an arch; the mirror passes through a point [mm] across a unit normal, both (3,)."""
+    """Return the mirror image of an arch in the plane through a point [mm] with a unit normal, both (3,)."""
     vertices = scan.vertices - 2.0 * np.outer((scan.vertices - point) @ normal, normal)
     crown, gum = (np.ascontiguousarray(faces[:, ::-1]) for faces in (scan.crown_faces, scan.gum_faces))
     return _with_tables(scan.name, vertices, crown, gum, scan.painted)
@@ -177,15 +177,15 @@ def _with_tables(
 
 
 def _weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
-    """Merge vertices at the same place: triangle soups would otherwise consist of borders only."""
+    """Merge coincident vertices: in a triangle soup, every edge would otherwise be a border."""
     places, index = welded(vertices)
     return places, np.ascontiguousarray(index[faces], np.int32)
 
 
 def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
-    """Return the faces with those connected pieces turned round that enclose a negative volume.
+    """Return the faces, with connected components of negative volume flipped.
 
-    Volumes are taken about each piece's own centre, so the open base of a crown adds little.
+    Volumes are taken about each component's own centre, so the open base of a crown adds little.
     """
     links = coo_array(
         (np.ones(3 * len(faces)), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), [len(vertices)] * 2
@@ -204,7 +204,7 @@ def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
 def _edge_table(faces: Faces) -> Faces:
     """Return vertex, vertex, face, other face (-1 at a border) of every edge, shape (E, 4).
 
-    Where more than two faces meet in an edge, all but the first two are paired off as edges of their own.
+    If more than two faces share an edge, the remaining ones are paired as separate edges.
     """
     pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(len(faces), dtype=np.int32), 3)

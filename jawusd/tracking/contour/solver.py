@@ -31,15 +31,15 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
-_ROUGH_FACES = 6_000  # of a crown row in trials: a third of a thinned scan's
-_DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
+_ROUGH_FACES = 6_000  # crown faces of an arch in short trials: a third of a decimated scan
+_DENSE_STEPS = 2  # with all faces of a dense scan, after the decimated one has converged
 
-# samples, how many of them are silhouette, their distances to the mask edge, visible contour length [px]
+# Samples, number of silhouette samples, distances to the mask edge, visible contour length [px].
 _Match = tuple[Array, int, Array, float]
 
 
 class Matched(NamedTuple):
-    """Hold the samples of an arch in a view with their distances to the mask edge, and the gate of their residuals."""
+    """The samples of an arch in a view, their distances to the mask edge, and the residual gate."""
 
     arch: int
     camera: int
@@ -49,7 +49,7 @@ class Matched(NamedTuple):
 
 
 class ContourSolver:
-    """Align two scans with masks; keeps buffers, so one solver serves one thread of control."""
+    """Aligns two scans with masks. Keeps a cache, so it is not thread-safe."""
 
     def __init__(self, scans: Sequence[Scan], config: TrackingConfig, executor: Executor | None = None) -> None:
         self.scans = tuple(scans)
@@ -61,33 +61,33 @@ class ContourSolver:
         towards_gum = _towards_gum(self.scans)
         self.contours = tuple(Contour(scan, *limits, way) for scan, way in zip(self.scans, towards_gum, strict=True))
         thin = [scan.thin or scan for scan in self.scans]
-        #: The same of scans with fewer faces; None where all have few.
+        #: The same for decimated scans; None if no scan is dense.
         self.thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
         self._executor = executor
-        #: What was drawn last; its pictures serve as long as they show nearly the same.
+        #: Cache of the last drawings.
         self.drawings = Drawings(self.scans, config.parallax_px)
 
     @cached_property
     def rough(self) -> ContourSolver:
-        """Return a solver of scans with few faces, for trials of which most are given up."""
+        """A solver of coarse scans, for short trials."""
         scans = [thinned(replace(scan.thin or scan, thin=None), _ROUGH_FACES) for scan in self.scans]
         return ContourSolver(scans, self.config, self._executor)
 
     def exact(self) -> ContourSolver:
-        """Return a solver of the same scans that draws them at every pose.
+        """Return a solver of the same scans that never warps drawings.
 
-        Searches need it: they rank poses by what they leave uncovered, in small pictures, and in any order.
+        Searches need it: they rank poses by uncovered pixels in small pictures, and jump between poses.
         """
         return ContourSolver(self.scans, replace(self.config, parallax_px=0.0), self._executor)
 
     def rendering(self, views: Sequence[View]) -> Rendering:
-        """Return a rendering of both scans in the views of one instant, to be shared by all that align there."""
+        """Return a rendering of both scans in the views of one instant, to be shared by all alignments there."""
         return Rendering(views, self.contours, self.drawings, self.config.redraw_px, self.map)
 
     def forget_drawings(self) -> None:
-        """Draw all scans anew the next time: poses then depend on nothing that was aligned before."""
+        """Clear the drawing cache, so that poses do not depend on earlier alignments."""
         self.drawings.forget()
-        for solver in (self.thin, self.__dict__.get("rough")):  # asking for it would make it
+        for solver in (self.thin, self.__dict__.get("rough")):  # the property would create it
             if solver is not None:
                 solver.forget_drawings()
 
@@ -106,11 +106,11 @@ class ContourSolver:
         Args:
             poses: start T_world_upper, T_world_lower, shape (2, 4, 4).
             views: one picture per camera.
-            gates_px: residual gate of every iteration; without any, the poses are judged where they are.
-            use: masks that take part, shape (2, C); by default all present ones.
-            terms: what constrains the poses besides the masks.
+            gates_px: residual gate of every iteration; if empty, the given poses are only evaluated.
+            use: masks to use, shape (2, C); default: all present ones.
+            terms: further constraints on the poses.
             outline_weight: as in `NormalEquations`; needed if the terms are log-likelihoods.
-            rendering: of these views by this solver, to share with other looks at them.
+            rendering: of these views by this solver, shared with other alignments.
         """
         use = present_masks(views) if use is None else use
         if self.thin is None or not gates_px:
@@ -147,7 +147,7 @@ class ContourSolver:
             for r in ARCHES:
                 poses[r] = motion_about(state.centres[r], step[r]) @ poses[r]
             left = self.config.gates_after(left, self._motion_mm(step))
-        if iterations:  # else rounding errors would grow, as predictions multiply poses frame after frame
+        if iterations:  # otherwise rounding errors accumulate, as predictions multiply poses frame after frame
             poses = orthonormalise(poses)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
@@ -163,14 +163,14 @@ class ContourSolver:
         final: bool = False,
         matched: list[Matched] | None = None,
     ) -> Solution:
-        """Find correspondences at the given poses and sum up their residuals.
+        """Find correspondences at the given poses and sum their residuals.
 
         Args:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            views, use: one picture per camera, and which masks take part, shape (2, C).
-            gate: residual beyond which a sample counts for nothing [px].
-            rendering: of these views; share one among all steps at an instant.
-            final: also sum up what the covariance needs.
+            views, use: one picture per camera, and the masks to use, shape (2, C).
+            gate: residual beyond which a sample has no weight [px].
+            rendering: of these views, shared by all steps at an instant.
+            final: also compute the sums for the covariance.
             matched: receives the samples behind the sums.
         """
         config = self.config
@@ -224,25 +224,25 @@ class ContourSolver:
         return samples, silhouettes, distances - samples[:, HABITS] @ view.habits[r], visible
 
     def _final_gate(self, distances: list[Array], gate: float) -> float:
-        """Return the Tukey gate that suits the spread of the residuals (median absolute deviation)."""
+        """Return the Tukey gate for the spread of the residuals (median absolute deviation)."""
         d = np.concatenate(distances) if distances else np.empty(0)
         d = np.abs(d[np.isfinite(d)])
         d = np.sort(d[d < gate])
         if len(d) < 20:
             return gate
-        median = 0.5 * float(d[(len(d) - 1) // 2] + d[len(d) // 2])  # np.median takes several times as long
+        median = 0.5 * float(d[(len(d) - 1) // 2] + d[len(d) // 2])  # np.median is several times slower
         low, high = self.config.final_gate_px
         return min(max(self.config.gate_sigmas * 1.4826 * median, low), high)
 
     def _motion_mm(self, step: Array) -> float:
-        """Return the largest motion of a crown vertex under twists about the centres [mm]."""
+        """Return an upper bound of the motion of crown vertices under twists about the centres [mm]."""
         return max(
             float(np.linalg.norm(step[r, :3]) * self.scans[r].radius_mm + np.linalg.norm(step[r, 3:])) for r in ARCHES
         )
 
 
 def _towards_gum(scans: Sequence[Scan]) -> list[Array | None]:
-    """Return for each arch where its gum must be, a unit vector in scan coordinates; None if the scan shows it."""
+    """Return the unit vector towards the gum of each arch, in scan coordinates; None if the scan has gum."""
     shown = [scan.shows_gum for scan in scans]
     if all(shown):
         return [None, None]
@@ -255,18 +255,18 @@ _Result = TypeVar("_Result")
 
 
 class Sharing:
-    """Map as `Executor.map` does, with one thread to wake for each further core instead of one for each item.
+    """A parallel `map` for short tasks that wakes one thread per core instead of one per item.
 
-    Tasks of the tracker take about a millisecond, and to wake a thread and wait for it a tenth of that.
+    The calling thread works too. Tasks of the tracker take about a millisecond, waking a thread a tenth of that.
     """
 
     def __init__(self, executor: Executor) -> None:
-        """Take the threads to share with."""
+        """Use the threads of an executor."""
         self._executor = executor
-        self._helpers = (os.cpu_count() or 1) - 1
+        self._more_threads = (os.cpu_count() or 1) - 1
 
     def __call__(self, function: Callable[[_Item], _Result], items: Iterable[_Item], /) -> list[_Result]:
-        """Return the results in the order of the items; after an error, which is raised, no further task is begun."""
+        """Return the results in the order of the items; an error is raised, and no further task is started."""
         left = deque(enumerate(items))
         results: dict[int, _Result] = {}
 
@@ -274,7 +274,7 @@ class Sharing:
             while left:
                 try:
                     k, item = left.popleft()
-                except IndexError:  # another thread took the last one
+                except IndexError:  # another thread took the last item
                     return
                 try:
                     results[k] = function(item)
@@ -282,12 +282,12 @@ class Sharing:
                     left.clear()
                     raise
 
-        helpers = [self._executor.submit(work) for _ in range(min(len(left) - 1, self._helpers))]
+        others = [self._executor.submit(work) for _ in range(min(len(left) - 1, self._more_threads))]
         try:
             work()
         finally:
-            begun = [helper for helper in helpers if not helper.cancel()]
-            wait(begun)
-        for helper in begun:
-            helper.result()
+            started = [other for other in others if not other.cancel()]
+            wait(started)
+        for other in started:
+            other.result()
         return [results[k] for k in sorted(results)]

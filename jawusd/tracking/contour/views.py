@@ -1,4 +1,4 @@
-"""The masks of a capture at the working size, one set of views per instant."""
+"""Masks of a capture at working resolution, as one set of views per instant."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from jawusd.media.mask_survey import ARCHES, odd_pictures, survey_masks
 from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
 
-#: Cameras that are needed where nothing but the masks tells how far away the teeth are.
+#: Cameras needed if only the masks determine the depth of the teeth.
 FEWEST_CAMERAS = 2
 
-_BORDER_PX = 20  # kept around the masks: more than the widest search
-_CHUNK = 48  # instants held at once when going backwards: about 20 MB
+_BORDER_PX = 20  # margin around the masks: more than the widest search
+_CHUNK = 48  # instants buffered when iterating backwards: about 20 MB
 
 
 class EdgeSearch(Protocol):
-    """Find where contour samples should lie in a picture."""
+    """Finds the picture edges that contour samples should lie on."""
 
     def search(
         self, samples: Array, count: int, arch: int, drawn: Drawn, limits: tuple[float, float, float]
     ) -> tuple[Array, Array]:
-        """Return the distance of each sample to its edge [px], NaN where none is seen, and its weight.
+        """Return the distance of each sample to its edge [px], NaN if there is none, and its weight.
 
-        Weights are 0 .. 1, NaN for samples that the other arch hides.
+        Weights are 0 .. 1, NaN for samples hidden by the other arch.
 
         Args:
             samples: shape (n, COLUMNS); the first `count` are silhouette.
@@ -45,7 +45,7 @@ class EdgeSearch(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Hold both arches as drawn into a picture."""
+    """Both arches as drawn in a picture."""
 
     own: NDArray[np.uint8]  # labels of the arch alone: CROWN, GUM or 0, shape (h, w)
     other: NDArray[np.uint8]  # the same of the other arch
@@ -54,27 +54,27 @@ class Drawn:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Hold what one camera shows of both arches at one instant, undistorted, at the working size."""
+    """The masks of one camera at one instant, undistorted, at working resolution."""
 
     matrix: Array  # world [mm] to homogeneous px of this picture, shape (3, 4)
     eye: Array  # camera centre in the world [mm], shape (3,)
-    # of the upper and the lower arch, uint8, 255 = teeth, shape (2, h, w); zeros where there is none
+    # of the upper and the lower arch, uint8, 255 = teeth, shape (2, h, w); zeros without a mask
     masks: NDArray[np.uint8]
-    present: Mask  # which of the two masks exist, shape (2,)
-    # how the arches move, in the world, from the reference instant to this camera's own, shape (2, 4, 4)
+    present: Mask  # whether each of the two masks exists, shape (2,)
+    # world motion of the arches from the reference instant to this camera's own, shape (2, 4, 4)
     T_delay: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
-    # how far masks reach beyond the teeth at free edges [px], at the gum line [px], along the gum [mm], shape (2, 3)
+    # mask bias beyond the teeth at free edges [px], at the gum line [px], along the gum [mm], shape (2, 3)
     habits: Array = field(default_factory=lambda: np.zeros((2, 3)))
-    # finds outlines by colour where there are no masks
+    # finds outlines by colour if there are no masks
     edges: EdgeSearch | None = None
 
 
 class MaskViews:
-    """Read the masks of all cameras at instants of the reference camera; use as a context manager.
+    """Reads the masks of all cameras at instants of the reference camera; a context manager.
 
     Attributes:
-        cameras: the cameras whose masks show anything, in capture order.
-        frames: first instant with a mask that could exist, and one past the last.
+        cameras: the cameras with masks that are not all black, in capture order.
+        frames: first instant at which any camera may have a mask, and one past the last.
     """
 
     def __init__(
@@ -86,18 +86,18 @@ class MaskViews:
         working_px_per_mm: float,
         fewest: int = FEWEST_CAMERAS,
     ) -> None:
-        """Open the mask readers and choose the working sizes.
+        """Open the masks and choose the working resolution.
 
         Args:
             sources, cameras: all cameras of the capture; the calibrated ones by name.
             offsets: reference frame minus own frame number of every camera.
-            centre_world: where the teeth are at the start [mm], shape (3,).
+            centre_world: position of the teeth at the start [mm], shape (3,).
             working_px_per_mm: resolution at the teeth; pictures are never enlarged.
-            fewest: cameras with masks that are needed.
+            fewest: required number of cameras with masks.
 
         Raises:
             TrackingError: fewer cameras have masks, or a camera is not calibrated or not synchronised.
-            CaptureError: masks are missing, damaged, of the wrong size, or no masks.
+            CaptureError: masks are missing, corrupt, of the wrong size, or not masks.
         """
         self._stack = ExitStack()
         self._masked = masked = masked_sources(sources, cameras, offsets, fewest)
@@ -122,7 +122,7 @@ class MaskViews:
         self._stack.close()
 
     def findings(self) -> list[Finding]:
-        """Return what is to be said of the masks, and of cameras that have none, as far as they were read."""
+        """Return findings about the masks read so far, and about cameras without masks."""
         out = [finding for source, size in self._sizes for finding in survey_masks(source, size)]
         for source, pair in zip(self._masked, self._readers, strict=True):
             for arch, reader in zip(ARCHES, pair, strict=True):
@@ -130,7 +130,7 @@ class MaskViews:
         return out
 
     def at(self, frame: int) -> list[View]:
-        """Return the views of one instant of the reference camera.
+        """Return the views of an instant of the reference camera.
 
         Raises:
             CaptureError: a mask cannot be decoded.
@@ -143,7 +143,7 @@ class MaskViews:
     def around(self, frame: int, reach: int) -> list[list[View]]:
         """Return the views of the instants up to `reach` frames before and after one, in order.
 
-        Masks are decoded once, in the order of their files: each jump to another frame opens these anew.
+        Masks are decoded once, in file order, since each jump reopens the files.
 
         Raises:
             CaptureError: a mask cannot be decoded.
@@ -156,20 +156,20 @@ class MaskViews:
         return [list(views) for views in zip(*cameras, strict=True)]
 
     def walk(self, first: int, stop: int, step: int = 1) -> Iterator[tuple[int, list[View]]]:
-        """Yield instants of a range with their views; with step -1 backwards, though masks are read forwards."""
+        """Yield the instants of a range with their views; with step -1 backwards, reading forwards in chunks."""
         if step > 0:
             for frame in range(first, stop):
                 yield frame, self.at(frame)
             return
         for end in range(first + 1, stop + 1, -_CHUNK):
             begin = max(end - _CHUNK, stop + 1)
-            held = [(frame, self.at(frame)) for frame in range(begin, end)]
-            while held:
-                yield held.pop()
+            chunk = [(frame, self.at(frame)) for frame in range(begin, end)]
+            while chunk:
+                yield chunk.pop()
 
 
 def present_masks(views: Sequence[View]) -> Mask:
-    """Return which masks exist, shape (2, C)."""
+    """Return whether each mask exists, shape (2, C)."""
     return np.array([view.present for view in views]).T
 
 
@@ -179,11 +179,11 @@ def masked_sources(
     offsets: Mapping[str, int],
     fewest: int = FEWEST_CAMERAS,
 ) -> tuple[CameraSource, ...]:
-    """Return the cameras whose masks show anything.
+    """Return the cameras with masks that are not all black.
 
     Raises:
         TrackingError: fewer than `fewest` have such masks, or one of them is not calibrated or not synchronised.
-        CaptureError: masks are missing, damaged, of the wrong size, or no masks.
+        CaptureError: masks are missing, corrupt, of the wrong size, or not masks.
     """
     masked = []
     for source in sources:
@@ -202,17 +202,17 @@ def masked_sources(
         ]
         raise TrackingError(
             f"{len(masked)} of {len(sources)} cameras have masks"
-            + ("; one view leaves the depth of the teeth unknown" if fewest > 1 else "")
+            + ("; with one view, the depth of the teeth is unknown" if fewest > 1 else "")
             + (f" ({'; '.join(without)})" if without else ""),
-            hint="Give masks for two cameras at least, some 30 degrees apart or more."
+            hint="Provide masks for at least two cameras, about 30 degrees apart or more."
             if fewest > 1
-            else "Segment one camera at least.",
+            else "Segment at least one camera.",
         )
     return tuple(masked)
 
 
 def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple[int, int]:
-    """Return the picture size that shows the given point at the wanted resolution, at most the recorded size.
+    """Return the picture size that shows a point at a given resolution, at most the recorded size.
 
     Raises:
         TrackingError: the point lies behind the camera.
@@ -220,7 +220,7 @@ def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple
     depth = float(camera.depth(centre_world))
     if depth <= 0:
         raise TrackingError(
-            f"the teeth lie {-depth:.0f} mm behind it",
+            f"the teeth are {-depth:.0f} mm behind this camera",
             camera=camera.name,
             hint="Check the calibration and the camera names of the picks.",
         )
@@ -230,9 +230,9 @@ def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple
 
 
 def _view(working: WorkingView, masks: Sequence[NDArray[np.uint8] | None]) -> View:
-    """Cut both masks of a camera down to their surroundings."""
+    """Return the view of a camera, cropped to its masks."""
     camera = working.camera
-    # Masks that reach the half level nowhere have no outline: too small to show at the working size.
+    # Masks without a pixel above half have no outline: they are too small at this resolution.
     highest = [None if m is None else m.max(axis=1) for m in masks]
     masks = [m if h is not None and h.max() > 127 else None for m, h in zip(masks, highest, strict=True)]
     present = np.array([m is not None for m in masks])
