@@ -19,7 +19,7 @@ from jawusd.base import errors
 from jawusd.cli.command import with_vectors_split
 from jawusd.cli.main import app
 from jawusd.cli.summaries import EXIT_CODES, SUMMARIES
-from jawusd.pipeline.build import _verdict_lines
+from jawusd.pipeline.build_lines import _verdict_lines
 from jawusd.pipeline.plan import about
 
 COMMANDS = typer.main.get_command(app).commands
