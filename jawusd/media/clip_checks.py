@@ -1,9 +1,14 @@
-"""Can the clips of a capture be read, and do they fit one another? A few pictures of each are decoded."""
+"""Can the clips of a capture be read, do cameras freeze, and do the clips fit one another? In some seconds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array
 from jawusd.base.errors import JawusdError
 from jawusd.formats.finding import Finding
 from jawusd.formats.numbered import gaps
@@ -14,17 +19,33 @@ from jawusd.media.picture_sequence import PictureSequence
 _DRIFT_FRAMES = 0.5
 # Rates stated to three digits differ from the file's by less; 23.976 against 24 is within, 25 is not [1].
 _RATE_TOLERANCE = 0.005
+_DECODED_PX = 1.5e9  # of a clip: 700 pictures of full HD, some seconds
+_ENDS_S = 4.0  # what `sync` reads first
+_PART = 48  # pictures
+_SPARSE = 4  # every 4th pixel in both directions
+_LISTED = 5
+# When pictures count as repeated, in shares of the usual change, the 75th percentile of so many pictures around.
+# Chosen on `tests/benchmarks/frozen.py`, which states how often still and noisy scenes are taken for frozen ones.
+_MOST, _AROUND = 75, 48
+_FEWEST = 12  # pictures, of which a usual change can be told
+_LEAST_CHANGE = 0.1  # of 255 levels
+_SAME, _ALIKE = 0.05, 0.03  # of long runs, and of one or two pictures, which a motion that turns back resembles
+_SHORT, _SOME, _LONG = 2, 5, 12  # pictures
+_STOPS, _FARTHER = (0.5, 4.0), 1.25
+_FAR_BELOW = 0.2  # of the 25th percentile
+_REGULAR = 0.15  # of the pictures
 _MISSING_SHARE = 0.01  # of the frames without a picture of their own that a constant rate may show
 
 
 def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
-    """Decode the first, the middle and the last picture of a clip; yield an error for each that cannot be.
+    """Decode a clip, a long one in parts; yield an error if a picture cannot be, and warnings about what they show.
 
-    Say, too, whether pictures are woven of two instants.
+    Kinds: "clip_damaged", "interlaced", "pictures_repeated".
     """
-    for number in sorted({0, video.count // 2, video.count - 1}):
+    repeated: list[tuple[int, int]] = []
+    for first, last in _parts(video):
         try:
-            next(iter(video.frames(number, number + 1, threads=1)))
+            changes = picture_changes(frame.image for frame in video.frames(first, last))
         except JawusdError as error:
             yield Finding(
                 "clip_damaged",
@@ -32,11 +53,95 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
                 error.message,
                 path=str(video.path),
                 camera=camera,
-                frame=number,
                 hint=error.hint,
             )
+            break
+        repeated += [(first + start, first + end) for start, end in repeated_runs(changes)]
     if video.is_interlaced:
         yield Finding("interlaced", "warning", INTERLACED, path=str(video.path), camera=camera, hint=INTERLACED_HINT)
+    if repeated:
+        numbers = [video.timeline.numbers[[start, end]].tolist() for start, end in repeated]
+        listed = ", ".join(f"{start} to {end}" if end > start else f"{start}" for start, end in numbers[:_LISTED])
+        more = f" and {len(numbers) - _LISTED} more times" if len(numbers) > _LISTED else ""
+        yield Finding(
+            "pictures_repeated",
+            "warning",
+            f"frames {listed}{more} show the picture before again: the camera froze, or pictures were doubled",
+            sum(end - start + 1 for start, end in repeated),
+            0,
+            path=str(video.path),
+            camera=camera,
+            frame=numbers[0][0],
+            hint="Export the clip again at its own frame rate, or leave those frames out of the take.",
+        )
+
+
+def _parts(video: Clip) -> list[tuple[int, int]]:
+    """Return which pictures to decode: all, or both ends, where cameras are aligned, and parts between."""
+    most = int(_DECODED_PX / (video.size_px[0] * video.size_px[1]))
+    if video.count <= most:
+        return [(0, video.count)]
+    end = min(round(_ENDS_S * video.fps), most // 3)
+    starts = np.linspace(end, video.count - end - _PART, max(1, (most - 2 * end) // _PART)).astype(int)
+    return [(0, end), *((start, start + _PART) for start in starts.tolist()), (video.count - end, video.count)]
+
+
+def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
+    """Return the mean difference of each gray picture (h, w) from the one before, NaN for the first [of 255 levels]."""
+    before, changes = None, []
+    for picture in pictures:
+        shown = picture[::_SPARSE, ::_SPARSE].astype(np.int16)
+        changes.append(np.nan if before is None else float(np.abs(shown - before).mean()))
+        before = shown
+    return np.array(changes)
+
+
+def repeated_runs(changes: Array) -> list[tuple[int, int]]:
+    """Return the first and last picture of runs that show the picture before them again.
+
+    Scenes that stand still are repeated by encoders, too, but there changes fade and grow: here they stop at once and
+    go on at once, after one or two repeated pictures by more than usual. A light that goes off changes more before it
+    than usual. Scenes without any usual change tell nothing.
+
+    Args:
+        changes: of `picture_changes`, shape (n,).
+    """
+    known = changes[1:]
+    if len(known) < _FEWEST:
+        return []
+    around = sliding_window_view(np.pad(known, _AROUND, mode="edge"), 2 * _AROUND + 1)
+    usual = np.maximum(np.percentile(around, _MOST, axis=1), np.percentile(known, _MOST))
+    same = np.flatnonzero((known <= _SAME * usual) & (usual > _LEAST_CHANGE))
+    runs = [(int(run[0]), int(run[-1])) for run in np.split(same, np.flatnonzero(np.diff(same) > 1) + 1) if len(run)]
+    short = [
+        run for run in runs if run[1] - run[0] < _SHORT and known[run[0] : run[1] + 1].max() <= _ALIKE * usual[run[0]]
+    ]
+    regular = len(short) > _REGULAR * len(known)  # as of a clip converted from another rate
+    found = [run for run in runs if (run in short and regular) or _stands_out(known, *run)]
+    return [(first + 1, last + 1) for first, last in found]
+
+
+def _stands_out(changes: Array, first: int, last: int) -> bool:
+    """Tell whether changes stop at once before a run, and go on at once after it."""
+    outside = np.concatenate([changes[max(0, first - _AROUND) : first], changes[last + 1 : last + 1 + _AROUND]])
+    if first == 0 or len(outside) < _FEWEST:
+        return False  # many takes begin at rest
+    little, usual = np.percentile(outside, (100 - _MOST, _MOST))
+    before = changes[max(0, first - 2) : first].max()
+    length, most = last - first + 1, changes[first : last + 1].max()
+    # Where even the quietest pictures change, by noise or motion, no encoder repeats one by chance.
+    restless = length >= _SOME and little > _LEAST_CHANGE and most <= _FAR_BELOW * little
+    least = _STOPS[0] * (little if restless else usual)
+    if usual <= _LEAST_CHANGE or not least <= before <= _STOPS[1] * usual:
+        return False
+    if last + 1 == len(changes):
+        return length >= _LONG
+    after = changes[last + 1]
+    if length <= _SHORT:
+        beside = [changes[first - 1], *changes[last + 2 : last + 3]]
+        alike = most <= _ALIKE * usual and min(beside) >= _STOPS[0] * usual
+        return bool(alike and _FARTHER * max(beside) <= after <= _STOPS[1] * usual)
+    return bool(after >= (little if restless else _FARTHER * usual))
 
 
 def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator[Finding]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import filecmp
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -23,7 +24,7 @@ _CROWN_POINTS = 6000
 
 
 def clips(parts: Parts) -> Iterator[Finding]:
-    """Open every clip and decode three pictures of it."""
+    """Open every clip and decode it, long ones in parts."""
     from jawusd.media.clip_checks import decoded_findings, rate_findings
     from jawusd.media.footage import open_clip
 
@@ -35,8 +36,10 @@ def clips(parts: Parts) -> Iterator[Finding]:
         except JawusdError as error:
             yield replace(found_error("clip", error), camera=camera.name)
             continue
-        yield from decoded_findings(video, camera.name)
         parts.videos[camera.name] = video
+    with ThreadPoolExecutor() as pool:
+        for found in pool.map(lambda item: list(decoded_findings(item[1], item[0])), parts.videos.items()):
+            yield from found
     yield from _copies({name: video.path for name, video in parts.videos.items()})
     yield from rate_findings(parts.videos, parts.given.fps, parts.description)
 

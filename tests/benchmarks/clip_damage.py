@@ -2,7 +2,7 @@
 
     python tests/benchmarks/clip_damage.py [--places 500] [--codecs h264 hevc prores ffv1] [--threads 1 8]
 
-The clips are made by one encoder thread: 36 pictures of 320 x 192 px, key frames every 12 in H.264 and HEVC, ProRes HQ,
+The clips are made by one encoder thread: 36 pictures of 160 x 96 px, key frames every 12 in H.264 and HEVC, ProRes HQ,
 FFV1 with checksums. Each place, evenly over the file, is damaged alone: one bit flipped, or 16 bytes zeroed. "found":
 opening or reading the clip raises an error, or a frame has no picture; "no effect": all pictures and times are as
 before; "missed": other pictures, and no error. The share is that of what has an effect.

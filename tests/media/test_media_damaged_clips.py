@@ -36,7 +36,7 @@ def test_clips_are_the_same_bytes_and_are_read(codec, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("codec", "least"), [("h264", 0.4), ("prores", 1.0), ("ffv1", 1.0)])
 def test_damage_in_slice_data_is_found_whatever_the_threads(codec, least, tmp_path):
-    path = write_clip(tmp_path, codec)
+    path = write_clip(tmp_path, codec, size=(320, 192))
     data, places = path.read_bytes(), packets(path)
     found = {threads: [] for threads in THREADS}
     for at, size in places[::3]:
