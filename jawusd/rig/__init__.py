@@ -7,6 +7,7 @@ What its names need is loaded when they are first used. `jawusd.rig.bake` and
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING
 
 from jawusd.rig.schema import register_schema, schema_is_live
@@ -46,6 +47,8 @@ _MODULES = {
     "write_splines": "jawusd.rig.animation",
 }
 
+# onnxruntime would send its maker what it runs on; it reads this when it is loaded.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 # At import: OpenUSD ignores schemas registered after a process has used its first stage.
 register_schema()
 

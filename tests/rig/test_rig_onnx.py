@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -265,3 +266,14 @@ def test_onnx_files_that_cannot_pose_are_refused(folder, tmp_path):
     for option in ("fast", "untrusted"):
         with pytest.raises(ValueError, match="onnxruntime"):
             jawusd.load(folder / "actor.onnx", **{option: True})
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
+def test_nothing_is_sent_anywhere(anchored_folder, tmp_path):
+    """Onnxruntime 1.31 looks for a machine of its maker some ten seconds after it was loaded."""
+    code = "import sys, time; from jawusd.rig import validate_stage; validate_stage(sys.argv[1]); time.sleep(15)"
+    log = tmp_path / "calls"
+    line = ["strace", "-f", "-qq", "-e", "trace=connect", "-o", log, sys.executable, "-c", code]
+    subprocess.run([*line, anchored_folder / "actor.usda"], check=True)
+    assert "connect(" not in log.read_text()

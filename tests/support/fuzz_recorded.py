@@ -87,7 +87,8 @@ def _animated(rig, place, motion):
     from jawusd.rig.animation import write_animation
 
     kept, _ = kept_inside(rig, motion)
-    (place / "actor.usda").write_text('#usda 1.0\ndef Xform "Actor" ( prepend apiSchemas = ["JawRigAPI"] ) {}\n')  # the layer stands on it
+    actor = '#usda 1.0\ndef Xform "Actor" ( prepend apiSchemas = ["JawRigAPI"] ) {}\n'
+    (place / "actor.usda").write_text(actor)  # the layer stands on it
     write_animation(place / "out.usdc", place / "actor.usda", kept.frames, kept.d, kept.fps or 24.0, rig=rig)
 
 
