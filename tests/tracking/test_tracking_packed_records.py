@@ -88,6 +88,6 @@ def test_a_full_folder_is_one_message(records, monkeypatch):
 
     packed = PackedRecords()
     monkeypatch.setattr(packed._store._file, "write", full)
-    with pytest.raises(OutputError, match="while it is tracked: No space left") as caught:
+    with pytest.raises(OutputError, match="of a long take: No space left") as caught:
         packed.update(records)
     assert "TMPDIR" in caught.value.hint

@@ -40,7 +40,7 @@ def test_the_size_is_that_of_the_world(capture, factor):
 def test_masks_of_something_else_tell_no_size(capture, monkeypatch):
     monkeypatch.setattr("jawusd.tracking.initialization.scale_search._STARTS", (1.0,))
     turned = [replace(m, vertices=m.vertices * [0.6, 1.0, 1.3]) for m in MESHES]
-    with pytest.raises(TrackingError, match=r"fit the masks of frames \d+, \d+ at no size from 0\.5 to 2"):
+    with pytest.raises(TrackingError, match=r"do not fit the masks of frames \d+, \d+ at any size from 0\.5 to 2"):
         seen_size(capture, CAMERAS, OFFSETS, turned)
     with pytest.raises(TrackingError, match="has masks of both rows"):
         seen_size(make_capture(capture.folder, COUNT, frames=(400, 402)), CAMERAS, OFFSETS, MESHES)
@@ -57,6 +57,6 @@ def test_a_climb_without_an_end_counts_as_no_fit(capture, monkeypatch):
     monkeypatch.setattr(scale_search._Sizes, "_fitted", better)
     monkeypatch.setattr(scale_search, "_MOST_SIZES", 20)
     monkeypatch.setattr(StartSearch, "at", lambda *_: Found(np.stack([np.eye(4)] * 2), 1.0, np.ones(2)))
-    with pytest.raises(TrackingError, match=r"at no size from 0\.5 to 2"):
+    with pytest.raises(TrackingError, match=r"at any size from 0\.5 to 2"):
         seen_size(capture, CAMERAS, OFFSETS, MESHES)
     assert 2 * 5 * 20 < len(sizes) <= 2 * 5 * 21  # frames, starts, and the first size of each climb

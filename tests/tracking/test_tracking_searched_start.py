@@ -76,7 +76,7 @@ def _searched(footage, search):
     return take_start.search_start(search, footage)
 
 
-def test_first_frame_that_fits_beyond_doubt_is_taken(footage):
+def test_first_frame_that_fits_only_clear_is_taken(footage):
     search = _FoundBefore([0.1, 0.5, 0.9])
     assert _searched(footage, search).frame == search.asked[1] and len(search.asked) == 2
 

@@ -209,7 +209,7 @@ def test_a_picked_frame_without_two_masks_of_each_row_gives_way_to_another(take)
 def test_first_frame_needs_two_masks_of_each_row(take):
     for camera in CAMERAS[1:]:
         png(take, camera.name, "upper", START).unlink()
-    with pytest.raises(TrackingError, match="frame 8: 1 masks of the upper teeth, the first frame needs two"):
+    with pytest.raises(TrackingError, match="frame 8: 1 masks of the upper teeth; the first frame needs two"):
         track(_capture(take, frames=(8, 9)))
 
 

@@ -122,7 +122,7 @@ def test_two_cameras_are_enough(pictures, short_search):
 
 
 def test_masks_of_something_else_are_refused_with_what_was_tried(tmp_path, short_search, monkeypatch):
-    monkeypatch.setattr(take_start, "refuse_by_cause", lambda *arguments: "No mistake explains it.")
+    monkeypatch.setattr(take_start, "raise_cause", lambda *arguments: "No mistake explains it.")
     folder = write_masks(tmp_path / "take", FRAMES)
     for k, path in enumerate(sorted(folder.rglob("*.png"))):
         picture = np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
@@ -161,7 +161,7 @@ def test_no_frame_with_masks_of_both_rows_is_refused(tmp_path):
     capture = _capture(folder, bootstrap=None, cameras=[source(folder, "cam0"), source(folder, "cam1")])
     blank = np.zeros((400, 640), np.uint8)
     cv2.imwrite(str(folder / "cam1" / "lower" / "000003.png"), blank)
-    with pytest.raises(TrackingError, match="none of 5 frames looked at from 5 to 9 has masks of both rows"):
+    with pytest.raises(TrackingError, match="none of 5 frames sampled from 5 to 9 has masks of both arches"):
         _start(capture)
 
 

@@ -8,7 +8,7 @@ from jawusd.base.errors import TrackingError
 from jawusd.formats.capture_parts import CameraSource, Masks
 from jawusd.tracking.initialization import start_causes
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.initialization.start_causes import refuse_lone_arch
+from jawusd.tracking.initialization.start_causes import raise_for_unmatched_arch
 from jawusd.tracking.initialization.start_search import Found
 
 TABLE = {camera.name: camera for camera in CAMERAS}
@@ -47,10 +47,10 @@ def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, w
 def test_a_scan_that_fits_nowhere_while_the_other_does_is_named(fits, named):
     fits = {frame: np.array(fit) for frame, fit in fits.items()}
     if named is None:
-        refuse_lone_arch(fits)
+        raise_for_unmatched_arch(fits)
     else:
         with pytest.raises(TrackingError, match=named):
-            refuse_lone_arch(fits)
+            raise_for_unmatched_arch(fits)
 
 
 class _Searches:
@@ -72,14 +72,14 @@ class _Searches:
         return Found(np.stack([np.eye(4)] * 2), 1000.0, np.full(2, self.fits[self.count]))
 
 
-def _refused(searches, monkeypatch, fits=None, accused=(), beyond_doubt=False):
+def _refused(searches, monkeypatch, fits=None, accused=(), only_clear=False):
     monkeypatch.setattr(start_causes, "aligned", lambda search, footage, poses, frame: poses)
     sources = [
         CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
         for name in ("cam0", "cam1", "cam2")
     ]
     footage = Footage(sources, TABLE, OFFSETS, (0, 10))
-    return start_causes.refuse_by_cause(searches, footage, [3, 6, 8], fits or {}, set(accused), beyond_doubt)
+    return start_causes.raise_cause(searches, footage, [3, 6, 8], fits or {}, set(accused), only_clear)
 
 
 def test_the_search_for_a_mistake_ends_and_says_what_was_tried(monkeypatch):
@@ -87,13 +87,16 @@ def test_the_search_for_a_mistake_ends_and_says_what_was_tried(monkeypatch):
     monkeypatch.setattr(start_causes, "MOST_PICTURES", 20)
     words = _refused(searches, monkeypatch)
     assert searches.count == 6  # of three cameras each
-    assert "any of 6 mistakes" in words and "14 more were not tried: no more than 20 pictures are searched" in words
+    assert (
+        "any of 6 possible mistakes" in words
+        and "14 more were not tried, since at most 20 pictures are searched" in words
+    )
 
 
 def test_every_mistake_of_three_cameras_is_tried(monkeypatch):
     searches = _Searches()
     assert _refused(searches, monkeypatch) == (
-        "Undoing any of 20 mistakes in masks, scans and calibration does not help on frames 3, 6."
+        "Undoing any of 20 possible mistakes in masks, scans and calibration does not help on frames 3, 6."
     )
     assert searches.count == 40  # of 57 pictures each time
 
@@ -111,7 +114,7 @@ def test_a_scan_that_fits_nowhere_is_named_before_mistakes_are_looked_for_on_oth
     assert searches.count == 20
 
 
-def test_of_mistakes_that_are_not_all_tried_only_one_beyond_doubt_counts(monkeypatch):
+def test_of_mistakes_that_are_not_all_tried_only_one_only_clear_counts(monkeypatch):
     monkeypatch.setattr(start_causes, "MOST_PICTURES", 20)
     assert "not tried" in _refused(_Searches({5: 0.2}), monkeypatch)
     with pytest.raises(TrackingError, match="found only with that undone"):
@@ -125,7 +128,7 @@ def test_sizes_are_tried_first_where_the_scans_are_of_no_usual_size(monkeypatch)
         _refused(_Searches({1: 0.2}), monkeypatch)
 
 
-def test_only_a_fit_beyond_doubt_counts_where_one_is_asked_for(monkeypatch):
-    assert "does not help" in _refused(_Searches({1: 0.2}), monkeypatch, beyond_doubt=True)
+def test_only_a_fit_only_clear_counts_where_one_is_asked_for(monkeypatch):
+    assert "does not help" in _refused(_Searches({1: 0.2}), monkeypatch, only_clear=True)
     with pytest.raises(TrackingError, match="the scans are mirrored"):
-        _refused(_Searches({1: 0.4}), monkeypatch, beyond_doubt=True)
+        _refused(_Searches({1: 0.4}), monkeypatch, only_clear=True)

@@ -1,4 +1,4 @@
-"""First poses from picked vertices: triangulation, rigid fit by consensus, refinement on the pixels."""
+"""Initial poses from picked vertices: triangulation, consensus of rigid fits, refinement on the pixels."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from jawusd.geometry import (
 from jawusd.tracking.contour.equations import motion_about
 
 _FEWEST = 3
-# A pick whose vertex projects farther than this from its pixel counts as wrong [mm at the teeth]: three times the
-# error of a careless click (5 px where a pixel is 0.07 mm).
+# Distance between projected vertex and pixel from which a pick is rejected [mm at the teeth]: three times the error of
+# a careless click (5 px where a pixel is 0.07 mm).
 TOLERANCE_MM = 1.1
 _CLICK_MM = TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
-_GAP_MM = 0.8  # by which the views of a carelessly clicked pick may miss one point
-# Size of the teeth by the picks over that of the scan, less 1, from which it may explain misses: clicks 0.4 mm off on
-# picks 40 mm apart leave 0.01.
+_GAP_MM = 0.8  # allowed distance between the lines of sight of a careless pick
+# Deviation from 1 of the scan size by the picks, from which it may explain contradictions: clicks 0.4 mm off on picks
+# 40 mm apart cause 0.01.
 _SIZE_SHARE = 0.03
-_MOST_TRIPLES = 500  # consensus over more start triples adds nothing but time
+_MOST_TRIPLES = 500  # more start triples do not improve the consensus
 
 
 @dataclass(frozen=True, eq=False)
 class _Sighting:
-    """One pick ready for fitting: the scan point and its undistorted pixels."""
+    """A pick prepared for fitting: the scan point and its undistorted pixels."""
 
     number: int
     point: Array
@@ -48,17 +48,17 @@ class _Sighting:
 def pose_from_picks(
     picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], arch: str
 ) -> tuple[Array, list[int]]:
-    """Return T_world_scan that agrees with the picks, shape (4, 4), and the numbers of picks left out as wrong.
+    """Return T_world_scan from the picks, shape (4, 4), and the numbers of rejected picks.
 
-    Numbers count from 1; `vertices` are those of the scan file [mm], shape (V, 3); `arch` names it in messages.
+    Numbers start at 1. `vertices` are those of the scan file [mm], shape (V, 3); `arch` is its name in messages.
 
     Raises:
-        TrackingError: too few picks, a pick that cannot be, or picks that contradict one another.
+        TrackingError: too few picks, an invalid pick, or picks that contradict one another.
     """
     if len(picks) < _FEWEST:
         raise TrackingError(
             f"bootstrap: {len(picks)} picks on the {arch} teeth, at least {_FEWEST} are needed",
-            hint="Pick more vertices, spread over the arch, each in two or more cameras.",
+            hint="Pick more vertices, spread over the arch, each in at least two cameras.",
         )
     sightings = [_sighting(k, pick, vertices, cameras, arch) for k, pick in enumerate(picks, start=1)]
     places = np.stack([triangulate(s.matrices, s.pixels) for s in sightings])
@@ -70,7 +70,7 @@ def pose_from_picks(
         try:
             pose = rigid_fit(points[k], places[k])
         except ValueError:
-            continue  # three picks on a line leave a rotation free
+            continue  # three collinear picks do not determine a rotation
         cost = sum(min(_miss_mm(s, pose), TOLERANCE_MM) ** 2 for s in sightings)
         if cost < best_cost:
             best, best_cost = pose, cost
@@ -83,8 +83,8 @@ def pose_from_picks(
         if len(good) < _FEWEST:
             if (size := _other_size(sightings, places)) is not None:
                 raise TrackingError(
-                    f"bootstrap: the picks on the {arch} teeth agree with a scan {_than(1 / size)} than this one, and "
-                    "contradict one another on this one: the scale of the scans is wrong, or the calibration's lengths",
+                    f"bootstrap: the picks on the {arch} teeth contradict one another, but agree with a scan "
+                    f"{_than(1 / size)}: the scale of the scans or of the calibration is wrong",
                     hint="Check the scans' unit and scaling, and the square size of the calibration board.",
                 )
             if (cause := _wrong_sight(picks, vertices, cameras, arch, places, sightings)) is not None:
@@ -103,7 +103,7 @@ def pose_from_picks(
 
 
 def _other_size(sightings: Sequence[_Sighting], places: Array) -> float | None:
-    """Return how many times too large the scan is if that explains why picks miss one another; else None.
+    """Return the factor by which the scan is too large if that explains the contradictions, otherwise None.
 
     `places` are the triangulated picks, world coordinates [mm], shape (P, 3).
     """
@@ -125,7 +125,7 @@ def _wrong_sight(
     places: Array,
     sightings: Sequence[_Sighting],
 ) -> str | None:
-    """Say what is wrong if an exchange of cameras explains the misses, or views do not meet in a point; else None.
+    """Describe an exchange of cameras that explains the contradictions, or lines of sight that do not meet; else None.
 
     `places` are the triangulated picks, world coordinates [mm], shape (P, 3).
     """
@@ -143,18 +143,18 @@ def _wrong_sight(
         pose = rigid_fit(points, meets)
         if all(_miss_mm(s, pose) < TOLERANCE_MM for s in seen):
             return f"cameras {a} and {b} are exchanged, in the picks or in the calibration"
-    # Views from side by side meet even where they are of different points at one height.
+    # Lines of sight of neighbouring cameras meet even for different points at the same height.
     gaps = [_miss_mm(replace(s, point=place), np.eye(4)) for s, place in zip(sightings, places, strict=True)]
     if float(np.median(gaps)) < _GAP_MM:
         return None
     return (
-        f"the lines of sight of their views pass one another by up to {max(gaps):.1f} mm (usual are {_GAP_MM:g} mm): a "
-        "calibration is wrong, or a camera name, or the views are of different instants"
+        f"the lines of sight of their views miss one another by up to {max(gaps):.1f} mm (usual: {_GAP_MM:g} mm): "
+        "a calibration or camera name is wrong, or the views show different instants"
     )
 
 
 def _than(ratio: float) -> str:
-    """Say in words how much larger or smaller something is."""
+    """Format a size ratio."""
     return f"{abs(ratio - 1.0):.1%} {'larger' if ratio > 1.0 else 'smaller'}"
 
 
@@ -165,7 +165,7 @@ def picked_sigma_mm(
     pose: Array,
     probes: Array,
 ) -> float:
-    """Return the rms standard deviation of the crowns' position that careless clicks leave [mm].
+    """Return the rms position uncertainty of the crowns caused by careless clicks [mm].
 
     `picks` are those behind the pose T_world_scan, shape (4, 4); `probes` are points spread over the crowns, scan
     coordinates [mm], shape (N, 3).
@@ -184,7 +184,7 @@ def picked_sigma_mm(
 
 
 def picks_miss_mm(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], pose: Array) -> Array:
-    """Return how far each pick's vertex lies off its pixels at T_world_scan (4, 4), at the vertex [mm], shape (P,)."""
+    """Return the error of each pick at T_world_scan (4, 4), measured at the vertex [mm], shape (P,)."""
     sightings = [_sighting(k, pick, vertices, cameras, "picked") for k, pick in enumerate(picks, start=1)]
     return np.array([_miss_mm(s, pose) for s in sightings])
 
@@ -192,12 +192,12 @@ def picks_miss_mm(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, 
 def picked_size(
     picks: Sequence[Sequence[Pick]], vertices: Sequence[Array], cameras: Mapping[str, Camera]
 ) -> tuple[float, float]:
-    """Return how many times as large as the picks show them the scans are [-], and the standard deviation of that.
+    """Return the ratio of the scans' size to the size by the picks [-], and its standard deviation for careless clicks.
 
-    `picks` and `vertices` are those of the upper and the lower scan. The deviation is that of careless clicks.
+    `picks` and `vertices` are those of the upper and the lower scan.
 
     Raises:
-        TrackingError: a pick that cannot be.
+        TrackingError: an invalid pick.
     """
     product, square = 0.0, 0.0
     for own, points in zip(picks, vertices, strict=True):
@@ -208,7 +208,7 @@ def picked_size(
         try:
             turned = given @ rigid_fit(given, places)[:3, :3].T
         except ValueError:
-            continue  # on a line
+            continue  # collinear picks
         product += float((turned * (places - places.mean(0))).sum())
         square += float((turned**2).sum())
     return square / max(product, 1e-9), _CLICK_MM / np.sqrt(max(square, 1e-9))
@@ -217,11 +217,11 @@ def picked_size(
 def _sighting(number: int, pick: Pick, vertices: Array, cameras: Mapping[str, Camera], arch: str) -> _Sighting:
     where = f"bootstrap: pick {number} on the {arch} teeth"
     if pick.vertex >= len(vertices):
-        raise TrackingError(f"{where} names vertex {pick.vertex}, the scan has {len(vertices)} (numbered from 0)")
+        raise TrackingError(f"{where} names vertex {pick.vertex}, but the scan has vertices 0 to {len(vertices) - 1}")
     names = [view.camera for view in pick.views]
     if len(set(names)) < 2:
         raise TrackingError(
-            f"{where} is seen by camera {names[0]} alone: its depth is unknown", hint="Give pixels in two cameras."
+            f"{where} is seen by camera {names[0]} only: its depth is unknown", hint="Add a pixel in a second camera."
         )
     matrices, pixels = [], []
     for view in pick.views:
@@ -231,8 +231,7 @@ def _sighting(number: int, pick: Pick, vertices: Array, cameras: Mapping[str, Ca
         width, height = camera.size_px
         if not (-0.5 <= view.x <= width - 0.5 and -0.5 <= view.y <= height - 0.5):
             raise TrackingError(
-                f"{where} lies at ({view.x:g}, {view.y:g}) px in {view.camera}, "
-                f"outside of its {width} x {height} picture"
+                f"{where} lies at ({view.x:g}, {view.y:g}) px in {view.camera}, outside its {width} x {height} picture"
             )
         matrices.append(camera.projection_matrix())
         pixels.append(camera.undistort_pixels([view.x, view.y]))
@@ -257,7 +256,7 @@ def _miss_mm(s: _Sighting, pose: Array) -> float:
 
 
 def _refined(sightings: Sequence[_Sighting], pose: Array) -> Array:
-    """Minimise the pixel error of the picks by Gauss-Newton, starting close by."""
+    """Minimise the pixel error of the picks by Gauss-Newton from a nearby pose."""
     for _ in range(10):
         H, g = np.zeros((6, 6)), np.zeros(6)
         centre = transform_point(pose, np.mean([s.point for s in sightings], axis=0))

@@ -1,4 +1,4 @@
-"""The first frame: from picked poses to an aligned one, with the checks only a first frame needs."""
+"""Alignment of the first frame, with the checks that only a first frame needs."""
 
 from __future__ import annotations
 
@@ -19,18 +19,15 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.magnification import magnified, measure_magnification
 
-# Least `arch_fit` of a first frame [-]. Of five synthetic persons with lower teeth moved by a tooth, 4 mm up, 5 mm down
-# or 6 mm forwards, wrong poses reached 0.027, right ones 0.053 with most of the lower teeth hidden.
+# Least `arch_fit` of a first frame [-]: between wrong poses, and correct ones with most of the lower teeth hidden.
 _LEAST_FIT = 0.03
-# The same of a fit without one camera, which is to leave no doubt; see `start`.
+# The same for a fit without one camera, which must be unambiguous; see `start_causes.CLEAR_FIT`.
 _CLEAR_FIT = 0.3
-# Magnification of the masks against scans and calibration [-] from which it explains a start that fails, and that of
-# one camera against the others; it is estimated so often, since contours far from their masks are missed at first.
+# Magnification [-] of a camera from which it explains a failed start, and deviation of a camera from the others from
+# which it is corrected; number of estimates, since contours far from their masks are not matched at first.
 _LEAST_SCALE, _OWN_SCALE, _SIZE_ROUNDS = 0.02, 0.015, 3
-_SIZE_HINT = (
-    "Check the scans' scaling, the board's square size, and that each calibration is of the lens and zoom used."
-)
-_FEWEST_MASKS = 2  # of an arch: one view leaves the depth unknown
+_SIZE_HINT = "Check the scans' scale, the board's square size, and that each calibration is for the lens and zoom used."
+_FEWEST_MASKS = 2  # per arch: one view does not determine the depth
 
 
 def first_record(
@@ -43,22 +40,22 @@ def first_record(
 ) -> FrameRecord:
     """Align the first frame from its views, starting from given T_world_upper and T_world_lower, shape (2, 4, 4).
 
-    With `explain`, which takes longer, an error names a wrong focal length if that is the cause.
+    With `explain`, which takes longer, the error names a wrong focal length if that is the cause.
 
     Raises:
-        TrackingError: too few masks on this frame, or no alignment.
+        TrackingError: too few masks on this frame, or the alignment failed.
     """
     use = present_masks(views)
     for r in ARCHES:
         if use[r].sum() < _FEWEST_MASKS:
             raise TrackingError(
-                f"{use[r].sum()} masks of the {ARCH_NAMES[r]} teeth, the first frame needs two",
+                f"{use[r].sum()} masks of the {ARCH_NAMES[r]} teeth; the first frame needs two",
                 frame=frame,
                 hint="Choose a bootstrap frame that is segmented in every camera.",
             )
     first = _aligned(solver, config, start, views, use)
     if (problem := _problem(first, config)) is not None:
-        # One camera's wrong masks (of another place, size or time) may have pulled all poses off.
+        # Wrong masks of one camera (another position, size or time) may have biased all poses.
         others = [_aligned(solver, config, start, views, _without_camera(use, c)) for c in range(len(views))]
         clear = [one for one in others if one.fit.min() >= _CLEAR_FIT and _problem(one, config) is None]
         if not clear:
@@ -76,7 +73,7 @@ def first_record(
 
 @dataclass(frozen=True, eq=False)
 class _Aligned:
-    """Hold an alignment with the masks that took part and what they say of it; arrays per arch and view."""
+    """An alignment with the masks used and its quality, per arch and view."""
 
     solution: Solution
     use: Mask  # shape (2, C)
@@ -85,7 +82,7 @@ class _Aligned:
 
 
 def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View], use: Mask) -> _Aligned:
-    """Align with narrow and with wide gates, then without masks that stay uncovered."""
+    """Align with narrow and with wide gates, then without uncovered masks."""
     whole = use
     best = solver.solve(start, views, config.gates_from(0.0), use)
     wide = solver.solve(start, views, config.wide_gates_px, use)
@@ -93,7 +90,7 @@ def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views:
         poses = np.where(better[:, None, None], wide.poses, best.poses)
         best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
-    for _ in range(2):  # without masks that stay uncovered; with those again that then are covered
+    for _ in range(2):  # exclude uncovered masks, and include excluded ones again that are now covered
         kept = _without_spoiled(whole, coverage, config.lost_coverage)
         if (kept == use).all():
             break
@@ -104,22 +101,22 @@ def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views:
 
 
 def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
-    """Say why an alignment cannot be believed; None if it can."""
+    """Describe why an alignment is rejected; None if it is accepted."""
     for r in ARCHES:
         share = score_px(first.solution)[r].sum() / max(first.solution.visible_px[r].sum(), 1.0)
         uncovered = np.nanmedian(first.coverage[r, first.use[r]])
         if share < config.first_share or uncovered > config.lost_coverage or first.fit[r] < _LEAST_FIT:
             return (
                 f"the {ARCH_NAMES[r]} teeth do not fit their masks: {share:.0%} of the visible contour "
-                f"matches (at least {config.first_share:.0%} is needed), {uncovered:.1%} of the masks stays uncovered "
-                f"(at most {config.lost_coverage:.0%} is allowed), and the first less the price of the second is "
-                f"{first.fit[r]:.3f} (at least {_LEAST_FIT} is needed)"
+                f"matches (at least {config.first_share:.0%} is needed), {uncovered:.1%} of the masks is not covered "
+                f"(at most {config.lost_coverage:.0%} is allowed), and the match less the penalty for uncovered mask "
+                f"is {first.fit[r]:.3f} (at least {_LEAST_FIT} is needed)"
             )
     return None
 
 
 def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View]) -> str | None:
-    """Say by how much scans or pictures are too large or small if that explains why they do not fit; else None."""
+    """Describe a camera whose magnification explains a failed alignment; None if there is none."""
     use = present_masks(views)
     poses = solver.solve(start, views, config.wide_gates_px, use).poses
     scales = np.zeros(len(views))
@@ -136,23 +133,23 @@ def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, vie
     if np.abs(scales).max() > _LEAST_SCALE and _problem(again, config) is None and again.fit.min() >= _CLEAR_FIT:
         worst = int(np.abs(scales).argmax())
         return (
-            f"camera {worst + 1} of {len(views)} shows the teeth {100 * scales[worst]:+.1f} % larger than scans and "
-            "calibration say, and all fit once that is corrected: its focal length is wrong"
+            f"camera {worst + 1} of {len(views)} magnifies the teeth by {100 * scales[worst]:+.1f} % relative to the "
+            "scans and its calibration, and everything fits once that is corrected: its focal length is wrong"
         )
     return None
 
 
 def _without_camera(use: Mask, camera: int) -> Mask:
-    """Leave one camera out of the arches that then have enough masks, shape (2, C)."""
+    """Exclude a camera from arches that have enough masks without it, shape (2, C)."""
     kept = use.copy()
     kept[:, camera] = False
     return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)
 
 
 def _without_spoiled(use: Mask, coverage: Array, limit: float) -> Mask:
-    """Leave out masks that stay uncovered while at least two of their arch are covered, shape (2, C).
+    """Exclude uncovered masks of arches with at least two covered ones, shape (2, C).
 
-    The limit is that of a lost arch, so what is left out would have cost every frame in which it took part.
+    The limit is that of a lost arch, so an excluded mask would have made every frame lost.
     """
     kept = use & ~(coverage > limit)
     return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)

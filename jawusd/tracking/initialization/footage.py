@@ -1,4 +1,4 @@
-"""The masks of a take before the teeth are located: where the masks are, and which frames show them well."""
+"""Mask files before tracking: position and size of the masks, and the frames that show them best."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
-_BESIDE = 2  # surveyed frames to either side that show much the same
-_WIDTH_PX = 320  # of the surveyed pictures: their middles are good to a tenth of a millimetre
+_BESIDE = 2  # surveyed frames on either side that are redundant
+_WIDTH_PX = 320  # of the surveyed pictures: mask centres are accurate to a tenth of a millimetre
 
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """Name the masks to be tracked: those of cameras with masks, in frames from first to one past the last, or all.
+    """The masks to be tracked: cameras with masks, and frames from first to one past the last, or all.
 
     `offsets` are reference frame minus own frame number, by camera name.
     """
@@ -32,18 +32,18 @@ class Footage:
     cameras: Mapping[str, Camera]
     offsets: Mapping[str, int]
     frames: tuple[int, int] | None
-    fewest: int = FEWEST_CAMERAS  # that must show both arches
+    fewest: int = FEWEST_CAMERAS  # cameras that must show both arches
 
     def survey(self, frames: tuple[int, int] | None, count: int) -> MaskSurvey:
-        """Measure the masks of evenly spread frames, of the whole footage if no range is given."""
+        """Measure the masks of evenly spaced frames, of the whole footage by default."""
         return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count, self.fewest)
 
     def views(self, centre: Array, px_per_mm: float) -> MaskViews:
-        """Open the masks at a resolution at the teeth, which are near a world point [mm], shape (3,)."""
+        """Open the masks at a resolution at the teeth, which are near a world point (3,) [mm]."""
         return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm, self.fewest)
 
     def has_masks(self, frame: int) -> bool:
-        """Tell whether both arches have masks in two cameras on a frame."""
+        """Return whether both arches have masks in enough cameras on a frame."""
         try:
             self.survey((frame, frame + 1), 1)
         except TrackingError:
@@ -53,19 +53,19 @@ class Footage:
 
 @dataclass(frozen=True, eq=False)
 class MaskSurvey:
-    """Hold middles and areas of the masks of some frames."""
+    """Centres and areas of the masks of some frames."""
 
     frames: NDArray[np.int64]  # reference camera frames, shape (F,)
     # mean position (x, y) of every mask in its undistorted survey picture [px], NaN without a mask, shape (F, 2, C, 2);
     # rows are upper, lower
     middles: Array
-    areas_px: Array  # size of every mask, shape (F, 2, C); 0 without one
+    areas_px: Array  # area of every mask, shape (F, 2, C); 0 without a mask
     matrices: Array  # world [mm] to homogeneous px of the survey pictures, shape (C, 3, 4)
     eyes: Array  # camera centres in the world [mm], shape (C, 3)
     fewest: int = FEWEST_CAMERAS  # cameras that must show both arches
 
     def places(self) -> Array:
-        """Return the world points seen at the middles of the masks [mm], NaN with fewer than two, shape (F, 2, 3)."""
+        """Return the triangulated mask centres in the world [mm], NaN with fewer than two masks, shape (F, 2, 3)."""
         out = np.full((len(self.frames), 2, 3), np.nan)
         for f, r in np.ndindex(out.shape[:2]):
             seen = self.areas_px[f, r] > 0
@@ -74,10 +74,10 @@ class MaskSurvey:
         return out
 
     def promising(self, count: int) -> NDArray[np.int64]:
-        """Return frames that show much of both arches in all cameras, the best first, at most `count`.
+        """Return at most `count` frames that show large masks of both arches in all cameras, the best first.
 
-        Beyond what a tenth of the frames reach more area counts for nothing: a mask that large may be a wrong one.
-        Frames next to one another resemble each other: neighbours come after all others.
+        Areas are clipped at their 90 % quantile, since larger masks may be wrong. Neighbouring frames are redundant, so
+        they come after all others.
         """
         full = np.maximum(np.quantile(self.areas_px, 0.9, axis=0), 1.0)
         shown = np.sqrt(np.minimum(self.areas_px / full, 1.0)).sum(-1).min(-1)
@@ -98,7 +98,7 @@ def survey_masks(
     count: int,
     fewest: int = FEWEST_CAMERAS,
 ) -> MaskSurvey:
-    """Measure the masks of at most `count` evenly spread frames; all arguments as in `Footage`.
+    """Measure the masks of at most `count` evenly spaced frames; other arguments as in `Footage`.
 
     Raises:
         TrackingError: no frame shows both arches in enough cameras.
@@ -133,9 +133,9 @@ def survey_masks(
                 areas[f, r, c] = area
     if not ((areas > 0).sum(-1) >= fewest).all(-1).any():
         raise TrackingError(
-            f"none of {len(chosen)} frames looked at from {chosen[0]} to {chosen[-1]} has masks of both rows of teeth "
+            f"none of {len(chosen)} frames sampled from {chosen[0]} to {chosen[-1]} has masks of both arches "
             f"in {fewest} camera{'s' if fewest > 1 else ''}",
-            hint="Segment some frames in every camera, or give [bootstrap] picks on one that is.",
+            hint="Segment some frames in every camera, or add [bootstrap] picks on a segmented frame.",
         )
     return MaskSurvey(
         frames=chosen,

@@ -1,8 +1,8 @@
-"""Whether pictures are larger or smaller than calibration and scans say: wrong focal lengths, lenses and scan sizes.
+"""Magnification of the masks relative to calibration and scans: wrong focal lengths, lenses and scan sizes.
 
-Poses of the teeth cannot make up for a picture that is magnified about its principal point: over a take, the distances
-between projected contours and mask edges then grow with the distance from there. Magnification and its change with the
-radius are estimated per camera, poses, camera motions and outline biases eliminated.
+Poses cannot compensate for a picture that is magnified about its principal point: over a take, distances between
+projected contours and mask edges then grow with the distance from that point. Magnification and its change with the
+radius are estimated per camera, with poses, camera motions and outline biases eliminated.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z, 
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import Drawn, View
 
-# How far contours are looked for [px]: a focal length off by 5 % moves the molars' by 9 px at 7 px/mm.
+# Search distance for contours [px]: an error of 5 % in focal length moves molars by 9 px at 7 px/mm.
 _REACH_PX = 16.0
-# Distance from the optical axis at which bending is stated [mm]: the outermost teeth that cameras see.
+# Distance from the optical axis at which distortion is stated [mm]: the outermost visible teeth.
 _RADIUS_MM = 25.0
-# What is known without the take, standard deviations: magnification and bending [-], turn [rad] and motion [mm] of a
-# camera per axis, outline bias [px].
+# Prior standard deviations: magnification and distortion [-], rotation [rad] and motion [mm] of a camera per axis,
+# outline bias [px].
 _PRIORS = (0.1, 0.1, *(0.01,) * 3, *(2.0,) * 3, 1.0, 1.0)
 _UNKNOWNS = len(_PRIORS)
 _ROUNDS = 5
-_LENGTH_FACTOR = 1.5  # what a Tukey weight and the fit hide of the errors' correlation
+_LENGTH_FACTOR = 1.5  # correction of the correlation length for the Tukey weight and the fit
 _LEAST_SPREAD_PX = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Magnification:
-    """How much larger than expected each camera shows the teeth.
+    """Magnification of the teeth in each camera relative to what is expected.
 
     Attributes:
-        scale, sigma_scale: relative, shape (C,): 0.05 where pictures are 5 % larger than expected.
-        bend, sigma_bend: change of it from the optical axis to a radius of 25 mm at the teeth, shape (C,).
-        bias_px, sigma_bias_px: how far masks reach beyond the teeth at the working size, per arch, shape (C, 2).
-        turn_rad, move_mm: how far each camera turned and moved against the mean of all, shape (C,).
+        scale, sigma_scale: relative, shape (C,): 0.05 for pictures 5 % larger than expected.
+        bend, sigma_bend: change of `scale` from the optical axis to a radius of 25 mm at the teeth, shape (C,).
+        bias_px, sigma_bias_px: mask bias beyond the teeth at working resolution, per arch, shape (C, 2).
+        turn_rad, move_mm: rotation and motion of each camera relative to the mean of all, shape (C,).
         motion_clear: length of that motion in standard deviations (Mahalanobis), shape (C,).
-        spread_px: rms distance that remains.
+        spread_px: robust standard deviation of the residuals.
     """
 
     scale: Array
@@ -59,29 +59,29 @@ class Magnification:
 
     @property
     def common(self) -> float:
-        """The magnification that all cameras share [-], as their median."""
+        """The magnification common to all cameras [-], their median."""
         return float(np.median(self.scale))
 
 
-#: One frame: T_world_upper and T_world_lower (2, 4, 4), views, masks that took part (2, C).
+#: One frame: T_world_upper and T_world_lower (2, 4, 4), views, masks used (2, C).
 Instant = tuple[Array, Sequence[View], Mask]
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Linearised distances of one arch in one frame: d = J x + C theta."""
+    """Linearised distances of one arch in one frame: d = J x + C theta, x the pose, theta the shared unknowns."""
 
     distance: Array  # shape (n,)
     length: Array  # contour length [px], shape (n,)
-    pose: Array  # slopes by the arch's own twist, shape (n, 6)
+    pose: Array  # derivatives by the twist of the arch, shape (n, 6)
     camera: Array  # camera of each row, shape (n,)
-    shared: Array  # slopes by the unknowns of its camera, shape (n, _UNKNOWNS)
+    shared: Array  # derivatives by the unknowns of its camera, shape (n, _UNKNOWNS)
 
 
 def measure_magnification(
     scans: Sequence[Scan], instants: Iterable[Instant], config: TrackingConfig
 ) -> Magnification | None:
-    """Estimate the magnification of all cameras from some frames; None if they show too little."""
+    """Estimate the magnification of all cameras from some frames; None without enough matches."""
     blocks: list[_Rows] = []
     cameras = 0
     for poses, views, use in instants:
@@ -100,7 +100,7 @@ def measure_magnification(
 def _rows(
     scans: Sequence[Scan], r: int, c: int, poses: Array, view: View, pivot: Array, config: TrackingConfig
 ) -> _Rows | None:
-    """Match the contour of an arch in one view with its edges, from far; None if nothing matches."""
+    """Match the contour of an arch in one view over a large distance; None if nothing matches."""
     scan, pose = scans[r], view.T_delay[r] @ poses[r]
     samples, distance = _matched(scans, r, view, poses, config)
     if not len(samples):
@@ -133,10 +133,10 @@ def _rows(
 
 
 def _matched(scans: Sequence[Scan], r: int, view: View, poses: Array, config: TrackingConfig) -> tuple[Array, Array]:
-    """Return the contour samples of an arch that have an edge in reach, (n, COLUMNS), and its distances [px], (n,)."""
+    """Return the contour samples of an arch with an edge in reach (n, COLUMNS), and their distances (n,) [px]."""
     labels = np.zeros((2, *view.masks.shape[1:]), np.uint8)
     depth = np.zeros(labels.shape, np.float32)
-    drawn = [r] if view.edges is None else ARCHES  # masks show both arches apart
+    drawn = [r] if view.edges is None else ARCHES  # masks separate the arches already
     for arch in drawn:
         scans[arch].draw(view.matrix @ view.T_delay[arch] @ poses[arch], depth[arch], labels[arch])
     pose = view.T_delay[r] @ poses[r]
@@ -166,7 +166,7 @@ def _joined(parts: Sequence[_Rows]) -> _Rows:
 
 
 def _solved(blocks: Sequence[_Rows], cameras: int, config: TrackingConfig) -> Magnification:
-    """Solve by reweighting (Tukey), the poses eliminated block by block."""
+    """Solve by iterative reweighting (Tukey), with poses eliminated block by block."""
     size = _UNKNOWNS * cameras
     prior = np.diag(np.tile(np.array(_PRIORS) ** -2.0, cameras))
     left = [block.distance for block in blocks]
@@ -204,7 +204,7 @@ def _solved(blocks: Sequence[_Rows], cameras: int, config: TrackingConfig) -> Ma
 
 
 def _motion(theta: Array, covariance: Array, cameras: int) -> tuple[Array, Array, Array]:
-    """Return turn [rad] and motion [mm] of each camera against the mean of all, and their clearness, shapes (C,)."""
+    """Return rotation [rad] and motion [mm] of each camera relative to the mean, and its significance, shapes (C,)."""
     against_mean = np.eye(cameras) - 1.0 / cameras
     pick = np.zeros((6, _UNKNOWNS))
     pick[:, 2:8] = np.eye(6)
@@ -217,7 +217,7 @@ def _motion(theta: Array, covariance: Array, cameras: int) -> tuple[Array, Array
 
 
 def magnified(view: View, scale: float) -> View:
-    """Return a view as a camera of a longer focal length would have it."""
+    """Return a view with the focal length multiplied by 1 + scale."""
     axis, grown = _principal_point(view.matrix), 1.0 + scale
     enlarge = np.array([[grown, 0.0, -scale * axis[0]], [0.0, grown, -scale * axis[1]], [0.0, 0.0, 1.0]])
     return replace(view, matrix=enlarge @ view.matrix)

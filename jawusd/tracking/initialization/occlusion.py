@@ -1,4 +1,4 @@
-"""How two teeth scans meet: contact, overlap and relation of opposing crowns, measured locally along the arches."""
+"""Measurements of how two teeth scans meet: contact, overlap, and relation of opposing crowns."""
 
 from __future__ import annotations
 
@@ -12,55 +12,55 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal
 from jawusd.tracking.contour.scan import Scan
 
-_SAMPLES = 8000  # pieces of surface per arch: one per half millimetre
-_SHARE = 0.002  # of the crown surface that may be exceptions: a speck, a spike of the mesh
-_DEEPEST_MM = 5.0  # no point inside a crown is farther from its surface; what seems so lies past an open border
+_SAMPLES = 8000  # surface samples per arch: one per half millimetre
+_SHARE = 0.002  # of the crown surface ignored as outliers, such as spikes of the mesh
+_DEEPEST_MM = 5.0  # larger depths inside a crown are impossible: such points lie beyond an open border
 _DEEP_MM = 1.0
 _SAME_MM = 0.05
-_BESIDE_MM = 4.0  # half of a molar: crowns nearer than this across the bite plane stand over one another
+_BESIDE_MM = 4.0  # half of a molar: crowns nearer than this in the bite plane oppose one another
 _CELL_MM = 1.0
-_THROUGH_MM = 2.0  # cusps reach less deep into the other arch as seen from above
+_THROUGH_MM = 2.0  # vertical overlap of arches that passed through one another; cusps overlap less
 _SLAB_MM = 3.0
-_FEWEST = 50  # pieces of surface that make a side of an arch
-_ASIDE_MM = 6.0  # nearer to the middle, left and right are one tooth
-_OPEN = 0.08  # a surface whose directed area is a smaller share of its area is closed and shows no open side
-# Gum that says where the crowns stand: of this share of their area, and so far below them. What is less is crumbs.
+_FEWEST = 50  # surface samples required on a side of an arch
+_ASIDE_MM = 6.0  # nearer to the midline, left and right belong to the same tooth
+_OPEN = 0.08  # least directed area over area of an open surface
+# Least gum area relative to the crowns, and distance below them, from which gum shows the orientation of a scan.
 _GUM_SHARE, _GUM_BELOW_MM = 0.3, 2.0
 
 
 @dataclass(frozen=True)
 class Occlusion:
-    """Hold how two arches meet; lengths in mm, NaN where the teeth do not show a figure."""
+    """How two arches meet; lengths in mm, NaN if they cannot be measured."""
 
-    gap_mm: float  # distance of the crowns where they are closest, 0 where they touch
-    side_gaps_mm: tuple[float, float]  # the same left and right of the middle, negative where crowns overlap
-    depth_mm: float  # how deep crowns run into one another
-    deep_share: float  # of the crown surface that stands opposite other crowns: what runs in deeper than a millimetre
-    through: float  # share of the ground covered by both arches on which the lower crowns end 2 mm above the upper ones
+    gap_mm: float  # smallest distance between the crowns, 0 if they touch
+    side_gaps_mm: tuple[float, float]  # the same left and right of the midline, negative if crowns overlap
+    depth_mm: float  # largest overlap of the crowns
+    deep_share: float  # share of the opposed crown surface that overlaps by more than 1 mm
+    through: float  # share of the common area in the bite plane on which lower crowns end 2 mm above upper ones
     same: float  # share of the surfaces that coincide
-    opposite: float  # share of the arch with fewer teeth that stands over or under crowns of the other one
-    aside_mm: float  # distance of the middles of both arches along the bite plane
+    opposite: float  # share of the arch with fewer teeth that has crowns of the other arch over or under it
+    aside_mm: float  # distance between the centres of the arches along the bite plane
     turn_rad: float  # angle in the bite plane between the forward directions of both arches
     turned_over: tuple[bool | None, bool | None]  # upper, lower: gum between crowns and other arch; None: no gum
     opens_towards: tuple[bool, bool]  # upper, lower: the open side of the crowns faces the other arch
-    midlines_mm: float  # distance of the middles sideways, where both arches have teeth left and right
+    midlines_mm: float  # lateral distance of the midlines, where both arches have teeth left and right
     width_ratio: float  # width of the upper arch over that of the lower one at equal depth
     widths_mm: tuple[float, float]  # largest width of each arch
-    lower_ahead_mm: float  # how far the lower front teeth stand before the upper ones
+    lower_ahead_mm: float  # distance of the lower front teeth in front of the upper ones
 
 
 @dataclass(frozen=True, eq=False)
 class CrownSurface:
-    """Hold pieces of a crown surface."""
+    """Samples of a crown surface."""
 
     points: Array  # [mm], shape (N, 3)
-    normals: Array  # outward units, shape (N, 3)
+    normals: Array  # outward unit normals, shape (N, 3)
     areas: Array  # [mm^2], shape (N,)
-    border: Mask  # next to an opening of the surface, where inside and outside cannot be told, shape (N,)
+    border: Mask  # next to an opening of the surface, where the inside is undefined, shape (N,)
 
 
 def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlusion:
-    """Measure how two scans meet that lie in one frame; `T_anatomical_scan` maps it to (left, up, front) axes."""
+    """Measure how two scans in one frame meet; `T_anatomical_scan` maps that frame to (left, up, front) axes."""
     surfaces = [crown_surface(scan) for scan in scans]
     crowns = [scan.crown_vertices(_SAMPLES) for scan in scans]
     normal = bite_normal(*crowns)
@@ -69,7 +69,7 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
     axes = np.stack([left, normal, np.cross(left, normal)])
     upper, lower = (points @ axes.T for points in crowns)
     middle = float(np.mean([np.percentile(points[:, 0], [1, 99]).mean() for points in (upper, lower)]))
-    # Both ways: the surface that is finer sees contacts that the other one steps over.
+    # In both directions: the finer surface finds contacts that the coarser one misses.
     signed = [_signed_distances(surfaces[k], surfaces[1 - k]) for k in (0, 1)]
     nearest = [_weighted_quantile(d, surfaces[k].areas, _SHARE) for k, d in enumerate(signed)]
     stand = [_beside(a, b) for a, b in ((upper, lower), (lower, upper))]
@@ -97,7 +97,7 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
 
 
 def crown_surface(scan: Scan) -> CrownSurface:
-    """Return the crown faces as pieces of surface, at most about `_SAMPLES` of them."""
+    """Return about `_SAMPLES` crown faces at most as surface samples."""
     border = np.zeros(len(scan.crown_faces), bool)
     border[scan.edges[scan.edges[:, 3] < 0, 2]] = True
     chosen = slice(None, None, max(1, len(scan.crown_faces) // _SAMPLES))
@@ -108,16 +108,16 @@ def crown_surface(scan: Scan) -> CrownSurface:
 
 
 def _signed_distances(these: CrownSurface, others: CrownSurface) -> Array:
-    """Return the distance of each piece from the other arch, negative inside of it [mm], shape (N,)."""
+    """Return the distance of each sample to the other arch, negative inside [mm], shape (N,)."""
     distance, nearest = cKDTree(others.points).query(these.points)
     behind = np.einsum("ij,ij->i", these.points - others.points[nearest], others.normals[nearest])
-    # Behind the surface and not merely past its border.
+    # Behind the surface, and not just beyond its border.
     inside = (behind < -0.7 * distance) & (distance < _DEEPEST_MM) & ~others.border[nearest]
     return np.where(inside, -distance, distance)
 
 
 def _through(upper: Array, lower: Array) -> float:
-    """Return on which share of the ground that both arches cover the lower crowns end far above the upper ones.
+    """Return the share of the common area in the bite plane where lower crowns end far above upper ones.
 
     Args:
         upper, lower: crown points (left, up, front) [mm], shapes (N, 3) and (M, 3).
@@ -139,12 +139,12 @@ def _weighted_quantile(values: Array, weights: Array, share: float) -> float:
 
 
 def _beside(these: Array, others: Array) -> Array:
-    """Return for each point whether the other arch has one over or under it, shape (N,)."""
+    """Return whether the other arch has a point over or under each point, shape (N,)."""
     return cKDTree(others[:, [0, 2]]).query(these[:, [0, 2]])[0] < _BESIDE_MM
 
 
 def _side_gap(signed: Sequence[Array], surfaces: Sequence[CrownSurface], aside: Array, middle: float) -> float:
-    """Return the gap of the crowns on the side to which `aside` points [mm]; NaN where an arch has no teeth there."""
+    """Return the gap of the crowns on the side that `aside` points to [mm]; NaN if an arch has no teeth there."""
     gaps = []
     for distance, surface in zip(signed, surfaces, strict=True):
         there = surface.points @ aside - middle > _ASIDE_MM
@@ -155,9 +155,9 @@ def _side_gap(signed: Sequence[Array], surfaces: Sequence[CrownSurface], aside: 
 
 
 def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
-    """Return by how much the middles differ sideways [mm], and the ratio of the widths; NaN where not known.
+    """Return the lateral distance of the midlines [mm], and the ratio of the widths; NaN if unknown.
 
-    They are compared in slabs across the arch in which both arches have teeth on both sides.
+    They are measured in slabs across the arches where both have teeth on both sides.
     """
     middle = 0.5 * (upper[:, 0].mean() + lower[:, 0].mean())
     apart, ratios = [], []
@@ -177,9 +177,9 @@ def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
 
 
 def _forward(flat: Array) -> Array:
-    """Return the direction in which the horseshoe of points (N, 2) is closed, shape (2,).
+    """Return the direction of the closed end of a horseshoe of points (N, 2), shape (2,).
 
-    Of all directions it is the one against which both legs spread alike.
+    It is the direction for which both legs widen symmetrically.
     """
     flat = flat[:: max(1, len(flat) // 2000)]
     best, found = -np.inf, np.array([0.0, 1.0])
@@ -190,14 +190,14 @@ def _forward(flat: Array) -> Array:
         left, right = depth[lateral > 0], depth[lateral < 0]
         if min(len(left), len(right)) < 20:
             continue
-        worth = -np.corrcoef(depth, np.abs(lateral))[0, 1] - abs(left.mean() - right.mean()) / np.std(depth)
-        if worth > best:
-            best, found = worth, ahead
+        symmetry = -np.corrcoef(depth, np.abs(lateral))[0, 1] - abs(left.mean() - right.mean()) / np.std(depth)
+        if symmetry > best:
+            best, found = symmetry, ahead
     return found
 
 
 def _widest_mm(points: Array) -> float:
-    """Return the larger of both extents of an arch in its own plane [mm], wherever it lies."""
+    """Return the larger extent of an arch in its own plane [mm]."""
     axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
     return float(np.ptp(points @ axes[:2].T, axis=0).max())
 
@@ -207,7 +207,7 @@ def _angle(a: Array, b: Array) -> float:
 
 
 def _turned_over(scan: Scan, surface: CrownSurface, towards: Array) -> bool | None:
-    """Return whether the crowns lie on that side of their gum that looks away from the other arch; None: no gum."""
+    """Return whether the gum lies between the crowns and the other arch; None without gum."""
     corners = scan.vertices[scan.gum_faces]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     if areas.sum() < _GUM_SHARE * surface.areas.sum():

@@ -22,20 +22,20 @@ from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.scan import CROWN, Scan, prepare_scan
 from jawusd.tracking.contour.views import View
 
-_CELL_MM = 1.2  # vertices closer than this become one: below the pixels of the search
-_BLUR_MM = 0.9  # of the outlines, so that a grid of a few degrees and two millimetres does not miss the optimum
-# Price of an uncovered mask pixel of 1 mm in mm of fitting outline [1/mm].
+_CELL_MM = 1.2  # vertices in cells of this size are merged
+_BLUR_MM = 0.9  # of the outlines, so that the coarse grid does not miss the optimum
+# Penalty per mm^2 of uncovered mask, in mm of matched outline [1/mm].
 _UNCOVERED_PRICE = 1.0
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Lay out the poses to be tried about a guess.
+    """A grid of poses about a guess.
 
     Attributes:
         yaw_rad, pitch_rad, roll_rad: turns about the up, left and front axes of the arch.
-        reach_mm: translations to either side along left, up and front.
-        step_mm: distance of the translations.
+        reach_mm: largest translation along left, up and front, in both directions.
+        step_mm: spacing of the translations.
     """
 
     yaw_rad: Array
@@ -45,28 +45,28 @@ class Grid:
     step_mm: float = 1.5
 
     def turns(self) -> Iterator[Array]:
-        """Yield the rotations to be tried, those that differ in their roll together, shape (N, 3, 3)."""
+        """Yield the rotations, all rolls of one yaw and pitch together, shape (N, 3, 3)."""
         rolls = so3_exp(self.roll_rad[:, None] * [0.0, 0.0, 1.0])
         for yaw in self.yaw_rad:
             for pitch in self.pitch_rad:
                 yield so3_exp([0, yaw, 0]) @ so3_exp([pitch, 0, 0]) @ rolls
 
     def shifts(self) -> Array:
-        """Return the translations to be tried along left, up and front [mm], shape (N, 3)."""
+        """Return the translations along left, up and front [mm], shape (N, 3)."""
         axes = [np.arange(-r, r + self.step_mm / 2, self.step_mm) for r in self.reach_mm]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Hold one pose that the search found promising: its objective [px] and T_world_arch, shape (4, 4)."""
+    """A promising pose: its objective [px] and T_world_arch, shape (4, 4)."""
 
     objective: float
     pose: Array
 
 
 def coarse_scan(mesh: Mesh, name: str) -> Scan:
-    """Return a teeth scan with as few faces as the search needs; crowns and gum stay apart."""
+    """Return a teeth scan decimated for the search, with crowns and gum still separate."""
     cells = np.floor(mesh.vertices / _CELL_MM).astype(np.int64)
     _, chosen, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     faces = inverse.reshape(-1)[mesh.faces]
@@ -77,17 +77,17 @@ def coarse_scan(mesh: Mesh, name: str) -> Scan:
 
 
 class Screen:
-    """Tell how well the drawn arch fits its mask in one picture at every shift."""
+    """Correlates the drawn arch with its mask in one picture, for all shifts at once."""
 
     def __init__(self, view: View, arch: int, px_per_mm: float, shifts: Array, at: Array) -> None:
         """Prepare the correlation for world translations `shifts` (N, 3) of a world point `at` (3,) [mm]."""
-        # Rounded: sub-pixel shifts gain nothing on blurred outlines.
+        # Rounded, since sub-pixel shifts do not matter for blurred outlines.
         pixels = np.rint(shifts @ _slope(view.matrix, at).T).astype(np.int64)
         picture = _template(view.masks[arch], view.masks[1 - arch], px_per_mm)
         some = np.abs(picture) > 1e-3
         y, x = np.flatnonzero(some.any(1)), np.flatnonzero(some.any(0))
         picture = picture[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
-        # With as much border as the farthest shift nothing that wraps around meets the template.
+        # A border as wide as the largest shift keeps wrapped-around content off the template.
         right, down = np.abs(pixels).max(0)
         picture = np.pad(picture, ((down, down), (right, right))).astype(np.float32)
         self._shape = picture.shape
@@ -126,12 +126,11 @@ def search_arch(
     Args:
         scan: the arch, coarse.
         arch: 0 upper, 1 lower.
-        views: of one instant; those without a mask of the arch are left out.
+        views: of one instant; those without a mask of the arch are ignored.
         px_per_mm: their resolution at the teeth.
-        base: guessed pose of the arch's (left, up, front) axes about the point to turn about, world <- axes, shape
-            (4, 4).
-        hinge: scan frame to (left, up, front) axes about that point, shape (4, 4).
-        map_: runs the orientations.
+        base: guessed T_world_axes with (left, up, front) axes of the arch at the centre of rotation, shape (4, 4).
+        hinge: T_axes_scan to the same axes, shape (4, 4).
+        map_: distributes the orientations among threads.
     """
     shifts = grid.shifts() @ base[:3, :3].T
     screens = [Screen(view, arch, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[arch]]
@@ -150,12 +149,11 @@ def search_arch(
 def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> Array:
     """Return the picture whose correlation with the drawn crowns is their objective, up to a constant [px].
 
-    The objective is the length of outline that lies on the mask's outline, less a price of uncovered mask pixels. The
-    first is the correlation of the blurred gradients of both pictures, normalised to 1 per pixel of a straight edge;
-    moving both derivatives to the mask makes it -div(w grad m). Where the other arch begins, the outline belongs to
-    that arch (w = 0).
+    The objective is the length of outline on the mask's outline, less a penalty for uncovered mask pixels. The first is
+    the correlation of the blurred gradients of both pictures, normalised to 1 per pixel of a straight edge. Moving both
+    derivatives to the mask turns it into -div(w grad m), with w = 0 where the outline belongs to the other arch.
     """
-    sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # both outlines' blur in one
+    sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # blur of both outlines combined
     inside = mask / 255.0
     own = 1.0 - ndimage.binary_dilation(other > 127, iterations=max(1, round(px_per_mm)))
     smooth = ndimage.gaussian_filter(inside, sigma)
@@ -171,30 +169,31 @@ def _slope(matrix: Array, point: Array) -> Array:
 
 
 def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
-    """Return the anatomical frame of an arch, moved to the middle of its front teeth, shape (4, 4).
+    """Return the transform from the scan frame to anatomical axes at the centre of the front teeth, shape (4, 4).
 
     Args:
         crowns: crown vertices in the scan frame [mm], shape (N, 3).
         T_anatomical_scan: scan to anatomical axes, shape (4, 4).
     """
     points = transform_points(T_anatomical_scan, crowns)
-    front = points[points[:, 2] > points[:, 2].max() - 15.0]  # incisors to first premolars: what cameras see
+    front = points[points[:, 2] > points[:, 2].max() - 15.0]  # incisors to first premolars, which cameras see
     return make_transform(np.eye(3), -front.mean(0)) @ T_anatomical_scan
 
 
 def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], use: Mask) -> Array:
-    """Return the translation across the line of sight that brings the crowns' middle onto that of their masks [mm].
+    """Return the translation across the line of sight that moves the centre of the crowns to that of their masks [mm].
 
-    Lips hide the back teeth, and others in every view, so the depth found would be wrong by a centimetre or two: it
-    is left alone. Across, the result is good to a few millimetres: enough for a search to start from.
+    It brings teeth that were out of view back near their masks. Lips hide different teeth in every view, so a depth
+    estimate would be off by a centimetre or two; depth is not changed. Across, the result is accurate to a few
+    millimetres, enough to start a search.
 
-    `pose` is T_world_scan, `use` tells the masks to be used, shape (2, C). Zero without a mask.
+    `pose` is T_world_scan, `use` the masks to use, shape (2, C). Zero without masks.
     """
     centre = np.append(transform_point(pose, scan.centre), 1.0)
     H, g, sight = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for view in (view for view, used in zip(views, use[arch], strict=True) if used):
         height, width = view.masks.shape[1:]
-        # Three pictures wide and high: what is to be brought near may lie off the picture.
+        # Three times the picture size, since the teeth may be outside the picture.
         bits = scan.silhouette(view.matrix @ view.T_delay[arch] @ pose, (3 * height, 3 * width), -width, -height)
         crowns, mask = unpack_bits(bits, 3 * width), view.masks[arch] > 127
         depth = view.matrix[2] @ centre
@@ -208,7 +207,7 @@ def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], us
         sight += (centre[:3] - view.eye) / np.linalg.norm(centre[:3] - view.eye)
     if not sight.any():
         return np.zeros(3)
-    across = np.linalg.svd(sight[None])[2][1:]  # two directions normal to the mean line of sight
+    across = np.linalg.svd(sight[None])[2][1:]  # two directions perpendicular to the mean line of sight
     return across.T @ np.linalg.solve(across @ H @ across.T, across @ g)
 
 

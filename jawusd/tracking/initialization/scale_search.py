@@ -1,7 +1,7 @@
-"""The size of the teeth as calibrated cameras see them: a search for the size at which masks and scans agree best.
+"""A search for the world scale at which masks and scans agree best.
 
-Pictures of a board do not show how large its squares are. With the wrong size the whole world is scaled, and the teeth
-fit their masks in several views at no pose until the cameras are moved closer together or apart.
+Pictures of a calibration board do not reveal the size of its squares. A wrong size scales the whole world, and no pose
+of the teeth fits their masks in several views until the distances between cameras are corrected.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start_search import StartSearch
 
-# Sizes of the world at which the poses are searched from scratch; between them the fit rises towards the true one.
+# World scales at which poses are searched from scratch; between them the fit improves towards the true scale.
 _STARTS = (1.0, 1 / 1.15, 1.15, 1 / 1.32, 1.32)
 _STEPS = (0.03, 0.01, 0.005)
 _SMALLEST, _LARGEST = 0.5, 2.0
 _SURVEYED, _FRAMES_TRIED = 24, 2
-# Sizes aligned in a climb: from one end to the other in the widest steps, and the others. Uneven masks may have hills.
+# Maximum evaluations of a hill climb: the whole range in the widest steps, and the finer ones.
 _MOST_SIZES = 64
-_CLEAR_FIT = 0.3  # as for the start of a take: wrong poses stay below 0.1 in one of the arches
+_CLEAR_FIT = 0.3  # as for the start of a take: wrong poses stay below 0.1 in one arch
 
 
 def seen_size(
@@ -42,17 +42,17 @@ def seen_size(
     meshes: Sequence[Mesh],
     map_: Mapper = map,
 ) -> float:
-    """Return how many times as large as their scans the cameras see the teeth, to half a per cent.
+    """Return the ratio of the teeth's size as seen by the cameras to the scans, accurate to half a per cent.
 
     Args:
-        capture: gives masks, frame range and anatomical axes.
-        cameras: calibrated up to the size of the world.
+        capture: provides masks, frame range and anatomical axes.
+        cameras: calibrated up to the scale of the world.
         offsets: reference frame minus own frame number, by camera name.
         meshes: upper and lower teeth scans in one frame, in occlusion [mm].
-        map_: runs parts of the search.
+        map_: distributes the search among threads.
 
     Raises:
-        TrackingError: too few masks, or the scans fit them at no size.
+        TrackingError: too few masks, or the scans do not fit them at any size.
         CaptureError: a mask cannot be read.
     """
     solver = ContourSolver(tuple(prepare_scan(m, n) for m, n in zip(meshes, ARCH_NAMES, strict=True)), TrackingConfig())
@@ -68,16 +68,16 @@ def seen_size(
                 continue
             size, fit = sizes.climb(frame, start, poses)
             if fit >= _CLEAR_FIT:
-                return 1.0 / size  # the world has to grow by as much as the teeth are seen too small
+                return 1.0 / size  # the world must grow by the factor by which the teeth appear too small
             best_fit = max(best_fit, fit)
     raise TrackingError(
-        f"the scans fit the masks of frames {', '.join(map(str, frames))} at no size from {_SMALLEST:g} to "
-        f"{_LARGEST:g} (at best by {best_fit:.2f}; {_CLEAR_FIT} is clear)"
+        f"the scans do not fit the masks of frames {', '.join(map(str, frames))} at any size from {_SMALLEST:g} to "
+        f"{_LARGEST:g} (the best fit is {best_fit:.2f}; at least {_CLEAR_FIT} is needed)"
     )
 
 
 class _Sizes:
-    """Fit the teeth with the world as calibrated times a size."""
+    """Fits the teeth with the calibrated world scaled by a factor."""
 
     def __init__(
         self, capture: Capture, cameras: Sequence[Camera], offsets: Mapping[str, int], search: StartSearch
@@ -86,7 +86,7 @@ class _Sizes:
         self.search, self._solver = search, search.solver
 
     def footage(self, size: float) -> Footage:
-        """Return the masks as seen by cameras that are farther apart by a factor."""
+        """Return the masks with camera distances multiplied by a factor."""
         cameras = {}
         for camera in self._cameras:
             T = camera.T_cam_world.copy()
@@ -96,9 +96,9 @@ class _Sizes:
         return Footage(sources, cameras, self._offsets, self._capture.frames)
 
     def climb(self, frame: int, size: float, poses: Array) -> tuple[float, float]:
-        """Return the size at which the fit is best, going uphill from given poses, and the fit of the worse arch.
+        """Return the size with the best fit, by hill climbing from given poses, and the fit of the worse arch.
 
-        The fit counts as none at all if there is no end to it after `_MOST_SIZES`.
+        The fit is -inf if the climb has not ended after `_MOST_SIZES` evaluations.
         """
         objective, fit, poses = self._fitted(frame, size, poses, size)
         left = _MOST_SIZES
@@ -119,13 +119,13 @@ class _Sizes:
                     size, (objective, fit, poses) = there, other
         if left == 0:
             return size, -np.inf
-        if {1, -1} <= beside.keys():  # the top of a parabola through the last three
+        if {1, -1} <= beside.keys():  # the vertex of a parabola through the last three
             bend = beside[1] - 2 * objective + beside[-1]
             size *= (1 + _STEPS[-1]) ** (0.5 * (beside[-1] - beside[1]) / bend if bend < 0 else 0.0)
         return size, fit
 
     def _fitted(self, frame: int, size: float, poses: Array, size_of_poses: float) -> tuple[float, float, Array]:
-        """Return objective, fit of the worse arch and poses, aligned from poses found at another size."""
+        """Return objective, fit of the worse arch, and poses, aligned from poses at another size."""
         scans, config = self._solver.scans, self._solver.config
         start = poses.copy()
         start[:, :3, 3] *= size / size_of_poses

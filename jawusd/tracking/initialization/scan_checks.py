@@ -1,4 +1,4 @@
-"""Checks on the two teeth scans together: can they be a bite, and what is doubtful about it?"""
+"""Checks of both teeth scans together: whether they form a possible bite, and what is unusual about it."""
 
 from __future__ import annotations
 
@@ -14,19 +14,16 @@ from jawusd.geometry import anatomical_frame
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusion
 
-# Figures of 130 subjects of `tests/support` as their scanners deliver them, a third without paint, of three other
-# captures and of the scans of two patients (`tests/benchmarks/occlusion.py --persons 130`); the limits lie outside of
-# all of them: no valid bite is refused, and none is warned of but the underbites, 13 per cent of these persons.
-#
-# What no bite can be. Found: touching to 0.4 mm apart, nothing through, 0.61 of the smaller arch or more opposite the
-# other one, turned by up to 40 degrees where molars of one side lack, 48 to 78 mm wide.
+# The limits lie outside all valid bites measured (docs/explanation/constants.md).
+# Impossible bites: distance of the arches, share that passed through, share of coinciding surface, least opposed share,
+# rotation about the bite normal, range of widths.
 _APART_MM = 4.0
 _THROUGH_SHARE = 0.5
 _SAME_SHARE = 0.5
 _BESIDE_SHARE = 0.35
 _FACING_BACK_RAD = np.pi / 2
 _WIDEST_MM, _NARROWEST_MM = 100.0, 20.0
-# What is doubtful. Found: up to 1.1 mm deep, 0.4 mm one-sided, midlines 3.0 mm apart, width ratios 0.93 to 1.31.
+# Unusual bites.
 _LOOSE_MM = 0.8
 _TIGHT_MM = 1.3
 _ONE_SIDED_MM = 1.0
@@ -36,19 +33,19 @@ _RATIOS = (0.88, 1.36)
 _LOWER_AHEAD_MM = 0.5
 _AXES_OFF_DEG = 30.0
 
-_EXPORT = "Export both scans in one coordinate frame with the teeth in occlusion (closed bite)."
+_EXPORT = "Export both scans in one coordinate frame, with the teeth in occlusion (closed bite)."
 _UNITS = "Check units and scale of both scan files: lengths must be in mm."
-_LOOK = "Look at both scans together; correct them if it is not this person's bite."
+_LOOK = "View both scans together, and correct them if this is not the person's bite."
 
 
 def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
-    """Check that both arches lie in one frame, in occlusion; return T_anatomical_scan (4, 4) and what is doubtful.
+    """Check that both arches are in one frame, in occlusion; return T_anatomical_scan (4, 4) and warnings.
 
     `T_anatomical_scan` maps the scan frame to (left, up, front) axes; None derives it.
 
     Raises:
-        TrackingError: the scans cannot be a bite: far apart, beside or inside one another, one turned over, one the
-            copy of the other, or not of the size of teeth.
+        TrackingError: the scans cannot be a bite: apart, beside or inside one another, upside down, identical, or not
+            of the size of teeth.
     """
     T, findings = occlusion_findings(scans, T_anatomical_scan)
     for finding in findings:
@@ -58,9 +55,9 @@ def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) 
 
 
 def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
-    """Return T_anatomical_scan (4, 4), given or derived, and everything wrong or doubtful about two scans in one frame.
+    """Return T_anatomical_scan (4, 4), given or derived, and findings about two scans in one frame.
 
-    Only what cannot be a bite is an error; then nothing else is reported, since it follows from that.
+    Only an impossible bite is an error. Nothing else is reported then, since it would be a consequence.
     """
     given = T_anatomical_scan is not None
     derived = anatomical_frame(*(scan.crown_vertices(6000) for scan in scans))
@@ -77,7 +74,7 @@ def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | Non
                 "anatomical_axes_off",
                 "warning",
                 f"the up axis of [anatomy] T_anatomical_skull is {tilt_deg:.0f} degrees off the normal of the bite, "
-                f"up to {_AXES_OFF_DEG:g} are usual",
+                f"up to {_AXES_OFF_DEG:g} degrees is usual",
                 tilt_deg,
                 _AXES_OFF_DEG,
                 hint="Correct or remove T_anatomical_skull: without it the axes are derived from the scans.",
@@ -87,77 +84,79 @@ def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | Non
 
 
 def _impossible(found: Occlusion) -> Iterator[Finding]:
-    """Yield what shows that two scans are no bite, causes before their consequences."""
+    """Yield errors of scans that cannot be a bite, causes before consequences."""
 
     def error(kind: str, message: str, value: float, limit: float, hint: str = _EXPORT) -> Finding:
         return Finding(kind, "error", message, value, limit, hint=hint)
 
     for name, width in zip(ARCH_NAMES, found.widths_mm):
         if not _NARROWEST_MM <= width <= _WIDEST_MM:
-            message = f"the {name} arch is {width:.0f} mm wide, teeth are {_NARROWEST_MM:g} to {_WIDEST_MM:g} mm"
+            message = f"the {name} arch is {width:.0f} mm wide; arches are {_NARROWEST_MM:g} to {_WIDEST_MM:g} mm wide"
             yield error("scans_size", message, width, _WIDEST_MM, _UNITS)
     off = "the upper and lower teeth scans are not in occlusion: "
     if found.same > _SAME_SHARE:
         message = f"the upper and lower teeth scans are the same arch: {found.same:.0%} of their surfaces coincide"
         yield error("scans_same", message, found.same, _SAME_SHARE, "Name the other arch's file in [scans].")
     if found.opposite < _BESIDE_SHARE and found.turn_rad < _FACING_BACK_RAD:
-        message = f"{off}their arches lie {found.aside_mm:.0f} mm beside one another, only {found.opposite:.0%} of the "
-        message += f"smaller one stands over the other, at least {_BESIDE_SHARE:.0%} are needed"
+        message = f"{off}the arches lie {found.aside_mm:.0f} mm beside one another; only {found.opposite:.0%} of the "
+        message += f"smaller one overlaps the other in the bite plane, at least {_BESIDE_SHARE:.0%} is needed"
         yield error("scans_beside", message, found.opposite, _BESIDE_SHARE)
     if found.gap_mm > _APART_MM:
-        message = f"{off}they are {found.gap_mm:.1f} mm apart where they are closest, at most {_APART_MM:g} mm are "
+        message = f"{off}they are {found.gap_mm:.1f} mm apart at the closest point, at most {_APART_MM:g} mm is "
         yield error("scans_apart", message + "allowed", found.gap_mm, _APART_MM)
     if found.turn_rad > _FACING_BACK_RAD:
         turn_deg = float(np.degrees(found.turn_rad))
-        message = f"{off}one arch is turned by {turn_deg:.0f} degrees against the other, front to back"
+        message = f"{off}one arch is rotated by {turn_deg:.0f} degrees relative to the other, front to back"
         yield error("scans_turned", message, turn_deg, float(np.degrees(_FACING_BACK_RAD)))
     over = [k for k in (0, 1) if found.turned_over[k]]
     if len(over) == 1:
-        message = f"{off}the {ARCH_NAMES[over[0]]} arch is upside down, its gum lies between the teeth of both arches"
+        message = f"{off}the {ARCH_NAMES[over[0]]} arch is upside down: its gum lies between the teeth of both arches"
         yield error("scan_upside_down", message, 1.0, 0.0)
     elif over:
-        message = f"{off}both arches have their gum between them: they were moved through one another"
+        message = f"{off}the gum of both arches lies between them: they were moved through one another"
         yield error("scans_passed", message, 1.0, 0.0)
     if found.through > _THROUGH_SHARE:
-        message = f"{off}the arches are inside one another, the lower crowns end more than 2 mm above the upper ones "
-        message += f"over {found.through:.0%} of the bite, at most {_THROUGH_SHARE:.0%} are possible"
+        message = f"{off}the arches are inside one another: the lower crowns end more than 2 mm above the upper ones "
+        message += f"over {found.through:.0%} of the bite, at most {_THROUGH_SHARE:.0%} is possible"
         yield error("scans_inside", message, found.through, _THROUGH_SHARE)
 
 
 def _doubtful(found: Occlusion) -> Iterator[Finding]:
-    """Yield what a bite may be, but seldom is."""
+    """Yield warnings about a possible but unusual bite."""
 
     def warning(kind: str, message: str, value: float, limit: float, hint: str = _LOOK) -> Finding:
         return Finding(kind, "warning", message, value, limit, hint=hint)
 
     if found.gap_mm > _LOOSE_MM:
-        message = f"the teeth scans do not touch: {found.gap_mm:.1f} mm apart where they are closest, up to "
-        yield warning("scans_open", f"{message}{_LOOSE_MM:g} mm are usual", found.gap_mm, _LOOSE_MM, _EXPORT)
+        message = f"the teeth scans do not touch: they are {found.gap_mm:.1f} mm apart at the closest point, up to "
+        yield warning("scans_open", f"{message}{_LOOSE_MM:g} mm is usual", found.gap_mm, _LOOSE_MM, _EXPORT)
     if found.depth_mm > _TIGHT_MM:
-        message = f"the crowns of the scans run {found.depth_mm:.1f} mm into one another, up to {_TIGHT_MM:g} mm are "
+        message = f"the crowns of the scans overlap by {found.depth_mm:.1f} mm, up to {_TIGHT_MM:g} mm is "
         bare = [name for name, over in zip(ARCH_NAMES, found.turned_over) if over is None]
-        turned = f" Without gum, an upside down scan ({' or '.join(bare)}) also looks like that." if bare else ""
+        turned = f" Without gum, an upside-down scan ({' or '.join(bare)}) looks the same." if bare else ""
         yield warning("scans_overlap", message + "usual", found.depth_mm, _TIGHT_MM, _EXPORT + turned)
     left, right = found.side_gaps_mm
     if abs(left - right) > _ONE_SIDED_MM:
         tight, loose = ("right", "left") if left > right else ("left", "right")
-        message = f"the bite is tilted: on the {loose} side the teeth are {abs(left - right):.1f} mm farther apart "
-        message += f"than on the {tight} one, up to {_ONE_SIDED_MM:g} mm are usual"
+        message = f"the bite is tilted: the teeth are {abs(left - right):.1f} mm farther apart on the {loose} side "
+        message += f"than on the {tight} side, up to {_ONE_SIDED_MM:g} mm is usual"
         yield warning("bite_tilted", message, abs(left - right), _ONE_SIDED_MM)
     if found.midlines_mm > _MIDLINES_MM:
-        message = f"the middles of the two arches lie {found.midlines_mm:.1f} mm apart sideways, up to "
-        yield warning("midlines_apart", f"{message}{_MIDLINES_MM:g} mm are usual", found.midlines_mm, _MIDLINES_MM)
+        message = f"the midlines of the two arches are {found.midlines_mm:.1f} mm apart, up to "
+        yield warning("midlines_apart", f"{message}{_MIDLINES_MM:g} mm is usual", found.midlines_mm, _MIDLINES_MM)
     for name, width in zip(ARCH_NAMES, found.widths_mm):
         if not _NARROW_MM <= width <= _WIDE_MM:
-            message = f"the {name} arch is {width:.0f} mm wide, usual are {_NARROW_MM:g} to {_WIDE_MM:g} mm"
+            message = f"the {name} arch is {width:.0f} mm wide; {_NARROW_MM:g} to {_WIDE_MM:g} mm is usual"
             yield warning("scan_size", message, width, _WIDE_MM, _UNITS)
     if not _RATIOS[0] <= found.width_ratio <= _RATIOS[1] and np.isfinite(found.width_ratio):
-        message = f"the upper arch is {found.width_ratio:.2f} times as wide as the lower one, usual are {_RATIOS[0]:g} "
-        message += f"to {_RATIOS[1]:g}: a crossbite, or scans of different scale"
+        message = f"the upper arch is {found.width_ratio:.2f} times as wide as the lower one ({_RATIOS[0]:g} "
+        message += f"to {_RATIOS[1]:g} is usual): a crossbite, or scans of different scale"
         yield warning("arch_widths", message, found.width_ratio, _RATIOS[found.width_ratio > 1.0])
     if found.lower_ahead_mm > _LOWER_AHEAD_MM:
-        message = f"the lower front teeth stand {found.lower_ahead_mm:.1f} mm before the upper ones: an underbite, or "
-        hint = "Check that [scans] names the upper and the lower file rightly."
+        message = (
+            f"the lower front teeth are {found.lower_ahead_mm:.1f} mm in front of the upper ones: an underbite, or "
+        )
+        hint = "Check that the upper and the lower file in [scans] are not exchanged."
         yield warning("underbite", message + "exchanged scan files", found.lower_ahead_mm, _LOWER_AHEAD_MM, hint)
     for k, name in enumerate(ARCH_NAMES):
         if found.opens_towards[k] and found.turned_over[k] is None:

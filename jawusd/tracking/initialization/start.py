@@ -28,54 +28,54 @@ from jawusd.tracking.initialization.start_causes import (
     aligned,
     all_arches_exchanged,
     likely_mixup,
-    refuse_by_cause,
+    raise_cause,
 )
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
-#: Frames surveyed: two seconds of reading, and every exercise of a usual take is met.
+#: Frames surveyed: two seconds of reading, covering every exercise of a usual take.
 SURVEYED = 24
-#: Frames on which the teeth are searched.
+#: Maximum frames on which the teeth are searched.
 FRAMES_TRIED = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Say where tracking begins."""
+    """The first tracked frame and its poses."""
 
     frame: int  # reference camera frame
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     notes: dict[str, object]  # how it was found, for the meta data of the tracks
-    findings: tuple[Finding, ...] = ()  # what is doubtful about the scans
+    findings: tuple[Finding, ...] = ()  # about scans and picks
     T_anatomical_scan: Array = field(default_factory=lambda: np.eye(4))  # scan frame to (left, up, front) axes
 
 
-def search_start(search: StartSearch, footage: Footage, doubts: Collection[str] = (), explain: bool = True) -> Start:
-    """Find a frame on which both arches can be aligned, and their poses there.
+def search_start(search: StartSearch, footage: Footage, suspects: Collection[str] = (), explain: bool = True) -> Start:
+    """Find a frame on which both arches can be aligned, and their poses.
 
-    The first frame that fits beyond doubt is taken, or else the one that fits best. Where neither arch fits there as
-    right poses do, but both fit beyond doubt with a mistake undone, that mistake is refused.
+    Uses the first frame with a clear fit, or else the one with the best fit. If neither arch fits acceptably there, but
+    both fit clearly with a mistake undone, that mistake is an error.
 
     Args:
         search: of the scans.
-        footage: gives the masks.
-        doubts: hints of mistakes that the scans themselves suggest.
-        explain: whether to search for the mistake where no frame fits, which takes several times as long.
+        footage: the masks.
+        suspects: hints of mistakes suggested by the scans.
+        explain: whether to look for a mistake if no frame fits, which takes several times as long.
 
     Raises:
-        TrackingError: no frame of those tried could be aligned; the message says what happened on each, or which
-            mistake undone would let it succeed.
+        TrackingError: none of the frames tried could be aligned; the message gives the reason for each frame, or the
+            mistake whose correction makes it succeed.
     """
     most = max(1, min(FRAMES_TRIED, MOST_PICTURES // len(footage.sources)))
     frames = footage.survey(None, SURVEYED).promising(most).tolist()
     failed: dict[int, str] = {}
-    accused = set(doubts)
+    suspected = set(suspects)
     best: tuple[int, Found] | None = None
     fits: dict[int, Array] = {}
     for frame in frames:
         try:
             found = search.at(footage, frame)
             fits[frame] = found.fits
-            # Most masks being right, the poses are, and show which ones are not. Poor poses may accuse any.
+            # If most masks are correct, so are the poses, and they reveal the wrong masks. Poor poses prove nothing.
             mixup = likely_mixup(footage, search.solver, found.poses, frame)
             if mixup is None:
                 found = replace(found, poses=aligned(search, footage, found.poses, frame))
@@ -84,35 +84,35 @@ def search_start(search: StartSearch, footage: Footage, doubts: Collection[str] 
             continue
         if mixup is not None:
             if found.fit >= CLEAR_FIT:
-                raise mixup.refusal(frame)
+                raise mixup.error(frame)
             failed[frame] = mixup.finding
-            accused.add(mixup.hint)
+            suspected.add(mixup.hint)
             continue
         if best is None or found.fit > best[1].fit:
             best = frame, found
         if found.fit >= CLEAR_FIT:
             break
     if best is None:
-        tried = refuse_by_cause(search, footage, frames, fits, accused) if explain else ""
+        tried = raise_cause(search, footage, frames, fits, suspected) if explain else ""
         raise TrackingError(
-            f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "
+            f"there are no [bootstrap] picks, and the search for the teeth failed on all {len(frames)} frames tried. "
             + " ".join([*(f"Frame {frame}: {message}." for frame, message in failed.items()), tried]),
-            hint="Give [bootstrap] picks, three or more per row of teeth, each seen by two cameras; and check the "
-            "masks, the calibration and the time offsets.",
+            hint="Add [bootstrap] picks, at least three per arch, each in two cameras; and check the masks, the "
+            "calibration and the time offsets.",
         )
     frame, found = best
     if explain and found.fits.max() < EXPLAINS:
-        refuse_by_cause(search, footage, [frame], {}, accused, beyond_doubt=True)
+        raise_cause(search, footage, [frame], {}, suspected, only_clear=True)
     _check_upright(search, footage, frame, found)
     notes = {"by": "search", "frame": frame, "worth_px": found.objective_px, "fit": found.fit}
     return Start(frame, found.poses, {**notes, "failed": {str(f): m for f, m in failed.items()}})
 
 
 def search_around(search: StartSearch, footage: Footage, frame: int, poses: Array) -> Found:
-    """Find the poses near given ones; if none fits beyond doubt, the best ones of all.
+    """Search near given poses, and everywhere if none of them fits clearly.
 
     Raises:
-        TrackingError: no pair of poses that a jaw can take.
+        TrackingError: no anatomically possible pair of poses.
     """
     near = search.near(footage, frame, poses)
     if near.fit >= CLEAR_FIT:
@@ -127,9 +127,9 @@ def search_around(search: StartSearch, footage: Footage, frame: int, poses: Arra
 def around_without_a_camera(
     search: StartSearch, footage: Footage, frame: int, poses: Array, found: Found
 ) -> tuple[str, Found] | None:
-    """Return a camera whose masks bias the poses, and the poses without it; None if all masks agree.
+    """Return a camera whose masks contradict the others, and the poses without it; None if all masks agree.
 
-    A camera is left out only if the others then fit beyond doubt.
+    A camera is excluded only if the others then fit clearly.
     """
     if len(footage.sources) < 3:
         return None
@@ -151,7 +151,7 @@ def around_without_a_camera(
 
 
 def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Found) -> None:
-    """Refuse masks that fit better with the arches exchanged: turned over, an upper arch resembles a lower one."""
+    """Reject masks that fit better with the arches exchanged: an upside-down upper arch resembles a lower one."""
     mixup = all_arches_exchanged(footage.sources)
     try:
         other = search.at(replace(footage, sources=mixup.sources), frame)
@@ -159,15 +159,15 @@ def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Fou
         return
     if other.objective_px > found.objective_px:
         raise TrackingError(
-            f"{mixup.finding}: {other.objective_px:.0f} px of contour fit after exchanging them, "
-            f"{found.objective_px:.0f} px as they are named",
+            f"{mixup.finding}: {other.objective_px:.0f} px of contour match after exchanging them, "
+            f"{found.objective_px:.0f} px as given",
             frame=frame,
             hint=mixup.hint,
         )
 
 
 _PICKS_OFF_MM = 3.0  # half a tooth
-# Poses as sure as this [mm] lie within the basin of the contour solver.
+# Uncertainty of picked poses up to which the contour solver converges from them [mm].
 _SURE_MM = 0.8
 
 
@@ -179,18 +179,18 @@ def find_start(
     solver: ContourSolver,
     map_: Mapper = map,
 ) -> Start:
-    """Return the first frame and the poses there, from the capture's picks or, without any, by search.
+    """Return the first frame and its poses, from the capture's picks or, without picks, by search.
 
     Args:
-        capture: gives masks, picks and frame range.
+        capture: provides masks, picks and frame range.
         cameras, offsets: by camera name; reference frame minus own frame number.
         meshes: upper and lower teeth scans in one frame, in occlusion [mm].
         solver: holds the same scans, prepared.
-        map_: runs parts of the search.
+        map_: distributes the search among threads.
 
     Raises:
-        TrackingError: picks that cannot be, scans that do not belong together, masks that were exchanged, or no frame
-            on which the search finds the teeth.
+        TrackingError: invalid picks, scans that do not belong together, exchanged masks, or teeth that were found on no
+            frame.
         CaptureError: a mask cannot be read.
     """
     footage = Footage(masked_sources(capture.cameras, cameras, offsets), cameras, offsets, capture.frames)
@@ -200,14 +200,14 @@ def find_start(
         if capture.bootstrap is not None:
             start = _picked(capture.bootstrap, capture.frames, footage, meshes, search)
         else:
-            doubts = {SIZE_HINT} if any(finding.kind == "scan_size" for finding in findings) else set()
-            start = search_start(search, footage, doubts)
+            suspects = {SIZE_HINT} if any(finding.kind == "scan_size" for finding in findings) else set()
+            start = search_start(search, footage, suspects)
     return replace(start, findings=(*start.findings, *findings), T_anatomical_scan=T_anatomical_scan)
 
 
 @contextlib.contextmanager
 def quoting(findings: Sequence[Finding]) -> Iterator[None]:
-    """Add findings to the hint of a TrackingError that is raised inside: they may be its cause.
+    """Append findings to the hint of a TrackingError raised inside the context, since they may be its cause.
 
     Raises:
         TrackingError: as raised inside, with the findings.
@@ -226,7 +226,7 @@ def quoting(findings: Sequence[Finding]) -> Iterator[None]:
 def _picked(
     bootstrap: Bootstrap, frames: tuple[int, int] | None, footage: Footage, meshes: Sequence[Mesh], search: StartSearch
 ) -> Start:
-    """Return the poses that agree with the picks; where picks are uncertain, the best ones for the masks nearby."""
+    """Return the poses from the picks; if the picks are uncertain, refine them by a search nearby."""
     first, stop = frames or (0, bootstrap.frame + 1)
     if not first <= bootstrap.frame < stop:
         raise TrackingError(f"bootstrap.frame is {bootstrap.frame}, frames run from {first} to {stop - 1}")
@@ -241,7 +241,7 @@ def _picked(
     notes |= {"picks_left_out": left_out, "picks_sigma_mm": sigma_mm}
     start = Start(bootstrap.frame, np.stack(poses), notes)
     if (mixup := likely_mixup(footage, search.solver, start.poses, start.frame)) is not None:
-        raise mixup.refusal(start.frame)
+        raise mixup.error(start.frame)
     if not footage.has_masks(start.frame):
         return _elsewhere(search, footage, start, "the frame of the picks lacks masks of both arches in two cameras")
     if max(sigma_mm.values()) <= _SURE_MM and _fits(search, footage, start):
@@ -256,18 +256,18 @@ def _picked(
     near = Start(start.frame, found.poses, notes | searched, _picks_off(search, start, found.poses, sigma_mm))
     if "camera_left_out" in notes or _fits(search, footage, near):
         return near
-    # A search may end in another minimum than picks that are hardly unsure.
+    # The search may end in a wrong minimum although the picks were nearly good enough.
     return start if _fits(search, footage, start) else _elsewhere(search, footage, start)
 
 
 def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mapping[str, float]) -> tuple[Finding, ...]:
-    """Return a warning if the search found the teeth away from sure picks."""
+    """Return warnings for arches that the search found far from accurate picks."""
     out = []
     for scan, picked, found in zip(search.solver.scans, start.poses, poses, strict=True):
         off = float(np.linalg.norm(transform_point(found, scan.centre) - transform_point(picked, scan.centre)))
         if off > max(_PICKS_OFF_MM, 4.0 * sigma_mm[scan.name]):
-            message = f"the picks of the {scan.name} teeth lie {off:.1f} mm from where the masks show them"
-            hint = "The masks were followed. Check the picked vertices and pixels."
+            message = f"the picks of the {scan.name} teeth are {off:.1f} mm off the position that the masks show"
+            hint = "The masks were used. Check the picked vertices and pixels."
             limit = _PICKS_OFF_MM
             out.append(Finding("picks_off", "warning", message, round(off, 2), limit, frame=start.frame, hint=hint))
     return tuple(out)
@@ -279,9 +279,9 @@ def _elsewhere(
     start: Start,
     reason: str = "the picks do not fit the masks of their frame",
 ) -> Start:
-    """Return a start on another frame if there is one that fits: lips may hide the teeth on the picked one.
+    """Return a start on another frame that fits, since lips may hide the teeth on the picked one.
 
-    Otherwise the start as it is, which is then refused with its own reasons.
+    If there is none, return the start unchanged; it then fails with its own error.
     """
     other = _near_on_another_frame(search, footage, start)
     if other is None:
@@ -290,12 +290,14 @@ def _elsewhere(
         except TrackingError:
             return start
     message = f"{reason}; the teeth were found on frame {other.frame}"
-    unused = Finding("picks_unused", "warning", message, frame=start.frame, hint="Pick where both arches show well.")
+    unused = Finding(
+        "picks_unused", "warning", message, frame=start.frame, hint="Pick on a frame that shows both arches well."
+    )
     return replace(other, findings=(unused,))
 
 
 def _near_on_another_frame(search: StartSearch, footage: Footage, start: Start) -> Start | None:
-    """Return the first frame that fits beyond doubt near the picked poses: heads move little, jaws not far."""
+    """Return the first frame with a clear fit near the picked poses: heads and jaws move little."""
     try:
         frames = footage.survey(None, SURVEYED).promising(FRAMES_TRIED).tolist()
     except TrackingError:
@@ -311,7 +313,7 @@ def _near_on_another_frame(search: StartSearch, footage: Footage, start: Start) 
 
 
 def _fits(search: StartSearch, footage: Footage, start: Start) -> bool:
-    """Tell whether the poses of a start pass the checks of a first frame: hidden teeth have other minima nearby."""
+    """Return whether a start passes the checks of a first frame, since hidden teeth have other minima nearby."""
     try:
         aligned(search, footage, start.poses, start.frame)
     except TrackingError:

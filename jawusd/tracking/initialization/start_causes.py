@@ -18,28 +18,28 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_search import StartSearch
 
-# An exchange is believed if it leaves less than this share of what is uncovered as the masks are named.
+# Share of the uncovered mask that may remain for an exchange to be believed.
 _PROOF = 0.5
-# Uncovered share of all masks of a camera from which an exchange is looked for: good poses leave 0.01, and two cameras'
-# masks may resemble one another up to 0.1.
+# Uncovered share of a camera's masks from which an exchange is looked for: good poses leave 0.01, and exchanged masks
+# of similar cameras as little as 0.1.
 _ODD_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Mixup:
-    """Hold one way in which masks may have been exchanged."""
+    """A possible exchange of masks."""
 
-    finding: str  # what is wrong, to follow "frame F: "
+    finding: str  # description of the exchange
     hint: str  # what to do
-    sources: tuple[CameraSource, ...]  # the cameras with the exchange undone
+    sources: tuple[CameraSource, ...]  # the cameras, with the exchange undone
 
-    def refusal(self, frame: int) -> TrackingError:
-        """Return the error that names the exchange."""
+    def error(self, frame: int) -> TrackingError:
+        """Return the error that reports the exchange."""
         return TrackingError(self.finding, frame=frame, hint=self.hint)
 
 
 def all_arches_exchanged(sources: Sequence[CameraSource]) -> Mixup:
-    """Return the exchange of arches in all cameras, which exchanged scan files look like as well."""
+    """Return the exchange of arches in all cameras; exchanged scan files look the same."""
     return Mixup(
         "the masks of the upper and lower teeth are exchanged in every camera",
         "Exchange masks.upper and masks.lower, or upper_teeth and lower_teeth in [scans].",
@@ -48,7 +48,7 @@ def all_arches_exchanged(sources: Sequence[CameraSource]) -> Mixup:
 
 
 def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
-    """Return every exchange of arches in one camera or in all, and of masks between two cameras of one picture size."""
+    """Return every exchange of arches in one camera or all, and of masks between two cameras."""
     out = []
     for k, source in enumerate(sources):
         out.append(
@@ -72,9 +72,9 @@ def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
 
 
 def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Mixup | None:
-    """Return the exchange that explains much better why masks lie off their scans, with the evidence; None without.
+    """Return the exchange that best explains masks off their scans, with its evidence; None if none does.
 
-    `poses` are T_world_upper and T_world_lower of the frame, good to a millimetre or so, shape (2, 4, 4).
+    `poses` are T_world_upper and T_world_lower of the frame, accurate to about 1 mm, shape (2, 4, 4).
     """
     given = _uncovered_shares(footage, solver, poses, frame)
     if not (given >= _ODD_SHARE).any():
@@ -86,8 +86,8 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: i
         try:
             shares = _uncovered_shares(replace(footage, sources=mixup.sources), solver, poses, frame)
         except CaptureError:
-            continue  # mask videos of other lengths than those cameras' clips
-        # An exchange may leave a camera without masks on this frame: that explains nothing.
+            continue  # mask videos with another length than the clips of those cameras
+        # If an exchange leaves a camera without masks on this frame, that is not evidence.
         both = np.isfinite(given) & np.isfinite(shares)
         if (given[both] >= _ODD_SHARE).any():
             found.append((float(shares[both].mean()), float(given[both].mean()), mixup))
@@ -96,19 +96,19 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: i
     share, before, mixup = min(found, key=lambda f: f[0] / f[1])
     if share >= _PROOF * before:
         return None
-    evidence = f"{before:.0%} of the masks lie off their scans, {share:.0%} would after exchanging them"
+    evidence = f"{before:.0%} of the masks lie off their scans, {share:.0%} after exchanging them"
     return replace(mixup, finding=f"{mixup.finding}: {evidence}")
 
 
 def _uncovered_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
-    """Return the share of each camera's masks that lies off their scans, NaN without a mask, shape (C,)."""
+    """Return the uncovered share of each camera's masks, NaN without masks, shape (C,)."""
     with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm / 2) as masks:
         uncovered, total = uncovered_px(solver.scans, poses, masks.at(frame))
     return coverage_error(uncovered.sum(0), total.sum(0))
 
 
 def _masks(source: CameraSource) -> Masks:
-    """Return the masks of a camera that `masked_sources` chose."""
+    """Return the masks of a camera chosen by `masked_sources`."""
     if source.masks is None:
         raise TrackingError("there are no masks", camera=source.name)
     return source.masks
@@ -119,33 +119,30 @@ def _with_masks(sources: Sequence[CameraSource], masks: dict[int, Masks]) -> tup
 
 
 def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
-    """Tell whether masks would go to a camera with pictures of another size."""
+    """Return whether masks would be assigned to a camera with another picture size."""
     size = {_masks(source).upper: footage.cameras[source.name].size_px for source in footage.sources}
     size |= {_masks(source).lower: footage.cameras[source.name].size_px for source in footage.sources}
     return any(size[_masks(source).upper] != footage.cameras[source.name].size_px for source in sources)
 
 
-# Fit that leaves no doubt [-]. Wrong poses of a hundred searches stayed below 0.1 in one of the arches, right ones
-# exceed 0.35 where much of the teeth shows, and 0.1 with lips nearly closed or cameras 0.1 degrees off.
-# (Scans of other persons: 0.35 to 0.77 in the arch that is right, below 0.05 in the other one, on seven persons.)
+#: Clear fit [-]: correct poses exceed it unless lips are nearly closed; wrong poses stay below 0.1 in one arch.
 CLEAR_FIT = 0.3
-#: Least fit with a mistake undone, which wrong poses do not reach [-].
+#: Least acceptable fit with a mistake undone [-]: wrong poses do not reach it.
 EXPLAINS = 0.1
-_MOST_CAMERAS = 4  # whose exchanges are tried; every one costs a search
-#: Pictures searched after which no further search begins [-], on the frames of a start and again for the mistake; each
-#: takes two to three seconds of processor time. All mistakes of up to four cameras are tried, and without exchanges, of
-#: eight.
-#: Work is counted, not time: what is said does not depend on the machine.
+_MOST_CAMERAS = 4  # up to which exchanges are tried; each costs a search
+#: Maximum pictures searched [-], separately for the start and for mistakes; each takes 2 to 3 s of CPU time.
+#: It covers all mistakes of four cameras, and of eight without exchanges. Work is counted instead of time, so that
+#: messages do not depend on the machine.
 MOST_PICTURES = 120
-# Sizes of the scans that are tried, each of which finds teeth that are 5 % off it.
+# Scan sizes that are tried; each finds teeth whose size differs by up to 5 %.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
-#: Hint for scans of a wrong size; where it is among the `accused`, sizes are tried first.
+#: Hint for scans of a wrong size; if it is suspected, sizes are tried first.
 SIZE_HINT = "Check the scans' unit and scaling, and the square size of the calibration board."
 
 
 @dataclass(frozen=True, eq=False)
 class _Cause:
-    """Hold a mistake with the search and the footage in which it is undone."""
+    """A mistake, with the search and footage that undo it."""
 
     message: str
     hint: str
@@ -154,66 +151,65 @@ class _Cause:
 
 
 def aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> Array:
-    """Return the poses as aligned by the solver if they pass the checks of a first frame, shape (2, 4, 4).
+    """Return the poses aligned by the solver, if they pass the checks of a first frame, shape (2, 4, 4).
 
     Raises:
-        TrackingError: they do not.
+        TrackingError: they do not pass.
     """
     solver = search.solver
     with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm) as masks:
         return first_record(solver, solver.config, poses, masks.at(frame), frame).solution.poses
 
 
-def refuse_by_cause(
+def raise_cause(
     search: StartSearch,
     footage: Footage,
     frames: Sequence[int],
     fits: Mapping[int, Array],
-    accused: set[str],
-    beyond_doubt: bool = False,
+    suspected: set[str],
+    only_clear: bool = False,
 ) -> str:
-    """Refuse a capture for the mistake with which undone the search succeeds on one of some frames.
+    """Raise an error for a mistake if undoing it makes the search succeed on one of some frames.
 
-    Exchanges whose hints are among the `accused` are tried before others, and sizes before everything. What is wrong
-    with one camera alone, or else with the size of the scans, is looked for last, since leaving out what contradicts
-    makes many poses fit. No search begins that would look at more than `MOST_PICTURES`; what was found in a group of
-    mistakes that are not all tried counts if it fits beyond doubt. A scan that fits none of its masks is the next
-    suspect; then other frames are tried, as far as all mistakes can be: the right one is missed on some, as teeth are
-    with nothing wrong.
+    Suspected exchanges are tried before others, and suspected sizes before everything else. Mistakes of single cameras,
+    and otherwise of the scan size, come last, since excluding contradictions makes many poses fit. At most
+    `MOST_PICTURES` are searched; in a group of mistakes that was not fully tried, only a clear fit counts. A scan that
+    fits none of its masks is tested next, then other frames within the same budget, since the search can miss the
+    teeth on a frame.
 
     Args:
         search, footage: that failed.
         frames: tried in this order.
-        fits: what the search found, by frame: `arch_fit` of both arches [-], shape (2,).
-        accused: hints of mistakes.
-        beyond_doubt: whether only a fit beyond doubt counts.
+        fits: `arch_fit` of both arches by frame, as found by the search [-], shape (2,).
+        suspected: hints of mistakes.
+        only_clear: whether only a clear fit counts.
 
     Returns:
-        What was tried, as a sentence, if there is no such mistake among it.
+        A sentence that says what was tried, if no mistake explains the failure.
 
     Raises:
         TrackingError: names the mistake.
     """
-    exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in accused)
+    exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in suspected)
     sizes = [*_sizes(search, footage)]
     hands, cameras = [*_mirrored(search, footage)], [*_cameras(search, footage)]
-    groups = (sizes, hands, exchanges, cameras) if SIZE_HINT in accused else (hands, exchanges, sizes, cameras)
+    groups = (sizes, hands, exchanges, cameras) if SIZE_HINT in suspected else (hands, exchanges, sizes, cameras)
     count = sum(map(len, groups))
     pictures = sum(len(cause.footage.sources) for group in groups for cause in group)
     frames = frames[: max(1, MOST_PICTURES // pictures)]
-    tried = _refuse_on(frames[0], groups, beyond_doubt)
-    refuse_lone_arch(fits)
+    tried = _raise_cause_on(frames[0], groups, only_clear)
+    raise_for_unmatched_arch(fits)
     for frame in frames[1:]:
-        _refuse_on(frame, groups, beyond_doubt)
+        _raise_cause_on(frame, groups, only_clear)
     where = f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames))}"
-    sentence = f"Undoing any of {tried} mistakes in masks, scans and calibration does not help on {where}"
+    sentence = f"Undoing any of {tried} possible mistakes in masks, scans and calibration does not help on {where}"
     if tried == count:
         return f"{sentence}."
-    return f"{sentence}; {count - tried} more were not tried: no more than {MOST_PICTURES} pictures are searched."
+    return f"{sentence}; {count - tried} more were not tried, since at most {MOST_PICTURES} pictures are searched."
 
 
-def _refuse_on(frame: int, groups: Sequence[Sequence[_Cause]], beyond_doubt: bool) -> int:
-    """Refuse a capture for the mistake with which undone the search succeeds on a frame; return how many were tried."""
+def _raise_cause_on(frame: int, groups: Sequence[Sequence[_Cause]], only_clear: bool) -> int:
+    """Raise an error for a mistake if undoing it makes the search succeed on a frame; return the number tried."""
     tried, pictures = 0, 0
     for causes in groups:
         explained: list[tuple[float, _Cause]] = []
@@ -223,7 +219,7 @@ def _refuse_on(frame: int, groups: Sequence[Sequence[_Cause]], beyond_doubt: boo
                 break
             explained.append((_fit(cause, frame), cause))
         tried += len(explained)
-        least = CLEAR_FIT if beyond_doubt or len(explained) < len(causes) else EXPLAINS
+        least = CLEAR_FIT if only_clear or len(explained) < len(causes) else EXPLAINS
         fit, best = max(explained, key=lambda one: one[0], default=(0.0, None))
         if best is not None and fit >= least:
             message = f"{best.message}: the teeth are found only with that undone"
@@ -231,11 +227,11 @@ def _refuse_on(frame: int, groups: Sequence[Sequence[_Cause]], beyond_doubt: boo
     return tried
 
 
-def refuse_lone_arch(fits: Mapping[int, Array]) -> None:
-    """Refuse a scan that fits none of its masks where the other one fits beyond doubt; return if there is none.
+def raise_for_unmatched_arch(fits: Mapping[int, Array]) -> None:
+    """Raise an error for a scan that fits none of its masks while the other one fits clearly.
 
     Args:
-        fits: what a search that failed found, by frame: `arch_fit` of both arches [-], shape (2,).
+        fits: `arch_fit` of both arches by frame, as found by a failed search [-], shape (2,).
 
     Raises:
         TrackingError: names the scan.
@@ -257,7 +253,7 @@ def refuse_lone_arch(fits: Mapping[int, Array]) -> None:
 
 
 def _fit(cause: _Cause, frame: int) -> float:
-    """Return how well the teeth fit with a mistake undone [-]; zero if they are not found."""
+    """Return the fit of the teeth with a mistake undone [-]; zero if they are not found."""
     try:
         found = cause.search.at(cause.footage, frame)
         if found.fit < EXPLAINS:
@@ -284,7 +280,7 @@ def _exchanges(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
     for mixup in possible_mixups(footage.sources):
         yield _Cause(mixup.finding, mixup.hint, search, replace(footage, sources=mixup.sources))
     for a, b in combinations([source.name for source in footage.sources], 2):
-        if footage.offsets[a] != footage.offsets[b]:  # else it is the same as an exchange of masks
+        if footage.offsets[a] != footage.offsets[b]:  # otherwise identical to an exchange of masks
             cameras = {**footage.cameras, a: footage.cameras[b], b: footage.cameras[a]}
             message = f"the calibrations of cameras {a} and {b} are exchanged"
             hint = f"Exchange the names {a} and {b} in the calibration."
@@ -294,8 +290,8 @@ def _exchanges(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
 def _sizes(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
     for size in _SIZES:
         yield _Cause(
-            f"the scans are about {abs(size - 1.0):.0%} too {'large' if size > 1.0 else 'small'}: their scale is "
-            "wrong, or the calibration's lengths",
+            f"the scans are about {abs(size - 1.0):.0%} too {'large' if size > 1.0 else 'small'}: the scale of "
+            "the scans or of the calibration is wrong",
             SIZE_HINT,
             search.scaled(1.0 / size),
             footage,
@@ -309,8 +305,8 @@ def _cameras(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
         others = replace(footage, sources=[other for other in footage.sources if other is not source])
         yield _Cause(
             f"camera {source.name} contradicts the other cameras: its calibration is wrong (focal length, principal "
-            "point), it was turned or knocked since, or its masks are of another instant",
-            f"Calibrate camera {source.name} again, check its time offset, or leave it out.",
+            "point), it was turned or moved since, or its masks are of another instant",
+            f"Calibrate camera {source.name} again, check its time offset, or exclude it.",
             search,
             others,
         )

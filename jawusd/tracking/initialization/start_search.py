@@ -1,4 +1,4 @@
-"""Search the poses of both arches on single frames: all poses coarsely, the best ones finely."""
+"""Search for the poses of both arches on single frames: a coarse global search, then refinement."""
 
 from __future__ import annotations
 
@@ -20,48 +20,47 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_arch
 
-_PX_PER_MM = 2.0  # of the search: one pixel is a third of the step between orientations at the canines
+_PX_PER_MM = 2.0  # search resolution: a pixel is a third of the step between orientations at the canines
 _FINALISTS = 5  # poses per arch that are refined
-_DISTINCT_MM = 2.0  # poses closer than this T_delay to the same minimum
-# Turns about the guess: the teeth face the cameras, the upper ones are above the lower ones. Masks one beside the other
-# in a lateral movement, or half hidden by lips, mislead the roll most. With lips retracted the middle of the masks lies
-# up to 20 mm behind the front teeth.
+_DISTINCT_MM = 2.0  # poses closer than this converge to the same minimum
+# Rotations about the guess that the teeth face the cameras and the upper ones are above. Lateral movements and lips
+# bias the roll most. With retracted lips, the centre of the masks lies up to 20 mm behind the front teeth.
 _GRID = Grid(
     yaw_rad=np.radians(np.arange(-50, 51, 10.0)),
     pitch_rad=np.radians(np.arange(-40, 41, 10.0)),
     roll_rad=np.radians(np.arange(-50, 51, 10.0)),
     reach_mm=(13.0, 9.0, 22.5),
 )
-# Turns and translations about poses from picks: four careless clicks close together leave as much.
+# Rotations and translations about picked poses: the errors of four careless clicks close together.
 _NEAR_GRID = Grid(
     yaw_rad=np.radians(np.arange(-20, 21, 10.0)),
     pitch_rad=np.radians(np.arange(-20, 21, 10.0)),
     roll_rad=np.radians(np.arange(-20, 21, 10.0)),
     reach_mm=(6.0, 6.0, 6.0),
 )
-# How far open a jaw is tried against an arch that was found alone [mm], turning about a point so far above and behind
-# the front teeth [mm], as condyles are: rows of teeth look alike when shifted by a tooth, jaws cannot be.
+# Openings of the jaw that are tried relative to an arch found alone [mm], and position of the hinge axis above and
+# behind the front teeth [mm]: arches look alike when shifted by a tooth, but a jaw cannot shift so.
 _OPENINGS_MM, _CONDYLES_MM = (0.0, 6.0, 14.0, 24.0, 36.0), (40.0, -90.0)
-_WIDEST_JAW_RAD = 0.8  # turn between the arches beyond which a jaw does not open
-_FARTHEST_JAW_MM = 75.0  # distance of the arches' front teeth beyond which it does not either
+_WIDEST_JAW_RAD = 0.8  # largest rotation between the arches of a jaw
+_FARTHEST_JAW_MM = 75.0  # largest distance between the front teeth of the arches
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Hold what a search found on a frame."""
+    """The result of a search on a frame."""
 
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
-    objective_px: float  # fitting contour less the price of uncovered mask, both arches
+    objective_px: float  # matched contour less the penalty for uncovered mask, both arches
     fits: Array  # `arch_fit` of both arches [-], shape (2,)
 
     @property
     def fit(self) -> float:
-        """The fit of the arch that fits worse [-]."""
+        """The smaller fit of the two arches [-]."""
         return float(self.fits.min())
 
 
 class StartSearch:
-    """Search the poses of both arches on single frames."""
+    """Searches for the poses of both arches on single frames."""
 
     def __init__(
         self,
@@ -74,9 +73,9 @@ class StartSearch:
 
         Args:
             meshes: upper and lower teeth scans in one frame, in occlusion [mm].
-            solver: holds the same scans, prepared.
+            solver: for the same scans.
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
-            map_: runs parts of the search.
+            map_: distributes the search among threads.
         """
         self.solver, self._map = solver.exact(), map_
         self._config = self.solver.config
@@ -87,19 +86,19 @@ class StartSearch:
         self._jaws = _opened(self._coarse[1].crown_vertices(), T_anatomical_scan)
 
     def mirrored(self) -> StartSearch:
-        """Return the search of the same scans mirrored, left and right exchanged."""
+        """Return a search with mirrored scans, left and right exchanged."""
         meshes = [mirrored_scan(mesh, self._T_anatomical_scan) for mesh in self._meshes]
         return self._of(meshes, self._T_anatomical_scan)
 
     def scaled(self, factor: float) -> StartSearch:
-        """Return the search of the same scans with all lengths multiplied by a factor [-]."""
+        """Return a search with all lengths of the scans multiplied by a factor [-]."""
         meshes = [replace(mesh, vertices=factor * mesh.vertices) for mesh in self._meshes]
         T = self._T_anatomical_scan.copy()
         T[:3, 3] *= factor
         return self._of(meshes, T)
 
     def _of(self, meshes: Sequence[Mesh], T_anatomical_scan: Array) -> StartSearch:
-        """Return the search of other scans."""
+        """Return a search with other scans."""
         scans = [prepare_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True)]
         solver = ContourSolver((scans[0], scans[1]), self._config)
         return StartSearch(meshes, solver, T_anatomical_scan, self._map)
@@ -108,7 +107,7 @@ class StartSearch:
         """Return the best poses on a frame.
 
         Raises:
-            TrackingError: too few masks, or no pair of poses that a jaw can take.
+            TrackingError: too few masks, or no anatomically possible pair of poses.
         """
         survey = footage.survey((frame, frame + 1), 1)
         places = survey.places()[0]
@@ -123,7 +122,7 @@ class StartSearch:
         """Return the best poses on a frame near given ones, T_world_upper and T_world_lower, shape (2, 4, 4).
 
         Raises:
-            TrackingError: no pair of poses that a jaw can take.
+            TrackingError: no anatomically possible pair of poses.
         """
         with footage.views(transform_point(poses[0], self._coarse[0].centre), _PX_PER_MM) as masks:
             views = masks.at(frame)
@@ -134,17 +133,17 @@ class StartSearch:
         return self._settled(finalists, views, footage, frame)
 
     def _searched(self, r: int, views: Sequence[View], base: Array, grid: Grid) -> list[Array]:
-        """Return the best poses of an arch that differ from one another."""
+        """Return the best distinct poses of an arch."""
         found = search_arch(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
         return self._distinct(found, r)
 
     def _settled(
         self, finalists: Sequence[Sequence[Array]], views: Sequence[View], footage: Footage, frame: int
     ) -> Found:
-        """Return the best pair of finalists, refined at the working size."""
+        """Return the best pair of finalists, refined at working resolution."""
         pairs = self._refined_pairs(finalists, views)
         if not pairs:
-            raise TrackingError("the best poses of the two rows of teeth are none a jaw can take", frame=frame)
+            raise TrackingError("the best poses of the two arches are not possible for a jaw", frame=frame)
         with footage.views(teeth_centre(self._coarse, pairs[0]), self._config.working_px_per_mm) as masks:
             views = masks.at(frame)
         ends = [self.solver.solve(poses, views, self._config.wide_gates_px) for poses in pairs]
@@ -154,7 +153,7 @@ class StartSearch:
         return Found(ends[best].poses, float(objective[best]), fits)
 
     def _distinct(self, found: Sequence[Candidate], r: int) -> list[Array]:
-        """Return the best poses that differ from one another."""
+        """Return the best poses that are distinct from one another."""
         probes = self._coarse[r].probes
         kept: list[Array] = []
         for candidate in found:
@@ -166,7 +165,7 @@ class StartSearch:
         return kept
 
     def _refined_pairs(self, finalists: Sequence[Sequence[Array]], views: Sequence[View]) -> list[Array]:
-        """Refine the finalists coarsely and return up to four pairs a jaw can take, shape (2, 4, 4) each."""
+        """Refine the finalists coarsely; return up to four anatomically possible pairs, shape (2, 4, 4) each."""
 
         def ranked(r: int, poses: Sequence[Array], others: Array) -> list[tuple[float, Array]]:
             ends = []
@@ -185,16 +184,16 @@ class StartSearch:
         return [poses for _, poses in sorted(pairs, key=lambda p: -p[0])[:4]]
 
     def _possible(self, poses: Array) -> bool:
-        """Tell whether a jaw can bring the arches into these poses."""
+        """Return whether the poses of the arches are anatomically possible."""
         turn = so3_log(poses[0, :3, :3].T @ poses[1, :3, :3])
         fronts = [(poses[r] @ np.linalg.inv(self._hinges[r]))[:3, 3] for r in ARCHES]
         gap_mm = np.linalg.norm(fronts[1] - fronts[0])
         return bool(np.linalg.norm(turn) < _WIDEST_JAW_RAD and gap_mm < _FARTHEST_JAW_MM)
 
     def _objective(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> Array:
-        """Return the fitting contour less the price of uncovered mask per arch [px], shape (2,)."""
+        """Return the matched contour less the penalty for uncovered mask per arch [px], shape (2,)."""
         uncovered, _ = uncovered_px(solver.scans, solution.poses, views)
-        # A price per area: the coarse pictures' pixels are larger.
+        # The penalty is per area, and coarse pictures have larger pixels.
         price = self._config.uncovered_price
         if solver is self._coarse_solver:
             price *= self._config.working_px_per_mm / _PX_PER_MM
@@ -202,7 +201,7 @@ class StartSearch:
 
 
 def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:
-    """Return T_upper_lower of jaws that are closed, or opened as a hinge does, shape (4, 4) each.
+    """Return T_upper_lower of a closed jaw and of pure hinge openings, shape (4, 4) each.
 
     Args:
         crowns: of the lower teeth, scan coordinates [mm], shape (N, 3).
@@ -220,10 +219,10 @@ def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:
 
 
 def guessed_axes(places: Array, eyes: Array) -> Array:
-    """Return left, up and front of the teeth in the world as far as the masks show, shape (3, 3), axes in columns.
+    """Return a guess of the left, up and front axes of the teeth in the world, shape (3, 3), axes in columns.
 
     Args:
-        places: middles of the upper and the lower masks [mm], shape (2, 3).
+        places: centres of the upper and the lower masks [mm], shape (2, 3).
         eyes: camera centres [mm], shape (C, 3).
     """
     rays = eyes - places.mean(0)
