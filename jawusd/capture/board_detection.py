@@ -1,4 +1,4 @@
-"""Find calibration boards in clips."""
+"""Calibration boards in single pictures: reading board clips, corner detection, and edge sharpness."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from jawusd.media.video import Video
 
 Search = Callable[[NDArray[np.uint8]], Array | None]
 
-_TIMES, _FEW_MARKERS = 2, 4  # pictures that must agree on another board; fewest markers in each
-_FEWEST_CORNERS = 8  # of a ChArUco board; fewer do not fix its pose
-# The corner is refined in a window of this share of a cell: larger ones reach blur and lens, smaller ones only noise.
+_TIMES, _FEW_MARKERS = 2, 4  # pictures that must agree on a different board; fewest markers in each
+_FEWEST_CORNERS = 8  # of a ChArUco board; fewer do not determine its pose
+# Refinement window as a fraction of a cell: blur and distortion bias larger windows, noise dominates smaller ones.
 _WINDOW_SHARE, _WINDOW_PX = 0.12, (3, 12)
-_LARGE_PX = 1000  # width from which pictures are first searched at half their size: a quarter of the time
+_LARGE_PX = 1000  # width from which pictures are searched at half resolution first, in a quarter of the time
 _FLAGS = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 
 
 def detector(boards: Boards) -> Search:
-    """Return what finds the corners of a board in a gray picture: row by row (N, 2), NaN where not seen, or None.
+    """Return a function that finds a board's corners in a gray picture: (N, 2) row by row, NaN where hidden, or None.
 
     Raises:
-        CalibrationError: the dictionary has too few markers for such a board.
+        CalibrationError: the dictionary has too few markers for the board.
     """
     return _charuco(boards) if boards.pattern == "charuco" else _chessboard(boards)
 
 
 def shown_instead(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: bool) -> str | None:
-    """Return which board gray pictures (h, w) show if it is not the one described; None if it may well be that one.
+    """Return the board that gray pictures (h, w) show if it differs from the one described, else None.
 
     Args:
-        missed: the one described is not found in most of the clip's pictures, so markers that never show may not exist.
+        missed: the described board is not found in most pictures of the clip, so missing markers count as evidence.
     """
     plain: Counter[tuple[int, int]] = Counter()
     for image in images:
@@ -54,7 +54,7 @@ def shown_instead(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: b
     described = f"{boards.cols} x {boards.rows}"
     if boards.pattern == "chessboard":
         if times >= _TIMES and {cols, rows} != {boards.cols, boards.rows}:
-            return f"the board has {cols} x {rows} inner corners, [boards] says {described}"
+            return f"the board has {cols} x {rows} inner corners, but [boards] describes {described}"
         return None
     markers = cv2.aruco.ArucoDetector(_dictionary(boards))
     found = [markers.detectMarkers(np.ascontiguousarray(image))[1] for image in images]
@@ -65,12 +65,14 @@ def shown_instead(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: b
         return f"the pictures show {shown}" if times >= _TIMES else None
     beyond = sum(number >= count for number in highest) >= _TIMES
     if beyond or (missed and max(highest) < count - 1):
-        return f"the board has markers 0 to {max(highest)}, one of {described} inner corners has 0 to {count - 1}"
+        return (
+            f"the board has markers 0 to {max(highest)}, but a board of {described} inner corners has 0 to {count - 1}"
+        )
     return None
 
 
 def corners_and_width(search: Search, image: NDArray[np.uint8], boards: Boards) -> tuple[Array, float]:
-    """Return the corners found in a picture, shape (N, 2), and the width of the edges [px]; NaN without a board."""
+    """Return the corners in a picture, shape (N, 2), and the edge width [px]; NaN without a board."""
     corners = search(image)
     if corners is None:
         return np.full((boards.cols * boards.rows, 2), np.nan), np.nan
@@ -100,7 +102,7 @@ def _chessboard(boards: Boards) -> Search:
 
 
 def _refined(image: NDArray[np.uint8], corners_px: Array, boards: Boards) -> Array:
-    """Return corners moved to the saddle points (Förstner & Gülch 1987, by OpenCV): a third of the scatter."""
+    """Return corners refined to the saddle points (Förstner & Gülch 1987, by OpenCV): a third of the scatter."""
     grid = corners_px.reshape(boards.rows, boards.cols, 2)
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     half = int(np.clip(round(_WINDOW_SHARE * min(sides)), *_WINDOW_PX))
@@ -118,20 +120,20 @@ def _charuco(boards: Boards) -> Search:
             f"[boards] a ChArUco board of {boards.cols} x {boards.rows} inner corners needs {markers} markers, "
             f"{boards.dictionary} has {known}."
         )
-    # Before version 4.6, OpenCV began boards of an even number of rows with the other colour; shops still sell them.
+    # Before version 4.6, OpenCV started boards with an even number of rows with the other colour; these are still sold.
     detectors = [_charuco_detector(boards, size, legacy) for legacy in (False, True)[: 2 - size[1] % 2]]
 
     def search(image: NDArray[np.uint8]) -> Array | None:
         for detector in list(detectors):
             corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(image))
             if ids is not None and len(ids) >= _FEWEST_CORNERS:
-                detectors.sort(key=lambda other: other is not detector)  # which the next picture shows, too
+                detectors.sort(key=lambda other: other is not detector)  # the next picture shows the same board
                 break
         else:
             return None
         out = np.full((boards.cols * boards.rows, 2), np.nan)
         out[np.ravel(ids)] = np.reshape(corners, (-1, 2))
-        # Corners of one row do not fix a pose, nor the size of a cell.
+        # Corners of a single row determine neither the pose nor the cell size.
         grid = np.isfinite(out[:, 0]).reshape(boards.rows, boards.cols)
         whole = (grid[:, 1:] & grid[:, :-1]).any() and (grid[1:] & grid[:-1]).any()
         return out if whole else None
@@ -150,18 +152,18 @@ def _dictionary(boards: Boards) -> cv2.aruco.Dictionary:
 
 
 def _marker_count(boards: Boards) -> int:
-    """Return how many white squares, and so markers, a ChArUco board has."""
+    """Return the number of white squares, and therefore of markers, of a ChArUco board."""
     return (boards.cols + 1) * (boards.rows + 1) // 2
 
 
 def edge_width_px(image: NDArray[np.uint8], corners_px: Array, cols: int) -> float:
-    """Return the 10 to 90 % width of a chessboard's edges in a gray picture (h, w) from its gradient energy.
+    """Return the 10 to 90 % edge width of a chessboard in a gray picture (h, w) from its gradient energy.
 
     A step of contrast C blurred by a Gaussian of sigma has the gradient energy C^2 / (2 sigma sqrt(pi)) per length of
     edge; a chessboard with cell sides a and b has (|a| + |b|) / |a x b| of edge per area.
 
     Args:
-        corners_px: found corners row by row, `cols` in each, NaN where not seen, shape (N, 2).
+        corners_px: corners row by row, `cols` per row, NaN where hidden, shape (N, 2).
     """
     grid = corners_px.reshape(-1, cols, 2)
     along, down = np.nanmean(np.diff(grid, axis=1), axis=(0, 1)), np.nanmean(np.diff(grid, axis=0), axis=(0, 1))
@@ -183,11 +185,11 @@ def edge_width_px(image: NDArray[np.uint8], corners_px: Array, cols: int) -> flo
 
 
 class BoardClip:
-    """Hold the board pictures of one camera: a video, or numbered pictures.
+    """Board pictures of one camera: a video or numbered pictures.
 
     Attributes:
         path: video or pattern.
-        numbers: picture numbers, increasing; in a video the frames at which the pictures are shown.
+        numbers: increasing picture numbers; in a video, the frames at which the pictures are shown.
         size_px: (width, height) of every picture.
     """
 
@@ -195,7 +197,7 @@ class BoardClip:
         """Find the pictures.
 
         Raises:
-            CaptureError: there are none, or the first cannot be read.
+            CaptureError: there are no pictures, or the first cannot be read.
         """
         self.path = path
         self._files: dict[int, Path] = {}
@@ -211,19 +213,19 @@ class BoardClip:
 
     @property
     def is_video(self) -> bool:
-        """Return whether successive pictures are moments of one motion."""
+        """Return whether the pictures are frames of a video."""
         return self._video is not None
 
     @property
     def is_interlaced(self) -> bool:
-        """Return whether pictures are marked as woven of two instants, as far as they were read."""
+        """Return whether any picture read so far is flagged as interlaced."""
         return self._video is not None and self._video.is_interlaced
 
     def pictures(self, wanted: list[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield (number, gray picture) of the given numbers, in order.
 
         Raises:
-            CalibrationError: a picture has another size than the first.
+            CalibrationError: a picture differs in size from the first one.
             CaptureError: a picture cannot be read.
         """
         if self._video is None:
@@ -232,7 +234,7 @@ class BoardClip:
                 image = _read(path)
                 if image.shape[::-1] != self.size_px:
                     raise CalibrationError(
-                        f"is {image.shape[1]} x {image.shape[0]} px, the first picture {self.size_px[0]} x "
+                        f"is {image.shape[1]} x {image.shape[0]} px, but the first picture is {self.size_px[0]} x "
                         f"{self.size_px[1]} px.",
                         path=path,
                     )
@@ -249,16 +251,14 @@ def _read(path: Path) -> NDArray[np.uint8]:
     image = read_picture(path, cv2.IMREAD_GRAYSCALE)
     if image is not None:
         return np.asarray(image, np.uint8)
-    try:  # what OpenCV does not read: EXR, DPX
+    try:  # formats that OpenCV does not read: EXR, DPX
         stored = read_stored(path)
     except CaptureError as error:
-        raise CaptureError(
-            "is not a picture that can be read.", path=path, hint="Use PNG, JPEG, TIFF, EXR or DPX."
-        ) from error
+        raise CaptureError("is not a readable picture.", path=path, hint="Use PNG, JPEG, TIFF, EXR or DPX.") from error
     shown = to_display(stored.pixels, stored.largest, read_header(path).colour_space, None)
     return shown if shown.ndim == 2 else np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def sharpness(image: NDArray[np.uint8]) -> float:
-    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000), comparable between pictures of one camera."""
+    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000), comparable among pictures of one camera."""
     return float(cv2.Laplacian(image, cv2.CV_16S).var()) + 1e-9

@@ -1,4 +1,4 @@
-"""Find calibration boards in videos or pictures: sharp pictures chosen, blurred ones refused."""
+"""Find calibration boards in videos or pictures, using only sharp pictures."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from jawusd.capture.board_detection import BoardClip, corners_and_width, detecto
 from jawusd.formats.capture import Boards
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT
 
-MOST_VIEWS = 80  # more add minutes, not accuracy
-_LOOKED_AT = 6  # pictures searched for another board
-_PER_WINDOW = 2  # successive video pictures of which the sharpest is taken
-# 10 to 90 % width of the board's edges: wider than this share of the camera's median is motion, within these limits.
+MOST_VIEWS = 80  # more add time but no accuracy
+_LOOKED_AT = 6  # pictures searched for a different board
+_PER_WINDOW = 2  # consecutive video frames of which the sharpest is used
+# A picture is blurred if its 10 to 90 % edge width exceeds this multiple of the camera's median, within these limits.
 _BLUR_RATIO, _BLUR_LIMITS_PX = 1.5, (4.0, 8.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Hold where the board's corners were seen."""
+    """Detected board corners."""
 
     names: tuple[str, ...]  # camera names, C of them
     sizes_px: tuple[tuple[int, int], ...]  # picture (width, height) per camera
     numbers: NDArray[np.int64]  # picture number of each view, shape (V,)
-    corners_px: Array  # pixel of each corner, NaN where not seen, shape (C, V, N, 2)
-    blurred: dict[str, list[int]]  # per camera the numbers of pictures refused because of blur
+    corners_px: Array  # pixel of each corner, NaN where hidden, shape (C, V, N, 2)
+    blurred: dict[str, list[int]]  # per camera the numbers of pictures rejected as blurred
     missed: dict[str, list[int]]  # per camera the numbers of pictures in which no board was found
     notes: tuple[str, ...]  # remarks on the clips for the user
 
 
 def board_points(boards: Boards) -> Array:
-    """Return the inner corners row by row, origin at the board's middle [mm], shape (cols * rows, 3)."""
+    """Return the inner corners row by row, with the origin at the board's centre [mm], shape (cols * rows, 3)."""
     i, j = np.meshgrid(np.arange(boards.cols), np.arange(boards.rows))
     x, y = i.ravel() - (boards.cols - 1) / 2, j.ravel() - (boards.rows - 1) / 2
     return np.stack([x, y, 0.0 * x], axis=1) * boards.square_mm
 
 
 def board_symmetries(boards: Boards) -> list[NDArray[np.int64]]:
-    """Return the orders in which a detector may list the corners of the same board, as permutations of (N,).
+    """Return the orders in which a detector may list the corners of a board, as permutations of (N,).
 
-    A chessboard may come turned by half a turn, a square one by quarter turns; a ChArUco board numbers its corners.
+    A chessboard has a two-fold symmetry, a square one a four-fold symmetry; a ChArUco board numbers its corners.
     """
     grid = np.arange(boards.cols * boards.rows).reshape(boards.rows, boards.cols)
     if boards.pattern == "charuco":
@@ -55,10 +55,10 @@ def board_symmetries(boards: Boards) -> list[NDArray[np.int64]]:
 
 
 def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int, int], None]) -> Sightings:
-    """Choose sharp pictures of the boards, which give a clip per camera, and find the corners in them.
+    """Select sharp pictures from each camera's board clip and find the corners in them.
 
     Raises:
-        CalibrationError: the clips share no pictures, show no board, or a board with other counts.
+        CalibrationError: the clips share no picture number, or show no board or a different one.
         CaptureError: a clip cannot be read.
     """
     clips = [BoardClip(path) for path in boards.videos]
@@ -100,7 +100,7 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
 
 
 def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], list[str]]:
-    """Return the numbers of the pictures to search, and notes."""
+    """Return the numbers of the pictures to search, and notes for the user."""
     notes = []
     counts = [len(clip.numbers) for clip in clips]
     shared = sorted(set.intersection(*(set(clip.numbers) for clip in clips)))
@@ -109,8 +109,8 @@ def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], 
     if len(set(counts)) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in zip(names, counts))
         notes.append(
-            f"the board clips hold different numbers of pictures ({listed}): {len(shared)} of like number or time are "
-            "taken as simultaneous; a clip that was cut at its beginning would spoil the result."
+            f"the board clips have different numbers of pictures ({listed}): {len(shared)} with equal number or time "
+            "are assumed simultaneous; a clip trimmed at its start would invalidate the result."
         )
     if not all(clip.is_video for clip in clips):
         step = max(1, -(-len(shared) // MOST_VIEWS))
@@ -119,19 +119,19 @@ def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], 
     with ThreadPoolExecutor(max_workers=min(len(clips), 4)) as pool:
         for values in pool.map(lambda clip: [sharpness(image) for _, image in clip.pictures(shared)], clips):
             sharp.append(np.array(values) / np.median(values))
-    worst = np.min(sharp, axis=0)  # a picture counts as sharp if it is sharp in all cameras
+    worst = np.min(sharp, axis=0)  # a picture must be sharp in all cameras
     windows = np.array_split(np.arange(len(shared)), min(MOST_VIEWS, -(-len(shared) // _PER_WINDOW)))
     return [shared[window[np.argmax(worst[window])]] for window in windows], notes
 
 
 def _limits_px(widths: Array) -> Array:
-    """Return per camera the width of edges above which a picture is blurred, shape (C,)."""
+    """Return per camera the edge width above which a picture is blurred, shape (C,)."""
     median = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in widths])
     return np.clip(_BLUR_RATIO * median, *_BLUR_LIMITS_PX)
 
 
 def _refuse_other_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, found: int) -> None:
-    """Raise if the pictures show another board than the one described, or none at all."""
+    """Raise an error if the pictures show no board or a different one."""
     missed = found < len(chosen) / 2
     if missed and clip.is_interlaced:
         raise CalibrationError(
@@ -141,14 +141,14 @@ def _refuse_other_board(name: str, clip: BoardClip, chosen: list[int], boards: B
             hint=INTERLACED_HINT,
         )
     if not missed and boards.pattern == "chessboard":
-        return  # part of another ChArUco board may pass for the one described
+        return  # part of a different ChArUco board may match the described one
     some = [image for _, image in clip.pictures(chosen[:: max(1, len(chosen) // _LOOKED_AT)])]
     if (other := shown_instead(some, boards, missed)) is not None:
         raise CalibrationError(
             f"{other}.",
             camera=name,
             path=clip.path,
-            hint="Correct [boards] in capture.toml; cols and rows count inner corners, one fewer than squares.",
+            hint="Correct [boards] in capture.toml; cols and rows count inner corners, one less than squares.",
         )
     if not found:
         extra = f" of {boards.dictionary}" if boards.pattern == "charuco" else ""
@@ -157,19 +157,19 @@ def _refuse_other_board(name: str, clip: BoardClip, chosen: list[int], boards: B
             f"{len(chosen)} pictures.",
             camera=name,
             path=clip.path,
-            hint="Check [boards]: pattern and inner corners; all of a chessboard must be in view, sharp, with a white "
-            "rim.",
+            hint="Check pattern and inner corners in [boards]; a chessboard must be fully in view, sharp, and have a "
+            "white rim.",
         )
 
 
 def _refuse_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, blurred: Mask) -> None:
-    """Raise if a camera saw the board, but never sharply."""
+    """Raise an error if all pictures of the board by a camera are blurred."""
     for name, clip, row, out, limit in zip(names, clips, widths, blurred, _limits_px(widths)):
         seen = np.isfinite(row)
         if seen.any() and out[seen].all():
             raise CalibrationError(
                 f"all {seen.sum()} pictures of the board are blurred: its edges are "
-                f"{np.median(row[seen]):.1f} px wide (10 to 90 %), at most {limit:.1f} px are allowed.",
+                f"{np.median(row[seen]):.1f} px wide (10 to 90 %), the limit is {limit:.1f} px.",
                 camera=name,
                 path=clip.path,
                 hint="Film the board again: in focus, held still, with more light or a shorter exposure.",

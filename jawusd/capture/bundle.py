@@ -1,8 +1,8 @@
 """Bundle adjustment of fixed cameras over views of a planar board.
 
-Minimises the robust reprojection error over intrinsics (fx, fy, cx, cy, k1, k2; the other coefficients stay 0: few
-pictures of a small board do not determine them), camera poses (the first camera is the world) and board poses. The
-Jacobian is analytic: OpenCV's for the lens, Solà et al. 2018 (eq. 143) for the rotations; most of it is 0.
+Minimises the robust reprojection error over intrinsics (fx, fy, cx, cy, k1, k2; the other coefficients stay 0, since
+few pictures of a small board do not determine them), camera poses (the first camera is the world) and board poses.
+The Jacobian is analytic and sparse: OpenCV's for the lens, Solà et al. 2018 (eq. 143) for the rotations.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ _LENS = 6  # fx, fy, cx, cy, k1, k2
 _POSE = 6  # rotation vector [rad], translation [mm]
 _HUBER_SIGMAS, _LEAST_SIGMA_PX = 3.0, 0.02
 _MOST_STEPS = 100
-_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # a corner further off than both is not that corner
-_FEWEST_CORNERS = 6  # left of a view; else the view is dropped
+_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # a corner beyond both is an outlier
+_FEWEST_CORNERS = 6  # views with fewer inliers are dropped
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Hold the result of the adjustment."""
+    """Result of the adjustment."""
 
     K: Array  # intrinsic matrices [px], shape (C, 3, 3)
     distortion: Array  # k1 and k2, shape (C, 2)
     T_cam_world: Array  # world (the first camera) to camera [mm], shape (C, 4, 4)
     T_world_board: Array  # board to world [mm], shape (V, 4, 4)
-    corners_px: Array  # the corners used, NaN where not, shape (C, V, N, 2)
-    residuals_px: Array  # projected minus seen, NaN where not seen, shape (C, V, N, 2)
-    parameters: Array  # the cameras' share of the unknowns, see `camera_from`, shape (12 C - 6,)
+    corners_px: Array  # corners used, NaN elsewhere, shape (C, V, N, 2)
+    residuals_px: Array  # projected minus observed, NaN where not used, shape (C, V, N, 2)
+    parameters: Array  # the camera parameters, see `camera_from`, shape (12 C - 6,)
     covariance: Array  # of these parameters, shape (12 C - 6, 12 C - 6)
 
 
 def adjust(start: FirstGuess, points_mm: Array) -> Bundle:
-    """Adjust, drop corners that fit far worse than the others, and adjust again; points_mm (N, 3) are on the board.
+    """Adjust, discard outlier corners, and adjust again; points_mm (N, 3) are the corners on the board.
 
     Raises:
         CalibrationError: the adjustment does not converge.
@@ -75,7 +75,7 @@ def adjust(start: FirstGuess, points_mm: Array) -> Bundle:
 
 
 def camera_from(parameters: Array) -> tuple[Array, Array, Array]:
-    """Return K (C, 3, 3), k1 and k2 (C, 2) and T_cam_world (C, 4, 4) of the cameras' parameters, shape (12 C - 6,)."""
+    """Return K (C, 3, 3), k1 and k2 (C, 2) and T_cam_world (C, 4, 4) from camera parameters, shape (12 C - 6,)."""
     count = (len(parameters) + _POSE) // (_LENS + _POSE)
     lens = parameters[: count * _LENS].reshape(count, _LENS)
     K = np.zeros((count, 3, 3))
@@ -85,35 +85,35 @@ def camera_from(parameters: Array) -> tuple[Array, Array, Array]:
 
 
 class _Problem:
-    """Residuals and Jacobian over the views that are seen by any camera."""
+    """Residuals and Jacobian over the views that any camera sees."""
 
     def __init__(self, corners_px: Array, points_mm: Array) -> None:
         self.views = np.flatnonzero(np.isfinite(corners_px[..., 0]).any((0, 2)))
         self.corners_px, self.points_mm = corners_px[:, self.views], points_mm
         self.cameras = len(corners_px)
         self.seen = np.isfinite(self.corners_px[..., 0])
-        # Per camera the view and the corner of each point it saw.
+        # Per camera, the view and corner of each observed point.
         self.points = [np.nonzero(seen) for seen in self.seen]
 
     def pack(self, start: FirstGuess) -> Array:
-        """Return all unknowns of a start: lenses, poses of cameras 1.., poses of boards."""
+        """Return the unknowns of an initial guess: lenses, poses of cameras 1.., poses of boards."""
         lens = np.stack([start.K[:, 0, 0], start.K[:, 1, 1], start.K[:, 0, 2], start.K[:, 1, 2]], axis=1)
         T = np.concatenate([start.T_cam_world[1:], start.T_world_board[self.views]])
         poses = np.concatenate([so3_log(T[:, :3, :3]), T[:, :3, 3]], axis=1)
         return np.concatenate([np.hstack([lens, start.distortion]).ravel(), poses.ravel()])
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Return the cameras' parameters and the boards' (V, 6)."""
+        """Return the camera parameters, and the board parameters (V, 6)."""
         own = self.cameras * (_LENS + _POSE) - _POSE
         return x[:own], x[own:].reshape(-1, _POSE)
 
     def solve(self, x: Array) -> Array:
-        """Return the unknowns with the least robust error (Levenberg-Marquardt, reweighted; Triggs et al. 2000).
+        """Return the unknowns with the least robust error (reweighted Levenberg-Marquardt; Triggs et al. 2000).
 
-        The normal equations are formed from the sparse Jacobian and solved densely: exact, where iterative solvers
-        converge slowly because focal length and distance are nearly exchangeable.
+        The normal equations are formed from the sparse Jacobian and solved densely. Iterative solvers converge slowly,
+        since focal length and distance are strongly correlated.
         """
-        for _ in range(2):  # the second time with the spread that the first one reached
+        for _ in range(2):  # the second time with the residual scale of the first
             scale = _HUBER_SIGMAS * max(_LEAST_SIGMA_PX, 1.4826 * float(np.median(np.abs(self.residuals(x)))))
             x = self._descend(x, scale)
         return x
@@ -135,18 +135,18 @@ class _Problem:
                     break
                 damping *= 10
             else:
-                return x  # no step lowers the error any more
+                return x  # no step reduces the error
             if before - cost <= 1e-10 * before:
                 return x
-        raise CalibrationError(f"the bundle adjustment did not settle in {_MOST_STEPS} steps.")
+        raise CalibrationError(f"the bundle adjustment did not converge in {_MOST_STEPS} steps.")
 
     def residuals(self, x: Array) -> Array:
-        """Return projected minus seen pixels, shape (R,)."""
+        """Return projected minus observed pixels, shape (R,)."""
         turns = so3_exp(self.split(x)[1][:, :3])
         return np.concatenate([self._camera(x, turns, c)[0] for c in range(self.cameras)])
 
     def spread(self, x: Array) -> Array:
-        """Return the residuals as (C, V, N, 2), NaN where not seen."""
+        """Return the residuals as (C, V, N, 2), NaN where not observed."""
         out = np.full(self.corners_px.shape, np.nan)
         out[self.seen] = self.residuals(x).reshape(-1, 2)
         return out
@@ -167,21 +167,21 @@ class _Problem:
         return csr_matrix(entries, shape=(row, len(x)))
 
     def covariance(self, x: Array) -> Array:
-        """Return the covariance of the cameras' parameters, the boards' poses marginalised."""
+        """Return the covariance of the camera parameters, with the board poses marginalised."""
         J, residual = self.jacobian(x), self.residuals(x)
         sigma = 1.4826 * np.median(np.abs(residual))
         normal = (J.T @ J).toarray()
-        scale = 1 / np.sqrt(np.diag(normal))  # px, rad and mm: bring them to one size before inverting
+        scale = 1 / np.sqrt(np.diag(normal))  # px, rad and mm: normalise before inverting
         inverse = np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
         own = len(self.split(x)[0])
         return sigma**2 * inverse[:own, :own]
 
     def _camera(self, x: Array, turns: Array, c: int) -> tuple[Array, Array, Array, Array]:
-        """Return what one camera sees at the boards' rotations (V, 3, 3): its n points in order of the views.
+        """Project the n points of one camera, in the order of the views, at the boards' rotations (V, 3, 3).
 
         Returns:
-            residuals (2n,), OpenCV's derivative of the pixels (2n, ...), points turned as the board is and points
-            turned as the camera is (n, 3).
+            Residuals (2n,), OpenCV's derivative of the pixels (2n, ...), and the points rotated by the board and by the
+            camera (n, 3).
         """
         cameras, boards = self.split(x)
         lens, pose = cameras[c * _LENS : (c + 1) * _LENS], self._pose(x, c)
@@ -196,14 +196,14 @@ class _Problem:
         return residual.ravel(), np.asarray(derived, np.float64), turned, carried
 
     def _parts(self, x: Array, turns: Array, slopes: Array, c: int) -> list[tuple[Array | int, Array]]:
-        """Return the parts of one camera's Jacobian, shape (2n, 6), with their first column, an int or per row.
+        """Return the blocks of one camera's Jacobian, shape (2n, 6), with their first column, an int or one per row.
 
         Args:
-            turns, slopes: the boards' rotations and their left Jacobians, shape (V, 3, 3).
+            turns, slopes: rotations of the boards and their left Jacobians, shape (V, 3, 3).
         """
         pose, views = self._pose(x, c), self.points[c][0]
         _, J, turned, carried = self._camera(x, turns, c)
-        # Columns of OpenCV: rotation 0-2, translation 3-5, f 6-7, c 8-9, distortion from 10.
+        # OpenCV's columns: rotation 0-2, translation 3-5, f 6-7, c 8-9, distortion from 10.
         by_point = J[:, 3:6].reshape(-1, 2, 3)
         parts: list[tuple[Array | int, Array]] = [(c * _LENS, J[:, 6:12])]
         if c:
@@ -217,7 +217,7 @@ class _Problem:
         return parts
 
     def _pose(self, x: Array, c: int) -> Array:
-        """Return the pose of a camera; the first one is the world."""
+        """Return the pose of a camera; the first camera is the world."""
         column = self.cameras * _LENS + (c - 1) * _POSE
         return x[column : column + _POSE] if c else np.zeros(_POSE)
 

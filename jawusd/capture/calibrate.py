@@ -24,21 +24,21 @@ from jawusd.capture.scale import (
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera
 
-#: Called with the cameras and the reason why the picks give no scale.
+#: Called with the cameras and the reason why the picks do not determine the scale.
 MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 
-_ENOUGH_VIEWS = 40  # a quarter of the shape error of 20
+_ENOUGH_VIEWS = 40  # a quarter of the shape error of 20 views
 _GOOD_RMS_PX = 0.5
-_FAR_MM = 40.0  # the board's nearest corner from the middle of the mouth
-_GRID = (8, 5)  # cells of the picture whose coverage is counted
+_FAR_MM = 40.0  # from the board's nearest corner to the centre of the mouth
+_GRID = (8, 5)  # cells of the picture for the coverage
 _LITTLE_COVERAGE = 0.5
-_LARGE_EXPECTED_MM = 0.05  # a share of the tracking error of about 0.1 mm
+_LARGE_EXPECTED_MM = 0.05  # half of the typical tracking error of 0.1 mm
 
 
 class CameraFigures(TypedDict):
-    """What is known of one camera's calibration.
+    """Statistics of one camera's calibration.
 
-    `coverage` is the share of the picture's cells with corners; `blurred` and `missed` are picture numbers.
+    `coverage` is the fraction of the picture's cells with corners; `blurred` and `missed` are picture numbers.
     """
 
     views: int
@@ -51,17 +51,17 @@ class CameraFigures(TypedDict):
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """Hold the accuracy of a calibration, and advice."""
+    """Accuracy of a calibration, with advice."""
 
     cameras: dict[str, CameraFigures]
     views: int  # board poses used
     board_shape: ShapeError  # error of distances between triangulated corners near the mouth, on the pictures used
-    expected_shape_mm: float  # mean error of distances in the mouth volume expected from the corners' scatter
-    mouth_mm: tuple[float, float, float]  # middle of the mouth in the world, and from what it is known
+    expected_shape_mm: float  # expected mean error of distances in the mouth, from the scatter of the corners
+    mouth_mm: tuple[float, float, float]  # centre of the mouth in the world, and its source
     mouth_from: str
     scale: ScaleCheck  # the board's square size, checked against the teeth
-    advice: tuple[str, ...]  # what to do better, one sentence each
-    notes: tuple[str, ...]  # what was assumed
+    advice: tuple[str, ...]  # possible improvements, one sentence each
+    notes: tuple[str, ...]  # assumptions
 
     def as_dict(self) -> dict[str, object]:
         """Return the report as plain data."""
@@ -74,21 +74,21 @@ def calibrate_capture(
     progress: Callable[[int, int], None],
     scale_without_picks: MeasureScale | None = None,
 ) -> tuple[list[Camera], CalibrationReport]:
-    """Calibrate from the boards of a capture.
+    """Calibrate the cameras from the boards of a capture.
 
     Args:
         scans: vertices of the teeth scans [mm] by "upper" and "lower", shape (n, 3); picks refer to them.
-        scale_without_picks: measures the size of the teeth with the calibrated cameras if the picks do not suffice.
+        scale_without_picks: measures the size of the teeth with the calibrated cameras if the picks are insufficient.
 
     Raises:
-        CalibrationError: there are no boards, or they do not carry a calibration.
+            CalibrationError: there are no boards, or they do not determine the calibration.
         CaptureError: a clip cannot be read.
     """
     if capture.boards is None:
         raise CalibrationError(
             "has no [boards].",
             path=capture.folder / "capture.toml",
-            hint="Film a chessboard where the teeth will be and name the clips there, or give a calibration file.",
+            hint="Film a chessboard at the position of the teeth and name the clips there, or give a calibration file.",
         )
     names = tuple(camera.name for camera in capture.cameras)
     return calibrate_sightings(find_boards(names, capture.boards, progress), capture, scans, scale_without_picks)
@@ -100,10 +100,10 @@ def calibrate_sightings(
     scans: Mapping[str, Array],
     scale_without_picks: MeasureScale | None = None,
 ) -> tuple[list[Camera], CalibrationReport]:
-    """Calibrate from corners already found; see `calibrate_capture`.
+    """Calibrate the cameras from detected corners; see `calibrate_capture`.
 
     Raises:
-        CalibrationError: the corners do not carry a calibration.
+        CalibrationError: the corners do not determine the calibration.
     """
     boards = capture.boards
     if boards is None:
@@ -143,7 +143,7 @@ def _camera_figures(c: int, camera: Camera, bundle: Bundle, sightings: Sightings
     cells = np.floor(pixels / camera.size_px * _GRID).astype(int)
     covered = {(x, y) for x, y in cells.tolist()}
     corners = {"top left": (0, 0), "top right": (1, 0), "bottom left": (0, 1), "bottom right": (1, 1)}
-    # A quarter of the picture in either direction counts as its corner.
+    # Corners of the picture extend over a quarter of its width and height.
     share = pixels / camera.size_px
     empty = [name for name, (right, low) in corners.items() if not ((np.abs(share - [right, low]) < 0.25).all(1)).any()]
     return {
@@ -163,33 +163,33 @@ def _advice(
     fewest = min(figures, key=lambda name: figures[name]["views"])
     if figures[fewest]["views"] < _ENOUGH_VIEWS:
         advice.append(
-            f"camera {fewest} uses {figures[fewest]['views']} views of the board; {_ENOUGH_VIEWS} and more make the "
-            "result steadier."
+            f"camera {fewest} uses {figures[fewest]['views']} views of the board; {_ENOUGH_VIEWS} or more give a more "
+            "accurate result."
         )
     corners = np.einsum("vij,nj->vni", bundle.T_world_board[:, :3, :3], points_mm)
     corners += bundle.T_world_board[:, None, :3, 3]
     distance = float(np.median(np.linalg.norm(corners - centre_mm, axis=-1).min(1)))
     if distance > _FAR_MM:
         advice.append(
-            f"the board was held {distance:.0f} mm from the mouth (median of its nearest corner); hold it where the "
-            f"teeth will be, within {_FAR_MM:.0f} mm."
+            f"the board was held {distance:.0f} mm from the mouth (median of its nearest corner); hold it at the "
+            f"position of the teeth, within {_FAR_MM:.0f} mm."
         )
     for name, figure in figures.items():
         if figure["rms_px"] > _GOOD_RMS_PX:
             advice.append(
-                f"camera {name} misses the corners by {figure['rms_px']:.2f} px rms (good is below {_GOOD_RMS_PX:g}): "
-                "look for blur, a bent board, a zoom or a camera that moved."
+                f"camera {name} has a reprojection error of {figure['rms_px']:.2f} px rms (good is below "
+                f"{_GOOD_RMS_PX:g}): check for blur, a bent board, a zoom or a camera that moved."
             )
         if figure["coverage"] < _LITTLE_COVERAGE or figure["empty_corners"]:
             empty = ", ".join(figure["empty_corners"]) or "parts"
             advice.append(
                 f"camera {name}: the board covered {figure['coverage']:.0%} of the picture and left {empty} empty; "
-                "the lens is extrapolated there, keep the teeth out of it."
+                "the lens model is extrapolated there, so keep the teeth out of it."
             )
     if expected_mm > _LARGE_EXPECTED_MM:
         advice.append(
-            f"distances in the mouth are expected to be wrong by {expected_mm:.3f} mm: add views, tilted up to 30 "
-            "degrees, with all of the board in all cameras."
+            f"the expected error of distances in the mouth is {expected_mm:.3f} mm: add views, tilted up to 30 "
+            "degrees, with the whole board visible in all cameras."
         )
     return advice
 
@@ -199,9 +199,8 @@ def _notes(sightings: Sightings, bundle: Bundle, scale: ScaleCheck) -> list[str]
     lost = int(np.isfinite(sightings.corners_px[..., 0]).sum() - np.isfinite(bundle.corners_px[..., 0]).sum())
     if lost:
         notes.append(
-            f"{lost} of {int(np.isfinite(sightings.corners_px[..., 0]).sum())} corners disagree with the rest and were "
-            "left out."
+            f"{lost} of {int(np.isfinite(sightings.corners_px[..., 0]).sum())} corners are outliers and were discarded."
         )
     if scale.ratio is None:
-        notes.append(f"nothing but [boards] square_mm tells the scale: {scale.reason}.")
+        notes.append(f"the scale relies on [boards] square_mm alone: {scale.reason}.")
     return notes

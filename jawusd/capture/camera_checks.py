@@ -1,4 +1,4 @@
-"""Can a calibration be right? Lenses, places and directions of the cameras, without looking at a picture."""
+"""Plausibility checks of a calibration: lenses, positions and directions of the cameras."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
 
-# Focal length over picture width: from a fisheye's 100 degrees to a telephoto's 3.
+# Focal length over picture width: fields of view from 100 down to 3 degrees.
 _FOCAL_WIDTHS = (0.4, 20.0)
-_SQUARE = 0.03  # relative difference of fx and fy; pixels of cameras sold today are square
-_CENTRE_SHARE = 0.15  # of the picture's width by which the principal point may lie off its middle
+_SQUARE = 0.03  # relative difference of fx and fy; current cameras have square pixels
+_CENTRE_SHARE = 0.15  # offset of the principal point from the picture's centre, over its width
 _LEAST_BASELINE_MM, _MOST_BASELINE_MM = 10.0, 5000.0
-_LEAST_ANGLE_DEG = 3.0  # between two views of the teeth: depth is ten times as uncertain as a pixel then
+_LEAST_ANGLE_DEG = 3.0  # between two views of the teeth; depth is then ten times as uncertain as a pixel
 _NEAREST_MM, _FARTHEST_MM = 40.0, 5000.0
 
 
 def camera_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
-    """Yield what is wrong or doubtful about calibrated cameras, lengths in mm; `path` is that of the calibration."""
+    """Yield findings about calibrated cameras, lengths in mm; `path` is the calibration file."""
     for camera in cameras:
         yield from _lens_findings(camera, path)
     if len(cameras) < 2:
@@ -34,13 +34,13 @@ def camera_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
             yield Finding(
                 "cameras_together" if baseline < _LEAST_BASELINE_MM else "cameras_far_apart",
                 "error" if max(baselines) < _LEAST_BASELINE_MM else "warning",
-                f"it is {baseline:.4g} mm away from camera {a.name}, usual are {_LEAST_BASELINE_MM:g} to "
+                f"it is {baseline:.4g} mm away from camera {a.name}, the usual range is {_LEAST_BASELINE_MM:g} to "
                 f"{_MOST_BASELINE_MM:g} mm.{unit}",
                 baseline,
                 _LEAST_BASELINE_MM,
                 path=path,
                 camera=b.name,
-                hint="Set calibration_unit_mm to the length of the file's unit, or calibrate again.",
+                hint="Set calibration_unit_mm to the length unit of the file, or calibrate again.",
             )
     if max(baselines) >= _LEAST_BASELINE_MM:
         yield from _aim_findings(cameras, path)
@@ -55,33 +55,31 @@ def _lens_findings(camera: Camera, path: str) -> Iterator[Finding]:
     focal = float(camera.K[0, 0] / width)
     if not _FOCAL_WIDTHS[0] <= focal <= _FOCAL_WIDTHS[1]:
         low, high = _FOCAL_WIDTHS
-        message = f"its focal length is {focal:.3g} picture widths, usual are {low:g} to {high:g}"
+        message = f"its focal length is {focal:.3g} picture widths, the usual range is {low:g} to {high:g}"
         yield warning("focal_length", message, focal, high if focal > high else low)
     uneven = float(abs(camera.K[1, 1] / camera.K[0, 0] - 1.0))
     if uneven > _SQUARE:
-        message = f"its focal lengths fx and fy differ by {uneven:.1%}, up to {_SQUARE:.0%} are usual"
+        message = f"its focal lengths fx and fy differ by {uneven:.1%}, usually by at most {_SQUARE:.0%}"
         yield warning("pixels_not_square", message, uneven, _SQUARE)
     middle = np.array([width - 1, height - 1]) / 2
     off = float(np.abs(camera.K[:2, 2] - middle).max() / width)
     if off > _CENTRE_SHARE:
-        message = (
-            f"its principal point lies {off:.0%} of the picture's width off the middle, up to {_CENTRE_SHARE:.0%} "
-        )
-        yield warning("principal_point", message + "are usual", off, _CENTRE_SHARE)
+        message = f"its principal point is {off:.0%} of the picture's width off the centre, usually at most "
+        yield warning("principal_point", message + f"{_CENTRE_SHARE:.0%}", off, _CENTRE_SHARE)
     if (worst := _fold(camera)) is not None:
-        message = f"its distortion folds the picture {worst:.0%} of the way to the corner: points there have two places"
+        message = f"its distortion folds over at {worst:.0%} of the way to the corner: it is not invertible there"
         yield warning("distortion_folds", message, worst, 1.0)
 
 
 def _fold(camera: Camera) -> float | None:
-    """Return how far on the way to the farthest corner distortion turns points back, None if it never does."""
+    """Return where the distortion folds over, as a fraction of the way to the farthest corner; None if it does not."""
     width, height = camera.size_px
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], np.float64)
     centre = camera.K[:2, 2]
     share = np.linspace(0.0, 1.0, 101)[:, None]
     folds = []
     for corner in corners:
-        # Ideal points up to the one that is seen at the corner, which lies farther out under barrel distortion.
+        # Undistorted radii up to the corner, which are larger under barrel distortion.
         seen = camera.distort_pixels(centre + 1.5 * share * (corner - centre))
         reach = np.linalg.norm(seen - centre, axis=1)
         turned = np.flatnonzero(np.diff(reach) < 0)
@@ -91,7 +89,7 @@ def _fold(camera: Camera) -> float | None:
 
 
 def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
-    """Yield cameras that do not look at the point at which the others look."""
+    """Yield findings about cameras that do not look at the same point as the others."""
     target = aimed_at(cameras)
     for camera in cameras:
         depth = float(camera.depth(target))
@@ -99,8 +97,8 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
             yield Finding(
                 "camera_aim",
                 "warning",
-                f"the point at which the cameras look lies {depth:.0f} mm before it, usual are {_NEAREST_MM:g} to "
-                f"{_FARTHEST_MM:g} mm",
+                f"the common target of the cameras is {depth:.0f} mm in front of it, the usual range is "
+                f"{_NEAREST_MM:g} to {_FARTHEST_MM:g} mm",
                 depth,
                 _NEAREST_MM,
                 path=path,
@@ -113,7 +111,7 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
         yield Finding(
             "views_alike",
             "warning",
-            f"all cameras see the teeth within {max(angles):.1f} degrees; at least {_LEAST_ANGLE_DEG:g} are needed",
+            f"all viewing directions lie within {max(angles):.1f} degrees, at least {_LEAST_ANGLE_DEG:g} are needed",
             max(angles),
             _LEAST_ANGLE_DEG,
             path=path,
@@ -122,7 +120,7 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
 
 
 def aimed_at(cameras: Sequence[Camera]) -> Array:
-    """Return the point nearest to the optical axes of all cameras [mm], shape (3,)."""
+    """Return the point closest to the optical axes of all cameras [mm], shape (3,)."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for camera in cameras:
         axis = camera.T_cam_world[2, :3]

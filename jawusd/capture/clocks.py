@@ -1,4 +1,4 @@
-"""Align cameras by what their clips say of time: time codes, or the numbers of their pictures."""
+"""Synchronise cameras by the clocks of their clips: time codes or picture numbers."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from jawusd.media.footage import open_clip
 _DAY_S = 86400
 _RATE_TOLERANCE = 1e-3
 _NEARLY_WHOLE = 0.01
-_FASTEST_USUAL = 30.5  # frames per second; of faster pictures, two or four often share a number of a time code
+_FASTEST_USUAL = 30.5  # frames per second; above it, two or four pictures often share a time code
 
 
 def refuse_other_rates(clips: Mapping[str, Clip], reference: str) -> None:
-    """Raise an error if a clip runs at another rate than that of the reference camera.
+    """Check that all clips have the frame rate of the reference camera.
 
     Raises:
-        SyncError: one does.
+        SyncError: a clip has a different frame rate.
     """
     rate = clips[reference].timeline.rate
     for name, clip in clips.items():
         if abs(clip.timeline.rate / rate - 1) > _RATE_TOLERANCE:
             raise SyncError(
-                f"camera {name} runs at {clip.timeline.rate:.6g} frames per second, camera {reference} at {rate:.6g}.",
+                f"camera {name} has {clip.timeline.rate:.6g} frames per second, camera {reference} has {rate:.6g}.",
                 path=clip.path,
-                hint="Offsets in whole frames need equal rates: convert the videos to one rate.",
+                hint="Offsets in whole frames need equal frame rates: convert the videos to one rate.",
             )
 
 
 def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ...]]:
-    """Return the offset of every camera by `[sync] method`, "timecode" or "numbers", and remarks for the user.
+    """Return the offset of every camera by `[sync] method`, "timecode" or "numbers", and notes for the user.
 
     Raises:
-        SyncError: a camera has no video, or its clip no such clock; the clips share no instant; or their rates differ.
+        SyncError: a camera has no video or its clip no clock of that kind, the clips do not overlap, or rates differ.
         CaptureError: a clip cannot be read.
     """
     path = capture.folder / "capture.toml"
     clips: dict[str, Clip] = {}
     for camera in capture.cameras:
         if camera.clip is None:
-            raise SyncError("has no video, so there is no clock to align it by.", camera=camera.name, path=path)
+            raise SyncError("has no video, so it has no clock to synchronise by.", camera=camera.name, path=path)
         clips[camera.name] = open_clip(camera.clip)
     refuse_other_rates(clips, capture.reference)
     by_code = capture.sync.method == "timecode"
@@ -58,12 +58,11 @@ def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ..
             offset -= day if offset > 0 else -day  # recorded over midnight
         if offset >= clips[capture.reference].timeline.count or -offset >= clips[name].timeline.count:
             raise SyncError(
-                f"begins {abs(offset)} frames {'after' if offset > 0 else 'before'} camera {capture.reference} by its "
-                f"{capture.sync.method}: the clips share no instant.",
+                f"starts {abs(offset)} frames {'after' if offset > 0 else 'before'} camera {capture.reference} by its "
+                f"{capture.sync.method}: the clips do not overlap in time.",
                 camera=name,
                 path=clips[name].path,
-                hint="Check that the clips are of one take; align them by light flashes instead, or give "
-                "[sync] offsets.",
+                hint="Check that the clips belong to one take, synchronise by light flashes, or give [sync] offsets.",
             )
         out[name] = Offset(offset, float(offset), 0.0, 0, 1.0)
     return out, tuple(_notes(clips)) if by_code else ()
@@ -74,28 +73,28 @@ def _notes(clips: Mapping[str, Clip]) -> Iterator[str]:
         rate, counted = clip.timeline.rate, clip.timecode_fps
         if counted is None and rate > _FASTEST_USUAL:
             yield (
-                f"camera {name}: its time code is taken to count each of the {rate:.6g} pictures of a second; its file "
-                "does not say"
+                f"camera {name}: its time code is assumed to count {rate:.6g} frames per second, since the file does "
+                "not specify it"
             )
         elif counted is not None and (shared := round(rate / counted)) > 1:
             yield (
-                f"camera {name}: its time code counts {counted:.6g} numbers of a second, {shared} pictures share one: "
-                f"the offset is known to {shared} frames only"
+                f"camera {name}: its time code counts {counted:.6g} numbers per second, so {shared} frames share one: "
+                f"the offset is accurate to {shared} frames only"
             )
 
 
 def _frames_of_number(clip: Clip) -> int:
-    """Return how many pictures share a number of the time code.
+    """Return the number of pictures per time code.
 
     Raises:
-        CaptureError: no whole number of them.
+        CaptureError: it is not an integer.
     """
     ratio = clip.timeline.rate / (clip.timecode_fps or clip.timeline.rate)
     if round(ratio) < 1 or abs(ratio / round(ratio) - 1) > _NEARLY_WHOLE:
         raise CaptureError(
-            f"the time code counts {clip.timecode_fps:.6g} numbers of a second, the clip has {clip.timeline.rate:.6g} "
-            "pictures: no whole number of pictures for each.",
-            hint="Give the time code of the first picture at the rate of the clip, or align by light.",
+            f"the time code counts {clip.timecode_fps:.6g} numbers per second, which is not an integer fraction of the "
+            f"clip's {clip.timeline.rate:.6g} frames per second.",
+            hint="Give the time code of the first frame at the rate of the clip, or synchronise by light.",
         )
     return round(ratio)
 
@@ -105,10 +104,10 @@ def _timecodes(clips: Mapping[str, Clip]) -> dict[str, int]:
     for name, clip in clips.items():
         if not clip.timecode:
             raise SyncError(
-                "its clip carries no time code.",
+                "its clip has no time code.",
                 camera=name,
                 path=clip.path,
-                hint='Give that of the first picture, timecode = "HH:MM:SS:FF" in its [[camera]], or align by light.',
+                hint='Give timecode = "HH:MM:SS:FF" of the first frame in its [[camera]], or synchronise by light.',
             )
         try:
             shared = _frames_of_number(clip)

@@ -1,4 +1,9 @@
-"""Initial cameras for the bundle adjustment, from matched pixels or from boards."""
+"""Initial values of a calibration: the board that clips show, intrinsics per camera, then the camera poses.
+
+A detector may list a symmetric board's corners in a different order in every picture. Each order corresponds to the
+board rotated in its plane. The relative pose of two fixed cameras is the same in all views only if both list the same
+corner first, so the pose that most views agree on resolves the orders and exposes views that were not simultaneous.
+"""
 
 from __future__ import annotations
 
@@ -14,26 +19,26 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import CalibrationError
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log
 
-FEWEST_VIEWS = 6  # per camera; fewer leave focal length and distance exchangeable
-_SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # relative poses this close (share of the distance) agree
-_LEAST_AGREEMENT = 0.5  # of the views shared by two cameras
+FEWEST_VIEWS = 6  # per camera; with fewer, focal length and distance are ambiguous
+_SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # tolerance of equal relative poses: angle, relative distance
+_LEAST_AGREEMENT = 0.5  # fraction of the views shared by two cameras
 _INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-_WIDTH_PX = 960  # large enough for boards that fill a fifth of the picture
-_FEWEST_PICTURES = 2  # that must agree
+_WIDTH_PX = 960  # search width; large enough for boards that fill a fifth of the picture
+_FEWEST_PICTURES = 2  # pictures that must agree
 _FEWEST_MARKERS = 4
 _FAMILIES = ("4X4", "5X5", "6X6", "7X7")
-_SIZES = (50, 100, 250, 1000)  # OpenCV's smaller dictionaries are the beginnings of the larger ones
+_SIZES = (50, 100, 250, 1000)  # OpenCV's smaller dictionaries are prefixes of the larger ones
 
 
 @dataclass(frozen=True, eq=False)
 class FirstGuess:
-    """Hold a start for the bundle adjustment."""
+    """Initial values of the bundle adjustment."""
 
     K: Array  # intrinsic matrices [px], shape (C, 3, 3)
     distortion: Array  # k1 and k2 per camera, shape (C, 2)
     T_cam_world: Array  # world (the first camera) to camera [mm], shape (C, 4, 4)
-    T_world_board: Array  # board to world [mm], NaN for views that fit nothing, shape (V, 4, 4)
-    corners_px: Array  # corners in one common order, NaN where unseen or inconsistent, shape (C, V, N, 2)
+    T_world_board: Array  # board to world [mm], NaN for inconsistent views, shape (V, 4, 4)
+    corners_px: Array  # corners in a common order, NaN where hidden or inconsistent, shape (C, V, N, 2)
 
 
 def guess_cameras(
@@ -43,28 +48,28 @@ def guess_cameras(
     points_mm: Array,
     symmetries: list[NDArray[np.int64]],
 ) -> FirstGuess:
-    """Calibrate each camera alone, then place the cameras by the views they share.
+    """Calibrate each camera separately, then estimate the camera poses from shared views.
 
     Args:
-        corners_px: seen corners, NaN where unseen, shape (C, V, N, 2).
+        corners_px: detected corners, NaN where hidden, shape (C, V, N, 2).
         points_mm: corners on the board, shape (N, 3).
-        symmetries: orders in which the same corners may be listed, permutations of (N,); the first is the identity.
+        symmetries: orders in which the corners may be listed, permutations of (N,); the first is the identity.
 
     Raises:
-        CalibrationError: too few views, or cameras that share too few views or contradict themselves.
+        CalibrationError: there are too few views or shared views, or the views are inconsistent.
     """
     count, views = corners_px.shape[:2]
     K, distortion, T_cam_board = np.empty((count, 3, 3)), np.empty((count, 2)), np.full((count, views, 4, 4), np.nan)
     for c, name in enumerate(names):
         K[c], distortion[c], T_cam_board[c] = _single_camera(name, sizes_px[c], corners_px[c], points_mm)
-    # Listing the corners in another order is turning the board: T_cam_board of order s = T_cam_board @ turns[s].
+    # Reordering the corners rotates the board: T_cam_board of order s = T_cam_board @ turns[s].
     turns = [_turn(points_mm, order) for order in symmetries]
     T_cam_world = _place_cameras(names, T_cam_board, turns)
     corners, T_world_board = corners_px.copy(), np.full((views, 4, 4), np.nan)
     for v in range(views):
         seen = [c for c in range(count) if np.isfinite(T_cam_board[c, v, 0, 0])]
         agreed: list[tuple[int, int]] = []
-        for first in seen:  # the board's pose is taken from the camera that most others agree with
+        for first in seen:  # use the board pose of the camera that most others agree with
             T = se3_inverse(T_cam_world[first]) @ T_cam_board[first, v]
             found = [
                 (c, s)
@@ -88,9 +93,9 @@ def _single_camera(
     used = np.flatnonzero(seen.any(1))
     if len(used) < FEWEST_VIEWS:
         raise CalibrationError(
-            f"the board is seen sharply in {len(used)} pictures, at least {FEWEST_VIEWS} are needed.",
+            f"the board is sharp in {len(used)} pictures, at least {FEWEST_VIEWS} are needed.",
             camera=name,
-            hint="Film the board again: 40 poses where the teeth will be, tilted up to 30 degrees, held still.",
+            hint="Film the board again: 40 poses at the position of the teeth, tilted up to 30 degrees, held still.",
         )
     objects = [points_mm[seen[v]].astype(np.float32) for v in used]
     pixels = [corners_px[v, seen[v]].astype(np.float32) for v in used]
@@ -100,9 +105,9 @@ def _single_camera(
         )
     except cv2.error as error:
         raise CalibrationError(
-            f"the board's views do not fix the lens ({error.err}).",
+            f"the views of the board do not determine the lens ({error.err}).",
             camera=name,
-            hint="Tilt the board by up to 30 degrees in all directions; views facing the camera tell nothing.",
+            hint="Tilt the board by up to 30 degrees in all directions; fronto-parallel views are not enough.",
         ) from error
     T = np.full((len(corners_px), 4, 4), np.nan)
     T[used] = make_transform(
@@ -112,8 +117,8 @@ def _single_camera(
 
 
 def _turn(points_mm: Array, order: NDArray[np.int64]) -> Array:
-    """Return the transform of the board with points[order] = R points, about its middle."""
-    # Planar: the two in-plane axes by least squares, the normal stays.
+    """Return the rotation of the board about its centre with points[order] = R points."""
+    # Planar: least squares for the two in-plane axes; the normal is fixed.
     plane = np.linalg.lstsq(points_mm[:, :2], points_mm[order, :2], rcond=None)[0].T
     R = np.eye(3)
     R[:2, :2] = np.round(plane)
@@ -121,14 +126,14 @@ def _turn(points_mm: Array, order: NDArray[np.int64]) -> Array:
 
 
 def _alike(a: Array, b: Array) -> Mask:
-    """Return whether poses agree, shape (...)."""
+    """Return whether poses are equal within the tolerance, shape (...)."""
     angle = np.linalg.norm(so3_log(a[..., :3, :3] @ np.swapaxes(b[..., :3, :3], -1, -2)), axis=-1)
     apart = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
     return (angle < _SAME_ANGLE_RAD) & (apart < _SAME_SHARE * np.linalg.norm(b[..., :3, 3], axis=-1))
 
 
 def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array]) -> Array:
-    """Return T_cam_world (C, 4, 4), walking from the first camera over the pairs that share most views."""
+    """Return T_cam_world (C, 4, 4), chained from the first camera over the pairs that share most views."""
     seen = np.isfinite(T_cam_board[..., 0, 0])
     T_cam_world = np.full((len(names), 4, 4), np.nan)
     T_cam_world[0] = np.eye(4)
@@ -140,7 +145,7 @@ def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array
             raise CalibrationError(
                 f"camera {names[b]} shares {views} sharp board views with {names[a]}, at least {FEWEST_VIEWS} are "
                 "needed.",
-                hint="Hold the board so that both cameras see all of it, and start the board clips together.",
+                hint="Hold the board so that both cameras see the whole board, and start the board clips together.",
             )
         T_cam_world[b] = _relative_pose(names[a], names[b], T_cam_board[[a, b]], turns) @ T_cam_world[a]
         placed.append(b)
@@ -149,10 +154,10 @@ def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array
 
 
 def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Array]) -> Array:
-    """Return the T_b_a that most shared views agree on in one of the orders."""
+    """Return the T_b_a that most shared views agree on in any of the orders."""
     both = np.isfinite(T_cam_board[..., 0, 0]).all(0)
     T_a, T_b = T_cam_board[0, both], T_cam_board[1, both]
-    # (orders, views, 4, 4): the pose of b in a's coordinates if b lists the corners in that order.
+    # (orders, views, 4, 4): T_b_a if b lists the corners in that order.
     candidates = np.stack([T_b @ turn @ se3_inverse(T_a) for turn in turns])
     flat = candidates.reshape(-1, 4, 4)
     votes = _alike(flat[:, None, None], candidates[None]).any(1)  # (candidates, views)
@@ -160,11 +165,11 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
     best = int(np.argmax(support))
     if support[best] < _LEAST_AGREEMENT * both.sum():
         raise CalibrationError(
-            f"the views of the board by {name_a} and {name_b} contradict each other: at most {support[best]} of "
-            f"{both.sum()} agree on where the cameras stand.",
-            hint="The board clips must be simultaneous picture by picture, and the cameras must not move.",
+            f"the views of the board by {name_a} and {name_b} are inconsistent: at most {support[best]} of "
+            f"{both.sum()} agree on the relative camera pose.",
+            hint="The board clips must be synchronous frame by frame, and the cameras must not move.",
         )
-    # Of those with much support, the one in the middle.
+    # The most central one of the well supported poses.
     strong = flat[support >= 0.8 * support[best]]
     near = strong[_alike(strong, flat[best])]
     gap = np.linalg.norm(near[:, None, :3] - near[None, :, :3], axis=(-1, -2)).sum(1)
@@ -173,7 +178,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
 
 @dataclass(frozen=True)
 class BoardSeen:
-    """Hold what board clips show: inner corners of a chessboard, or the dictionary of markers."""
+    """Board found in clips: inner corners of a chessboard, or a dictionary of markers."""
 
     pattern: str
     cols: int | None = None
@@ -182,7 +187,7 @@ class BoardSeen:
 
 
 def seen_board(pictures: Iterable[NDArray[np.uint8]]) -> BoardSeen | None:
-    """Return the board in most of some gray pictures (h, w); None if none is in two of them."""
+    """Return the board that most gray pictures (h, w) show; None if no two agree."""
     boards: Counter[tuple[int, int]] = Counter()
     markers: Counter[str] = Counter()
     highest: dict[str, int] = {}
@@ -212,7 +217,7 @@ def _shrunk(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _markers(picture: NDArray[np.uint8]) -> Iterable[tuple[str, int]]:
-    """Yield each family of markers seen, with the highest number."""
+    """Yield each marker family seen, with the highest marker number."""
     for family in _FAMILIES:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}_{_SIZES[-1]}"))
         numbers = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)[1]

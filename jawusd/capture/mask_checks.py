@@ -1,4 +1,8 @@
-"""Check masks before tracking."""
+"""Consistency checks of masks, calibration and offsets before tracking.
+
+Mask centres of two cameras must lie on each other's epipolar lines, and masks swapped between two cameras start and
+end at the wrong frames.
+"""
 
 from __future__ import annotations
 
@@ -11,27 +15,27 @@ from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera, triangulate
 
-#: First and last frame with a mask of the upper and of the lower teeth, in a camera's own numbers; None without any.
+#: First and last frame with a mask of the upper and of the lower teeth, in the camera's own numbers; None if empty.
 Ranges = tuple[tuple[int, int] | None, tuple[int, int] | None]
-#: The middle of all teeth pixels of one instant by camera [px], shape (2,).
+#: Centre of all teeth pixels at one instant by camera [px], shape (2,).
 Middles = Mapping[str, Array]
 
-# Distance of the two rays through the middles of the masks: what shows of the teeth differs between views [mm].
-# Valid synthetic persons: 10.4 mm at most of 70, 8.3 mm the next.
+# Largest distance of the two rays through the mask centres [mm]; the visible part of the teeth differs between views.
+# No false alarm on 70 valid synthetic persons, with at most 10.4 mm.
 _RAYS_MM = 15.0
-# Width of what the masks show of both rows at the depth where the rays meet; lips hide much, no mouth shows more [mm].
+# Plausible width of the teeth in the masks at the triangulated depth [mm]; lips may hide much of them.
 _SEEN_MM = (10.0, 90.0)
 
 
 def exchanged_by_frames(
     ranges: Mapping[str, Ranges], offsets: Mapping[str, int], first: int, stop: int
 ) -> list[tuple[str, str]]:
-    """Return pairs of cameras whose masks begin and end with the take only if they are exchanged.
+    """Return pairs of cameras whose masks start and end with the take only when swapped.
 
     Args:
         ranges: frames with masks, by camera.
         offsets: reference frame minus own frame number, by camera.
-        first, stop: first frame of the take and one past its last, of the reference camera.
+        first, stop: first frame of the take and one past the last, of the reference camera.
     """
 
     def fits(source: str, camera: str) -> bool:
@@ -44,13 +48,13 @@ def exchanged_by_frames(
 
 
 def middles_findings(cameras: Mapping[str, Camera], middles: Sequence[Sequence[Middles]]) -> Iterator[Finding]:
-    """Compare where the cameras see the middle of the teeth.
+    """Yield findings about cameras whose mask centres contradict those of other cameras.
 
     Args:
         cameras: calibrated cameras by name.
-        middles: of some instants; each as often as there are guesses of the offsets, of which the best one counts.
+        middles: mask centres at some instants, one entry per candidate offset; the best candidate counts.
 
-    A pair of cameras that fits nowhere is named; the camera that is in most of such pairs is accused.
+    The camera that is part of most inconsistent pairs is reported.
     """
     apart: dict[tuple[str, str], float] = {}
     for pair in combinations(cameras, 2):
@@ -70,17 +74,17 @@ def middles_findings(cameras: Mapping[str, Camera], middles: Sequence[Sequence[M
     yield Finding(
         "cameras_contradict",
         "warning",
-        f"its rays through the middle of the teeth pass those of camera {other} at {mm:.0f} mm, up to {_RAYS_MM:g} mm "
-        "are possible",
+        f"its rays through the centre of the teeth miss those of camera {other} by {mm:.0f} mm, at most {_RAYS_MM:g} "
+        "mm is plausible",
         mm,
         _RAYS_MM,
         camera=worst,
-        hint="Check that masks, video and calibration are those of this camera, and the time offsets.",
+        hint="Check that masks, video and calibration belong to this camera, and check the time offsets.",
     )
 
 
 def seen_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -> Iterator[Finding]:
-    """Compare the width of what masks show with that of teeth, at the depth that two cameras give.
+    """Yield findings about masks whose width, at the triangulated depth, is not that of teeth.
 
     Args:
         cameras: calibrated cameras by name.
@@ -102,16 +106,16 @@ def seen_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) ->
         yield Finding(
             "teeth_size",
             "warning",
-            f"the masks show teeth {width:.3g} mm wide by this calibration, {_SEEN_MM[0]:g} to {_SEEN_MM[1]:g} mm are "
-            "possible",
+            f"by this calibration the masks show teeth {width:.3g} mm wide, {_SEEN_MM[0]:g} to {_SEEN_MM[1]:g} mm is "
+            "plausible",
             width,
             _SEEN_MM[width > _SEEN_MM[1]],
-            hint="Check calibration_unit_mm, the size of the board's squares, and that the masks belong to it.",
+            hint="Check calibration_unit_mm, the board's square size, and that the masks belong to this calibration.",
         )
 
 
 def _rays_mm(cameras: Mapping[str, Camera], pair: tuple[str, str], found: Mapping[str, Array]) -> float:
-    """Return the distance of the rays through two cameras' middles [mm]."""
+    """Return the distance between the rays through two cameras' mask centres [mm]."""
     starts, rays = [], []
     for name in pair:
         camera = cameras[name]

@@ -1,4 +1,4 @@
-"""Scale of a calibration."""
+"""Accuracy of a calibration: its scale, checked against the teeth, and errors of lengths in the mouth."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, se3_inverse, triangulate
 
 _FEWEST_PICKS = 3  # per jaw
-_TOLERANCE = 0.03  # picks give the scale to about half a per cent
+_TOLERANCE = 0.03  # picks determine the scale to about 0.5 %
 _SIGMAS = 4.0
-_MOUTH_RADIUS_MM = 35.0  # holds both arches through an opening of 40 mm
+_MOUTH_RADIUS_MM = 35.0  # contains both arches up to an opening of 40 mm
 _DRAWS = 40
 _POINTS = 150
 
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """Compare the size of the teeth as the cameras see them with the scan."""
+    """Size of the teeth seen by the cameras relative to the scan."""
 
-    ratio: float | None  # seen / scanned, None if unknown
+    ratio: float | None  # measured / scanned, None if unknown
     sigma: float | None  # its standard error
     reason: str = ""  # why it is unknown, else ""
 
@@ -34,7 +34,7 @@ class ScaleCheck:
 def triangulated_picks(
     cameras: list[Camera], bootstrap: Bootstrap | None
 ) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Return per jaw the picked vertices (n,) and where the cameras see them [mm], shape (n, 3)."""
+    """Return per jaw the picked vertices (n,) and their triangulated positions [mm], shape (n, 3)."""
     known = {camera.name: camera for camera in cameras}
     out = {}
     for jaw in ("upper", "lower"):
@@ -53,13 +53,13 @@ def triangulated_picks(
 def check_scale(
     cameras: list[Camera], bootstrap: Bootstrap | None, scans: Mapping[str, Array], square_mm: float
 ) -> ScaleCheck:
-    """Compare the spread of the picks in space with that on the scans (Umeyama 1991).
+    """Compare the spread of the triangulated picks with that on the scans (Umeyama 1991).
 
     Args:
         scans: vertices [mm] by "upper" and "lower", shape (n, 3).
 
     Raises:
-        CalibrationError: the teeth come out with another size than the scan's.
+        CalibrationError: the measured size of the teeth differs from the scan.
     """
     squares, weights, residuals = [], [], []
     for jaw, (vertices, points) in triangulated_picks(cameras, bootstrap).items():
@@ -74,7 +74,7 @@ def check_scale(
         squares.append(float((S * sign).sum()) / spread)
         residuals.append((b - squares[-1] * a @ (Vt.T * sign) @ U.T).ravel())
     if not squares:
-        return ScaleCheck(None, None, "there are no picks in two cameras to compare with the scans")
+        return ScaleCheck(None, None, "no picks are seen by two cameras")
     ratio = float(np.average(squares, weights=weights))
     off = np.concatenate(residuals)
     freedom = max(1, len(off) - 7 * len(squares))
@@ -83,51 +83,53 @@ def check_scale(
 
 
 def judged_scale(ratio: float, sigma: float, square_mm: float) -> ScaleCheck:
-    """Return a measured size of the teeth (seen / scanned) if it confirms the squares or is too uncertain to tell.
+    """Check a measured size ratio of the teeth (measured / scanned) against the square size.
 
     Raises:
-        CalibrationError: the teeth come out with another size than the scan's.
+        CalibrationError: the measured size of the teeth differs from the scan.
     """
     if abs(ratio - 1) > max(_TOLERANCE, _SIGMAS * sigma):
         raise CalibrationError(
-            f"seen with these boards the teeth are {ratio:.3f} times as large as their scan (+-{sigma:.3f}): squares "
+            f"with these boards the teeth measure {ratio:.3f} times their scan (+-{sigma:.3f}): squares "
             f"of {square_mm:g} mm would have to be {square_mm / ratio:.2f} mm.",
-            hint="Measure the printed board and correct [boards] square_mm; or the picks or the scan's unit are wrong.",
+            hint="Measure the printed board and correct [boards] square_mm, or check the picks and the scan's unit.",
         )
     if _SIGMAS * sigma > 3 * _TOLERANCE:
-        return ScaleCheck(None, None, f"the picks scatter too much to check it (+-{sigma:.1%})")
+        return ScaleCheck(None, None, f"the picks are too inaccurate to check it (+-{sigma:.1%})")
     return ScaleCheck(ratio, sigma)
 
 
 @dataclass(frozen=True)
 class ShapeError:
-    """Sum up errors of distances between points [mm]."""
+    """Errors of distances between points [mm]."""
 
     mean: float  # mean absolute error
     p95: float  # its 95th percentile
-    max: float  # the largest
-    distances: int  # how many were compared; 0 = no corner near the mouth was seen by two cameras
+    max: float  # largest error
+    distances: int  # number of distances compared; 0 if no corner near the mouth was seen by two cameras
 
 
 def mouth_centre(cameras: list[Camera], bootstrap: Bootstrap | None, T_world_board: Array) -> tuple[Array, str]:
-    """Return the middle of the mouth in the world [mm], shape (3,), and what it was found from."""
+    """Return the centre of the mouth in the world [mm], shape (3,), and its source."""
     picks = triangulated_picks(cameras, bootstrap)
     if picks:
         return np.concatenate([points for _, points in picks.values()]).mean(0), "the picked teeth"
     if len(cameras) == 1:
-        return np.median(T_world_board[:, :3, 3], axis=0), "the middle of the boards"
-    # The point nearest to all optical axes.
+        return np.median(T_world_board[:, :3, 3], axis=0), "the centre of the boards"
+    # The point closest to all optical axes.
     T = np.stack([se3_inverse(camera.T_cam_world) for camera in cameras])
     across = np.eye(3) - T[:, :3, 2, None] * T[:, None, :3, 2]
-    return np.linalg.solve(across.sum(0), (across @ T[:, :3, 3, None]).sum(0))[:, 0], "where the cameras look"
+    return np.linalg.solve(across.sum(0), (across @ T[:, :3, 3, None]).sum(0))[
+        :, 0
+    ], "the intersection of the optical axes"
 
 
 def board_shape_error(cameras: list[Camera], bundle: Bundle, points_mm: Array, centre_mm: Array) -> ShapeError:
-    """Compare distances between triangulated corners with those on the board, near the mouth.
+    """Compare distances between triangulated corners near the mouth with those on the board.
 
     Args:
         points_mm: corners on the board, shape (N, 3).
-        centre_mm: middle of the mouth in the world, shape (3,).
+        centre_mm: centre of the mouth in the world, shape (3,).
     """
     errors = []
     for corners in np.moveaxis(bundle.corners_px, 1, 0):
@@ -144,10 +146,10 @@ def board_shape_error(cameras: list[Camera], bundle: Bundle, points_mm: Array, c
 
 
 def expected_shape_error(cameras: list[Camera], bundle: Bundle, centre_mm: Array) -> float:
-    """Return the mean error of distances in the mouth volume [mm] when the cameras err by their covariance.
+    """Return the mean error of distances in the mouth [mm] expected from the cameras' covariance.
 
-    Points of the volume are seen with the calibrated cameras and triangulated with cameras drawn from the covariance.
-    What the model leaves out (bent boards, other lens terms, rolling shutters) is not in it.
+    Points in the mouth are projected with the calibrated cameras and triangulated with cameras drawn from the
+    covariance. Effects outside the model (bent boards, other lens terms, rolling shutter) are not included.
     """
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(_POINTS, 3))
@@ -172,10 +174,10 @@ def distance_errors(found: Array, exact: Array) -> Array:
 
 
 def _triangulate(cameras: list[Camera], pixels: Array) -> Array:
-    """Return points (M, 3) seen at distorted pixels (C, M, 2), NaN where unseen: linear, all at once.
+    """Triangulate points (M, 3) linearly from distorted pixels (C, M, 2), NaN where hidden.
 
-    Rows in normalised coordinates, solved for the inhomogeneous point about the median board distance (Hartley &
-    Zisserman, section 12.2): with cameras at like distances the algebraic error is the reprojection error.
+    Inhomogeneous method in normalised coordinates (Hartley & Zisserman, section 12.2). With cameras at similar
+    distances the algebraic error approximates the reprojection error.
     """
     rows, right = [], []
     for camera, seen in zip(cameras, pixels):

@@ -1,4 +1,13 @@
-"""Signals for synchronisation: brightness, timecode, sound."""
+"""Signals for synchronisation: light flashes and sound.
+
+The mean brightness of a picture falls and rises with the room light. The times of these steps, matched between two
+cameras, give their offset in whole frames. A step during an exposure leaves a picture of intermediate brightness,
+which gives the fraction of a frame: always with an open shutter, otherwise only if the step hits the exposure.
+
+Sounds are matched by generalised cross-correlation (Knapp & Carter 1976) with partial whitening: full whitening (PHAT)
+weights noisy bands as much as the voice, and none lets hum dominate. The resolution is 1/16000 s, but sound travels at
+3 ms per metre, so cameras that are metres apart are off by that.
+"""
 
 from __future__ import annotations
 
@@ -14,52 +23,52 @@ from jawusd.base.errors import SyncError
 from jawusd.media.audio import Sound
 from jawusd.media.clip import Clip
 
-_FIRST_WINDOW_S = 4.0  # searched at either end; doubled until a flash is found
-_SPARSE = 8  # the mean brightness is that of every 8th pixel in both directions
-_CONTRAST = 0.3  # share of the brightness a flash must change; moving people change a few per cent
-_ABRUPT_FRAMES = 3  # a lamp is off or on within this many frames
-_TOLERANCE_FRAMES = 1.0  # steps this close are the same step
-_DROPPED_S = 0.5  # steps that fit with an offset this different mean lost frames
+_FIRST_WINDOW_S = 4.0  # initial search window at both ends; doubled until a flash is found
+_SPARSE = 8  # subsampling of pixels in both directions for the mean brightness
+_CONTRAST = 0.3  # smallest relative change of brightness by a flash; moving people change it by a few per cent
+_ABRUPT_FRAMES = 3  # longest duration of a light step
+_TOLERANCE_FRAMES = 1.0  # tolerance of matched steps
+_DROPPED_S = 0.5  # steps that match at an offset differing by up to this indicate dropped frames
 _FEWEST_STEPS = 2
-_BETWEEN_FRAMES = 0.15  # a fraction of a frame this small is noise
+_BETWEEN_FRAMES = 0.15  # smaller fractions of a frame are noise
 RATE_HZ = 16000
 _WHITENING = 0.75
-_LOWEST_HZ = 80.0  # below it is mains hum and wind
-_APART_S = 0.02  # two peaks closer than this are one
-_LEAST_SIGMAS = 9.0  # the largest of millions of chance correlations stays below 6
-_SECOND_PEAK = 0.7  # of the highest; more is a rhythm that fits several ways
+_LOWEST_HZ = 80.0  # mains hum and wind lie below
+_APART_S = 0.02  # closer peaks are the same peak
+_LEAST_SIGMAS = 9.0  # the largest of millions of random correlations stays below 6
+_SECOND_PEAK = 0.7  # relative to the highest; a higher second peak is a periodic sound
 
 
 @dataclass(frozen=True)
 class Step:
-    """Mark one sudden change of brightness."""
+    """A sudden change of brightness."""
 
-    time_frames: float  # when, in frames of the camera's video; k = as the exposure of frame k begins
-    rising: bool  # whether the light goes on, not off
-    slack_frames: float = 0.0  # how much earlier it may have been, because the pictures before it are missing
+    time_frames: float  # time in frames of the camera's video; k is the start of the exposure of frame k
+    rising: bool  # whether the light goes on
+    slack_frames: float = 0.0  # how much earlier the step may be, because preceding pictures are missing
 
 
 @dataclass(frozen=True)
 class Offset:
-    """Hold the time offset of one camera: its frame k shows the instant of frame k + frames of the reference camera."""
+    """Time offset of a camera: its frame k shows the instant of frame k + frames of the reference camera."""
 
     frames: int  # the offset in whole frames
-    exact_frames: float  # the same with its estimated fraction
-    spread_frames: float  # largest deviation of a matched step from exact_frames; 0 by sound
-    matched_steps: int  # number of steps found in both cameras; 0 by sound
-    confidence: float  # share of the steps of both cameras that have a partner, or that of `SoundMatch`; 0 .. 1
+    exact_frames: float  # the offset with its estimated fraction
+    spread_frames: float  # largest deviation of a matched step from exact_frames; 0 for sound
+    matched_steps: int  # number of steps found in both cameras; 0 for sound
+    confidence: float  # fraction of the steps of both cameras that match, or that of `SoundMatch`; 0 .. 1
 
 
 @dataclass(frozen=True)
 class Flashes:
-    """Hold the steps of one video."""
+    """Light steps of one video."""
 
     steps: list[Step]  # in order of time
-    reason: str = ""  # why they are too few to align by, else ""
+    reason: str = ""  # why there are too few steps to synchronise by, else ""
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
-    """Return when the light goes off or on, in order of time; nothing if brightness changes by less than a flash does.
+    """Return the times when the light goes off or on, in order; empty if brightness changes less than by a flash.
 
     Args:
         brightness: mean brightness of successive pictures, 0 .. 255, shape (n,).
@@ -76,7 +85,7 @@ def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
         around = brightness[first:last]
         low, high = around.min(), around.max()
         if high - low < contrast / 2:
-            continue  # a slow change: clouds, a dimmer, an automatic exposure
+            continue  # slow change: clouds, a dimmer, automatic exposure
         lit = float(((around - low) / (high - low)).sum())
         rising = bool(bright[at])
         steps.append(Step(first_frame + (last - lit if rising else first + lit), rising))
@@ -84,24 +93,22 @@ def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
 
 
 def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
-    """Align the steps of one camera with those of the reference camera.
+    """Estimate the offset of a camera from its steps and those of the reference camera.
 
     Raises:
-        SyncError: fewer than two steps fit, two alignments fit equally well, or frames were lost in between.
+        SyncError: fewer than two steps match, the offset is ambiguous, or frames were dropped.
     """
     candidates = {round(r.time_frames - s.time_frames) for s in steps for r in reference if s.rising == r.rising}
     ranked = sorted((_aligned(steps, reference, offset) for offset in candidates), key=lambda a: (-len(a[0]), a[1]))
     if not ranked or len(ranked[0][0]) < _FEWEST_STEPS:
         raise SyncError(
-            f"the light steps at {_listed(steps)} do not fit those at {_listed(reference)} of the reference."
+            f"the light steps at {_listed(steps)} do not match those at {_listed(reference)} of the reference."
         )
     pairs, spread, exact = ranked[0]
     _refuse_lost_frames(steps, reference, pairs, exact, _DROPPED_S * fps)
     for other_pairs, other_spread, other in ranked[1:]:
         if len(other_pairs) == len(pairs) and other_spread < spread + 0.5 and abs(other - exact) > _TOLERANCE_FRAMES:
-            raise SyncError(
-                f"the light flashes fit equally well with an offset of {exact:.0f} and of {other:.0f} frames."
-            )
+            raise SyncError(f"the light flashes match equally well at offsets of {exact:.0f} and {other:.0f} frames.")
     confidence = 2 * len(pairs) / (len(steps) + len(reference))
     return Offset(round(exact), exact, spread, len(pairs), confidence)
 
@@ -109,7 +116,7 @@ def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
 def _refuse_lost_frames(
     steps: list[Step], reference: list[Step], pairs: list[tuple[int, int]], exact: float, reach_frames: float
 ) -> None:
-    """Raise if steps that found no partner would find one with a slightly different offset."""
+    """Raise an error if unmatched steps would match at a slightly different offset."""
     lone_steps, lone_partners = (
         [step for k, step in enumerate(own) if k not in {pair[side] for pair in pairs}]
         for side, own in enumerate((steps, reference))
@@ -122,12 +129,12 @@ def _refuse_lost_frames(
                 (early, before), (late, after) = sorted([(matched, exact), (step.time_frames, other)])
                 raise SyncError(
                     f"the offset is {before:.1f} frames at frame {early:.0f} and {after:.1f} at frame {late:.0f}: "
-                    "frames were lost while recording."
+                    "frames were dropped while recording."
                 )
 
 
 def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[list[tuple[int, int]], float, float]:
-    """Return the pairs of step numbers that meet under an offset, their spread and their exact offset [frames]."""
+    """Return the pairs of step numbers that match at an offset, their spread and their exact offset [frames]."""
     pairs, differences, slacks = [], [], []
     for i, step in enumerate(steps):
         for j, partner in enumerate(reference):
@@ -140,27 +147,27 @@ def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[lis
                 break
     if not pairs:
         return [], 0.0, float(offset)
-    # Only the most exact pairs give the offset.
+    # Use only the most precise pairs for the offset.
     best = np.array(differences)[np.array(slacks) == min(slacks)]
     exact = float(np.median(best))
     return pairs, float(np.abs(best - exact).max()), exact
 
 
 def on_grid(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
-    """Return steps timed in pictures, timed on the grid of frames instead; numbers (n,) are the pictures' frames."""
+    """Convert the times of steps from picture indices to frame numbers; numbers (n,) are the pictures' frames."""
     out = []
     for step in steps:
         nearest = round(step.time_frames)
         between = abs(step.time_frames - nearest) < _BETWEEN_FRAMES and 0 < nearest < len(numbers)
         picture = nearest if between else min(int(step.time_frames), len(numbers) - 1)
-        # Between two pictures the step is anywhere in the gap; within one, it follows from that picture's brightness.
+        # Between two pictures, the step is anywhere in the gap; within one, that picture's brightness determines it.
         gap = float(numbers[picture] - numbers[picture - 1] - 1) if between else 0.0
         out.append(Step(float(numbers[picture]) + step.time_frames - picture, step.rising, max(0.0, gap)))
     return out
 
 
 def find_flashes(video: Clip) -> Flashes:
-    """Find the steps near both ends of a video, looking further in until there are some.
+    """Find the light steps near both ends of a video, widening the search until there are enough.
 
     Raises:
         CaptureError: the video cannot be decoded.
@@ -183,7 +190,7 @@ def find_flashes(video: Clip) -> Flashes:
     return Flashes(
         steps,
         f"shows no light flash: {len(steps)} sudden changes, brightness {brightness.min():.0f} to "
-        f"{brightness.max():.0f} of 255 over all {video.count} frames; a flash changes it by more than "
+        f"{brightness.max():.0f} of 255 over all {video.count} frames; a flash changes brightness by more than "
         f"{_CONTRAST:.0%} and back",
     )
 
@@ -202,7 +209,7 @@ def _listed(steps: list[Step]) -> str:
 
 
 class SoundMatch(NamedTuple):
-    """Say how two sounds lie in time."""
+    """Time offset between two sounds."""
 
     delay_s: float  # time of an event in the reference's file minus that in the other's [s]
     confidence: float  # 1 minus the height of the second peak over that of the first, 0 .. 1
@@ -212,7 +219,7 @@ def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
     """Find the delay between two sounds of one scene.
 
     Raises:
-        SyncError: one is silent, they have nothing in common, or several delays fit as well.
+        SyncError: a sound is silent, the sounds do not match, or the delay is ambiguous.
     """
     if not (np.ptp(sound.samples) > 0 and np.ptp(reference.samples) > 0):
         raise SyncError("the sound is silent.")
@@ -232,13 +239,13 @@ def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
     second = float(correlation[far].max()) if far.any() else 0.0
     if peak < _LEAST_SIGMAS * sigma:
         raise SyncError(
-            f"the sounds have nothing in common: the best match stands out {peak / sigma:.1f} sigma, at least "
+            f"the sounds do not match: the correlation peak has {peak / sigma:.1f} sigma, at least "
             f"{_LEAST_SIGMAS:g} are needed."
         )
     if second > _SECOND_PEAK * peak:
         other = lags[far][int(np.argmax(correlation[far]))] / sound.rate_hz
         raise SyncError(
-            f"the sounds match with {lags[at] / sound.rate_hz:.2f} s and with {other:.2f} s of delay alike."
+            f"the sounds match equally well at delays of {lags[at] / sound.rate_hz:.2f} s and {other:.2f} s."
         )
     before, after = correlation[at - 1], correlation[(at + 1) % size]
     bend = before - 2 * peak + after

@@ -1,4 +1,4 @@
-"""Align cameras in time by the light going off and on, else by their sound.
+"""Synchronise cameras by light flashes, or by sound without flashes.
 
 Pictures are placed by their presentation times: in a video of variable rate, frame k is the picture shown k nominal
 frame durations after the first one.
@@ -34,16 +34,16 @@ from jawusd.media.clip import Clip
 from jawusd.media.footage import open_clip
 from jawusd.media.video import Video
 
-_FPS_TOLERANCE = 5e-3  # people write 24 for 23.976
-_EARLY_S = 2.0  # people stop their cameras one after the other
+_FPS_TOLERANCE = 5e-3  # relative; allows 24 for 23.976
+_EARLY_S = 2.0  # usual difference between the ends of clips
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Hold the offsets of all cameras of a capture."""
+    """Offsets of all cameras of a capture."""
 
-    reference: str  # the camera that counts the frames
-    cameras: dict[str, Offset]  # the offset per camera, in the order of the capture
+    reference: str  # the camera whose frame numbers are used
+    cameras: dict[str, Offset]  # offset per camera, in the order of the capture
     method: str = "light flash"  # "light flash", "sound", "time code" or "picture numbers"
     notes: tuple[str, ...] = ()  # remarks on the clips for the user
 
@@ -59,17 +59,17 @@ class Alignment:
 
 
 def estimate_offsets(capture: Capture) -> Alignment:
-    """Align the cameras of a capture by the light flashes, the sound or the clocks of their videos; see `align_videos`.
+    """Synchronise the cameras of a capture by the flashes, sound or clocks of their videos; see `align_videos`.
 
     Raises:
-        SyncError: a camera has no video, or there are neither flashes nor sound to align by.
+        SyncError: a camera has no video, or there are neither flashes nor sound.
         CaptureError: a video cannot be read.
     """
     videos = {camera.name: camera.clip for camera in capture.cameras if camera.clip is not None}
     for camera in capture.cameras:
         if camera.video is None:
             raise SyncError(
-                f"camera {camera.name} has no video to find light flashes in.",
+                f"camera {camera.name} has no video to search for light flashes.",
                 path=capture.folder / "capture.toml",
                 hint=_offsets_hint([camera.name for camera in capture.cameras]),
             )
@@ -81,19 +81,19 @@ def estimate_offsets(capture: Capture) -> Alignment:
     rate = open_clip(videos[capture.reference]).timeline.rate
     if abs(rate / capture.fps - 1) < _FPS_TOLERANCE:
         return found
-    said = f"capture.toml says fps = {capture.fps:g}: motion is timed by it"
+    said = f"capture.toml has fps = {capture.fps:g}, which is used as the time base"
     note = f"the clips run at {rate:.6g} frames per second, {said}"
     return replace(found, notes=(*found.notes, note))
 
 
 def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_light: bool = True) -> Alignment:
-    """Find the light flashes in all videos and align them with those of the reference camera.
+    """Synchronise videos with the reference camera by light flashes or sound.
 
-    Only the beginning and the end of each video are decoded, more of it only while no flash is found. If a video shows
-    no flash, or without `by_light`, and all have sound, the sound aligns them.
+    Only the start and end of each video are decoded, and more only until flashes are found. Sound is used if a video
+    shows no flash, or without `by_light`; all videos must have sound then.
 
     Raises:
-        SyncError: neither flash nor sound, rates that differ, or steps that do not fit together.
+        SyncError: there are neither flashes nor sound, frame rates differ, or the signals do not match.
         CaptureError: a video cannot be read.
     """
     opened = {name: open_clip(clip) for name, clip in videos.items()}
@@ -121,17 +121,17 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
     silent = [name for name in opened if name not in sounds]
     if silent:
         whose = "no clip has" if len(silent) == len(opened) else f"camera {silent[0]} has no"
-        raise SyncError(f"{why}{whose} sound to go by.", path=opened[dark or silent[0]].path, hint=hint)
+        raise SyncError(f"{why}{whose} sound to use instead.", path=opened[dark or silent[0]].path, hint=hint)
     offsets = {
         name: _against(name, reference, video, hint, partial(_by_sound, name, reference, sounds, opened, rate), why)
         for name, video in opened.items()
     }
-    by_sound = (f"{why}the sound aligns the cameras",) if why else ()
+    by_sound = (f"{why}the cameras are synchronised by sound",) if why else ()
     return Alignment(reference, offsets, "sound", (*by_sound, *notes, *_stopped_early(opened, offsets, rate)))
 
 
 def light_curve(clip: Path | ClipSource) -> LightCurve:
-    """Return the mean brightness of every picture of a video, and the sudden changes in it.
+    """Return the mean brightness of every picture of a video, and its sudden changes.
 
     Raises:
         CaptureError: the video cannot be read.
@@ -146,8 +146,8 @@ def light_curve(clip: Path | ClipSource) -> LightCurve:
 
 def _missing_pictures(videos: Mapping[str, Clip]) -> tuple[str, ...]:
     return tuple(
-        f"camera {name} has a variable rate: {video.timeline.missing} of {video.timeline.count} frames have no picture "
-        "of their own. Frames are counted by time; masks as PNG files are numbered by the pictures of their video."
+        f"camera {name} has a variable frame rate: {video.timeline.missing} of {video.timeline.count} frames have no "
+        "picture. Frames are counted by time, but masks in PNG files are numbered by the pictures of their video."
         for name, video in videos.items()
         if video.timeline.missing
     )
@@ -159,7 +159,7 @@ def _stopped_early(videos: Mapping[str, Clip], offsets: Mapping[str, Offset], ra
     last = max(ends, key=lambda name: ends[name])
     return tuple(
         f"camera {name} ends at frame {end - 1} of the reference camera, {ends[last] - end} frames before camera "
-        f"{last}: it was stopped early or its clip was cut short."
+        f"{last}: it was stopped early or its clip is truncated."
         for name, end in ends.items()
         if ends[last] - end > _EARLY_S * rate
     )
@@ -174,7 +174,7 @@ def _by_sound(name: str, reference: str, sounds: Mapping[str, Sound], videos: Ma
 
 
 def _against(name: str, reference: str, video: Clip, hint: str, work: Callable[[], Offset], before: str = "") -> Offset:
-    """Name the cameras in errors of comparing them."""
+    """Run a comparison of two cameras, naming both in its errors."""
     try:
         return work()
     except SyncError as error:
@@ -184,4 +184,4 @@ def _against(name: str, reference: str, video: Clip, hint: str, work: Callable[[
 
 
 def _offsets_hint(names: Iterable[str]) -> str:
-    return f"Give whole-frame offsets instead, in capture.toml: [sync] offsets = {{ {' = .., '.join(names)} = .. }}."
+    return f"Give whole-frame offsets in capture.toml instead: [sync] offsets = {{ {' = .., '.join(names)} = .. }}."

@@ -1,1 +1,4 @@
-"""Draw what the stages found."""
+"""The HTML reports of builds and solves, with their verdicts and figures.
+
+Reads `formats` and `evaluator` objects; imports no other stage, and no drawing code outside `style` and `figures`.
+"""

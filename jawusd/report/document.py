@@ -26,17 +26,17 @@ from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
 from jawusd.report.verdicts import MARKS, WORDS, BuildVerdict, in_short, judge, overall
 
-_LISTED = 60  # frames named one by one
+_LISTED = 60  # most frame ranges listed
 _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
 
 
 def write_document(
     path: str | os.PathLike[str], data: ReportData, figures: Mapping[str, Markup] | None = None
 ) -> BuildVerdict:
-    """Write the report to an HTML file; return what it says in short.
+    """Write the report to an HTML file; return its summary.
 
     Args:
-        figures: plots by the names of their places on the page; None: `draw_figures`. Those of the experiments are
+        figures: plots by their slot on the page, by default those of `draw_figures`. The experiments' plots come from
             `paper.figures.inline_figures`.
 
     Raises:
@@ -47,7 +47,7 @@ def write_document(
 
 
 def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> str:
-    """Return the report as HTML, see `write_document`; all content of files is escaped."""
+    """Return the report as HTML, see `write_document`; text from files is escaped."""
     verdicts = judge(data)
     return (
         page_environment()
@@ -78,39 +78,39 @@ def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> s
 
 
 def page_environment() -> jinja2.Environment:
-    """Return what fills in the templates of pages; it escapes what files say."""
+    """Return the Jinja environment of the page templates; it escapes text from files."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("jawusd.report", "page"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda value: shown(value) if type(value) is str else value,  # own HTML is Markup
+        finalize=lambda value: shown(value) if type(value) is str else value,  # our own HTML is Markup
     )
     environment.filters |= {"worded": worded, "figure": figure}
     return environment
 
 
 def worded(text: str) -> Markup:
-    """Return a sentence as HTML, what stands between two backticks as code."""
-    parts = re.split(r"`([^`]*)`", shown(text))  # what the group holds comes at odd places
+    """Return a sentence as HTML, with text in backticks as code."""
+    parts = re.split(r"`([^`]*)`", shown(text))  # odd elements are code
     return Markup().join(Markup("<code>{}</code>").format(p) if k % 2 else escape(p) for k, p in enumerate(parts))
 
 
 def figure(value: float) -> str:
-    """Return a length in mm with three decimals, a dash for one that is not known."""
+    """Return a length in mm with three decimals, or a dash if it is unknown."""
     return f"{value:.3f}" if math.isfinite(value) else "\u2013"
 
 
 def own_file(name: str) -> Markup:
-    """Return a file of the package unescaped."""
+    """Return a text file of this package as trusted HTML."""
     return Markup(resources.files("jawusd.report").joinpath("page", name).read_text(encoding="utf-8"))
 
 
 def draw_figures(data: ReportData) -> dict[str, Markup]:
-    """Return the plots of tracks and model by the names of their places on the page."""
+    """Return the plots of tracks and model by their slot on the page."""
     return {
-        "tracking": inline_svg(tracking_figure(data.tracks), "tracking", "How every frame was tracked."),
+        "tracking": inline_svg(tracking_figure(data.tracks), "tracking", "Tracking state and errors of every frame."),
         "model": inline_svg(model_figure(data.model), "model", "Parameters, model error and margin of every frame."),
     }
 
@@ -119,8 +119,8 @@ def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict
     """Return (short name, description, rows (place, figures)) per table."""
     names = {
         "train": ("fit", "poses the model was fitted to"),
-        "holdout": ("held out", "poses in parts of the take left out of the fit, each in turn"),
-        "trimmed": ("outliers", "poses that the fit left out as outliers"),
+        "holdout": ("held out", "poses of parts of the take that were held out of the fit, one part at a time"),
+        "trimmed": ("outliers", "poses excluded from the fit as outliers"),
     }
     tables = model_facts(data).get("errors", {})
     return [
@@ -131,7 +131,7 @@ def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict
 
 
 def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
-    """Return (reason, count, frames as text) of frames that were lost, aided, or left out of the model."""
+    """Return (reason, count, frames as text) of frames that were lost, regularised, or excluded from the fit."""
     tracks, meta = data.tracks, model_facts(data)
     lists = {"lost by the tracker": tracks.frames[np.any(tracks.status == LOST, axis=1)]}
     for arch, name in enumerate(("upper", "lower")):
@@ -139,32 +139,32 @@ def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
             chosen = (tracks.status[:, arch] == LOST) & (tracks.lost_reason[:, arch] == reason)
             if chosen.any():
                 lists[f"lost, {name} arch: {reason}"] = tracks.frames[chosen]
-    lists["tracked with the model's help"] = tracks.frames[tracks.prior_aided]
+    lists["regularised by the model"] = tracks.frames[tracks.prior_aided]
     for why, frames in meta.get("excluded_frames", {}).items():
-        lists[f"kept out of the fit: {why}"] = np.asarray(frames, dtype=np.int64)
-    lists["left out of the fit as outliers"] = np.asarray(meta.get("trimmed_frames", []), dtype=np.int64)
+        lists[f"excluded from the fit: {why}"] = np.asarray(frames, dtype=np.int64)
+        lists["excluded from the fit as outliers"] = np.asarray(meta.get("trimmed_frames", []), dtype=np.int64)
     return [(reason, len(frames), _spans(frames)) for reason, frames in lists.items()]
 
 
 def _spans(frames: NDArray[np.int64]) -> str:
-    """Return frame numbers with neighbours joined: 3-7, 9."""
+    """Return frame numbers as ranges: 3-7, 9."""
     if not len(frames):
         return ""
     frames = np.unique(frames)
     parts = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
     texts = [str(part[0]) if len(part) == 1 else f"{part[0]}\u2013{part[-1]}" for part in parts]
-    more = "" if len(texts) <= _LISTED else f" and {len(texts) - _LISTED} more spans"
+    more = "" if len(texts) <= _LISTED else f" and {len(texts) - _LISTED} more ranges"
     return ", ".join(texts[:_LISTED]) + more
 
 
 def _findings(data: ReportData) -> list[str]:
-    """Return what was found before the first stage and while tracking, each once."""
+    """Return the findings of the checks and of tracking, without duplicates."""
     tracked = [Finding.from_json(found) for found in data.tracks.meta.get("findings", [])]
     return list(dict.fromkeys(finding.line() for finding in (*data.findings, *tracked)))
 
 
 def _start(data: ReportData) -> str:
-    """Return how the tracking started."""
+    """Return how tracking was initialised."""
     start = tracks_facts(data).get("start", {})
     if not start:
         return "not recorded"
@@ -175,12 +175,12 @@ def _start(data: ReportData) -> str:
         if numbers
     ]
     if left_out:
-        text += f"; picks that did not fit were left out ({'; '.join(left_out)})"
+        text += f"; inconsistent picks were ignored ({'; '.join(left_out)})"
     return text
 
 
 def _cameras(data: ReportData) -> list[dict[str, str]]:
-    """Return a table row per camera: its footage and masks, and corrections of its calibration."""
+    """Return a table row per camera: footage, masks, and corrections of the calibration."""
     meta, offsets = tracks_facts(data), sync_facts(data).get("offsets", {})
     known = {camera.name: camera for camera in data.cameras}
     extrinsics = meta.get("extrinsics", {})
@@ -193,7 +193,7 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
         move = np.linalg.norm(extrinsics.get("moves_mm", {}).get(name, [np.nan]))
         notes = []
         if np.isfinite(turn):
-            notes.append(f"turned {turn:.3f} deg and moved {move:.2f} mm" if extrinsics["corrected"] else "unchanged")
+            notes.append(f"rotated {turn:.3f} deg and moved {move:.2f} mm" if extrinsics["corrected"] else "unchanged")
         if name in meta.get("calibration_rescaled_px", {}):
             was, now = meta["calibration_rescaled_px"][name]
             notes.append(f"calibrated at {was[0]} \u00d7 {was[1]} px, recorded at {now[0]} \u00d7 {now[1]} px: scaled")
@@ -213,7 +213,7 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
 
 
 def _drawn(meta: TracksFacts, camera: str) -> str:
-    """Return how far outlines reach beyond the teeth in a camera, upper and lower arch."""
+    """Return the offset of the mask outlines from the teeth in a camera, upper and lower arch."""
     edges, gum = meta.get("outline_bias_px", {}).get(camera), meta.get("gum_bias_px", {}).get(camera)
     if edges is None or gum is None:
         return ""
@@ -221,19 +221,21 @@ def _drawn(meta: TracksFacts, camera: str) -> str:
 
 
 def _bite(data: ReportData) -> str:
-    """Return what the take shows about the gum line as drawn and about the closed bite."""
+    """Return what the take shows about the annotated gum line and about the closed bite."""
     meta, said = tracks_facts(data), []
     if "gum_line_mm" in meta:
         upper, lower = meta["gum_line_mm"]
-        said.append(f"The gum line is drawn {upper:+.2f} mm (upper) and {lower:+.2f} mm (lower) towards the gum.")
+        said.append(
+            f"The gum line of the masks is offset towards the gum by {upper:+.2f} mm (upper), {lower:+.2f} mm (lower)."
+        )
     if "registration" in meta:
         found = meta["registration"]
         shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
         sigma_mm, sigma_deg = math.hypot(*found["shift_sigma_mm"]), math.hypot(*found["turn_sigma_deg"])
         off = f"{shift:.2f} \u00b1 {sigma_mm:.2f} mm and {turn:.2f} \u00b1 {sigma_deg:.2f} degrees"
         frames = f"frames {found['frames'][0]} to {found['frames'][-1]}"
-        what = "was moved to the closed bite by" if found["applied"] else "is off the closed bite by"
-        said.append(f"As {frames} show it, the lower scan {what} {off}.")
+        what = "was moved to the closed bite, by" if found["applied"] else "deviates from the closed bite by"
+        said.append(f"According to {frames}, the lower scan {what} {off}.")
     return " ".join(said)
 
 

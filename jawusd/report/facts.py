@@ -1,4 +1,4 @@
-"""The JSON headers of a build's files as the report reads them; written by the sync stage, tracking and fitting."""
+"""Types of the JSON headers that the report reads; written by synchronisation, tracking and fitting."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ErrorTable = dict[str, dict[str, float]]
 
 
 class SyncFacts(TypedDict, total=False):
-    """What the sync stage found, by camera."""
+    """Result of the synchronisation, by camera."""
 
     method: str
     offsets: dict[str, Frames]
@@ -22,7 +22,7 @@ class SyncFacts(TypedDict, total=False):
 
 
 class StartFacts(TypedDict, total=False):
-    """How the tracking started."""
+    """Initialisation of the tracking."""
 
     by: str
     frame: int
@@ -30,7 +30,7 @@ class StartFacts(TypedDict, total=False):
 
 
 class ExtrinsicsFacts(TypedDict, total=False):
-    """How tracking corrected the cameras' poses, by camera."""
+    """Corrections of the camera poses by tracking, by camera."""
 
     corrected: bool
     turns_deg: dict[str, list[float]]
@@ -38,7 +38,7 @@ class ExtrinsicsFacts(TypedDict, total=False):
 
 
 class TracksFacts(TypedDict, total=False):
-    """The header of tracks."""
+    """Header of tracks."""
 
     start: StartFacts
     extrinsics: ExtrinsicsFacts
@@ -51,7 +51,7 @@ class TracksFacts(TypedDict, total=False):
 
 
 class ModelFacts(TypedDict, total=False):
-    """The header of a model."""
+    """Header of a model."""
 
     method: str
     fps: float
@@ -63,7 +63,7 @@ class ModelFacts(TypedDict, total=False):
 
 
 def sync_facts(data: ReportData) -> SyncFacts:
-    """Return the result of the sync stage."""
+    """Return the result of the synchronisation."""
     return cast(SyncFacts, data.sync)
 
 

@@ -1,4 +1,4 @@
-"""Figures of the report: timeline, synchronisation and ranges of motion."""
+"""Figures of a build over its frames, of the synchronisation, and of ranges of motion."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ from jawusd.report.style import (
 )
 from jawusd.report.verdicts import GOOD, LOOK
 
-_COLUMNS = 1200  # points along the frames; longer takes show the extreme of every few frames
-_LANES = ("tracked", "recovered", "without a camera", "lost", "aided by the model")
+_COLUMNS = 1200  # most points per curve; longer takes show the extreme of every few frames
+_LANES = ("tracked", "recovered", "without a camera", "lost", "regularised")
 _LANE_COLORS = (GREEN, SKY, ORANGE, VERMILION, BLUE)
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, BLACK, GREY)
-_AROUND_FRAMES = 12  # shown before and after a flash
-_APART_FRAMES = 48  # steps farther apart belong to different flashes
-_QUANTILE = 99.5  # robust to single outliers
-_NEAR_CLOSED_MM = 5.0  # openings up to which protrusion is measured, as in clinics
+_AROUND_FRAMES = 12  # frames shown before and after a flash
+_APART_FRAMES = 48  # steps farther apart are separate flashes
+_QUANTILE = 99.5  # per cent; robust to single outliers
+_NEAR_CLOSED_MM = 5.0  # protrusion is measured at smaller openings, as clinicians do
 
 
-RANGES = "ranges"  # name of the files with many actors
+RANGES = "ranges"  # file name of the figure of several actors
 
 _PARAMETERS = {
     "opening": ("opening d1", BLUE),
@@ -55,11 +55,11 @@ _PARAMETERS = {
     "protrusion": ("protrusion d3, + forward", SKY),
 }
 _ROW_IN, _MARGINS_IN = 0.22, 0.9
-_MOST_ROWS = 400  # a taller picture cannot be opened
+_MOST_ROWS = 400  # programs cannot open taller pictures
 
 
 def tracking_figure(tracks: Tracks) -> Figure:
-    """Draw state, distance of outlines, uncovered mask and expected error of every frame."""
+    """Plot state, outline distance, uncovered mask and expected error of every frame."""
     figure, axes = new_figure(11.0, 7.4, 4, 1, sharex=True, height_ratios=[1.15, 1, 1, 1])
     _draw_state(axes[0], tracks)
     residual = np.where(tracks.status == LOST, np.nan, tracks.residual_px)
@@ -67,8 +67,8 @@ def tracking_figure(tracks: Tracks) -> Figure:
     for index, (name, color, style) in enumerate((("upper teeth", ORANGE, "-"), ("lower teeth", BLUE, "--"))):
         axes[1].plot(*thinned(tracks.frames, residual[:, index], np.fmax), style, color=color, lw=1, label=name)
         axes[2].plot(*thinned(tracks.frames, coverage[:, index], np.fmax), style, color=color, lw=1, label=name)
-    axes[1].set_ylabel("distance of\noutlines [px]")
-    axes[2].set_ylabel("mask left\nuncovered [%]")
+    axes[1].set_ylabel("outline\ndistance [px]")
+    axes[2].set_ylabel("uncovered\nmask [%]")
     sigma = tracks.sigma_mm
     shown = (("incisor", 0, BLACK, "-"), ("left condyle", 3, VERMILION, "--"), ("right condyle", 4, GREEN, ":"))
     for name, index, color, style in shown:
@@ -82,7 +82,7 @@ def tracking_figure(tracks: Tracks) -> Figure:
 
 
 def model_figure(model: JawModel) -> Figure:
-    """Draw the parameters of every frame, their distances to the model and their margins."""
+    """Plot the parameters of every frame, their distances to the model and their margins."""
     rig = JawRig(model.arrays, model.meta)
     known = np.all(np.isfinite(model.d), axis=1)
     margin = np.full(len(model.d), np.nan)
@@ -107,7 +107,7 @@ def model_figure(model: JawModel) -> Figure:
 
 
 def _draw_state(axis: Axes, tracks: Tracks) -> None:
-    """Draw a lane per state, in each the upper teeth above the lower, so that it is legible without colour."""
+    """Draw a lane per state, with the upper teeth above the lower, so that it is legible without colour."""
     states = [tracks.status == value for value in (TRACKED, RECOVERED, PARTIAL, LOST)]
     states.append(np.repeat(tracks.prior_aided[:, None], 2, axis=1))
     for lane, (has, color) in enumerate(zip(states, _LANE_COLORS, strict=True)):
@@ -122,7 +122,7 @@ def _draw_state(axis: Axes, tracks: Tracks) -> None:
 
 
 def runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
-    """Return the spans (start, width) of consecutive frames with a property."""
+    """Return the ranges (start, width) of consecutive frames with a property."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], has, [False]]).astype(np.int8)))
     spans = zip(edges[::2], edges[1::2], strict=True)
     return [(float(frames[a]) - 0.5, float(frames[b - 1] - frames[a]) + 1.0) for a, b in spans]
@@ -135,12 +135,12 @@ def _mean_of_known(values: Array, axis: int) -> Array:
 
 
 def farther(a: Array, b: Array) -> Array:
-    """Return the value of two that is farther from zero and not NaN."""
+    """Return the value with the larger magnitude, ignoring NaN."""
     return np.where(np.isnan(a) | (np.abs(b) > np.abs(a)), b, a)
 
 
 def thinned(frames: NDArray[np.int64], values: Array, keep: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
-    """Return at most `_COLUMNS` points (frames, values), reducing every few frames by `keep`."""
+    """Return at most `_COLUMNS` points (frames, values), reducing groups of frames with `keep`."""
     step = -(-len(frames) // _COLUMNS)
     if step <= 1:
         return frames.astype(np.float64), values
@@ -155,16 +155,16 @@ def thinned(frames: NDArray[np.int64], values: Array, keep: Callable[[Array, Arr
 
 
 def legend_beside(axis: Axes) -> None:
-    """Put the legend to the right of a plot."""
+    """Place the legend to the right of a plot."""
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
 def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str, path: Path) -> None:
-    """Draw the brightness of all clips to a PNG or SVG file, whole and around the first and last flash.
+    """Plot the brightness of all clips to a PNG or SVG file: whole clips, and around the first and last flash.
 
     Args:
-        offsets: frame k of a camera shows the instant of frame k + offset of the reference camera; None if they are not
-            known, for a picture of the clips as recorded only.
+        offsets: frame k of a camera shows the instant of frame k + offset of the reference camera; None plots the
+            clips only as recorded.
 
     Raises:
         OutputError: the file cannot be written.
@@ -174,7 +174,7 @@ def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | Non
 
 
 def sync_figure(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str) -> Figure:
-    """Return the figure of `draw_sync`: a row as recorded and, with offsets, one after alignment."""
+    """Return the figure of `draw_sync`: one row as recorded and, with offsets, one row aligned."""
     rows: list[tuple[str, str, Mapping[str, int]]] = [("as recorded", "frame of each camera", dict.fromkeys(curves, 0))]
     if offsets is not None:
         rows.append(("aligned", "frame of the reference camera", offsets))
@@ -199,7 +199,7 @@ def sync_figure(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | N
 
 
 def _draw_curves(axis: Axes, curves: Mapping[str, LightCurve], shifts: Mapping[str, int], close: bool) -> None:
-    """Draw one line per camera, with a mark where its light went off or on."""
+    """Draw one line per camera, with markers where the light went off or on."""
     for k, (name, curve) in enumerate(curves.items()):
         colour = _COLOURS[k % len(_COLOURS)]
         frames = curve.frames + shifts[name]
@@ -207,14 +207,14 @@ def _draw_curves(axis: Axes, curves: Mapping[str, LightCurve], shifts: Mapping[s
         for steps, mark in ((curve.off_frames, "v"), (curve.on_frames, "^")):
             height = np.interp(steps, curve.frames, curve.brightness)
             axis.plot(steps + shifts[name], height, mark, color=colour, ms=7, mec="white", mew=0.6)
-    # One entry for each kind of mark, whatever the camera.
+    # One legend entry per kind of marker for all cameras.
     axis.plot([], [], "v", color=GREY, label="light off")
     axis.plot([], [], "^", color=GREY, label="light on")
     axis.set_ylim(0, 255)
 
 
 def _flashes(curves: Mapping[str, LightCurve], shifts: Mapping[str, int]) -> list[tuple[float, float]]:
-    """Return the spans of the first and the last flash of all cameras [frames]; none without a sudden change."""
+    """Return the frame ranges of the first and last flash of all cameras; empty without flashes."""
     steps = np.sort(np.concatenate([np.append(c.off_frames, c.on_frames) + shifts[name] for name, c in curves.items()]))
     if not len(steps):
         return []
@@ -225,7 +225,7 @@ def _flashes(curves: Mapping[str, LightCurve], shifts: Mapping[str, int]) -> lis
 
 @dataclass(frozen=True)
 class RangeRow:
-    """Compare the range of one movement with that of about 95 % of people, in words; the grade is "good" or "look"."""
+    """Range of one movement compared with that of about 95 % of people; the grade is "good" or "look"."""
 
     name: str
     found: str
@@ -235,7 +235,7 @@ class RangeRow:
     grade: str
 
 
-# Lowest and highest usual value: mean -+ 2 SD, over both sexes where they are given apart.
+# Lowest and highest usual value: mean -+ 2 SD, over both sexes if published separately.
 _REFERENCE = {
     "opening at the incisors": (
         36.0,
@@ -253,7 +253,7 @@ _REFERENCE = {
 
 
 def human_ranges(tracks: Tracks, model: JawModel) -> list[RangeRow]:
-    """Measure the ranges of the poses that the model was fitted to, a row per movement; none without poses."""
+    """Return the ranges of the poses that the model was fitted to, one row per movement; none without poses."""
     T = tracks.raw_T_upper_lower
     used = np.isin(tracks.frames, model.frames[model.trained]) & np.all(np.isfinite(T), axis=(1, 2))
     if not used.any():
@@ -275,7 +275,7 @@ def _measured(motion: Array, landmarks: Array) -> list[float]:
 def _row(name: str, value: float) -> RangeRow:
     low, high, unit, source = _REFERENCE[name]
     if value < low:
-        remark, grade = "less than usual: perhaps the full range was not recorded", LOOK
+        remark, grade = "less than usual: the take may not contain the full range", LOOK
     elif value > high:
         remark, grade = "more than usual", LOOK
     else:
@@ -284,7 +284,7 @@ def _row(name: str, value: float) -> RangeRow:
 
 
 def draw_ranges(people: Sequence[tuple[str, dict[str, list[float]]]], folder: Path) -> list[Path]:
-    """Draw the ranges of actors, see `ranges_figure`, into a folder as PNG and SVG; return the files.
+    """Write the figure of `ranges_figure` to a folder as PNG and SVG; return the files.
 
     Raises:
         OutputError: a file cannot be written.
@@ -296,8 +296,8 @@ def ranges_figure(people: Sequence[tuple[str, dict[str, list[float]]]]) -> Figur
     """Draw the ranges of actors as bars, one row per actor, one column per parameter.
 
     Args:
-        people: name of each actor, and lowest and highest value [mm] by "opening", "laterotrusion", "protrusion"; the
-            first 400 are drawn.
+        people: name of each actor, and lowest and highest value [mm] by "opening", "laterotrusion", "protrusion"; only
+            the first 400 are drawn.
     """
     drawn = list(people)[:_MOST_ROWS]
     figure, axes = new_figure(9.0, _MARGINS_IN + _ROW_IN * max(len(drawn), 2), 1, 3, sharey=True)

@@ -1,4 +1,4 @@
-"""The data of the page's 3-D replay: small meshes and the poses of the take, encoded as text."""
+"""Data of the 3-D replay: decimated meshes and the poses of the take, encoded as text."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import transform_points
 from jawusd.report.facts import model_facts
 
-#: Names of the states of a frame in the page.
-STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "tracked with the model's help")
-_MOST_FRAMES = 6000  # longer takes are replayed with every second, third ... frame
+#: Names of the states of a frame.
+STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "regularised by the model")
+_MOST_FRAMES = 6000  # longer takes are subsampled
 _DEFAULT_FPS = 24.0
 
 
 def replay_data(data: ReportData) -> dict[str, object] | None:
-    """Return the JSON-able input of replay.js; None without meshes or frames.
+    """Return the input of replay.js for JSON; None without meshes or frames.
 
-    Poses are motions away from the closed bite in the anatomical frame, the upper 3 x 4 part row by row; meshes are
-    16-bit steps from their lowest corner.
+    Poses are motions relative to the closed bite in the anatomical frame, upper 3 x 4 part in row-major order. Mesh
+    vertices are quantised to 16 bits over the bounding box.
     """
     tracks, model = data.tracks, data.model
     if not data.parts or not len(tracks.frames):
@@ -36,7 +36,7 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
     fitted = np.full((len(rows), 4, 4), np.nan)
     known = np.all(np.isfinite(d), axis=1)
     fitted[known] = JawRig(model.arrays, model.meta).pose(d[known])
-    # The view is fitted to the jaw without the skull.
+    # The view is framed on the jaw without the skull.
     jaw = [part.mesh.vertices for part in data.parts if part.name != "skull"] or [data.parts[0].mesh.vertices]
     low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
     A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]
@@ -78,7 +78,7 @@ def _poses(motion: Array) -> str:
 def _packed(part: ReplayPart) -> dict[str, object]:
     mesh = part.mesh
     if len(mesh.vertices) > np.iinfo(np.uint16).max:
-        raise ValueError(f"a mesh of the replay has {len(mesh.vertices)} vertices, at most 65535 are allowed")
+        raise ValueError(f"a mesh of the replay has {len(mesh.vertices)} vertices, the limit is 65535")
     low = mesh.vertices.min(0)
     step = float(np.ptp(mesh.vertices, axis=0).max()) / np.iinfo(np.uint16).max or 1.0
     vertices = np.round((mesh.vertices - low) / step).astype("<u2")

@@ -1,4 +1,4 @@
-"""Report of a solve: its page and its figures."""
+"""The report of a solved performance as one self-contained HTML file, with its figures."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from jawusd.report.document import own_file, page_environment
 from jawusd.report.figures import farther, legend_beside, runs, thinned
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, VERMILION, inline_svg, new_figure
 
-#: Of the states, as near to the colours in the pictures as figures in light and dark pages allow.
+#: Colours of the states: close to those in the pictures, and legible on light and dark pages.
 STATE_INKS = {SolveState.SOLVED: GREEN, SolveState.CARRIED: ORANGE, SolveState.LOST: MAGENTA}
 _NAMES = ("d1 opening", "d2 laterotrusion,\nleft is positive", "d3 protrusion,\nforward is positive")
 _INKS = (BLACK, BLUE, VERMILION)
 _STYLES = ("-", "--", ":")
 _BAND = 2.0  # sigmas: 95 % of normal errors
 _UNSEEN = (SolveState.CARRIED, SolveState.LOST)
-_LISTED = 60  # runs named one by one
+_LISTED = 60  # most runs listed
 
 
 def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
-    """Draw d with a band of two sigmas, its sigma and the margin of every frame; what was not seen is shaded."""
+    """Plot d with a band of two sigma, its sigma and the margin of every frame, with unobserved frames shaded."""
     frames = tracks.frames
     figure, axes = new_figure(11.0, 9.6, 5, 1, sharex=True, height_ratios=[1.4, 1, 1, 0.8, 1])
     for axis, name, ink, value, sigma in zip(axes, _NAMES, _INKS, solved.d.T, solved.sigma_mm.T, strict=False):
@@ -63,7 +63,7 @@ def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
 
 
 def seen_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
-    """Draw the state and verdict of every frame, and which masks of each camera took part, arch by arch."""
+    """Plot the state and verdict of every frame, and the masks used of each camera and arch."""
     frames, names = tracks.frames, tracks.camera_names
     lanes = [(str(state), solved.state == state, ink) for state, ink in STATE_INKS.items()]
     lanes.append(("within tolerance", solved.valid & ~is_inside(solved.margin_mm), GREY))
@@ -80,7 +80,7 @@ def seen_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
             axes[1].broken_barh(spans, (low - lane, 0.38), facecolors=BLUE, edgecolors=BLUE, linewidth=0.8)
     used = tracks.masks_used.any(axis=1).sum(axis=0) if len(names) else []
     _name_lanes(axes[1], [f"{name}  {count}" for name, count in zip(names, used, strict=True)])
-    axes[1].set_title("masks that took part (upper half of a bar: upper teeth, lower half: lower teeth)", loc="left")
+    axes[1].set_title("masks used (upper half of a bar: upper teeth, lower half: lower teeth)", loc="left")
     _label_frames(axes[0], axes[1], fps)
     return figure
 
@@ -111,7 +111,7 @@ def _name_lanes(axis: Axes, names: list[str]) -> None:
 
 
 def _label_frames(top: Axes, bottom: Axes, fps: float) -> None:
-    """Write frames below and seconds above."""
+    """Label frames below and seconds above."""
     bottom.set_xlabel("frame of the reference camera")
     seconds = top.secondary_xaxis("top", functions=(partial(_scaled, factor=1 / fps), partial(_scaled, factor=fps)))
     seconds.set_xlabel("time [s]")
@@ -122,7 +122,7 @@ def _scaled(value: ArrayLike, factor: float) -> Array:
 
 
 class Unseen(NamedTuple):
-    """Describe a run of frames in which an arch was not found."""
+    """A run of frames in which an arch was not found."""
 
     first: int
     last: int
@@ -136,21 +136,21 @@ def write_solve_page(path: str | os.PathLike[str], data: SolveReportData) -> Non
     """Write the report to an HTML file.
 
     Raises:
-        FormatError: the tracks are not those of a solve.
+        FormatError: the tracks do not come from a solve.
         OutputError: the file cannot be written.
     """
     write_text_atomic(path, solve_page(data))
 
 
 def solve_page(data: SolveReportData) -> str:
-    """Return the report as HTML; all content of files is escaped.
+    """Return the report as HTML; text from files is escaped.
 
     Raises:
-        FormatError: the tracks are not those of a solve.
+        FormatError: the tracks do not come from a solve.
     """
     solved = data.tracks.solved
     if solved is None:
-        raise FormatError("holds no solved performance.", hint="Name the .npz that `jawusd solve` wrote.")
+        raise FormatError("holds no solved performance.", hint="Pass the .npz written by `jawusd solve`.")
     findings = list(dict.fromkeys(Finding.from_json(one).line() for one in data.tracks.meta.get("findings", [])))
     unseen = unseen_runs(data, solved)
     return (
@@ -173,7 +173,7 @@ def solve_page(data: SolveReportData) -> str:
 
 
 def unseen_runs(data: SolveReportData, solved: SolvedJaw) -> list[Unseen]:
-    """Return the runs of frames in which an arch was not found, of one state each."""
+    """Return the runs of frames in which an arch was not found, each with a single state."""
     frames, found = data.tracks.frames, []
     breaks = np.flatnonzero((np.diff(solved.state) != 0) | (np.diff(frames) != 1)) + 1
     for rows in np.split(np.arange(len(frames)), breaks):
@@ -194,24 +194,28 @@ def _figures(data: SolveReportData, solved: SolvedJaw) -> dict[str, Markup]:
         return {}
     return {
         "jaw": inline_svg(jaw_figure(data.tracks, solved, data.fps), "jaw", "d, sigma and margin of every frame."),
-        "seen": inline_svg(seen_figure(data.tracks, solved, data.fps), "seen", "What was seen in every frame."),
+        "seen": inline_svg(seen_figure(data.tracks, solved, data.fps), "seen", "State of every frame and masks used."),
     }
 
 
 def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
-    """Return (what, frames, share, what it means) per state and for poses outside."""
+    """Return (name, frames, percentage, meaning) of every state and verdict."""
     rows = (
         ("solved", solved.state == SolveState.SOLVED, "both arches were found in the masks"),
-        ("carried", solved.state == SolveState.CARRIED, "an arch was out of sight; the motion around carries it"),
+        (
+            "carried",
+            solved.state == SolveState.CARRIED,
+            "an arch was hidden; its pose is interpolated",
+        ),
         (
             "lost",
             solved.state == SolveState.LOST,
-            "there are masks that fit nothing; the motion around carries the jaw",
+            "the masks match no pose; the pose is interpolated from neighbouring frames",
         ),
         (
             "within tolerance",
             solved.valid & ~is_inside(solved.margin_mm),
-            "the pose lies outside the rig's bound, but no farther than measured poses may",
+            "the pose lies outside the rig's bound, but within the tolerance of measured poses",
         ),
         ("outside", ~solved.valid, "the rig does not allow the pose"),
     )
@@ -220,26 +224,26 @@ def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
 
 
 def _sentence(solved: SolvedJaw, doubts: bool) -> str:
-    """Say in words what a person should look at; no figure is judged by a limit of its own."""
+    """Return a summary of what to inspect; it applies no limits of its own."""
     said = []
     if (solved.state == SolveState.LOST).any():
-        said.append("frames are lost: look at their masks")
+        said.append("some frames are lost: inspect their masks")
     if (solved.state == SolveState.CARRIED).any():
-        said.append("frames are carried by the motion around: their sigma says how far they may be off")
+        said.append("some frames are interpolated from their neighbours: see their sigma for the expected error")
     if not solved.valid.all():
         said.append(
-            "poses lie outside the rig's bound: masks are wrong there, or the person went farther than captured"
+            "some poses lie outside the rig's bound: the masks are wrong, or the person exceeded the captured range"
         )
     if doubts:
         said.append("there are findings")
     if not said:
-        return "Every frame was seen, and every pose is one that the rig allows."
+        return "Both arches were found in every frame, and every pose is valid for the rig."
     text = "; ".join(said)
     return f"{text[0].upper()}{text[1:]}."
 
 
 def _jaw_rows(solved: SolvedJaw) -> list[tuple[str, str, str, str, str]]:
-    """Return (parameter, smallest, largest, typical sigma, largest sigma) in mm; typical over solved frames."""
+    """Return (parameter, smallest, largest, median sigma, largest sigma) in mm; the median is over solved frames."""
     names = ("d1 opening", "d2 laterotrusion (left is positive)", "d3 protrusion (forward is positive)")
     seen = solved.state == SolveState.SOLVED
     rows = []
@@ -251,7 +255,7 @@ def _jaw_rows(solved: SolvedJaw) -> list[tuple[str, str, str, str, str]]:
 
 
 def _cameras(data: SolveReportData) -> list[dict[str, str]]:
-    """Return a table row per camera: what it has, in how many frames its masks took part, and its focal length."""
+    """Return a table row per camera: footage, masks, number of frames used, and focal length."""
     tracks, known = data.tracks, {camera.name: camera for camera in data.cameras}
     rows = []
     for name in (*tracks.camera_names, *(name for name in known if name not in tracks.camera_names)):
@@ -267,7 +271,7 @@ def _cameras(data: SolveReportData) -> list[dict[str, str]]:
                 "video": facts.video if facts else "",
                 "masks": facts.masks if facts else "",
                 "size": f"{facts.size_px[0]} \u00d7 {facts.size_px[1]}" if facts else "",
-                "used": used or "not solved with",
+                "used": used or "not used",
                 "focal": "" if focal is None else f"{focal[0]:.4f} \u00b1 {focal[1]:.4f}",
             }
         )

@@ -1,4 +1,4 @@
-"""The style of figures: one palette for all kinds of colour vision, plain axes; files, and SVG inside a page."""
+"""Style and output of figures: colour-blind safe palette, plain axes, files, and inline SVG."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00"
 GREY, PALE, MAGENTA = "#777777", "#C8C8C8", "#D6278F"
 
-#: Matplotlib's settings for making and saving figures.
+#: Matplotlib settings for making and saving figures.
 SETTINGS: dict[RcKeyType, object] = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "svg.fonttype": "none",
-    "svg.hashsalt": "jawusd",  # the same picture gives the same file
+    "svg.hashsalt": "jawusd",  # reproducible files
 }
 DPI, _INLINE_DPI = 150, 110
 _PX_PER_PT = 4 / 3
-# Names of the colours in the page's style sheet; white is the background of text.
+# Colours replaced by variables of the page's style sheet; white is the background of text.
 _THEMED = {
     BLACK: "ink",
     "#ffffff": "paper",
@@ -58,7 +58,7 @@ def new_figure(
     sharey: bool = False,
     height_ratios: list[float] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure outside any window system, and its axes row by row; options as in `Figure.subplots`."""
+    """Return a figure without a GUI backend, and its axes in row-major order; options as in `Figure.subplots`."""
     with matplotlib.rc_context(SETTINGS):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey, height_ratios=height_ratios)
@@ -78,10 +78,10 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
 
 
 def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = False) -> bytes:
-    """Return a figure as a file of a kind, without dates and versions, so that equal figures give equal bytes."""
+    """Return a figure encoded as a file type, without dates and versions, so that equal figures give equal bytes."""
     drawn = io.BytesIO()
     metadata = {"Software": None} if kind == "png" else {"Date": None}
-    for text in figure.findobj(Text):  # names in it control nothing, and a $ in one starts no formula
+    for text in figure.findobj(Text):  # show names literally: no control characters, no $ as math
         text.set_text("\n".join(map(shown, text.get_text().split("\n"))))
         text.set_parse_math("$" not in text.get_text())
     with matplotlib.rc_context(SETTINGS):
@@ -90,13 +90,13 @@ def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = Fal
 
 
 def inline_svg(figure: Figure, key: str, words: str) -> Markup:
-    """Return a figure as an SVG element for a page, in the page's colours, with alternative text.
+    """Return a figure as an inline SVG element in the page's colours, with alternative text.
 
-    The key is the prefix of all ids of this figure; unique in the page.
+    The key is the prefix of all ids of this figure and must be unique in the page.
     """
     text = figure_bytes(figure, "svg", _INLINE_DPI, transparent=True).decode()
     text = text[text.index("<svg") :]
-    # Not needed inside a page, and the style would apply outside of the figure.
+    # Remove elements not needed in a page; the style would also apply outside the figure.
     text = re.sub(r"<metadata>.*?</metadata>|<style[^>]*>.*?</style>", "", text, flags=re.DOTALL)
     head, body = text.split(">", 1)
     width = float(head.split('width="', 1)[1].split('pt"', 1)[0])

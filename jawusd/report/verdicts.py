@@ -1,4 +1,4 @@
-"""Verdicts on the stages of a build, in plain words and with the thresholds."""
+"""Verdicts on the stages of a build, with their thresholds."""
 
 from __future__ import annotations
 
@@ -16,44 +16,44 @@ from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks
 from jawusd.report.facts import model_facts, sync_facts, tracks_facts
 
-#: Grades, the best first; "open" means that there is nothing to judge.
+#: Grades, best first; "open" means that there is nothing to judge.
 GOOD, LOOK, BAD, OPEN = "good", "look", "bad", "open"
-WORDS = {GOOD: "good", LOOK: "have a look", BAD: "not good", OPEN: "not judged"}
+WORDS = {GOOD: "good", LOOK: "needs review", BAD: "poor", OPEN: "not judged"}
 MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
 
-# Yang et al. (2019): mask left uncovered on average, and the mean and worst reconstruction error of their Fig. 12.
+# Yang et al. (2019): mean uncovered mask, and mean and largest reconstruction error in their Fig. 12.
 _PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
 _UNKNOWN = "not known"
 _EXERCISES = "full opening, slides to both sides and protrusion, closed and half open"
-# Findings of tracks.
+# Names of findings of tracks.
 _UNUSED = {"camera_without_masks", "masks_black", "camera_not_used", "camera_rarely_used"}
 _WRONG_SCANS = {"scan_misfit", "scans_mirrored"}
-_LACKING = {"take_lacks", "not_shown"}  # warnings of the fit about movements that are missing or too small
+_LACKING = {"take_lacks", "not_shown"}  # fit warnings about movements that are missing or too small
 _MISTAKES = {"scan_units", "pose_units", "front_back_flip", "left_right_flip", "upside_down", "swapped_jaws"}
 _SENTENCES = {
     "sync": {
-        GOOD: "The cameras agree in time; what is left below a frame was measured and taken into account.",
-        LOOK: "The cameras may be off by a frame: play the footage side by side.",
-        BAD: "The cameras do not agree in time: give the offsets by hand ([sync] offsets) and build again.",
+        GOOD: "The cameras are synchronised; delays below one frame were estimated and corrected.",
+        LOOK: "The cameras may be out of sync by a frame: play the footage side by side.",
+        BAD: "The cameras are not synchronised: give the offsets by hand ([sync] offsets) and build again.",
     },
     "track": {
-        GOOD: "The teeth were followed through the take, as exactly as the masks allow.",
-        LOOK: "Most of the take is tracked; look at the worst frames below before relying on it.",
+        GOOD: "The teeth were tracked through the whole take, as accurately as the masks allow.",
+        LOOK: "Most of the take is tracked; inspect the worst frames below before relying on it.",
         BAD: "Much of the take is lost or uncertain: check masks and calibration at the worst frames below.",
     },
     "fit": {
         GOOD: "Three parameters reproduce this person's poses to a fraction of a millimetre.",
-        LOOK: "The model is usable, but look at the figures marked below.",
-        BAD: "The model does not describe this take: see which figure is out of range.",
+        LOOK: "The model is usable, but see the checks marked below.",
+        BAD: "The model does not describe this take: see which check failed.",
     },
     "bounds": {
-        GOOD: "The limits enclose what was captured, and the take covers the envelope.",
-        LOOK: "The limits hold what was captured, but parts of the envelope were not recorded (see below).",
-        BAD: "The limits leave out poses that were captured: do not rely on them.",
+        GOOD: "The limits enclose the captured poses, and the take covers the envelope.",
+        LOOK: "The limits enclose the captured poses, but parts of the envelope were not recorded (see below).",
+        BAD: "The limits exclude captured poses: do not rely on them.",
     },
     "rig": {
-        GOOD: "The files are valid, and readers of the table get the model's poses.",
-        LOOK: "The files are valid; the table is a coarse copy of the model.",
+        GOOD: "The files are valid, and the pose table reproduces the model.",
+        LOOK: "The files are valid, but the pose table is a coarse approximation of the model.",
         BAD: "The rig has errors: run `jawusd validate` on it.",
     },
 }
@@ -61,7 +61,7 @@ _SENTENCES = {
 
 @dataclass(frozen=True)
 class Check:
-    """Judge one figure: its value with unit, the limits of good and acceptable, a grade of `WORDS`."""
+    """Result of one check: the value with unit, the limits of good and acceptable, and a grade of `WORDS`."""
 
     name: str
     found: str
@@ -71,7 +71,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Judge one stage in a sentence; the grade is the worst of the checks, those not judged excluded."""
+    """Verdict on one stage: a sentence and the worst grade of its checks, ignoring those not judged."""
 
     stage: str
     sentence: str
@@ -90,14 +90,14 @@ def overall(verdicts: Iterable[Verdict]) -> str:
 
 
 class BuildVerdict(TypedDict):
-    """Hold the verdict on a build: the worst grade of its stages, and which figures make it so."""
+    """Verdict on a build: the worst grade of its stages, and the checks with that grade."""
 
     grade: str
     because: list[str]
 
 
 def in_short(verdicts: Iterable[Verdict]) -> BuildVerdict:
-    """Return the worst grade, and the figures that have it, with their limits."""
+    """Return the worst grade, and the checks with that grade and their limits."""
     verdicts = list(verdicts)
     grade = overall(verdicts)
     checks = [(verdict.stage, check) for verdict in verdicts for check in verdict.checks if check.grade == grade]
@@ -110,7 +110,7 @@ def _worst(grades: list[str]) -> str:
 
 
 def _below(name: str, value: float, good: float, fair: float, unit: str, digits: int = 2) -> Check:
-    """Judge a figure that should be small."""
+    """Check a value that should be small."""
     limit = f"good up to {good:g} {unit}, acceptable up to {fair:g} {unit}"
     if not np.isfinite(value):
         return Check(name, _UNKNOWN, limit, OPEN)
@@ -119,7 +119,7 @@ def _below(name: str, value: float, good: float, fair: float, unit: str, digits:
 
 
 def _share(name: str, share: float, good: float, fair: float) -> Check:
-    """Judge a share, 0 .. 1, that should be large."""
+    """Check a fraction, 0 .. 1, that should be large."""
     limit = f"good from {100 * good:g} %, acceptable from {100 * fair:g} %"
     if not np.isfinite(share):
         return Check(name, _UNKNOWN, limit, OPEN)
@@ -127,27 +127,27 @@ def _share(name: str, share: float, good: float, fair: float) -> Check:
 
 
 def _mean(has: Mask) -> float:
-    """Return the share of a mask (F,) that is true, NaN of an empty one."""
+    """Return the mean of a mask (F,), NaN if it is empty."""
     return float(has.mean()) if has.size else np.nan
 
 
 def _verdict(stage: str, checks: list[Check]) -> Verdict:
     grade = _worst([check.grade for check in checks])
-    return Verdict(stage, _SENTENCES[stage].get(grade, "There is nothing to judge it by."), tuple(checks), grade)
+    return Verdict(stage, _SENTENCES[stage].get(grade, "There is nothing to judge."), tuple(checks), grade)
 
 
 def _sync(data: ReportData) -> Verdict:
     delays, sync = tracks_facts(data).get("delays_frames", {}), sync_facts(data)
     rest = max((abs(float(value)) for value in delays.values()), default=np.nan)
     if len(data.tracks.camera_names) == 1:
-        return Verdict("sync", "There is one camera: nothing to align in time.", (), GOOD)
-    checks = [_below("offset that the teeth themselves show beyond the whole frames", rest, 0.6, 1.0, "frames")]
+        return Verdict("sync", "A single camera needs no synchronisation.", (), GOOD)
+    checks = [_below("residual offset estimated by tracking", rest, 0.6, 1.0, "frames")]
     if sync.get("confidence"):
         least = min(float(value) for value in sync["confidence"].values())
-        checks.append(_share("flashes or sounds that both cameras show", least, 0.8, 0.5))
+        checks.append(_share("confidence: flashes or sound common to both cameras", least, 0.8, 0.5))
     method = str(sync.get("method", "not known"))
     if method == "taken as simultaneous":
-        checks.append(Check("how the cameras were aligned", method, "flash, sound or given offsets", LOOK))
+        checks.append(Check("synchronisation method", method, "flash, sound or given offsets", LOOK))
     return _verdict("sync", checks)
 
 
@@ -161,26 +161,26 @@ def _track(tracks: Tracks) -> Verdict:
     residual = tracks.residual_px[(tracks.status != LOST) & np.isfinite(tracks.residual_px)]
     checks = [
         _share("frames tracked", _mean(tracked), 0.98, 0.9),
-        _share("frames sure enough without the model's help or a new search", _mean(~helped), 0.6, 0.3),
+        _share("frames tracked without regularisation or a new search", _mean(~helped), 0.6, 0.3),
         _below(
-            f"mask left uncovered, mean (the paper: {_PAPER_COVERAGE_PERCENT} %)",
+            f"uncovered mask, mean (the paper: {_PAPER_COVERAGE_PERCENT} %)",
             100 * float(np.nanmean(coverage)) if np.isfinite(coverage).any() else np.nan,
             1.0,
             2.0,
             "%",
         ),
-        _below("distance of outlines, median", float(np.median(residual)) if residual.size else np.nan, 1.0, 2.0, "px"),
+        _below("outline distance, median", float(np.median(residual)) if residual.size else np.nan, 1.0, 2.0, "px"),
         _below("expected error at the incisor (1 sigma, median)", float(sigma[0]), 0.15, 0.5, "mm", 3),
         _below("expected error at the worse condyle (1 sigma, median)", float(sigma[3:].max()), 0.5, 1.0, "mm", 3),
     ]
     found = [Finding.from_json(one) for one in tracks.meta.get("findings", [])]
     unused = [f"{one.camera}: {one.message}" for one in found if one.kind in _UNUSED]
     if unused:
-        checks.append(Check("cameras that are not used", " ".join(unused), "none", LOOK))
+        checks.append(Check("unused cameras", " ".join(unused), "none", LOOK))
     wrong = [one.message for one in found if one.kind in _WRONG_SCANS]
     if wrong:
-        checks.append(Check("scans", " ".join(wrong), "they fit the masks", BAD))
-    # 7 of 30 valid persons carry one too (`population.py --persons 30 --seed 9500`), 3 of these for a true underbite.
+        checks.append(Check("scans", " ".join(wrong), "match the masks", BAD))
+    # False alarms: 7 of 30 valid persons (`population.py --persons 30 --seed 9500`), 3 of them with a true underbite.
     others = [one.line() for one in found if one.severity == "warning" and one.kind not in _UNUSED | _WRONG_SCANS]
     if others:
         checks.append(Check("warnings", " ".join(others), "none", LOOK))
@@ -210,7 +210,7 @@ def _fit(data: ReportData) -> Verdict:
             _PAPER_WORST_MM,
             "mm",
         ),
-        _share("frames that shaped the model", 1 - out / count if count else np.nan, 0.9, 0.7),
+        _share("frames used for the fit", 1 - out / count if count else np.nan, 0.9, 0.7),
     ]
     for warning in meta.get("warnings", []):
         if warning["code"] == "few_poses":
@@ -236,9 +236,15 @@ def _bounds(data: ReportData) -> Verdict:
     if known is not None and drawn is not None and len(known.values_mm):
         ratio = float(np.median(drawn.values_mm) / max(np.median(known.values_mm), 1e-9))
         checks.append(
-            _below("random valid poses: distance to the take, against captured ones left out", ratio, 3.0, 6.0, "times")
+            _below(
+                "distance of random valid poses to the take, over that of held-out poses",
+                ratio,
+                3.0,
+                6.0,
+                "times",
+            )
         )
-    # The plot shows what the experiments found: the verdict must not say otherwise.
+    # Use the experiments' numbers, so that the verdict agrees with the plot.
     warned = [w["message"] for w in meta.get("warnings", []) if w["code"] in _LACKING]
     lacks = data.experiments.coverage.sentences if data.experiments else warned
     checks += [Check("captured movements", sentence, _EXERCISES, LOOK) for sentence in lacks]
@@ -248,8 +254,8 @@ def _bounds(data: ReportData) -> Verdict:
     return _verdict("bounds", checks)
 
 
-# Only readers that know neither the exact model nor ONNX pose by the table. Its worst vertex was 0.007 to 0.136 mm off
-# in rigs of 11 persons, 0.154 mm in one of rough teeth that was tracked (`tests/benchmarks/contact.py`).
+# Limits of the pose table's error [mm]. The worst vertex of rigs of 11 persons was off by 0.007 to 0.136 mm
+# (`tests/benchmarks/contact.py`).
 _TABLE_MM = (0.06, 0.5)
 
 
@@ -257,6 +263,6 @@ def _rig(data: ReportData) -> Verdict:
     errors = [finding for finding in data.rig.findings if finding.startswith("error")]
     checks = [
         Check("validators", f"{len(errors)} errors", "no errors", BAD if errors else GOOD),
-        _below("sampled decoder against the exact model, worst vertex", data.rig.table_error_mm, *_TABLE_MM, "mm", 3),
+        _below("pose table against the exact model, worst vertex", data.rig.table_error_mm, *_TABLE_MM, "mm", 3),
     ]
     return _verdict("rig", checks)

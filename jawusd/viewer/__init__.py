@@ -1,5 +1,5 @@
-"""The browser viewer: see a jaw rig move, drag it, key it; see a capture's footage with its poses, set its picks.
+"""The browser viewer: pose, drag and key a jaw rig; inspect a capture's footage and poses, and set its picks.
 
-`session`, `motion`, `readouts`, `plots`, `coverage`, `decimate`, `picks` and `picking_layout` do not depend on viser;
-the other modules are the pages and the server.
+`session`, `motion`, `readouts`, `plots`, `take_plots`, `viewed` and `picking` do not depend on viser; `scene`, the
+panels, the pages and `server` do. The viewer never imports another stage: `viewed` holds the functions it calls.
 """

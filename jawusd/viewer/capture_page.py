@@ -1,4 +1,4 @@
-"""One visitor's page of a capture, with a view and picks of its own."""
+"""The page of a capture; every visitor has their own view and picks."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from jawusd.geometry import make_transform, transform_points
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.capture_panels import ALL, FootagePanel, PicksPanel
 from jawusd.viewer.capture_scene import UP, CaptureScene
-from jawusd.viewer.picking import ARCHES, PickingLayout, eye_to_see, hit_vertex, region_around
+from jawusd.viewer.picking import ARCHES, PickingLayout, fit_view, hit_vertex, region_around
 from jawusd.viewer.scan_labels import BRUSHES, ScanLabelsPanel
 from jawusd.viewer.scene import PHONE
 from jawusd.viewer.viewed import Region, ViewedCapture
 from jawusd.viewer.widgets import begin_panel, errors_shown, guarded, limit_uploads
 
 _PANEL_PX = 370
-_SLOW_S = 0.3  # a picture that takes longer is said to be loading
-_USUAL_MM, _USUAL_WEIGHT = 250.0, 1e-3  # from a camera to the mouth
-_SPACE_SIDE = (0.9, -0.7, 0.0)  # offset of the view direction in space from that of the first camera
+_SLOW_S = 0.3  # show "loading" when a picture takes longer
+_USUAL_MM, _USUAL_WEIGHT = 250.0, 1e-3  # prior on the distance from a camera to the mouth
+_SPACE_SIDE = (0.9, -0.7, 0.0)  # offset of the 3-D view direction from that of the first camera
 
 
 class CapturePage:
@@ -33,13 +33,13 @@ class CapturePage:
 
     Attributes:
         footage, picks, labels: the panels.
-        layout: of the picture shown, None before the first.
+        layout: layout of the picture shown; None before the first one.
         poses: T_page_scan (4, 4) of the scans shown, by arch.
         drawn: number of the last state drawn.
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
-        """Draw the page."""
+        """Build the page."""
         self.client, self._capture = client, capture
         gui = client.gui
         begin_panel(client, capture.name)
@@ -64,7 +64,7 @@ class CapturePage:
         self.refresh()
 
     def turn(self) -> None:
-        """Draw again, and move the visitor's eye so that everything is in view."""
+        """Redraw, and move the virtual camera so that everything is in view."""
         self._aim = True
         self.refresh()
 
@@ -74,14 +74,14 @@ class CapturePage:
         self.turn()
 
     def refresh(self) -> None:
-        """Draw the current state; requests that arrive while a picture is being made are merged into one."""
+        """Draw the current state; requests that arrive while drawing are merged into one."""
         self._wanted += 1
         if self._drawing is None or self._drawing.done():
             self._drawing = asyncio.get_running_loop().create_task(self._draw())
 
     @property
     def busy(self) -> bool:
-        """Return whether something is still to be drawn."""
+        """Return whether a redraw is pending."""
         return self.drawn != self._wanted
 
     async def _draw(self) -> None:
@@ -129,7 +129,7 @@ class CapturePage:
             self._look()
 
     def _show_partly(self) -> Callable[[NDArray[np.uint8]], None] | None:
-        """Return what threads call with the picture of all cameras so far; None while it plays."""
+        """Return a thread-safe callback that shows a partial picture of all cameras; None during playback."""
         if self.footage.player.playing:
             return None
         loop, layout = asyncio.get_running_loop(), self._lay_out(ALL, self.footage.frame)
@@ -140,7 +140,7 @@ class CapturePage:
         return show
 
     def _look(self) -> None:
-        """Move the visitor's eye so that everything is in view."""
+        """Move the virtual camera so that everything is in view."""
         camera = self.client.camera
         aspect = camera.image_width / camera.image_height
         seen = [
@@ -157,18 +157,20 @@ class CapturePage:
             seen.append(self.layout.corners())
         points = np.vstack(seen)
         if aspect < PHONE:
-            points = np.vstack([points, points - np.ptp(points @ UP) * np.array(UP)])  # all is seen in the upper half
-        self.scene.look(*eye_to_see(points, away, UP, aspect))
+            points = np.vstack(
+                [points, points - np.ptp(points @ UP) * np.array(UP)]
+            )  # leave the lower half to a phone's panel
+        self.scene.look(*fit_view(points, away, UP, aspect))
 
     def _poses_at(self, frame: int) -> tuple[Array, Array] | None:
-        """Return T_world_upper and T_world_lower of a frame: tracked, else from the picks of that frame."""
+        """Return T_world_upper and T_world_lower of a frame: tracked, or else fitted to that frame's picks."""
         tracked = self._capture.tracked_poses(frame)
         if tracked is None and self._of_picks is not None and self._of_picks[0].frame == frame:
             return self._of_picks[1]
         return tracked
 
     async def _fit_picks(self) -> None:
-        """Fit poses to the picks when these have changed and are complete."""
+        """Fit poses to the picks if they have changed and are complete."""
         book = self.picks.book
         if book.lacks() or book.frame is None:
             if self._of_picks is not None:
@@ -181,7 +183,7 @@ class CapturePage:
         try:
             poses, wrong = await asyncio.to_thread(self._capture.poses_of_picks, picks)
             self._of_picks = picks, poses
-            self.picks.say_fit(f"these do not fit: {', '.join(wrong)}" if wrong else "all of them fit together")
+            self.picks.say_fit(f"inconsistent picks: {', '.join(wrong)}" if wrong else "the picks are consistent")
         except JawusdError as error:
             self._of_picks = picks, None
             self.picks.say_fit(error.statement())
@@ -195,7 +197,7 @@ class CapturePage:
         return PickingLayout(capture.sizes_px[view], self._region(view, frame))
 
     def _region(self, camera: str, frame: int) -> Region:
-        """Return the region of a camera's picture to show: the teeth, as far as they are known."""
+        """Return the region of a camera's picture to show: around the teeth if their position is known."""
         capture, size = self._capture, self._capture.sizes_px[camera]
         tracked = self._poses_at(frame)
         if tracked is not None and camera in capture.cameras and all(np.isfinite(T).all() for T in tracked):
@@ -213,12 +215,12 @@ class CapturePage:
         return region_around(pixels, size) if len(pixels) > 1 else (0.0, 0.0, size[0] - 1.0, size[1] - 1.0)
 
     def _default_pose(self) -> Array:
-        """Return T_world_scan of untracked scans: where the cameras' axes meet, facing the first one."""
+        """Return T_world_scan of untracked scans: at the intersection of the optical axes, facing the first camera."""
         cameras = list(self._capture.cameras.values())
         axes = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
         across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
         centres = np.stack([camera.centre_world() for camera in cameras])
-        # Nearly parallel axes do not fix the distance: a prior at a usual distance from the first camera does.
+        # Nearly parallel axes do not determine the distance; a weak prior at the usual distance does.
         usual = centres[0] + _USUAL_MM * axes[0]
         A = across.sum(axis=0) + _USUAL_WEIGHT * np.eye(3)
         met = np.linalg.solve(A, np.einsum("nij,nj->i", across, centres) + _USUAL_WEIGHT * usual)
@@ -227,7 +229,7 @@ class CapturePage:
         return facing @ self._capture.T_anatomical_skull
 
     async def _clicked(self, event: viser.SceneClickEvent) -> None:
-        """Pick the vertex or the pixel under the pointer, or paint the scan there."""
+        """Pick the vertex or pixel under the pointer, or paint the scan there."""
         if not self.picks.picking.value and not self.labels.painting.value:
             return
         hits = []
@@ -256,12 +258,12 @@ class CapturePage:
         self.turn()
 
     def _show_labels(self, arch: str) -> None:
-        """Draw a scan whose labels have changed."""
+        """Redraw a scan after its labels have changed."""
         brush = self.labels.brush
         self.scene.show_labels(arch, *(brush.faces_with(arch, label) for label in BRUSHES.values()))
 
     def close(self) -> None:
-        """Stop what runs for this page."""
+        """Stop the tasks of this page."""
         self.footage.player.stop()
         if self._drawing is not None:
             self._drawing.cancel()

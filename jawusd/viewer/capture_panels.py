@@ -19,21 +19,21 @@ SPACE, ALL = "3-D", "all cameras"
 _LOOKS: dict[str, Look] = {"outlines of the teeth": "outlines", "tinted teeth": "tinted", "footage alone": "footage"}
 _STEPS = {"-10": -10, "-1": -1, "+1": 1, "+10": 10}
 _NONE = "none"
-_PICKING_HINT = "In the picture of one camera, and on scans in 3-D; not while all cameras are side by side."
+_PICKING_HINT = "Works in the picture of a single camera and on the scans in 3-D, not with all cameras side by side."
 _HELP = (
-    "Click a vertex on a scan, then the same place in the picture of two or more cameras, all at one frame. Three or "
-    "more of each arch, spread over it: front teeth and both sides. Wheel: zoom; right button: move."
+    "Click a vertex on a scan, then the same point in the pictures of at least two cameras at the same frame. Set at "
+    "least three picks per arch, spread over front teeth and both sides. Wheel: zoom; right button: pan."
 )
 
 
 class FootagePanel:
-    """Hold the widgets of camera and frame.
+    """Widgets that choose camera and frame.
 
     Attributes:
-        view: name of the camera shown, or `SPACE`, or `ALL` of them side by side.
+        view: name of the camera shown, `SPACE` for the 3-D view, or `ALL` for all cameras side by side.
         frame: frame of the reference camera.
         player: plays the footage.
-        worst: frames to inspect, the worst first.
+        worst: frames to inspect, worst first.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class FootagePanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Make the widgets in the present container; call `turned` for another view, `changed` for other changes."""
+        """Add the widgets to the current container; call `turned` for another view, `changed` for other changes."""
         self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
         self._loading = False
         self.view = next(iter(capture.sizes_px))
@@ -82,7 +82,7 @@ class FootagePanel:
 
     @property
     def in_space(self) -> bool:
-        """Return whether the view shows the cameras from outside."""
+        """Return whether the view is the 3-D view of the cameras."""
         return self.view == SPACE
 
     @property
@@ -101,7 +101,7 @@ class FootagePanel:
         return CoveragePlot(tracks, self._capture.frames, self.worst)
 
     def go_to(self, frame: int) -> None:
-        """Show another frame, and play no further."""
+        """Stop playback and show a frame."""
         self.player.stop()
         first, last = self._capture.frames
         self.frame = min(max(int(frame), first), last)
@@ -113,13 +113,13 @@ class FootagePanel:
         self._show(self.frame)
 
     def say_loading(self, loading: bool) -> None:
-        """Say that a picture is being decoded, or no longer."""
+        """Show or hide the note that a picture is being decoded."""
         if loading != self._loading:
             self._loading = loading
             self.refresh()
 
     def follow(self, frame: int) -> None:
-        """Update the widgets to a frame that was drawn, if it plays: they are never ahead of the picture."""
+        """During playback, update the widgets to the frame just drawn, so that they never run ahead of the picture."""
         if self.player.playing:
             self._show(frame)
 
@@ -128,17 +128,17 @@ class FootagePanel:
         capture = self._capture
         lines = [f"<b>{self.view}</b>, frame {frame}, {frame / capture.fps:.2f} s"]
         if self.view in capture.offsets and (own := frame - capture.offsets[self.view]) != frame:
-            lines[0] += f" (its own frame {own})"
+            lines[0] += f" (frame {own} of this camera)"
         if capture.tracks is not None:
             drawn = self._plot.with_playhead(frame)
             self._playhead.content = plot_seek(drawn, capture.frames, self._plot.across, self.slider._impl.uuid)
             lines.append(frame_words(capture.tracks, frame))
         else:
-            lines.append("no poses: name the folder of a build, or what a solve wrote, with --tracks")
+            lines.append("no poses: pass the folder of a build, or the file of a solve, with --tracks")
         if self._loading:
-            lines.append("<b>loading the pictures of this frame</b>")
+            lines.append("<b>loading this frame</b>")
         if frame in self.worst:
-            lines.append(f"number {self.worst.index(frame) + 1} of the {len(self.worst)} frames to look at")
+            lines.append(f"number {self.worst.index(frame) + 1} of {len(self.worst)} frames to inspect")
         self._words.content = small_text("<br>".join(lines), "padding-bottom:6px")
 
     async def _choose(self, event: Choice) -> None:
@@ -159,7 +159,7 @@ class FootagePanel:
         self.player.start(float(self.frame), self._capture.fps, span, lambda: bool(self.loop.value))
 
     def _play_to(self, frame: float) -> None:
-        """Show the frame that is on at a time; the page draws as many of them as it can."""
+        """Show the frame of a playback time; the page draws as many frames as it can."""
         shown = min(int(frame), self._capture.frames[1])
         if shown != self.frame:
             self.frame = shown
@@ -186,12 +186,12 @@ class FootagePanel:
 
 
 class PicksPanel:
-    """Hold the widgets of the picks.
+    """Widgets of the picks.
 
     Attributes:
         book: the picks.
-        side: that the scans in front of the picture show, one of `picking.SIDES`.
-        scans_shown: there are scans in front of the picture.
+        side: side of the scans facing the viewer, one of `picking.SIDES`.
+        scans_shown: whether there are scans in front of the picture.
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class PicksPanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Make the widgets in the present container; call `turned` for another side, `changed` for other picks."""
+        """Add the widgets to the current container; call `turned` for another side, `changed` for other picks."""
         self._client, self._capture, self._footage = client, capture, footage
         self._turned, self._changed = turned, changed
         self.book, self.side = PickBook(capture.picks), "front"
@@ -216,8 +216,8 @@ class PicksPanel:
         self.sides.on_click(guarded(client, self._choose_side))
         self.chosen = gui.add_dropdown("pick", (_NONE,))
         self.chosen.on_update(guarded(client, self._choose))
-        self.edit = gui.add_button_group("take away", ("pixel", "pick", "all"))
-        self.edit.on_click(guarded(client, self._take_away))
+        self.edit = gui.add_button_group("remove", ("pixel", "pick", "all"))
+        self.edit.on_click(guarded(client, self._remove))
         self.go = gui.add_button("show their frame")
         self.go.on_click(guarded(client, self._go))
         self._list = gui.add_html("")
@@ -226,7 +226,7 @@ class PicksPanel:
         self.refresh()
 
     def say_fit(self, words: str) -> None:
-        """Show a sentence about how well the picks agree."""
+        """Show a sentence about the consistency of the picks."""
         self._fit = words
         self.refresh()
 
@@ -265,7 +265,7 @@ class PicksPanel:
         self.book.selected = None if number < 0 else number
         self._changed()
 
-    async def _take_away(self, event: Choice) -> None:
+    async def _remove(self, event: Choice) -> None:
         if event.target.value == "pixel":
             self.book.forget_view(self._footage.view)
         elif event.target.value == "pick":
@@ -276,12 +276,12 @@ class PicksPanel:
 
     async def _go(self, _: object) -> None:
         if self.book.frame is None:
-            raise ValueError("the picks have no pixels yet, so they belong to no frame")
+            raise ValueError("no pick has a pixel yet, so there is no frame to show")
         self._footage.go_to(self.book.frame)
 
     async def _write(self, _: object) -> None:
         picks = self.book.bootstrap()
         await asyncio.to_thread(self._capture.save_picks, picks, self._saved)
         self._saved = picks
-        count = f"{len(picks.upper)} picks above and {len(picks.lower)} below"
+        count = f"{len(picks.upper)} upper and {len(picks.lower)} lower picks"
         say(self._client, "Written", f"{count}, frame {picks.frame}")

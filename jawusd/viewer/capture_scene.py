@@ -15,31 +15,31 @@ from jawusd.viewer.picking import ARCHES, FOV_RAD, PickBook, PickingLayout
 from jawusd.viewer.viewed import ViewedCapture, for_view
 
 ENAMEL, GUM, BASE = (236, 229, 212), (196, 112, 108), (120, 135, 165)
-#: Colours of picks by arch, equal to those of the outlines; and of the one selected.
+#: Colours of the picks by arch, as in the outlines; colour of the selected pick.
 ARCH_COLORS, SELECTED = {"upper": (255, 170, 0), "lower": (0, 200, 255)}, (255, 60, 200)
-#: Upwards in the page.
+#: Up direction of the page.
 UP = (0.0, -1.0, 0.0)
-_MOST_FACES = 7_000  # per part of an arch; clicks are tested against the whole scan
-_MOST_PAINTED_FACES = 25_000  # finer while labels are corrected
+_MOST_FACES = 7_000  # drawn per part of an arch; clicks are tested against the full scan
+_MOST_PAINTED_FACES = 25_000  # the same while labels are edited
 _JPEG_QUALITY = 88
 _THUMB_PX = 480
-_FRUSTUM_MM = 60.0  # from the eye of a camera to its picture
+_FRUSTUM_MM = 60.0  # distance from a camera's centre to its picture
 _FRUSTUM_COLOR = (120, 120, 120)
 _BALL_MM = 0.7
-_CROSS_MM = (0.35, 1.3)  # a cross leaves its middle free
+_CROSS_MM = (0.35, 1.3)  # inner and outer radius of a cross
 _FIRST_EYE_MM, _NEAR_MM, _FAR_MM = 300.0, 1.0, 10_000.0
-_LIFT_MM = 0.05  # from the picture to the marks in front of it
+_LIFT_MM = 0.05  # offset of marks in front of the picture
 
 
 class CaptureScene:
-    """Draw a capture for one page.
+    """3-D scene of a capture in one page.
 
     Attributes:
-        T_page_world: the page has the axes of the first camera, so that it is upright, shape (4, 4).
+        T_page_world: the page has the axes of the first camera, so that pictures are upright, shape (4, 4).
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
-        """Draw what does not depend on a picture."""
+        """Draw everything that does not depend on the picture."""
         self._client, self._scene, self._capture = client, client.scene, capture
         scene = self._scene
         scene.configure_default_lights(cast_shadow=False)
@@ -80,7 +80,7 @@ class CaptureScene:
         self._add_parts(arch, (("teeth", crowns, ENAMEL), ("gum", ~crowns, GUM)), _MOST_FACES)
 
     def show_labels(self, arch: str, crown: Mask, gum: Mask, base: Mask) -> None:
-        """Draw a scan again with other faces as crown, gum and base, masks of shape (F,)."""
+        """Redraw a scan with the given crown, gum and base faces, masks of shape (F,)."""
         parts = ("teeth", crown, ENAMEL), ("gum", gum, GUM), ("base", base, BASE)
         with self._client.atomic():
             self._add_parts(arch, parts, _MOST_PAINTED_FACES)
@@ -116,12 +116,12 @@ class CaptureScene:
             self._picture.render_width, self._picture.render_height = width, height
 
     def show_thumbnail(self, name: str, image: NDArray[np.uint8]) -> None:
-        """Show a reduced picture on a camera in space."""
+        """Show a thumbnail in the frustum of a camera."""
         step = -(-image.shape[1] // _THUMB_PX)
         self._frustums[name].image = np.ascontiguousarray(image[::step, ::step])
 
     def place(self, in_space: bool, poses: Mapping[str, Array]) -> None:
-        """Show the picture or the cameras in space, and the scans whose poses (4, 4) are given and finite."""
+        """Show the picture or the cameras in 3-D, and the scans whose poses (4, 4) are given and finite."""
         with self._client.atomic():
             self._layout.visible, self._space.visible = not in_space, in_space
             for arch, frame in self._arches.items():
@@ -132,7 +132,7 @@ class CaptureScene:
                 frame.visible = shown
 
     def show_marks(self, book: PickBook, camera: str | None, frame: int, layout: PickingLayout | None) -> None:
-        """Mark the picks on the scans and, those of this frame, in the picture of a camera."""
+        """Mark the picks on the scans, and those of this frame in the picture of a camera."""
         with self._client.atomic():
             for mark in self._marks:
                 mark.remove()
@@ -173,7 +173,7 @@ class CaptureScene:
         )
 
     def look(self, eye: Array, target: Array) -> None:
-        """Set the eye (3,) and target (3,) of the visitor's view."""
+        """Set position (3,) and target (3,) of the virtual camera."""
         camera = self._client.camera
         with self._client.atomic():
             camera.fov = FOV_RAD
@@ -181,7 +181,7 @@ class CaptureScene:
 
 
 def set_first_view(server: viser.ViserServer) -> None:
-    """Let every page start in front of the picture, upright."""
+    """Start every page in front of the picture, upright."""
     server.scene.set_up_direction("-y")
     first = server.initial_camera
     first.position, first.look_at, first.up = (0.0, 0.0, -_FIRST_EYE_MM), (0.0, 0.0, 0.0), UP
@@ -189,6 +189,6 @@ def set_first_view(server: viser.ViserServer) -> None:
 
 
 def _cross(place: Array) -> Array:
-    """Return four segments (4, 2, 3) around a place (3,)."""
+    """Return the four segments (4, 2, 3) of a cross around a point (3,)."""
     ends = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=np.float64)
     return place + np.stack([_CROSS_MM[0] * ends, _CROSS_MM[1] * ends], axis=1)

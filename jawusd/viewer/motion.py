@@ -17,12 +17,12 @@ from jawusd.formats.keys import Key
 #: Keys of an animation, in the order of their frames.
 KeyTrack = tuple[Key, ...]
 
-_MOST_PER_S = 30.0  # limits the load on the network; screens hardly show more
+_MOST_PER_S = 30.0  # updates per second; limits network load
 
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Hold parameters at rising frames, linear in between."""
+    """Parameters at increasing frames, linearly interpolated."""
 
     name: str
     frames: Array  # frame numbers, shape (F,)
@@ -31,17 +31,17 @@ class Clip:
 
     @classmethod
     def of(cls, name: str, frames: ArrayLike, d: ArrayLike, fps: float) -> Clip:
-        """Make a clip of frame numbers (F,) and parameters (F, 3) [mm]; lost frames (NaN) are bridged.
+        """Return a clip of frame numbers (F,) and parameters (F, 3) [mm]; lost frames (NaN) are interpolated.
 
         Raises:
-            FormatError: no frame has parameters, or the frames do not rise.
+            FormatError: no frame has parameters, or the frames do not increase.
         """
         frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
         known = np.all(np.isfinite(d), axis=1)
         if not known.any():
-            raise FormatError("no frame has parameters; there is nothing to play.", path=name)
+            raise FormatError("no frame has parameters, so there is nothing to play.", path=name)
         if (np.diff(frames[known]) <= 0).any():
-            raise FormatError("its frame numbers do not rise.", path=name)
+            raise FormatError("the frame numbers do not increase.", path=name)
         return cls(name, frames[known], d[known], float(fps))
 
     @property
@@ -50,7 +50,7 @@ class Clip:
         return float(self.frames[0]), float(self.frames[-1])
 
     def at(self, frames: ArrayLike) -> Array:
-        """Return parameters [mm] (..., 3) at frames (...); the first and last one hold outside."""
+        """Return parameters [mm] (..., 3) at frames (...); constant before the first and after the last frame."""
         at = np.asarray(frames, dtype=np.float64)
         return np.stack([np.interp(at, self.frames, column) for column in self.d.T], axis=-1)
 
@@ -65,7 +65,7 @@ def without_key(keys: KeyTrack, frame: float) -> KeyTrack:
     """Return the keys without the one at a frame.
 
     Raises:
-        FormatError: there is none.
+        FormatError: there is no key at that frame.
     """
     kept = tuple(key for key in keys if key.frame != frame)
     if len(kept) == len(keys):
@@ -75,20 +75,20 @@ def without_key(keys: KeyTrack, frame: float) -> KeyTrack:
 
 
 def at_frames(keys: KeyTrack, frames: Sequence[float]) -> KeyTrack:
-    """Return the keys, in their order, at other frames.
+    """Return the keys moved to other frames, in the same order.
 
     Raises:
-        FormatError: not one frame per key, or two keys would share a frame.
+        FormatError: the numbers of frames and keys differ, or two keys would share a frame.
     """
     if len(frames) != len(keys) or len(set(frames)) != len(keys):
-        raise FormatError(f"{len(set(frames))} frames for {len(keys)} keys; each key needs a frame of its own.")
+        raise FormatError(f"{len(set(frames))} frames for {len(keys)} keys: every key needs its own frame.")
     return tuple(Key(frame=float(frame), d=key.d) for key, frame in zip(keys, sorted(frames), strict=True))
 
 
 def frame_after(frame: float, elapsed_s: float, fps: float, span: tuple[float, float], loop: bool) -> float | None:
-    """Return the frame that plays `elapsed_s` seconds after `frame`; None when the end is passed without a loop.
+    """Return the frame to show `elapsed_s` seconds after `frame`; None past the end without a loop.
 
-    Playing starts at the beginning of the span when `frame` lies outside it.
+    Playback starts at the beginning of the span if `frame` lies outside it.
     """
     first, last = span
     if not first <= frame < last:
@@ -96,30 +96,30 @@ def frame_after(frame: float, elapsed_s: float, fps: float, span: tuple[float, f
     frame += elapsed_s * fps
     if frame <= last:
         return frame
-    # The last frame is shown for its own duration before the first one follows.
+    # The last frame is shown for its full duration before playback wraps around.
     return min(first + (frame - first) % (last - first + 1), last) if loop else None
 
 
 class Player:
-    """Step through the frames of a motion in the event loop, one task at a time."""
+    """Playback of a motion in the event loop."""
 
     def __init__(self, show: Callable[[float], None], ended: Callable[[], None]) -> None:
-        """Make a player that calls `show` with every frame number and `ended` whenever it stops."""
+        """Call `show` with every frame number during playback, and `ended` whenever it stops."""
         self._show, self._ended = show, ended
         self._task: asyncio.Task[None] | None = None
 
     @property
     def playing(self) -> bool:
-        """Return whether it plays."""
+        """Return whether playback is running."""
         return self._task is not None
 
     def start(self, frame: float, fps: float, span: tuple[float, float], loop: Callable[[], bool]) -> None:
-        """Play from a frame on; `loop` is evaluated at every step."""
+        """Start playback at a frame; `loop` is evaluated at every step."""
         self.stop()
         self._task = asyncio.get_running_loop().create_task(self._run(frame, fps, span, loop))
 
     def stop(self) -> None:
-        """Stop; does nothing when it does not play."""
+        """Stop playback; no effect when stopped."""
         if self._task is not None:
             self._task.cancel()
             self._task = None

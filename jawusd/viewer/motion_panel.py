@@ -1,4 +1,4 @@
-"""Timeline panel (keys, curves, playback, seeking) and file panel (keys in and out, animations out)."""
+"""Timeline panel (keys, curves, playback, seeking) and file panel (load and save keys, export animations)."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from jawusd.viewer.widgets import Choice, assign, guarded, limit_uploads, named,
 
 KEYS = "keys"
 _LENGTH = 100
-_MOST_THUMBS = 40  # more keys than this are moved with the buttons alone
+_MOST_THUMBS = 40  # no multi-slider for more keys than this
 
 
 class MotionPanel:
-    """Hold the timeline of one page and the frame it shows."""
+    """Timeline of one page and its current frame."""
 
     def __init__(
         self, client: viser.ClientHandle, session: Session, actor: ViewedActor, changed: Callable[[], None]
     ) -> None:
-        """Make the widgets in the present container; call `changed` after every change of the pose or the keys."""
+        """Add the widgets to the current container; call `changed` after every change of pose or keys."""
         self._client, self._session, self._actor, self._changed = client, session, actor, changed
         self._loaded: dict[str, Clip] = {}
         self._copied: tuple[float, float, float] | None = None
@@ -59,22 +59,22 @@ class MotionPanel:
         self.frame = 0.0
 
     def clip(self) -> Clip | None:
-        """Return the motion chosen, None while there are no keys or its file is still being read."""
+        """Return the selected motion; None without keys or while its file is being read."""
         return self._session.key_clip() if self.source.value == KEYS else self._loaded.get(self.source.value)
 
     def add_clip(self, clip: Clip) -> None:
-        """Offer a motion that came from a file of the visitor, and choose it."""
+        """Add a motion from an uploaded file and select it."""
         self._loaded[clip.name] = clip
         self.source.options = tuple(dict.fromkeys((*self.source.options, clip.name)))
         assign(self.source, clip.name)
         self._begin(clip)
 
     def offer_clips(self) -> None:
-        """Offer motions that were added beside the rig."""
+        """Add motions that have appeared beside the rig."""
         self.source.options = tuple(dict.fromkeys((*self.source.options, *self._actor.clip_names())))
 
     def show(self, frame: float) -> None:
-        """Show the chosen motion at a frame."""
+        """Show the selected motion at a frame."""
         self.frame = frame
         clip = self.clip()
         if clip is not None:
@@ -101,7 +101,7 @@ class MotionPanel:
         assign(self.frame_slider, float(round(self.frame)))
 
     def _set_ends(self, clip: Clip | None) -> tuple[float, float]:
-        """Fit the timeline to a motion; return its first and last frame."""
+        """Set the range of the timeline to a motion; return its first and last frame."""
         first, last = (0.0, 0.0) if clip is None else clip.span
         if self.source.value == KEYS:
             first, last = min(first, 0.0), max(last + 25.0, float(_LENGTH))
@@ -127,7 +127,7 @@ class MotionPanel:
             except Exception:
                 assign(self.source, KEYS)
                 raise
-        if self.source.value == name:  # the visitor may have chosen another one while the file was read
+        if self.source.value == name:  # another one may have been selected while the file was read
             self._begin(self.clip())
 
     def _begin(self, clip: Clip | None) -> None:
@@ -147,7 +147,7 @@ class MotionPanel:
             return
         clip = self.clip()
         if clip is None:
-            raise FormatError("there is nothing to play.", hint="Set keys, or choose another motion.")
+            raise FormatError("there is nothing to play.", hint="Set keys, or select another motion.")
         self.play.label, self.play.icon = "stop", viser.Icon.PLAYER_STOP
         fps = self._session.work.fps if self.source.value == KEYS else clip.fps
         self.player.start(self.frame, fps, clip.span, lambda: bool(self.loop.value))
@@ -165,7 +165,7 @@ class MotionPanel:
         elif event.target.value == "copy":
             self._copied = session.work.d
         elif self._copied is None:
-            raise FormatError("nothing was copied yet.", hint='Go to a frame and press "copy".')
+            raise FormatError("nothing has been copied.", hint='Go to a frame and press "copy".')
         else:
             session.set_keys(with_key(session.work.keys, frame, self._copied))
             session.show(self._copied)
@@ -197,7 +197,7 @@ class MotionPanel:
 
 
 class FilePanel:
-    """Hold the widgets that read and write files."""
+    """Widgets that read and write files."""
 
     def __init__(
         self,
@@ -207,7 +207,7 @@ class FilePanel:
         motion: MotionPanel,
         changed: Callable[[], None],
     ) -> None:
-        """Make the widgets in the present container; call `changed` after keys were loaded."""
+        """Add the widgets to the current container; call `changed` after keys were loaded."""
         self._client, self._session, self._actor = client, session, actor
         self._motion, self._changed = motion, changed
         gui = client.gui
@@ -224,7 +224,7 @@ class FilePanel:
     async def _save(self, _: object) -> None:
         saved = self._session.saved_keys()
         if saved is None:
-            raise FormatError("there are no keys to save.", hint='Press "set" under keys.')
+            raise FormatError("there are no keys to save.", hint='Press "set" under "keys".')
         content = _written(lambda path: save_keys(path, saved), "keys.json")
         self._client.send_file_download("keys.json", content, save_immediately=True)
 
@@ -263,12 +263,12 @@ class FilePanel:
     def _to_export(self) -> Clip:
         clip = self._motion.clip()
         if clip is None:
-            raise FormatError("there is no animation to write.", hint='Press "set" under keys.')
+            raise FormatError("there is no animation to write.", hint='Press "set" under "keys".')
         return clip
 
 
 def _written(write: Callable[[Path], None], name: str) -> bytes:
-    """Return the bytes that a function writes to a file."""
+    """Return the bytes a function writes to a file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         write(path)

@@ -1,4 +1,4 @@
-"""One visitor's page of a rig: its session, panels and plots."""
+"""The page of a rig; every visitor has their own session."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from jawusd.viewer.widgets import begin_panel, guarded, small_text
 
 _PANEL_PX, _PLOTS_PX = 350, 310
 _PLACEHOLDER = small_text(
-    "<b>The mandible is a placeholder, no anatomy:</b> the rig was built without its mesh. It shows where the teeth "
-    "and condyles go, not the bone.",
+    "<b>The mandible is a placeholder:</b> the rig was built without a mandible mesh. It shows the motion of teeth and "
+    "condyles, not the shape of the bone.",
     f"color:{VERMILION}",
 )
-_NO_CONTACTS = small_text("The scans do not show how the teeth meet: nothing keeps them apart.", "opacity:.7")
+_NO_CONTACTS = small_text("The scans do not define the occlusion: tooth collisions are not prevented.", "opacity:.7")
 _PLOT_HELP = (
     '<div style="font-size:11px;opacity:.7;padding:0 12px">blue: bound of this person; dashed: outline of the captured '
     "poses; grey: captured poses</div>"
@@ -30,7 +30,7 @@ _PLOT_HELP = (
 
 
 class StaticPlots:
-    """Draw the static parts of a rig's plots, once for all pages."""
+    """Static parts of a rig's plots, drawn once for all pages."""
 
     def __init__(self, rig: JawRig) -> None:
         """Draw the four plots of a rig."""
@@ -40,10 +40,10 @@ class StaticPlots:
 
 
 class PlotPanel:
-    """Hold the plots of one page that follow the jaw: bounds and Posselt's figures."""
+    """Plots of one page that follow the jaw: bounds and Posselt's figures."""
 
     def __init__(self, client: viser.ClientHandle, rig: JawRig, static: StaticPlots) -> None:
-        """Make the panel, docked at the left."""
+        """Add the panel, docked on the left."""
         self._rig, self._static = rig, static
         panel = client.gui.add_panel()
         with panel.add_tab("Bounds and borders"):
@@ -55,7 +55,7 @@ class PlotPanel:
         panel.set_width(_PLOTS_PX)
 
     def refresh(self, d: tuple[float, float, float], inside: bool) -> None:
-        """Mark the present pose [mm]."""
+        """Mark the current pose [mm]."""
         static, places = self._static, landmark_places(self._rig, np.array(d))
         parts = [plot.with_point(d[0], d[axis], inside) for axis, plot in static.bounds.items()]
         parts += [
@@ -65,7 +65,7 @@ class PlotPanel:
 
 
 def begin_page(client: viser.ClientHandle, actor: ViewedActor) -> JawScene:
-    """Draw the jaw, without any panel."""
+    """Draw the jaw without panels."""
     begin_panel(client, actor.name)
     scene = JawScene(client, actor)
     scene.look(FIRST_VIEW)
@@ -76,7 +76,7 @@ class Page:
     """Connect a page's widgets with its session."""
 
     def __init__(self, client: viser.ClientHandle, scene: JawScene, actor: ViewedActor, static: StaticPlots) -> None:
-        """Draw the panels beside the jaw that `begin_page` drew."""
+        """Add the panels beside the jaw drawn by `begin_page`."""
         self.client, self.scene = client, scene
         self.session = Session(actor.rig, actor.fps)
         gui = client.gui

@@ -1,6 +1,6 @@
 """Picks of one visitor, and the layout of picture and scans in which they are made.
 
-The layout frame has x to the right, y down and z away from the eye, in mm. The picture lies in z = 0, centred on the
+The layout frame has x to the right, y down and z away from the camera, in mm. The picture lies in z = 0, centred on the
 origin, scaled so that its teeth are about as large as the scans.
 """
 
@@ -21,19 +21,19 @@ from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.viewed import Region
 
 ARCHES = ("upper", "lower")
-_FEWEST, _FEWEST_VIEWS = 3, 2
+_FEWEST, _FEWEST_VIEWS = 3, 2  # picks per arch, views per pick
 FOV_RAD = 0.35
-#: Rotation of the scans about the subject's vertical and transverse axis [deg], by the side they show.
+#: Rotation of the scans about the subject's vertical and transverse axis [deg] by the side facing the viewer.
 SIDES = {"front": (0.0, 0.0), "left": (-60.0, 0.0), "right": (60.0, 0.0), "biting side": (0.0, 65.0)}
 _TEETH_MM = 60.0  # width of a region around the teeth in the layout
 _GAP_MM = 5.0
-_EDGE = 1e-9  # tolerance, so that no ray passes between two faces
+_EDGE = 1e-9  # tolerance, so that no ray slips between two faces
 _MARGIN = 1.05
 
 
 @dataclass
 class PickDraft:
-    """Hold a pick that may still lack views: a vertex of an arch's scan, its pixel (x, y) by camera."""
+    """A possibly incomplete pick: a vertex of an arch's scan and its pixel (x, y) by camera."""
 
     arch: str
     vertex: int
@@ -41,12 +41,12 @@ class PickDraft:
 
 
 class PickBook:
-    """Collect the picks of one frame.
+    """The picks of one frame.
 
     Attributes:
-        picks: the picks, in the order they were made.
-        frame: the frame of the reference camera that all pixels belong to; None before the first.
-        selected: number of the pick whose pixel the next click in a picture sets; None without picks.
+        picks: the picks in the order they were made.
+        frame: frame of the reference camera that all pixels belong to; None before the first pixel.
+        selected: index of the pick whose pixel the next click sets; None without picks.
     """
 
     def __init__(self, given: Bootstrap | None = None) -> None:
@@ -66,24 +66,24 @@ class PickBook:
         return f"{arch[0].upper()}{sum(pick.arch == arch for pick in self.picks[: number + 1])}"
 
     def add(self, arch: str, vertex: int) -> None:
-        """Select the pick at a vertex, adding it if there is none."""
+        """Select the pick at a vertex, adding it if necessary."""
         same = [k for k, pick in enumerate(self.picks) if (pick.arch, pick.vertex) == (arch, vertex)]
         if not same:
             self.picks.append(PickDraft(arch, vertex))
         self.selected = same[0] if same else len(self.picks) - 1
 
     def see(self, camera: str, frame: int, pixel: tuple[float, float]) -> None:
-        """Set the selected pick's pixel (x, y) in a camera, and select the next pick without one in this camera.
+        """Set the selected pick's pixel (x, y) in a camera, and select the next pick without a pixel in that camera.
 
         Raises:
-            ValueError: no pick is selected, or the pixels of the others belong to another frame.
+            ValueError: no pick is selected, or the other picks belong to another frame.
         """
         if self.selected is None:
-            raise ValueError("no pick is selected: click a vertex of a scan first, or choose a pick in the list")
+            raise ValueError("no pick is selected: click a vertex of a scan first, or select a pick in the list")
         others = any(pick.views for k, pick in enumerate(self.picks) if k != self.selected)
         if self.frame is not None and frame != self.frame and others:
             raise ValueError(
-                f'the picks belong to frame {self.frame}, this is frame {frame}: press "their frame", or "clear" them'
+                f'the picks belong to frame {self.frame}, not {frame}: press "show their frame", or remove "all"'
             )
         pick = self.picks[self.selected]
         if frame != self.frame:
@@ -94,7 +94,7 @@ class PickBook:
         self.selected = next((k for k in rest if camera not in self.picks[k].views), self.selected)
 
     def turn_to(self, camera: str) -> None:
-        """Select the first pick without a pixel in a camera, if there is one."""
+        """Select the first pick without a pixel in a camera, if any."""
         self.selected = next((k for k, pick in enumerate(self.picks) if camera not in pick.views), self.selected)
 
     def forget_view(self, camera: str) -> None:
@@ -116,25 +116,25 @@ class PickBook:
         self.picks, self.frame, self.selected = [], None, None
 
     def lacks(self) -> str:
-        """Return a few words about what is missing before the picks can be written; "" when nothing is."""
+        """Return what is missing before the picks can be written; "" when they are complete."""
         for arch in ARCHES:
             whole = sum(len(pick.views) >= _FEWEST_VIEWS for pick in self.picks if pick.arch == arch)
             if whole < _FEWEST:
-                return f"{arch} teeth: {whole} picks in {_FEWEST_VIEWS} cameras, at least {_FEWEST} are needed"
+                return f"{arch} teeth: {whole} picks with {_FEWEST_VIEWS} views, at least {_FEWEST} are needed"
         for number, pick in enumerate(self.picks):
             if len(pick.views) < _FEWEST_VIEWS:
-                return f"{self.name(number)} is seen by {len(pick.views)} camera, {_FEWEST_VIEWS} are needed"
+                return f"{self.name(number)} has views in {len(pick.views)} of the {_FEWEST_VIEWS} required cameras"
         return ""
 
     def bootstrap(self) -> Bootstrap:
-        """Return the picks as a capture holds them.
+        """Return the picks in the form of the capture file.
 
         Raises:
-            ValueError: something is missing; see `lacks`.
+            ValueError: the picks are incomplete; see `lacks`.
         """
         lacking = self.lacks()
         if lacking or self.frame is None:
-            raise ValueError(f"{lacking}: the picks cannot be written yet")
+            raise ValueError(f"the picks are incomplete: {lacking}")
         upper, lower = (tuple(_finished(pick) for pick in self.picks if pick.arch == arch) for arch in ARCHES)
         return Bootstrap(frame=self.frame, upper=upper, lower=lower)
 
@@ -146,7 +146,7 @@ def _finished(pick: PickDraft) -> Pick:
 
 @dataclass(frozen=True)
 class PickingLayout:
-    """Place one picture of a size [px] and the scans, so that a region of the picture is in view."""
+    """Layout of a picture of a given size [px] and the scans, with a region of the picture in view."""
 
     size_px: tuple[int, int]
     region: Region
@@ -157,13 +157,13 @@ class PickingLayout:
         return max(self.region[2] - self.region[0], 1.0) / _TEETH_MM
 
     def place(self, pixel: ArrayLike) -> Array:
-        """Return the places of pixels (..., 2) in the layout [mm], shape (..., 3)."""
+        """Return the positions of pixels (..., 2) in the layout [mm], shape (..., 3)."""
         middle = (np.array(self.size_px) - 1) / 2
         flat = (np.asarray(pixel, dtype=np.float64) - middle) / self.px_per_mm
         return np.concatenate([flat, np.zeros((*flat.shape[:-1], 1))], axis=-1)
 
     def pixel(self, origin: ArrayLike, direction: ArrayLike) -> tuple[float, float] | None:
-        """Return the pixel that a ray (3,), (3,) meets; None beside the picture."""
+        """Return the pixel hit by a ray, origin and direction (3,); None outside the picture."""
         o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
         if abs(d[2]) < 1e-9 or -o[2] / d[2] <= 0:
             return None
@@ -172,7 +172,7 @@ class PickingLayout:
         return (float(x), float(y)) if -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5 else None
 
     def scan_poses(self, scans: Mapping[str, Mesh], T_anatomical_skull: Array, side: str) -> dict[str, Array]:
-        """Return T_layout_scan (4, 4) of both arches, in front of the picture and below the region, showing a side."""
+        """Return T_layout_scan (4, 4) of both arches: in front of the picture, below the region, showing a side."""
         top = float(self.place([self.region[0], self.region[3]])[1]) + _GAP_MM
         middle = float(self.place([(self.region[0] + self.region[2]) / 2, 0.0])[0])
         found = {}
@@ -193,12 +193,12 @@ class PickingLayout:
         return self.place(np.reshape(self.region, (2, 2)))
 
 
-def eye_to_see(points: ArrayLike, away: ArrayLike, up: ArrayLike, aspect: float) -> tuple[Array, Array]:
-    """Return the nearest eye (3,) and its target (3,) that show all points (n, 3).
+def fit_view(points: ArrayLike, away: ArrayLike, up: ArrayLike, aspect: float) -> tuple[Array, Array]:
+    """Return the closest camera position (3,) and its target (3,) that show all points (n, 3).
 
     Args:
-        away: direction from the target to the eye, shape (3,).
-        up: upwards on the screen, about, shape (3,).
+        away: direction from target to camera, shape (3,).
+        up: approximate up direction on the screen, shape (3,).
         aspect: width over height of the screen.
     """
     p = np.asarray(points, dtype=np.float64)
@@ -215,7 +215,7 @@ def eye_to_see(points: ArrayLike, away: ArrayLike, up: ArrayLike, aspect: float)
 
 
 def region_around(points_px: ArrayLike, size_px: tuple[int, int]) -> Region:
-    """Return the part of a picture around points (n, 2) [px], with some room, inside the picture."""
+    """Return the part of a picture around points (n, 2) [px], padded and clipped to the picture."""
     points = np.asarray(points_px, dtype=np.float64)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = np.maximum(0.18 * (high - low), 0.03 * size_px[0])
@@ -225,7 +225,7 @@ def region_around(points_px: ArrayLike, size_px: tuple[int, int]) -> Region:
 
 
 def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: ArrayLike) -> tuple[int, float] | None:
-    """Return the vertex nearest to where a world ray (3,), (3,) meets a posed scan, and its distance [mm], or None."""
+    """Return the vertex nearest to a world ray's hit on a posed scan and the hit's distance [mm]; None if missed."""
     inverse = se3_inverse(T_world_scan)
     o = transform_point(inverse, np.asarray(origin, dtype=np.float64))
     d = inverse[:3, :3] @ np.asarray(direction, dtype=np.float64)

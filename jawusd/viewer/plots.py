@@ -1,7 +1,7 @@
 """Plots as SVG text: the bounds, Posselt's figures and the curves of an animation.
 
-The static part of a plot is sent once and has an id; the moving part refers to it (`<use>`), so that an update takes a
-few hundred bytes. Text has the page's colour and is legible on light and dark pages.
+The static part of a plot is sent once under an id. Updates refer to it with `<use>` and take a few hundred bytes. Text
+inherits the page's colour, so that it is legible on light and dark pages.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jawusd.evaluator import JawRig
 from jawusd.viewer.motion import Clip, KeyTrack
 from jawusd.viewer.readouts import INCISOR, border_path, captured_d, landmark_places, rest_places
 
-# Okabe and Ito's palette for all kinds of colour vision, also used for the jaw in 3-D.
+# Okabe and Ito's colour-blind safe palette, also used for the jaw in 3-D.
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"
 CURVE_COLORS = (BLUE, VERMILION, GREEN)
 
@@ -29,13 +29,13 @@ _TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
 
 @dataclass(frozen=True)
 class Plot:
-    """Hold a plot whose static part is drawn.
+    """A plot with its static part drawn.
 
     Attributes:
         name: id of the static part in the page.
         static: SVG of axes, outlines and points.
-        low, high: corners of the plotted area in data.
-        across: where the plotted area begins and ends, as shares of the plot's width.
+        low, high: corners of the plotted area in data coordinates.
+        across: start and end of the plotted area as fractions of the plot's width.
     """
 
     name: str
@@ -45,18 +45,18 @@ class Plot:
     across: ClassVar[tuple[float, float]] = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
 
     def definition(self) -> str:
-        """Return the HTML that defines the static part, invisibly; once per page."""
+        """Return hidden HTML that defines the static part; needed once per page."""
         return svg_definition(self.name, self.static)
 
     def with_point(self, x: float, y: float, inside: bool) -> str:
-        """Return the SVG of the plot with the present pose marked."""
+        """Return the SVG of the plot with the current pose marked."""
         px, py = place(self, np.array([[x, y]]))[0]
         mark = f'<circle cx="{px:.1f}" cy="{py:.1f}" r="5" fill="{GREEN if inside else VERMILION}" stroke="white"/>'
         return _svg(f'<use href="#{self.name}"/>{mark}')
 
 
 def bound_plot(rig: JawRig, axis: int) -> Plot:
-    """Draw the paper's outline, the slice bound and captured poses in the plane of d1 and d2 (axis 1) or d3 (2)."""
+    """Plot the paper's outline, the bound's slice and the captured poses over d1 and d2 (axis 1) or d3 (axis 2)."""
     name = ("", "d1d2", "d1d3")[axis]
     corners = rig.arrays[f"polygon_{name}"]
     rings = np.split(corners, np.cumsum(rig.arrays[f"polygon_{name}_counts"])[:-1].astype(int))
@@ -69,7 +69,7 @@ def bound_plot(rig: JawRig, axis: int) -> Plot:
 
 
 def posselt_plot(rig: JawRig, axis: int) -> Plot:
-    """Draw Posselt's figure, the border movements of the lower incisal point.
+    """Plot Posselt's figure: the border movements of the lower incisal point.
 
     Args:
         axis: 1 frontal (x is to the left, d3 = 0), 2 sagittal (x is forward, d2 = 0).
@@ -87,13 +87,13 @@ def posselt_plot(rig: JawRig, axis: int) -> Plot:
 
 
 def posselt_point(places: Array, rest: Array, axis: int) -> tuple[float, float]:
-    """Return the point of landmark places (5, 3) in Posselt's figure `axis`, given those at rest [mm]."""
+    """Return the point of landmarks (5, 3) in Posselt's figure `axis`, given the landmarks at rest [mm]."""
     moved = places[INCISOR] - rest[INCISOR]
     return float(moved[0 if axis == 1 else 2]), float(moved[1])
 
 
 def curve_plot(clip: Clip | None, keys: KeyTrack, span: tuple[float, float]) -> Plot:
-    """Draw d1, d2 and d3 of a motion over the frames of a span, keys as dots."""
+    """Plot d1, d2 and d3 of a motion over a range of frames, with keys as dots."""
     name = "jaw-curves"
     if clip is None:
         empty = f'<text x="{_WIDTH / 2}" y="{_HEIGHT / 2}" text-anchor="middle" {_TEXT}>no keys yet</text>'
@@ -116,7 +116,7 @@ def curve_plot(clip: Clip | None, keys: KeyTrack, span: tuple[float, float]) -> 
 
 
 def with_playhead(plot: Plot, frame: float) -> str:
-    """Return the SVG of a curve plot with a line at the frame shown."""
+    """Return the SVG of a curve plot with a line at the current frame."""
     frame = min(max(frame, plot.low[0]), plot.high[0])
     px = place(plot, np.array([[frame, plot.low[1]]]))[0, 0]
     line = f'<path d="M{px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{ORANGE}" stroke-width="2"/>'
@@ -124,14 +124,14 @@ def with_playhead(plot: Plot, frame: float) -> str:
 
 
 def plot_seek(drawn: str, ends: tuple[float, float], across: tuple[float, float], slider: str) -> str:
-    """Return the HTML of a drawn plot in which a click or drag sets a frame slider to the frame under the pointer.
+    """Return the HTML of a plot in which a click or drag sets a frame slider to the frame under the pointer.
 
-    viser does not report clicks in a plot, so the page does what typing in the slider's box does.
+    viser does not report clicks in a plot, so the page emulates typing into the slider's input.
 
     Args:
         drawn: SVG of the plot, one element.
         ends: first and last frame of its axis.
-        across: their positions, as shares of the plot's width.
+        across: their positions as fractions of the plot's width.
         slider: id of the slider in the page.
     """
     low, high = across
@@ -149,7 +149,7 @@ def plot_seek(drawn: str, ends: tuple[float, float], across: tuple[float, float]
 
 
 def svg_definition(name: str, content: str) -> str:
-    """Return HTML that defines SVG content under an id without showing it."""
+    """Return hidden HTML that defines SVG content under an id."""
     return f'<svg width="0" height="0" style="position:absolute"><defs><g id="{name}">{content}</g></defs></svg>'
 
 
@@ -162,7 +162,7 @@ def _thinned(points: Array) -> Array:
 
 
 def place(plot: Plot, points: Array) -> Array:
-    """Return pixels (n, 2) of data points (n, 2), kept inside the frame."""
+    """Return pixels (n, 2) of data points (n, 2), clipped to the frame."""
     low, high = np.array(plot.low), np.array(plot.high)
     share = np.clip((points - low) / (high - low), 0.0, 1.0)
     x = _LEFT + share[:, 0] * (_WIDTH - _LEFT - _RIGHT)
@@ -171,7 +171,7 @@ def place(plot: Plot, points: Array) -> Array:
 
 
 def framed(name: str, data: Array, title: str, x_label: str, y_label: str, pad_x: bool = True) -> Plot:
-    """Return a plot of axes, ticks and labels that holds data (n, 2)."""
+    """Return a plot with axes, ticks and labels whose range contains data (n, 2)."""
     low, high = data.min(axis=0), data.max(axis=0)
     pad = np.maximum(0.06 * (high - low), 0.5) * (float(pad_x), 1.0)
     low, high = low - pad, high + pad
@@ -194,7 +194,7 @@ def framed(name: str, data: Array, title: str, x_label: str, y_label: str, pad_x
 
 
 def drawn(plot: Plot, parts: list[str]) -> Plot:
-    """Return a plot with more SVG in its static part."""
+    """Return a plot with SVG added to its static part."""
     return replace(plot, static=plot.static + "".join(parts))
 
 

@@ -26,17 +26,17 @@ NAMES = ("opening", "laterotrusion", "protrusion")
 _HINTS = (
     "Opening d1 [mm] along this person's own path.",
     "Laterotrusion d2 [mm] at the incisal point, + to the subject's left.",
-    "Protrusion d3 [mm] relative to this person's path of opening, which itself leads back: + before it, - behind it.",
+    "Protrusion d3 [mm] relative to this person's opening path, which itself leads backwards: + in front, - behind.",
 )
 _DRAG_HELP = small_text(
-    "Drag the jaw itself, too: what you hold follows the pointer as far as this person can move it.", "opacity:.7"
+    "You can also drag the jaw: the grabbed point follows the pointer as far as this person can move.", "opacity:.7"
 )
 _KEYS_HELP = small_text("Undo: Ctrl+Z, redo: Ctrl+Shift+Z (Mac: Cmd)", "opacity:.7")
-_MARGIN_HELP = "How far the pose lies inside the bound of this person's jaw, in d; negative outside."
-_CAPTURED_HELP = "Distance in d to the nearest pose of the take: the farther, the more the model has made up."
-_VALID_HELP = "What this parameter may be at the present value of the others."
-_MOVED_HELP = "From its place in the closed bite, in anatomical axes: to the subject's left, down, forward."
-# How far sliders reach beyond the ranges of the rig while poses outside are allowed.
+_MARGIN_HELP = "Distance of the pose from this person's bound, in d; negative outside."
+_CAPTURED_HELP = "Distance in d to the nearest captured pose: the larger it is, the more the model extrapolates."
+_VALID_HELP = "Valid range of this parameter at the current values of the others."
+_MOVED_HELP = "Displacement from the closed bite, in anatomical axes: to the subject's left, down, forward."
+# Fraction by which sliders extend beyond the ranges of the rig while poses outside are allowed.
 _BEYOND = 0.25
 _PINNABLE = tuple(name for name in LANDMARKS if not name.startswith("molar"))
 _LEGEND = "<br>".join(
@@ -47,12 +47,12 @@ _NOTHING = np.full((8, 8, 3), 255, np.uint8)
 
 
 class PosePanel:
-    """Hold the widgets that pose the jaw; `sliders` are those of d1, d2, d3 [mm]."""
+    """Widgets that pose the jaw; `sliders` are those of d1, d2, d3 [mm]."""
 
     def __init__(
         self, client: viser.ClientHandle, session: Session, scene: JawScene, changed: Callable[[], None]
     ) -> None:
-        """Make the widgets in the present container; call `changed` after every change."""
+        """Add the widgets to the current container; call `changed` after every change."""
         self._client, self._session, self._scene, self._changed = client, session, scene, changed
         gui = client.gui
         self.sliders = [self._add_slider(index, label) for index, label in enumerate(f"{name} [mm]" for name in NAMES)]
@@ -62,11 +62,11 @@ class PosePanel:
         self.reading = gui.add_html("")
         gui.add_button_group("history", ("undo", "redo", "close jaw")).on_click(guarded(client, self._step))
         gui.add_html(_KEYS_HELP)
-        with gui.add_folder("Hold while dragging"):
+        with gui.add_folder("Pin while dragging"):
             self.pins = {name: self._add_pin(name) for name in _PINNABLE}
         with gui.add_folder("View"):
             gui.add_button_group("look from", tuple(PRESETS)).on_click(guarded(client, self._look))
-            gui.add_checkbox("paths and captured places", True).on_update(guarded(client, self._show_paths))
+            gui.add_checkbox("paths and captured positions", True).on_update(guarded(client, self._show_paths))
             add_dark_checkbox(client)
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(client, self._undo))
         gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift").on_trigger(guarded(client, self._redo))
@@ -135,12 +135,12 @@ class PosePanel:
 
 
 def slider_ends(limits: Array, d_range: Array, keep_valid: bool) -> list[tuple[float, float]]:
-    """Return low and high end of the three sliders [mm].
+    """Return lower and upper end of the three sliders [mm].
 
     Args:
-        limits: valid ends at the present pose, shape (3, 2) [mm].
-        d_range: ends of the rig as a whole, shape (3, 2) [mm].
-        keep_valid: use `limits`, rounded inwards to the step of the sliders, instead of a widened `d_range`.
+        limits: valid range at the current pose, shape (3, 2) [mm].
+        d_range: overall range of the rig, shape (3, 2) [mm].
+        keep_valid: use `limits`, rounded inwards to the slider step, instead of the widened `d_range`.
     """
     if keep_valid:
         return [(_outwards(low, 1), _outwards(high, -1)) for low, high in limits]
@@ -149,12 +149,12 @@ def slider_ends(limits: Array, d_range: Array, keep_valid: bool) -> list[tuple[f
 
 
 def _outwards(value: float, sign: int) -> float:
-    """Return a value rounded down (sign -1) or up (1) to the step of the sliders, up to rounding noise."""
+    """Return a value rounded down (sign -1) or up (1) to the slider step, ignoring rounding noise."""
     return round(sign * math.ceil(sign * value / STEP_MM - 1e-6) * STEP_MM, 6)
 
 
 def verdict_html(readout: Readout) -> str:
-    """Return in words and colour whether a pose is one that the person can take, as HTML."""
+    """Return HTML that says in words and colour whether a pose is inside the bound."""
     color, verdict = (GREEN, "inside the bound") if readout.inside else (VERMILION, "OUTSIDE the bound")
     margin = f'<span title="{_MARGIN_HELP}">margin {_plain(readout.margin_mm)} mm</span>'
     return small_text(f'<b style="color:{color}">&#9679; {verdict}</b>, {margin}', "padding-top:6px")
@@ -162,7 +162,7 @@ def verdict_html(readout: Readout) -> str:
 
 def reading_html(readout: Readout, d: tuple[float, float, float], limits: Array) -> str:
     """Return the numbers of a pose as HTML."""
-    captured = f"{readout.captured_mm:.2f} mm" if math.isfinite(readout.captured_mm) else "nothing captured"
+    captured = f"{readout.captured_mm:.2f} mm" if math.isfinite(readout.captured_mm) else "no captured poses"
     rows = [
         ("incisal point moved", _moved(readout.incisor_mm), _MOVED_HELP),
         ("left condyle moved", _moved(readout.condyle_left_mm), _MOVED_HELP),
@@ -180,7 +180,7 @@ def reading_html(readout: Readout, d: tuple[float, float, float], limits: Array)
 
 
 def _plain(value: float) -> str:
-    """Return a number of mm with two decimals and no minus in front of zero."""
+    """Format a length in mm with two decimals and no negative zero."""
     return f"{round(value, 2) + 0.0:.2f}"
 
 
@@ -196,7 +196,7 @@ def _moved(moved_mm: tuple[float, float, float]) -> str:
 
 
 class ContactPanel:
-    """Hold the picture of both arches; it is drawn only while it is switched on."""
+    """Picture of both arches with their contacts, drawn only while switched on."""
 
     def __init__(
         self,
@@ -205,7 +205,7 @@ class ContactPanel:
         draw: Callable[[Array], NDArray[np.uint8]],
         changed: Callable[[], None],
     ) -> None:
-        """Make the widgets in the present container; call `changed` when the picture is switched on or off."""
+        """Add the widgets to the current container; call `changed` when the picture is switched on or off."""
         self._rig, self._draw, self._changed = rig, draw, changed
         self._drawn: tuple[float, float, float] | None = None
         gui = client.gui
@@ -219,7 +219,7 @@ class ContactPanel:
         self._changed()
 
     def refresh(self, d: tuple[float, float, float]) -> None:
-        """Show the contacts of a pose [mm] if the picture is switched on."""
+        """Show the contacts of a pose [mm] if the picture is on."""
         if not self.shown.value or d == self._drawn:
             return
         try:
@@ -230,6 +230,6 @@ class ContactPanel:
         clear = float(self._rig.clearance(d).clearance_mm)
         color, word = (GREEN, "") if clear >= -AUTHORED_MM else (VERMILION, ": teeth collide")
         head = f'<div style="color:{color}">clearance {clear:.2f} mm{word}</div>'
-        foot = "Upper and lower teeth, fronts up, the subject's left on the right."
+        foot = "Upper and lower teeth, front teeth at the top, the subject's left on the right."
         self.text.content = small_text(f"{head}{_LEGEND}<br>{foot}", "line-height:1.35")
         self._drawn = d

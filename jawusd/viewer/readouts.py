@@ -1,4 +1,4 @@
-"""A pose of the jaw in clinical measures, and the paths of landmarks."""
+"""Clinical measures of a jaw pose, and paths of landmarks."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ INCISOR, CONDYLES = LANDMARKS.index("incisor"), (LANDMARKS.index("condyle_left")
 
 @dataclass(frozen=True)
 class Readout:
-    """Hold what is shown of one pose.
+    """The measures shown for one pose.
 
     Attributes:
         incisor_mm, condyle_left_mm, condyle_right_mm: displacement of the incisal point and of the condyle centres to
             the subject's left, up and forward.
         margin_mm: signed distance to the bound, > 0 inside.
-        captured_mm: distance in d to the nearest captured pose; infinite without any.
-        inside: d lies inside the bound.
+        captured_mm: distance in d to the nearest captured pose; infinite if there are none.
+        inside: whether d lies inside the bound.
     """
 
     incisor_mm: tuple[float, float, float]
@@ -35,7 +35,7 @@ class Readout:
 
 
 def landmark_places(rig: JawRig, d: Array) -> Array:
-    """Return the landmarks, anatomical frame [mm], shape (..., 5, 3), for d (..., 3) [mm]."""
+    """Return the landmarks for d (..., 3) [mm], anatomical frame [mm], shape (..., 5, 3)."""
     T = rig.T_anatomical_skull @ rig.pose(d)
     return transform_points(T, rig.landmarks)
 
@@ -47,7 +47,7 @@ def rest_places(rig: JawRig) -> Array:
 
 
 def read_out(rig: JawRig, d: Array) -> Readout:
-    """Measure the pose of parameters d (3,) [mm]."""
+    """Return the measures of the pose of parameters d (3,) [mm]."""
     moved = landmark_places(rig, d) - rest_places(rig)
     margin = float(rig.margin(d))
     incisor, left, right = (triple(moved[index]) for index in (INCISOR, *CONDYLES))
@@ -56,13 +56,13 @@ def read_out(rig: JawRig, d: Array) -> Readout:
 
 
 def triple(values: Array) -> tuple[float, float, float]:
-    """Return an array of three as floats."""
+    """Return an array of three as a tuple of floats."""
     x, y, z = values.tolist()
     return x, y, z
 
 
 def captured_d(rig: JawRig) -> Array:
-    """Return the parameters of the captured poses that a rig holds [mm], shape (N, 3)."""
+    """Return the parameters of the captured poses stored in a rig [mm], shape (N, 3)."""
     return rig.captured_d
 
 
@@ -73,7 +73,7 @@ def habitual_path(rig: JawRig, samples: int = 60) -> Array:
 
 
 def border_path(rig: JawRig, axis: int, samples: int = 40) -> Array:
-    """Return a ring of parameters (n, 3) [mm] on the bound in the plane of d1 and d2 (axis 1) or d3 (axis 2)."""
+    """Return a closed curve of parameters (n, 3) [mm] on the bound, over d1 and d2 (axis 1) or d1 and d3 (axis 2)."""
     # Samples are denser at both ends, where the bound closes.
     low, high = rig.d_range[0]
     opening = low + (high - low) * 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, samples)))

@@ -1,4 +1,4 @@
-"""Correct the labels of the teeth scans with a brush."""
+"""Editing the crown, gum and base labels of the teeth scans with a brush: label state and its panel."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh
 from jawusd.viewer.viewed import ViewedCapture
 from jawusd.viewer.widgets import Choice, enable, guarded, say, small_text
 
-#: What the brush paints, by the name on its button.
+#: Label painted by each button.
 BRUSHES = {"crown": TOOTH, "gum": GUM, "base": BASE}
 _HELP = (
-    "White is crown, red gum, blue base. Click on a scan to paint around the place clicked. Only the line between "
-    "crown and gum matters to the tracking; what lies below the gum does not."
+    "White: crown, red: gum, blue: base. Click on a scan to paint around the clicked point. Tracking uses only the "
+    "line between crown and gum; labels below the gum have no effect."
 )
 _RADIUS_MM = (0.3, 8.0, 0.1, 1.5)  # smallest, largest, step, first
 
 
 class ScanBrush:
-    """Hold the labels of both scans of one page.
+    """Editable labels of both scans of one page, with undo.
 
     Attributes:
-        labels: of `formats.mesh` per vertex, uint8 (V,), by arch.
-        changed: arches whose labels differ from those saved.
+        labels: label of every vertex as in `formats.mesh`, uint8 (V,), by arch.
+        changed: arches with unsaved labels.
     """
 
     def __init__(self, scans: Mapping[str, Mesh], labels: Mapping[str, NDArray[np.uint8]]) -> None:
@@ -38,7 +38,7 @@ class ScanBrush:
         self.changed: set[str] = set()
 
     def paint(self, arch: str, vertex: int, radius_mm: float, label: int) -> int:
-        """Label the surface within a radius of a vertex, as far as it hangs together there; return how many change."""
+        """Label the connected surface within a radius of a vertex; return the number of vertices changed."""
         near = surface_near(self._scans[arch], vertex, radius_mm)
         near = near[self.labels[arch][near] != label]
         if len(near):
@@ -49,11 +49,11 @@ class ScanBrush:
 
     @property
     def strokes(self) -> int:
-        """Return how many strokes can be taken back."""
+        """Return the number of strokes that can be undone."""
         return len(self._strokes)
 
     def undo(self) -> str | None:
-        """Take back the last stroke; return its arch, None where there is none."""
+        """Undo the last stroke; return its arch, None if there is none."""
         if not self._strokes:
             return None
         arch, where, before = self._strokes.pop()
@@ -62,11 +62,11 @@ class ScanBrush:
         return arch
 
     def saved(self, arch: str) -> None:
-        """Note that the labels of an arch are written."""
+        """Mark the labels of an arch as saved."""
         self.changed.discard(arch)
 
     def faces_with(self, arch: str, label: int) -> Mask:
-        """Return which faces of an arch are drawn as crown, gum or base, shape (F,): by most of their corners."""
+        """Return which faces of an arch have a label at most of their corners, shape (F,)."""
         corner = self.labels[arch][self._scans[arch].faces]
         tooth = ((corner != GUM) & (corner != BASE)).sum(axis=1) >= 2
         base = (corner == BASE).sum(axis=1) >= 2
@@ -74,11 +74,11 @@ class ScanBrush:
 
 
 def surface_near(mesh: Mesh, vertex: int, radius_mm: float) -> Indices:
-    """Return the vertices within a radius of one that faces inside the radius connect with it."""
+    """Return the vertices connected to a vertex by faces within a radius of it."""
     inside = np.linalg.norm(mesh.vertices - mesh.vertices[vertex], axis=1) <= radius_mm
     faces = mesh.faces[inside[mesh.faces].all(axis=1)]
     members = np.flatnonzero(inside)
-    # Vertices at the same place are one: triangle soups share none.
+    # Merge coincident vertices, since the triangles of a soup share none.
     place = np.unique(mesh.vertices[members], axis=0, return_inverse=True)[1].reshape(-1)
     of_vertex = np.full(len(mesh.vertices), -1, np.int64)
     of_vertex[members] = place
@@ -94,11 +94,11 @@ def surface_near(mesh: Mesh, vertex: int, radius_mm: float) -> Indices:
 
 
 class ScanLabelsPanel:
-    """Hold the widgets of the brush.
+    """Widgets of the brush.
 
     Attributes:
         brush: the labels.
-        label: that is painted.
+        label: the label that a click paints.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class ScanLabelsPanel:
         turned: Callable[[], None],
         painted: Callable[[str], None],
     ) -> None:
-        """Make the widgets in the present container; call `turned` on or off, `painted` with an arch to draw again."""
+        """Add the widgets to the current container; call `turned` when switched, `painted` with an arch to redraw."""
         self._client, self._capture, self._turned, self._painted = client, capture, turned, painted
         self.brush = ScanBrush(capture.scans, capture.labels)
         self.label = BRUSHES["crown"]
@@ -139,7 +139,7 @@ class ScanLabelsPanel:
         enable(self.undo, self.brush.strokes > 0)
         name = next(name for name, label in BRUSHES.items() if label == self.label)
         unsaved = " and ".join(sorted(self.brush.changed))
-        state = f"paints {name}; {self.brush.strokes} strokes; "
+        state = f"painting {name}; {self.brush.strokes} strokes; "
         self._state.content = small_text(state + (f"not saved: {unsaved}" if unsaved else "all saved"))
 
     async def _turn(self, _: object) -> None:
@@ -157,10 +157,14 @@ class ScanLabelsPanel:
         self._say_state()
 
     async def _write(self, _: object) -> None:
-        """Save both arches: what was looked at and left as it is, is accepted as well."""
+        """Save both arches: an arch left unchanged counts as accepted."""
         paths = []
         for arch, labels in self.brush.labels.items():
             paths.append(await asyncio.to_thread(self._capture.save_labels, arch, labels.copy()))
             self.brush.saved(arch)
         self._say_state()
-        say(self._client, "Written", f"{' and '.join(path.name for path in paths)}; track or build again to use them")
+        say(
+            self._client,
+            "Written",
+            f"{' and '.join(path.name for path in paths)}; run track or build again to use them",
+        )

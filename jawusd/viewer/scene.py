@@ -1,4 +1,4 @@
-"""The jaw in 3-D: meshes, paths, markers and the camera. World of the page: anatomical frame, mm."""
+"""3-D scene of the jaw: meshes, paths, markers and camera. The page's world is the anatomical frame in mm."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ Color = tuple[int, int, int]
 _ENAMEL, _GUM, _BONE = (236, 229, 212), (196, 112, 108), (222, 207, 178)
 _COLORS = {"upper_teeth": _ENAMEL, "lower_teeth": _ENAMEL, "upper_gum": _GUM, "lower_gum": _GUM}
 _OUTSIDE: Color = (222, 120, 90)
-_PLACEHOLDER: Color = (150, 158, 168)  # not anatomy: not the colour of bone, and translucent
+_PLACEHOLDER: Color = (150, 158, 168)  # distinct from bone
 _CLEAR = 0.45  # opacity of a translucent mandible
 _INCISOR, _CONDYLE, _PIN, _HELD = (0, 114, 178), (0, 158, 115), (230, 159, 0), (213, 94, 0)
 _SKULL_OPACITY = 0.28
 _GROUND: Color = (196, 190, 186)
 _AMBIENT = 1.6
 _MARKER_MM, _PIN_MM = 1.2, 2.2
-_BALL = 2  # subdivisions of a marker (320 faces)
+_BALL = 2  # icosphere subdivisions of a marker (320 faces)
 _CAPTURED_MM, _MOST_CAPTURED = 0.5, 400
 
-#: Views by name: from the target to the camera, in anatomical axes [mm].
+#: Views by name: offset from target to camera, anatomical axes [mm].
 PRESETS = {
     "front": (0.0, 10.0, 330.0),
     "left": (330.0, 10.0, 0.0),
@@ -39,26 +39,26 @@ PRESETS = {
     "condyle left": (105.0, 12.0, 40.0),
     "condyle right": (-105.0, 12.0, 40.0),
 }
-#: The view that pages begin with.
+#: Initial view of a page.
 FIRST_VIEW = "front"
-#: Width over height of the picture below which it is that of a phone, whose panel covers the lower half.
+#: Aspect ratio (width over height) below which the screen is a phone, whose panel covers the lower half.
 PHONE = 0.6
-_NARROW = 0.75  # below this width over height the eye steps back, so that the jaw is not wider than the picture
-_LOWER = 0.25  # share of the picture's height by which the eye of a phone aims below the jaw
+_NARROW = 0.75  # aspect ratio below which the camera moves back, so that the jaw fits the width
+_LOWER = 0.25  # fraction of the picture height by which the camera aims below the jaw on a phone
 _FOV_RAD, _NEAR_MM, _FAR_MM = 0.6, 1.0, 5000.0
 
 
 class JawScene:
-    """Draw the jaw for one page; `grips` are the meshes that can be dragged."""
+    """3-D scene of one page; `grips` are the meshes that can be dragged."""
 
     def __init__(self, client: viser.ClientHandle, actor: ViewedActor) -> None:
-        """Draw the skull side and the jaw in the closed bite."""
+        """Draw skull and jaw in the closed bite."""
         self._client, self._scene = client, client.scene
         rig = actor.rig
         self._T_world_skull = np.array(rig.T_anatomical_skull)
         self._rest = rest_places(rig)
         self._scene.configure_default_lights(cast_shadow=False)
-        # Hemisphere light: an environment map takes half of a frame's time on machines without a graphics card.
+        # A hemisphere light: without a GPU, an environment map takes half of the frame time.
         self._scene.configure_environment_map(None)
         self._scene.add_light_hemisphere("/light", ground_color=_GROUND, intensity=_AMBIENT)
         for name in STILL:
@@ -87,7 +87,7 @@ class JawScene:
         self.show_pins({})
 
     def _add_mesh(self, name: str, mesh: Mesh, color: Color, opacity: float | None) -> viser.MeshHandle:
-        # Drawing both sides of faces costs twice as much and is needed for open meshes only.
+        # Two-sided faces cost twice as much; only open meshes need them.
         side: Literal["front", "double"] = "front" if is_solid(mesh) else "double"
         return self._scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=color, opacity=opacity, side=side)
 
@@ -109,7 +109,7 @@ class JawScene:
         return self._scene.add_line_segments(name, ends, colors=color, thickness=2.5, thickness_units="screen")
 
     def _add_paths(self, actor: ViewedActor) -> list[viser.SceneNodeHandle]:
-        """Draw the paths of incisal point and condyles in plain opening, and their captured places."""
+        """Draw the opening paths of incisal point and condyles, and their captured positions."""
         d = captured_d(actor.rig)
         captured = landmark_places(actor.rig, d[:: max(1, -(-len(d) // _MOST_CAPTURED))])
         path = habitual_path(actor.rig)
@@ -132,12 +132,12 @@ class JawScene:
         return handles
 
     def show_paths(self, visible: bool) -> None:
-        """Show or hide paths and captured places."""
+        """Show or hide paths and captured positions."""
         for handle in self._paths:
             handle.visible = visible
 
     def move(self, T_skull_mandible: Array, inside: bool) -> None:
-        """Pose the mandible, in another colour when the pose is not valid."""
+        """Pose the mandible, coloured if the pose is invalid."""
         T = self._T_world_skull @ T_skull_mandible
         with self._client.atomic():
             self._jaw.position = tuple(T[:3, 3])
@@ -147,7 +147,7 @@ class JawScene:
         self._inside = inside
 
     def show_hold(self, held_skull: Array | None, pointer_skull: Array | None) -> None:
-        """Mark the held point and a line to the pointer, both (3,) [mm] in the skull frame; None hides them."""
+        """Mark the grabbed point and draw a line to the pointer, both (3,) [mm] in the skull frame; None hides them."""
         visible = held_skull is not None and pointer_skull is not None
         if held_skull is not None and pointer_skull is not None:
             ends = transform_points(self._T_world_skull, np.stack([held_skull, pointer_skull]))
@@ -157,7 +157,7 @@ class JawScene:
             self._held.visible = self._line.visible = visible
 
     def show_pins(self, places_skull: dict[str, Array]) -> None:
-        """Mark pinned landmarks at their places (3,) [mm], skull frame."""
+        """Mark pinned landmarks at their positions (3,) [mm], skull frame."""
         for name, ball in self._pins.items():
             if name in places_skull:
                 ball.position = tuple(transform_point(self._T_world_skull, places_skull[name]))
@@ -165,11 +165,11 @@ class JawScene:
                 ball.visible = name in places_skull
 
     def skull_from_page(self, position: tuple[float, float, float]) -> Array:
-        """Return a place of the page's world in the skull frame [mm], shape (3,)."""
+        """Transform a position from the page's world to the skull frame [mm], shape (3,)."""
         return transform_point(se3_inverse(self._T_world_skull), np.array(position))
 
     def look(self, preset: str) -> None:
-        """Move the camera to a preset; in a close-up the condyle's path shows through the mandible."""
+        """Move the camera to a preset; close-ups of a condyle make the mandible translucent."""
         camera = self._client.camera
         target, eye = preset_view(self._rest, preset, camera.image_width / max(camera.image_height, 1))
         if self._mandible is not None and self._bone != _PLACEHOLDER:
@@ -179,7 +179,7 @@ class JawScene:
 
 
 def preset_view(rest: Array, preset: str, aspect: float = 1.0) -> tuple[Array, Array]:
-    """Return target (3,) and eye (3,) of a preset [mm].
+    """Return target (3,) and camera position (3,) of a preset [mm].
 
     Args:
         rest: landmarks at rest, shape (5, 3) [mm].
@@ -196,7 +196,7 @@ def preset_view(rest: Array, preset: str, aspect: float = 1.0) -> tuple[Array, A
 
 
 def set_first_view(server: viser.ViserServer, rest: Array, preset: str = FIRST_VIEW) -> None:
-    """Let every page start with a preset, given the landmarks (5, 3) at rest [mm]."""
+    """Start every page with a preset view, given the landmarks (5, 3) at rest [mm]."""
     target, eye = preset_view(rest, preset)
     server.scene.set_up_direction("+y")
     first = server.initial_camera

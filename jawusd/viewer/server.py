@@ -1,4 +1,4 @@
-"""Serve the viewer to browsers on this machine."""
+"""Serve the viewer to browsers, by default only on this machine."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from jawusd.viewer.widgets import set_theme
 
 log = logging.getLogger(__name__)
 
-# Panels occupy a browser without a graphics card for most of a second: the jaw is sent this much earlier [s].
+# Without a GPU, building the panels blocks a browser for most of a second: send the jaw this much earlier [s].
 _HEAD_START_S = 0.5
-_SHOW_EVERY_S = 0.1  # poses that come live
+_SHOW_EVERY_S = 0.1  # shortest interval between live poses
 
 
 class _OneLine(logging.Filter):
-    """Report a connection that ended by an error in one line: any program may send bytes that mean nothing."""
+    """Log failed connections in one line without traceback, since any program may send invalid bytes."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Replace a traceback by the error's name; keep every record."""
+        """Replace the traceback by the error's name; drop no record."""
         if record.exc_info and record.exc_info[1] is not None:
-            log.debug("a connection ended by an error", exc_info=record.exc_info)
+            log.debug("a connection failed", exc_info=record.exc_info)
             record.msg, record.args = (
-                "a page was disconnected, it sent what cannot be read (%s)",
+                "disconnected a page that sent an invalid message (%s)",
                 (_words(record.exc_info[1]),),
             )
             record.exc_info = record.exc_text = None
@@ -51,11 +51,11 @@ _ONE_LINE = _OneLine()
 
 
 def _report_task(loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-    """Report in one line that a message of a page could not be followed."""
+    """Log in one line that a message of a page failed."""
     error = context.get("exception")
-    log.warning("a message of a page could not be followed (%s)", _words(error or context.get("message")))
+    log.warning("a message of a page failed (%s)", _words(error or context.get("message")))
     if isinstance(error, BaseException):
-        log.debug("its error", exc_info=error)
+        log.debug("error of that message", exc_info=error)
 
 
 def _words(error: object) -> str:
@@ -64,11 +64,11 @@ def _words(error: object) -> str:
 
 
 class _LocalServer(viser.ViserServer):
-    """A viser server that opens no public tunnel, which any page could request."""
+    """A viser server that never opens a public tunnel, which any page could request."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Refuse to share through viser's relay."""
-        log.warning("a page asked for a public address; the viewer gives none")
+        log.warning("refused a page's request for a public address")
         return None
 
 
@@ -78,20 +78,20 @@ class _Closable(Protocol):
 
 
 class PageServer(ABC):
-    """Serve one page per visitor; `pages` holds the open ones by client number, `url` is the address to open."""
+    """Server with one page per visitor; `pages` are the open ones by client number, `url` is the address to open."""
 
     def __init__(self, name: str, host: str, port: int) -> None:
-        """Start serving on a port: 0 takes any free one, a port in use the next free one.
+        """Start serving on a port; 0 means any free port, and a port in use means the next free one.
 
         Raises:
-            OutputError: the address is not this machine's.
+            OutputError: the address does not belong to this machine.
         """
         self._host = host
         self.pages: dict[int, _Closable] = {}
         _check_address(host)
         with contextlib.redirect_stdout(sys.stderr):  # viser prints a greeting; stdout is for results
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
-        logging.getLogger("websockets.server").addFilter(_ONE_LINE)  # adding it again changes nothing
+        logging.getLogger("websockets.server").addFilter(_ONE_LINE)  # repeated calls have no effect
         self._server.get_event_loop().set_exception_handler(_report_task)
         set_theme(self._server.gui)
         self._server.on_client_connect(self._welcome)
@@ -100,17 +100,17 @@ class PageServer(ABC):
 
     async def _welcome(self, client: viser.ClientHandle) -> None:
         if not self._trusted(client):
-            log.warning("refused a page that belongs to another site")
+            log.warning("refused a page of another site")
             return
         page = await self._page(client)
         if client.client_id in self._server.get_clients():
             self.pages[client.client_id] = page
-        else:  # disconnected before the page was complete
+        else:  # the visitor disconnected before the page was complete
             page.close()
 
     @abstractmethod
     async def _page(self, client: viser.ClientHandle) -> _Closable:
-        """Return the page of a visitor."""
+        """Build the page of a visitor."""
 
     async def _farewell(self, client: viser.ClientHandle) -> None:
         page = self.pages.pop(client.client_id, None)
@@ -118,7 +118,7 @@ class PageServer(ABC):
             page.close()
 
     def _trusted(self, client: viser.ClientHandle) -> bool:
-        """Return whether the page came from this server: browsers let pages of any site connect to localhost."""
+        """Return whether the page came from this server; browsers let pages of any site connect to localhost."""
         request = self._server._websock_server._live_connections[client.client_id].request
         if request is None:
             return False
@@ -135,10 +135,10 @@ class PageServer(ABC):
 
 
 class Viewer(PageServer):
-    """Serve a rig."""
+    """Server of a rig."""
 
     def __init__(self, actor: ViewedActor, host: str, port: int) -> None:
-        """Start serving an actor; see `PageServer` for the rest."""
+        """Start serving an actor; see `PageServer`."""
         self._actor = actor
         self._static = StaticPlots(actor.rig)
         self._shown_s = -math.inf
@@ -146,7 +146,7 @@ class Viewer(PageServer):
         set_first_view(self._server, self._static.rest)
 
     def show(self, d: Array) -> None:
-        """Show a pose of the jaw [mm] (3,) on all open pages; what comes faster than browsers draw is left out."""
+        """Show a pose of the jaw [mm] (3,) on all open pages; poses that arrive too fast to draw are dropped."""
         now = time.monotonic()
         if now - self._shown_s < _SHOW_EVERY_S:
             return
@@ -163,10 +163,10 @@ class Viewer(PageServer):
 
 
 class CaptureViewer(PageServer):
-    """Serve a capture."""
+    """Server of a capture."""
 
     def __init__(self, capture: ViewedCapture, host: str, port: int) -> None:
-        """Start serving a capture; see `PageServer` for the rest."""
+        """Start serving a capture; see `PageServer`."""
         self._capture = capture
         super().__init__(capture.name, host, port)
         capture_scene.set_first_view(self._server)
@@ -176,7 +176,7 @@ class CaptureViewer(PageServer):
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address is reached from this machine alone."""
+    """Return whether an address is reachable only from this machine."""
     if host == "localhost":
         return True
     try:
@@ -186,12 +186,12 @@ def is_loopback(host: str) -> bool:
 
 
 def is_own_page(host: str, origin: str | None, local: bool) -> bool:
-    """Return whether a connection comes from a page that this server sent.
+    """Return whether a connection comes from a page of this server.
 
     Args:
         host: the Host header, name and port.
-        origin: the Origin header; programs other than browsers send none.
-        local: the server listens on this machine alone; another name in `host` then means DNS rebinding.
+        origin: the Origin header; only browsers send one.
+        local: whether the server listens on a loopback address; another name in `host` then means DNS rebinding.
     """
     name = urlsplit(f"//{host}").hostname or ""
     if local and not is_loopback(name):
@@ -200,10 +200,10 @@ def is_own_page(host: str, origin: str | None, local: bool) -> bool:
 
 
 def _check_address(host: str) -> None:
-    """Check that an address can be listened on, since viser would search for a free port forever.
+    """Check that an address can be bound, since viser would search for a free port forever.
 
     Raises:
-        OutputError: it cannot.
+        OutputError: the address cannot be bound.
     """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
@@ -211,5 +211,6 @@ def _check_address(host: str) -> None:
             probe.bind(address)
     except OSError as error:
         raise OutputError(
-            f"cannot listen on {host}: {error.strerror}.", hint="The default, 127.0.0.1, is reached from this machine."
+            f"cannot listen on {host}: {error.strerror}.",
+            hint="Use the default, 127.0.0.1, for browsers on this machine.",
         ) from error

@@ -1,4 +1,4 @@
-"""The state of one visitor's work with a rig: parameters, pins, keys, undo; independent of the page."""
+"""State of one visitor's work on a rig: parameters, pins, keys and undo. Independent of the page."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from jawusd.viewer.readouts import Readout, read_out, triple
 
 Interpolation = Literal["linear", "smooth"]
 
-# Weight of a pinned landmark relative to the point under the pointer (squared distances): 5 mm of pull move it by a
-# fraction of a millimetre where the jaw could follow either.
+# Weight of a pinned landmark relative to the dragged point (squared distances): a pull of 5 mm moves the pin by a
+# fraction of a millimetre.
 _PIN_WEIGHT = 100.0
 _MOST_UNDO = 200
 _SHARES = np.linspace(1.0, 0.0, 65)
@@ -28,7 +28,7 @@ _SHARES = np.linspace(1.0, 0.0, 65)
 
 @dataclass(frozen=True)
 class Pin:
-    """Hold a landmark's place when it was pinned, mandible and skull frame [mm]."""
+    """Position of a landmark when it was pinned, mandible and skull frame [mm]."""
 
     name: str
     p_mandible: tuple[float, float, float]
@@ -37,7 +37,7 @@ class Pin:
 
 @dataclass(frozen=True)
 class Work:
-    """Hold everything that undo restores."""
+    """The state that undo restores."""
 
     d: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pins: tuple[Pin, ...] = ()
@@ -47,10 +47,10 @@ class Work:
 
 
 class Session:
-    """Let one visitor pose, drag and key a rig; with `keep_valid` sliders stay inside the bound."""
+    """Posing, dragging and keying of a rig by one visitor; with `keep_valid` sliders stay inside the bound."""
 
     def __init__(self, rig: JawRig, fps: float) -> None:
-        """Start at the closed bite, without keys."""
+        """Start in the closed bite without keys."""
         self.rig = rig
         self.work = Work(d=triple(rig.project(np.zeros(3))), fps=fps)
         self.keep_valid = True
@@ -58,32 +58,32 @@ class Session:
         self._redo: list[Work] = []
         self._gesture: str | None = None
         self._handle: Array | None = None
-        self._played: tuple[tuple[Keys, bool], Clip] | None = None  # what the clip was made of, and the clip
+        self._played: tuple[tuple[Keys, bool], Clip] | None = None  # cached clip and the keys it was made from
 
     @property
     def d(self) -> Array:
-        """Return the parameters now [mm], shape (3,)."""
+        """Return the current parameters [mm], shape (3,)."""
         return np.array(self.work.d)
 
     @property
     def dragging(self) -> bool:
-        """Return whether a point of the mandible is held."""
+        """Return whether a point of the mandible is grabbed."""
         return self._handle is not None
 
     def pose(self) -> Array:
-        """Return T_skull_mandible now, shape (4, 4)."""
+        """Return the current T_skull_mandible, shape (4, 4)."""
         return self.rig.pose(self.d)
 
     def readout(self) -> Readout:
-        """Return the measures of the pose now."""
+        """Return the measures of the current pose."""
         return read_out(self.rig, self.d)
 
     def limits(self) -> Array:
-        """Return the limits of each parameter [mm], shape (3, 2): low and high.
+        """Return the lower and upper limit of each parameter [mm], shape (3, 2).
 
-        The opening may use its whole range. d2 and d3 have the limits that are valid at the present opening and the
-        present value of the other one; if there are none, those with the other one at 0; otherwise both limits are the
-        value itself.
+        The opening has its full range. The limits of d2 and d3 are those valid at the current opening and the current
+        value of the other one. If no value is valid there, the other one is taken as 0, and failing that both limits
+        are the current value.
         """
         d = self.d
         alone = np.array(self.rig.ranges(d[0])).reshape(2, 2)
@@ -93,9 +93,9 @@ class Session:
         return np.vstack([self.rig.d_range[0], found])
 
     def set_parameter(self, index: int, value: float) -> None:
-        """Set d1, d2 or d3 (index 0 .. 2) [mm], as a slider does; successive moves of one are one step for undo.
+        """Set d1, d2 or d3 (index 0 .. 2) [mm] from a slider; successive moves of one slider are a single undo step.
 
-        With `keep_valid` a new opening scales d2 and d3 down until they are valid; d2 and d3 stop at the bound.
+        With `keep_valid`, changing the opening scales d2 and d3 down until they are valid; d2 and d3 stop at the bound.
 
         Raises:
             ValueError: the value is not finite.
@@ -108,17 +108,17 @@ class Session:
         self._change(f"d{index + 1}", replace(self.work, d=triple(kept)))
 
     def set_pose(self, d: ArrayLike) -> None:
-        """Move all parameters [mm] (3,) at once, inside the bound if `keep_valid`."""
+        """Set all parameters [mm] (3,); with `keep_valid` they are moved inside the bound."""
         d = np.asarray(d, dtype=np.float64)
         self._change(None, replace(self.work, d=triple(self._inside(d) if self.keep_valid else d)))
 
     def show(self, d: ArrayLike) -> None:
-        """Show parameters [mm] (3,) of a motion unchanged and without an undo step."""
+        """Show parameters [mm] (3,) of a motion, unchanged and without an undo step."""
         self.work = replace(self.work, d=triple(np.asarray(d, dtype=np.float64)))
         self._gesture = None
 
     def set_keep_valid(self, keep: bool) -> None:
-        """Switch whether sliders stay inside; switching it on brings the pose inside."""
+        """Set whether sliders stay inside the bound; switching it on moves the pose inside."""
         self.keep_valid = bool(keep)
         self._gesture = None
         if keep and not self.rig.is_inside(self.d):
@@ -128,7 +128,7 @@ class Session:
         return d if self.rig.is_inside(d) else self.rig.project(d)
 
     def _kept(self, d: Array, index: int) -> Array:
-        """Return d (3,) brought inside, moving the parameter `index` as little as the bound allows."""
+        """Return d (3,) moved inside the bound, changing parameter `index` as little as possible."""
         if float(self.rig.margin(d)) >= 0.0:
             return d
         d = d.copy()
@@ -143,18 +143,18 @@ class Session:
         return self._inside(d)
 
     def grab(self, p_skull: ArrayLike) -> None:
-        """Take hold of the point of the mandible that is now at p_skull [mm] (3,), skull frame."""
+        """Grab the point of the mandible at p_skull [mm] (3,), skull frame."""
         self._handle = transform_point(se3_inverse(self.pose()), np.asarray(p_skull, dtype=np.float64))
         self._gesture = None
 
     def drag_to(self, p_skull: ArrayLike) -> float:
-        """Move the held point towards p_skull [mm] (3,), skull frame: inverse kinematics from the last pose, pins held.
+        """Move the grabbed point towards p_skull [mm] (3,), skull frame, by inverse kinematics that respects the pins.
 
         Returns:
-            Distance left between the held point and p_skull [mm].
+            Remaining distance between the grabbed point and p_skull [mm].
 
         Raises:
-            RuntimeError: nothing is held.
+            RuntimeError: nothing is grabbed.
         """
         if self._handle is None:
             raise RuntimeError("drag_to before grab")
@@ -167,16 +167,16 @@ class Session:
         return float(np.linalg.norm(transform_point(self.rig.pose(d), self._handle) - target))
 
     def release(self) -> None:
-        """Let go of the held point."""
+        """Release the grabbed point."""
         self._handle = None
         self._gesture = None
 
     def held_place(self) -> Array | None:
-        """Return the held point now [mm], skull frame, shape (3,); None when nothing is held."""
+        """Return the position of the grabbed point [mm], skull frame, shape (3,); None if nothing is grabbed."""
         return None if self._handle is None else transform_point(self.pose(), self._handle)
 
     def set_pin(self, name: str, on: bool) -> None:
-        """Pin one of `geometry.LANDMARKS` at its place, or unpin it. Pins hold while dragging; sliders move them."""
+        """Pin or unpin one of `geometry.LANDMARKS`. Pins constrain dragging, not sliders."""
         pins = tuple(pin for pin in self.work.pins if pin.name != name)
         if on:
             place = self.rig.landmarks[LANDMARKS.index(name)]
@@ -188,10 +188,10 @@ class Session:
         self._change(None, replace(self.work, keys=keys))
 
     def move_keys(self, frames: Sequence[float], shown: float) -> None:
-        """Move the keys to other frames and show the frame `shown`; successive moves are one step for undo.
+        """Move the keys to other frames and show the frame `shown`; successive moves are a single undo step.
 
         Raises:
-            FormatError: not one frame per key, or two keys would share a frame.
+            FormatError: the numbers of frames and keys differ, or two keys would share a frame.
         """
         self._change("move keys", replace(self.work, keys=at_frames(self.work.keys, frames)))
         clip = self.key_clip()
@@ -199,7 +199,7 @@ class Session:
             self.work = replace(self.work, d=triple(clip.at(shown)))
 
     def add_key(self, frame: float) -> None:
-        """Set a key of the pose now at a frame; a key that was there is replaced."""
+        """Set a key with the current pose at a frame, replacing any key there."""
         self.set_keys(with_key(self.work.keys, frame, self.work.d))
 
     def load_keys(self, loaded: Keys) -> None:
@@ -208,26 +208,26 @@ class Session:
         self._change(None, work)
 
     def set_interpolation(self, interpolation: Interpolation) -> None:
-        """Choose how the jaw moves between keys."""
+        """Set the interpolation between keys."""
         self._change(None, replace(self.work, interpolation=interpolation))
 
     def set_fps(self, fps: float) -> None:
         """Set the frames per second.
 
         Raises:
-            ValueError: not more than 0.
+            ValueError: the rate is out of range.
         """
         if not 0 < fps <= 1000:
             raise ValueError(f"fps must be above 0 and at most 1000, got {fps}")
         self._change("fps", replace(self.work, fps=float(fps)))
 
     def saved_keys(self) -> Keys | None:
-        """Return the keys as they are saved, None without any."""
+        """Return the keys in the form of a file; None without keys."""
         work = self.work
         return Keys(fps=work.fps, interpolation=work.interpolation, keys=work.keys) if work.keys else None
 
     def key_clip(self) -> Clip | None:
-        """Return the animation of the keys, None without any: as `jawusd animate` writes it, inside if `keep_valid`."""
+        """Return the animation of the keys as `jawusd animate` writes it, inside if `keep_valid`; None without keys."""
         saved = self.saved_keys()
         if saved is None:
             return None
@@ -244,11 +244,11 @@ class Session:
         return Clip("keys", times, d, saved.fps)
 
     def undo(self) -> bool:
-        """Take the last change back; return whether there was one."""
+        """Undo the last change; return whether there was one."""
         return self._step(self._undo, self._redo)
 
     def redo(self) -> bool:
-        """Make the last change that was taken back again; return whether there was one."""
+        """Redo the last undone change; return whether there was one."""
         return self._step(self._redo, self._undo)
 
     def _step(self, source: list[Work], other: list[Work]) -> bool:
@@ -260,7 +260,7 @@ class Session:
         return True
 
     def _change(self, gesture: str | None, work: Work) -> None:
-        """Replace the work; successive changes of one gesture are one step for undo."""
+        """Replace the work; successive changes of one gesture are a single undo step."""
         if gesture is None or gesture != self._gesture:
             self._undo.append(self.work)
             del self._undo[:-_MOST_UNDO]

@@ -33,10 +33,10 @@ _COVERAGE_TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
 _STATUS: dict[int, str] = {
     LOST: "lost",
     TRACKED: "tracked",
-    RECOVERED: "found again",
+    RECOVERED: "recovered",
     PARTIAL: "tracked without one camera",
 }
-_COLORS = (ORANGE, BLUE)  # upper, lower, as the outlines in the pictures
+_COLORS = (ORANGE, BLUE)  # upper, lower; same as the outlines in the pictures
 _NAMES = ("d1 opening", "d2 laterotrusion", "d3 protrusion")
 _BAND = 2.0  # sigmas: 95 % of normal errors
 _MOST_SAMPLES = 400
@@ -44,19 +44,19 @@ _STRIP_PX = 6
 
 
 def frames_to_inspect(tracks: Tracks, fps: float) -> list[int]:
-    """Return frames to inspect, the worst first, no two within half a second: lost ones, then by coverage.
+    """Return frames to inspect, worst first and at least half a second apart: lost frames, then by coverage.
 
-    Those of a solve are ordered by `doubt`.
+    Frames of a solve are ordered by `severity`.
     """
     if tracks.solved is not None:
-        badness = doubt(tracks.solved)
+        badness = severity(tracks.solved)
     else:
         badness = np.where(tracks.tracked(), np.fmax.reduce(uncovered_percent(tracks), axis=1), np.inf)
     return [int(tracks.frames[index]) for index in worst_frames(badness, tracks.frames, fps, _MOST_WORST)]
 
 
 def frame_words(tracks: Tracks, frame: int) -> str:
-    """Return HTML about the tracking, or the solve, of a frame."""
+    """Return HTML that describes the tracking or the solve of a frame."""
     if tracks.solved is not None:
         return solve_words(tracks, tracks.solved, frame)
     index = tracks.row_of(frame)
@@ -70,22 +70,22 @@ def frame_words(tracks: Tracks, frame: int) -> str:
         state = f"lost, {tracks.explain_loss(index, arch)}" if code == LOST else _STATUS.get(int(code), "?")
         parts.append(f'<span style="color:{color}">&#9632;</span> {name}: {state}{area}')
     if tracks.prior_aided[index]:
-        parts.append("the jaw model helped")
+        parts.append("regularised by the jaw model")
     return "<br>".join(parts)
 
 
 class CoveragePlot:
-    """Draw the uncovered area of both arches over the frames, once, and a playhead over it.
+    """Uncovered mask area of both arches over the frames: a static plot with a moving playhead.
 
     Attributes:
-        definition: HTML that defines the plot, invisibly.
-        across: where the axis begins and ends, as shares of the plot's width.
+        definition: hidden HTML that defines the plot.
+        across: start and end of the axis as fractions of the plot's width.
     """
 
     across = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
 
     def __init__(self, tracks: Tracks, span: tuple[int, int], worst: list[int]) -> None:
-        """Draw tracks over a span of frames and mark the worst ones."""
+        """Plot tracks over a range of frames and mark the worst ones."""
         self._span = span
         percent = uncovered_percent(tracks)
         self._top = max(float(np.nanmax(percent, initial=0.1)) * 1.08, 0.1)
@@ -93,7 +93,7 @@ class CoveragePlot:
         parts = [
             f'<rect x="{_LEFT}" y="{_TOP}" width="{_WIDTH - _LEFT - _RIGHT}" height="{bottom - _TOP}" fill="none" '
             f'stroke="{GREY}"/>',
-            f'<text x="{_LEFT}" y="13" {_COVERAGE_TEXT} font-weight="bold">mask area left uncovered [%]</text>',
+            f'<text x="{_LEFT}" y="13" {_COVERAGE_TEXT} font-weight="bold">uncovered mask area [%]</text>',
         ]
         lost = f'stroke="{VERMILION}" stroke-opacity=".4"'
         parts += [self._vertical(int(frame), lost) for frame in tracks.frames[~tracks.tracked()]]
@@ -111,7 +111,7 @@ class CoveragePlot:
         self.definition = svg_definition("jaw-coverage", "".join(parts))
 
     def with_playhead(self, frame: int) -> str:
-        """Return the SVG of the plot with a line at the frame shown."""
+        """Return the SVG of the plot with a line at the current frame."""
         line = self._vertical(frame, 'stroke="currentColor" stroke-width="1.5"')
         box = f'viewBox="0 0 {_WIDTH} {_HEIGHT}" width="100%" style="display:block"'
         return f'<svg {box}><use href="#jaw-coverage"/>{line}</svg>'
@@ -127,7 +127,7 @@ class CoveragePlot:
         return f'<path d="M{self._x(frame):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" {style}/>'
 
     def _curve(self, frames: NDArray[np.int64], percent: Array, color: str) -> str:
-        """Return a curve that breaks where there is no value."""
+        """Return a curve with gaps where values are missing."""
         steps, pen = [], "M"
         for frame, value in zip(frames, percent, strict=True):
             if np.isfinite(value):
@@ -137,17 +137,17 @@ class CoveragePlot:
 
 
 class SolvePlot:
-    """Draw the jaw of a solved take, once, and a playhead over it.
+    """d of a solved take with its expected error: a static plot with a moving playhead.
 
     Attributes:
-        definition: HTML that defines the plot, invisibly.
-        across: where the axis begins and ends, as shares of the plot's width.
+        definition: hidden HTML that defines the plot.
+        across: start and end of the axis as fractions of the plot's width.
     """
 
     across = Plot.across
 
     def __init__(self, tracks: Tracks, solved: SolvedJaw, span: tuple[int, int]) -> None:
-        """Draw a solved take over a span of frames; bands are two sigmas, a strip below shows the states."""
+        """Plot a solved take over a range of frames, with bands of two sigma and a strip for the states."""
         step = max(1, -(-len(tracks.frames) // _MOST_SAMPLES))
         frames = tracks.frames[::step].astype(np.float64)
         d, sigma = solved.d[::step], solved.sigma_mm[::step]
@@ -166,7 +166,7 @@ class SolvePlot:
         self.definition = self._plot.definition()
 
     def with_playhead(self, frame: int) -> str:
-        """Return the SVG of the plot with a line at the frame shown."""
+        """Return the SVG of the plot with a line at the current frame."""
         return with_playhead(self._plot, frame)
 
     @staticmethod
@@ -177,7 +177,7 @@ class SolvePlot:
 
     @staticmethod
     def _strip(plot: Plot, tracks: Tracks, solved: SolvedJaw, state: SolveState) -> str:
-        """Return a bar along the axis where the take is in a state."""
+        """Return a bar along the axis for the frames in a state."""
         rows = np.flatnonzero(solved.state == state)
         runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
         ends = [(float(tracks.frames[run[0]]) - 0.5, float(tracks.frames[run[-1]]) + 0.5) for run in runs]
@@ -187,7 +187,7 @@ class SolvePlot:
 
 
 def solve_words(tracks: Tracks, solved: SolvedJaw, frame: int) -> str:
-    """Return HTML about the solve of a frame, with the colours of its outlines."""
+    """Return HTML that describes the solve of a frame, in the colours of its outlines."""
     row = tracks.row_of(frame)
     if row is None:
         return "not solved"
@@ -205,8 +205,8 @@ def solve_words(tracks: Tracks, solved: SolvedJaw, frame: int) -> str:
     return "<br>".join(parts)
 
 
-def doubt(solved: SolvedJaw) -> Array:
-    """Return how doubtful each frame is, shape (F,): those the rig does not allow first, then by expected error."""
+def severity(solved: SolvedJaw) -> Array:
+    """Return the priority of each frame for inspection, shape (F,): invalid poses first, then by expected error."""
     worst = solved.sigma_mm.max(axis=1)
     return np.where(solved.valid, worst, worst + 1e3 - np.minimum(solved.margin_mm, 0.0))
 

@@ -1,4 +1,4 @@
-"""What the viewer shows: an actor or a capture, its file functions, and meshes reduced for a screen."""
+"""Inputs of the viewer: an actor or a capture with the functions that read and write its files, and display meshes."""
 
 from __future__ import annotations
 
@@ -18,74 +18,74 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
 from jawusd.viewer.motion import Clip
 
-#: Names of meshes: the first three stand still (skull frame), the others move (mandible frame).
+#: Names of meshes: the fixed ones (skull frame) and the moving ones (mandible frame).
 STILL, MOVING = ("skull", "upper_teeth", "upper_gum"), ("mandible", "lower_teeth", "lower_gum")
 
 Look = Literal["outlines", "tinted", "footage"]
-#: Left, top, right, bottom of a part of a picture [px].
+#: A part of a picture: left, top, right, bottom [px].
 Region = tuple[float, float, float, float]
-_STEPS, _NEAR = 8, 0.93  # share of the wanted number of faces that ends the search
+_STEPS, _NEAR = 8, 0.93  # iterations; stop above this fraction of the requested number of faces
 
 
 @dataclass(frozen=True, eq=False)
 class ViewedActor:
-    """Hold an actor to be viewed."""
+    """An actor to view."""
 
     name: str
     rig: JawRig
-    # by the names of `STILL` and `MOVING` [mm], already decimated for a screen; any may be missing
+    # by the names in `STILL` and `MOVING` [mm], decimated for display; each is optional
     meshes: Mapping[str, Mesh]
-    placeholders: frozenset[str]  # names of meshes that only stand in for anatomy
+    placeholders: frozenset[str]  # names of meshes that are placeholders, not anatomy
     fps: float  # frames per second of new animations
     folder: Path  # of the rig; animations are written there
-    # lists the motions available now: the captured take and the animation layers beside the rig
+    # returns the available motions: the captured take and the animation layers beside the rig
     clip_names: Callable[[], tuple[str, ...]]
-    load_clip: Callable[[str], Clip]  # reads one of them; raises a JawusdError
+    load_clip: Callable[[str], Clip]  # reads a motion by name; raises a JawusdError
     # writes an animation layer (file name, clip, overwrite) beside the rig and returns its path; raises a JawusdError
     save_layer: Callable[[str, Clip, bool], Path]
-    # d (3,) [mm] to a picture of both arches with their contacts, RGB (h, w, 3); raises a JawusdError; None where the
-    # rig does not know how the teeth meet
+    # maps d (3,) [mm] to a picture of both arches with their contacts, RGB (h, w, 3); raises a JawusdError; None if the
+    # rig has no occlusion
     contacts: Callable[[Array], NDArray[np.uint8]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ViewedCapture:
-    """Hold a capture to be viewed."""
+    """A capture to view."""
 
     name: str
     fps: float
     frames: tuple[int, int]  # first and last frame to step through, of the reference camera, both inclusive
     offsets: Mapping[str, int]  # frame k of a camera shows the instant of frame k + offset of the reference camera
-    # (width, height) of the pictures by camera, for every camera with footage, in the capture's order
+    # (width, height) of the pictures of every camera with footage, in the capture's order
     sizes_px: Mapping[str, tuple[int, int]]
     cameras: Mapping[str, Camera]  # calibrated cameras by name; empty without a calibration
     scans: Mapping[str, Mesh]  # the teeth by arch, "upper" and "lower" [mm], vertices as in their files
     crowns: Mapping[str, Mask]  # which faces of a scan are teeth, shape (F,); the others are gum
     labels: Mapping[str, NDArray[np.uint8]]  # GUM, TOOTH, BOUNDARY or BASE per vertex of a scan, shape (V,), by arch
     T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
-    tracks: Tracks | None  # tracked poses; None without
-    picks: Bootstrap | None  # of the capture file; None without
-    # (camera, frame of the reference camera, T_world_upper and T_world_lower or None, look) to RGB (h, w, 3) uint8,
-    # gray where the camera has no picture; raises a JawusdError
+    tracks: Tracks | None  # tracked poses, if any
+    picks: Bootstrap | None  # picks of the capture file, if any
+    # maps (camera, frame of the reference camera, T_world_upper and T_world_lower or None, look) to RGB (h, w, 3)
+    # uint8, gray if the camera has no picture; raises a JawusdError
     picture: Callable[[str, int, tuple[Array, Array] | None, Look], NDArray[np.uint8]]
-    # the same without a camera: all of them side by side, in pictures of the size `wall_px`; the function given last is
-    # called with the picture so far while cameras are being decoded
+    # the same for all cameras side by side, each of the size `wall_px`; the last argument is called with partial
+    # pictures while cameras are being decoded
     wall: Callable[
         [int, tuple[Array, Array] | None, Look, Callable[[NDArray[np.uint8]], None] | None], NDArray[np.uint8]
     ]
     wall_px: tuple[int, int]
-    # (camera, frame) to the region of the teeth in its masks, None without masks
+    # maps (camera, frame) to the region of the teeth in its masks, None without masks
     teeth_region: Callable[[str, int], Region | None]
-    # poses that agree with picks, T_world_upper and T_world_lower (4, 4), and the names of the picks that do not fit;
+    # fits T_world_upper and T_world_lower (4, 4) to picks, and returns them with the names of inconsistent picks;
     # raises a JawusdError
     poses_of_picks: Callable[[Bootstrap], tuple[tuple[Array, Array], list[str]]]
-    # writes picks to the capture file, given those read from it before; raises a JawusdError
+    # writes picks to the capture file, given those read before; raises a JawusdError
     save_picks: Callable[[Bootstrap, Bootstrap | None], None]
-    # writes the labels of an arch that a person has seen, and returns the file; raises a JawusdError
+    # writes the approved labels of an arch and returns the file; raises a JawusdError
     save_labels: Callable[[str, NDArray[np.uint8]], Path]
 
     def tracked_poses(self, frame: int) -> tuple[Array, Array] | None:
-        """Return T_world_upper and T_world_lower of a frame, NaN where lost; None where nothing was tracked."""
+        """Return T_world_upper and T_world_lower of a frame, NaN where lost; None if the frame was not tracked."""
         row = None if self.tracks is None else self.tracks.row_of(frame)
         if self.tracks is None or row is None:
             return None
@@ -93,10 +93,10 @@ class ViewedCapture:
 
 
 def for_view(mesh: Mesh, most_faces: int) -> Mesh:
-    """Return a mesh decimated to at most `most_faces` faces for display; the mesh itself when it has no more.
+    """Return a mesh decimated to at most `most_faces` faces for display; meshes that are small enough are unchanged.
 
     Vertex clustering (Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993).
-    The number of faces goes with the inverse square of the grid's cell, which gives every next cell.
+    The face count is inversely proportional to the square of the cell size, which gives the next cell size to try.
     """
     if len(mesh.faces) <= most_faces:
         return mesh
@@ -120,7 +120,7 @@ def for_view(mesh: Mesh, most_faces: int) -> Mesh:
 
 
 def is_solid(mesh: Mesh) -> bool:
-    """Return whether a mesh is closed with its faces outwards, so that no back face is visible from outside."""
+    """Return whether a mesh is closed and oriented outwards, so that no back face is visible from outside."""
     a, b, c = mesh.faces.T.astype(np.int64)
     starts, ends = np.concatenate([a, b, c]), np.concatenate([b, c, a])
     count = len(mesh.vertices)
@@ -131,7 +131,7 @@ def is_solid(mesh: Mesh) -> bool:
 
 
 def _clustered(mesh: Mesh, cell_mm: float) -> Mesh:
-    """Return the mesh with one vertex, the mean, per occupied cell."""
+    """Return the mesh with the vertices of each grid cell merged to their mean."""
     cells = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell_mm).astype(np.int64)
     sizes = cells.max(axis=0) + 1
     flat = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
@@ -144,7 +144,7 @@ def _clustered(mesh: Mesh, cell_mm: float) -> Mesh:
     faces = owner[mesh.faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # Cyclic permutations of three vertices are the same face; flipped ones are its other side.
+    # Cyclic permutations of three vertices are the same face; a flipped one is its back.
     first = faces.argmin(axis=1)[:, None]
     turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
     return Mesh(means, np.unique(turned, axis=0), colors)

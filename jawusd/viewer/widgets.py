@@ -1,4 +1,4 @@
-"""Shared by all pages: theme, messages, guarded callbacks, small text and uploads."""
+"""Elements shared by all pages: theme, messages, guarded callbacks, small text and uploads."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Value = TypeVar("Value")
 #: The event of a button group.
 Choice = viser.GuiEvent[viser.GuiButtonGroupHandle]
 MOST_BYTES = 8 << 20
-_MOST_LETTERS = 80  # of a name in messages
+_MOST_LETTERS = 80  # of a file name in messages
 
 
 def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
@@ -31,7 +31,7 @@ def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
     gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, dark_mode=dark)
 
 
-# viser's page has no title of its own, and on phones (its breakpoint) a narrow panel that hides half of the picture.
+# Sets the page title and, below viser's phone breakpoint, widens the panel, which would hide half of the picture.
 _STYLE = """<style onload="document.title={title}">
 @media (max-width: 36em) {{
   .mantine-Paper-root:has(.jawusd-page) {{ width: 100% !important; max-height: 50% !important; }}
@@ -41,14 +41,14 @@ _STYLE = """<style onload="document.title={title}">
 
 
 def begin_panel(client: viser.ClientHandle, name: str) -> None:
-    """Set the theme, name a page after what it shows, and let its panel fill the width of a phone."""
+    """Set theme and title of a page, and let its panel fill the width of a phone."""
     set_theme(client.gui)
     client.gui.set_panel_label(name)
     client.gui.add_html(_STYLE.format(title=html.escape(json.dumps(f"{name} - jawusd"))))
 
 
 def add_dark_checkbox(client: viser.ClientHandle) -> None:
-    """Add the checkbox that makes the page dark."""
+    """Add the checkbox for dark mode."""
     box = client.gui.add_checkbox("dark page", False)
 
     async def darken(_: object) -> None:
@@ -58,9 +58,9 @@ def add_dark_checkbox(client: viser.ClientHandle) -> None:
 
 
 def assign(widget: viser.GuiInputHandle[Value], value: Value) -> None:
-    """Set the value of a widget where it differs, which saves a message to the page."""
+    """Set the value of a widget if it differs, which avoids redundant messages to the page."""
     if widget.value != value:
-        widget.value = value  # type: ignore[misc]  # viser's setter is not next to its getter, so mypy misses it
+        widget.value = value  # type: ignore[misc]  # mypy does not find viser's setter
 
 
 class _Widget(Protocol):
@@ -69,7 +69,7 @@ class _Widget(Protocol):
 
 
 def enable(widget: _Widget, on: bool) -> None:
-    """Let a widget be used, or show that it does not apply now: groups of buttons, which viser cannot disable, go."""
+    """Enable or disable a widget; button groups, which viser cannot disable, are hidden."""
     if isinstance(widget, viser.GuiButtonGroupHandle):
         if widget.visible != on:
             widget.visible = on
@@ -83,17 +83,17 @@ def small_text(html: str, style: str = "") -> str:
 
 
 def say(client: viser.ClientHandle, title: str, body: str, *, bad: bool = False) -> None:
-    """Show a message in a page; one of a failure (`bad`) stays until it is closed."""
+    """Show a message in a page; failures (`bad`) stay until they are closed."""
     client.add_notification(title, body, color="red" if bad else "teal", auto_close_seconds=None if bad else 5.0)
 
 
 @contextlib.contextmanager
 def errors_shown(client: viser.ClientHandle) -> Iterator[None]:
-    """Show errors in the page instead of raising them, so that one page's error does not stop the server."""
+    """Show errors in the page instead of raising them, so that they do not stop the server."""
     try:
         yield
     except (JawusdError, ValueError) as error:
-        say(client, "That did not work", str(error), bad=True)
+        say(client, "Failed", str(error), bad=True)
     except Exception as error:
         log.exception("unexpected error in the viewer")
         say(client, "Unexpected error", f"{type(error).__name__}: {error}", bad=True)
@@ -102,9 +102,9 @@ def errors_shown(client: viser.ClientHandle) -> Iterator[None]:
 def guarded(
     client: viser.ClientHandle, action: Callable[[Event], Coroutine[object, None, None]]
 ) -> Callable[[Event], Coroutine[object, None, None]]:
-    """Return a callback for a visitor's events that shows errors in the page.
+    """Wrap a callback for a visitor's events so that errors are shown in the page.
 
-    Events without a client come from the program itself (a slider that was set) and are ignored.
+    Events without a client come from the program itself, which has set a widget, and are ignored.
     """
 
     @functools.wraps(action)
@@ -117,24 +117,24 @@ def guarded(
 
 
 def named(upload: viser.UploadedFile, suffixes: tuple[str, ...]) -> tuple[str, str]:
-    """Return the name of an upload, for messages, and which of the suffixes it has.
+    """Return the name of an upload for messages, and its suffix.
 
     Raises:
-        FormatError: it has none of them.
+        FormatError: the suffix is not one of those allowed.
     """
     name = PurePosixPath(upload.name.replace("\\", "/")).name
     shown = "".join(letter if letter.isprintable() else "?" for letter in name[-_MOST_LETTERS:])
     suffix = next((suffix for suffix in suffixes if name.lower().endswith(suffix)), None)
     if suffix is None:
-        raise FormatError(f"is none of {', '.join(suffixes)}.", path=shown)
+        raise FormatError(f"is not a {' or '.join(suffixes)} file.", path=shown)
     return shown, suffix
 
 
 def limit_uploads(client: viser.ClientHandle, button: viser.GuiUploadButtonHandle | None) -> None:
-    """Drop uploads while they arrive that are larger than `MOST_BYTES`, more than one, or not for the page's button.
+    """Abort uploads that are larger than `MOST_BYTES`, concurrent, or not meant for the page's button.
 
-    viser keeps the parts of an upload until the last one has arrived, without a limit, for any widget that is named;
-    its handlers run before these.
+    viser buffers the parts of an upload without a limit, for any widget named in the message. Its handlers run
+    before these.
     """
     gui = client.gui
     pending = gui._current_file_upload_states
@@ -142,21 +142,21 @@ def limit_uploads(client: viser.ClientHandle, button: viser.GuiUploadButtonHandl
     def drop(transfer: str, why: str) -> None:
         state = pending.pop(transfer, None)
         if state is not None:
-            say(client, "That did not work", f"{state['filename'][-_MOST_LETTERS:]}: {why}", bad=True)
+            say(client, "Failed", f"{state['filename'][-_MOST_LETTERS:]}: {why}", bad=True)
 
     async def started(_: int, message: _messages.FileTransferStartUpload) -> None:
         if button is None or message.source_component_uuid != button._impl.uuid:
-            drop(message.transfer_uuid, "this page takes no such files.")
+            drop(message.transfer_uuid, "this page does not accept that file.")
         elif message.size_bytes > MOST_BYTES:
-            drop(message.transfer_uuid, f"is {message.size_bytes} bytes, at most {MOST_BYTES} are read.")
+            drop(message.transfer_uuid, f"is {message.size_bytes} bytes; the limit is {MOST_BYTES}.")
         elif len(pending) > 1:
-            drop(message.transfer_uuid, "another file is on its way; wait for it.")
+            drop(message.transfer_uuid, "another upload is in progress; wait for it to finish.")
 
     async def part_received(_: int, message: _messages.FileTransferPart) -> None:
         state = pending.get(message.transfer_uuid)
-        # A page may announce less than it sends.
+        # A page may send more than it has announced.
         if state is not None and state["transferred_bytes"] > MOST_BYTES:
-            drop(message.transfer_uuid, f"is {state['transferred_bytes']} bytes, at most {MOST_BYTES} are read.")
+            drop(message.transfer_uuid, f"is {state['transferred_bytes']} bytes; the limit is {MOST_BYTES}.")
 
     gui._websock_interface.register_handler(_messages.FileTransferStartUpload, started)
     gui._websock_interface.register_handler(_messages.FileTransferPart, part_received)

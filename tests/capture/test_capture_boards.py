@@ -158,7 +158,7 @@ def test_the_sharper_of_two_frames_is_taken(tmp_path):
 def test_a_wrong_corner_count_is_named_with_the_right_one(tmp_path, cols, rows):
     videos = write_pictures(tmp_path, pictures(board(), T_world_board=POSES[:3]))
     with pytest.raises(
-        CalibrationError, match=rf"c0: the board has 9 x 6 inner corners, \[boards\] says {cols} x {rows}"
+        CalibrationError, match=rf"c0: the board has 9 x 6 inner corners, but \[boards\] describes {cols} x {rows}"
     ):
         find_boards(NAMES, board(cols=cols, rows=rows, videos=videos), quiet)
 
@@ -170,7 +170,7 @@ ABOUT_CHARUCO = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm":
 def test_a_charuco_board_of_another_size_is_told_by_its_markers(tmp_path, cols, rows, last):
     shown = board(**ABOUT_CHARUCO, cols=7, rows=5)
     videos = write_pictures(tmp_path, pictures(shown, charuco, T_world_board=POSES[:3]))
-    message = rf"c0: the board has markers 0 to 23, one of {cols} x {rows} inner corners has 0 to {last}\."
+    message = rf"c0: the board has markers 0 to 23, but a board of {cols} x {rows} inner corners has 0 to {last}\."
     with pytest.raises(CalibrationError, match=message):
         find_boards(NAMES, board(**ABOUT_CHARUCO, cols=cols, rows=rows, videos=videos), quiet)
     assert len(find_boards(NAMES, board(**ABOUT_CHARUCO, cols=7, rows=5, videos=videos), quiet).numbers) == 3
@@ -187,7 +187,7 @@ def test_boards_that_are_blurred_throughout_are_refused(tmp_path, sigma):
     images = pictures(board(), T_world_board=POSES[:3])
     images[1] = [cv2.GaussianBlur(image, (0, 0), sigma) for image in images[1]]
     message = (
-        r"c1: all \d pictures of the board are blurred: its edges are \d+\.\d px wide .* at most 8\.0 px.*in focus"
+        r"c1: all \d pictures of the board are blurred: its edges are \d+\.\d px wide .* limit is 8\.0 px.*in focus"
         if sigma == 4.0
         else "c1: no chessboard with 9 x 6 inner corners in any of 3 pictures.*sharp"
     )
@@ -281,7 +281,7 @@ def test_pictures_that_cannot_be_read_are_named(tmp_path):
     with pytest.raises(CaptureError, match="no file of the folder is named like"):
         find_boards(("c0",), board(videos=(tmp_path / "c1" / "bord_%04d.png",)), quiet)
     cv2.imwrite(str(tmp_path / "c0" / "board_0003.png"), np.zeros((100, 100), np.uint8))
-    with pytest.raises(CalibrationError, match="is 100 x 100 px, the first picture 640 x 480"):
+    with pytest.raises(CalibrationError, match="is 100 x 100 px, but the first picture is 640 x 480"):
         find_boards(NAMES, board(videos=videos), quiet)
 
 

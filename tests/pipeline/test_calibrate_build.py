@@ -201,7 +201,7 @@ def test_without_picks_and_masks_the_size_is_said_to_be_unknown(capture, calibra
     bare = tuple(camera.model_copy(update={"masks": None}) for camera in opened.cameras)
     report = calibrate_boards(opened.model_copy(update={"cameras": bare}), out, lambda *told: None)
     assert report["scale"]["ratio"] is None
-    note = "nothing but [boards] square_mm tells the scale: there are no picks in two cameras"
+    note = "the scale relies on [boards] square_mm alone: no picks are seen by two cameras"
     assert any(note in line for line in calibration_lines(report))
     # Clips that cannot be aligned are no reason to fail: the boards are aligned already.
     unaligned = opened.model_copy(update={"sync": opened.sync.model_copy(update={"method": "audio"})})

@@ -203,13 +203,13 @@ def test_how_masks_were_drawn_and_the_closed_bite_are_told(words_alone):
     )
     text = " ".join(Page(document(data)).text)
     assert "edges +0.25 / -0.50, gum line +0.75 / +1.00" in text
-    assert "+0.11 mm (upper) and -0.12 mm (lower)" in text
+    assert "+0.11 mm (upper), -0.12 mm (lower)" in text
     assert "frames 46 to 50" in text and "off the closed bite by 0.50 ± 0.05 mm and 3.00 ± 0.10 degrees" in text
 
 
 def test_without_experiments_pictures_and_meshes_the_page_says_so():
     text = " ".join(Page(document(report_data(experiments=None, overlays=(), parts=(), cameras=()))).text)
-    assert "The experiments could not be done" in text and "There are no pictures" in text
+    assert "The experiments were not run" in text and "There are no pictures" in text
     assert "There is nothing to show" in text
 
 

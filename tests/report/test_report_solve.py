@@ -31,7 +31,7 @@ def test_the_page_counts_and_names_what_was_not_seen():
     assert "within tolerance 1 frame (1.7 %)" in text
     assert "outside 2 frames (3.3 %)" in text
     assert f"{first + 10}–{first + 14}" in text and "masks <are> wide" in text and "lost <here>" in text
-    assert "1.0200 ± 0.0030" in text and "not solved with" in text and "Limited by having one camera" in text
+    assert "1.0200 ± 0.0030" in text and "not used" in text and "Limited by having one camera" in text
     runs = unseen_runs(data, data.tracks.solved)
     assert [(run.first - first, run.last - first, run.arches, run.sigma) for run in runs] == [
         (10, 14, "lower", "1.00, 0.50, 0.25"),
@@ -52,7 +52,7 @@ def test_a_good_take_says_so():
     good = replace(data.tracks.solved, state=np.ones(60, np.int8), valid=np.ones(60, bool))
     data.tracks.solved, data.tracks.meta["findings"] = good, []
     text = text_of(solve_page(data))
-    assert "Every frame was seen, and every pose is one that the rig allows." in text
+    assert "Both arches were found in every frame, and every pose is valid for the rig." in text
     assert "Both arches were found in every frame." in text
 
 

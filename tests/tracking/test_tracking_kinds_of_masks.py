@@ -1,4 +1,4 @@
-"""Masks as any program writes them track alike, and cameras that are not used are named."""
+"""Masks as any program writes them track alike, and unused cameras are named."""
 
 from pathlib import Path
 

@@ -51,7 +51,7 @@ def test_pages_of_captures_take_no_files(page):
         await api._websock_interface._handle_incoming_message(0, message)
 
     asyncio.run_coroutine_threadsafe(send(), page.loop).result(60)
-    assert api._current_file_upload_states == {} and "takes no such files" in page.notices[-1][1]
+    assert api._current_file_upload_states == {} and "does not accept that file" in page.notices[-1][1]
 
 
 def test_the_capture_is_read_with_its_poses(viewed):
@@ -99,14 +99,14 @@ def test_stepping_jumping_and_looking(page):
     assert scene._layout.visible and "cam1" in footage._words.content
     page.press(footage._look, "footage alone")
     own = FIRST + 7 - page.page._capture.offsets["cam1"]
-    assert f"(its own frame {own})" in footage._words.content
+    assert f"(frame {own} of this camera)" in footage._words.content
     assert page.notices == []
 
 
 def test_all_cameras_stand_side_by_side(page):
     footage, capture = page.page.footage, page.page._capture
     page.press(footage.views, "all cameras")
-    assert "all cameras" in footage._words.content and "its own frame" not in footage._words.content
+    assert "all cameras" in footage._words.content and "of this camera" not in footage._words.content
     width, height = capture.wall_px
     assert page.page.scene._picture.image.shape == (height, width, 3) and page.page.layout.size_px == (width, height)
     drawn, bare = (capture.wall(FIRST, capture.tracked_poses(FIRST), look) for look in ("outlines", "footage"))
@@ -276,10 +276,10 @@ def test_picks_are_clicked_and_written(page, copy, viewed):
         for pick in picks.book.picks:
             place = transform_point(poses[pick.arch], viewed.scans[pick.arch].vertices[pick.vertex])
             page.click(page.page.layout.place(viewed.cameras[camera].project(place)))
-    assert "all of them fit together" in picks._list.content and "complete" in picks._list.content
+    assert "the picks are consistent" in picks._list.content and "complete" in picks._list.content
     page.press(footage.steps, "+1")
     page.click(page.page.layout.place((5.0, 5.0)))
-    assert f"belong to frame {FIRST}, this is frame {FIRST + 1}" in page.notices.pop()[1]
+    assert f"belong to frame {FIRST}, not {FIRST + 1}" in page.notices.pop()[1]
     page.enter(picks.go, True)
     assert footage.frame == FIRST
     page.enter(picks.write, True)
@@ -291,7 +291,7 @@ def test_picks_are_clicked_and_written(page, copy, viewed):
     assert page.notices.pop()[0] == "Written"
     page.press(picks.edit, "all")
     page.enter(picks.write, True)
-    assert "cannot be written yet" in page.notices.pop()[1]
+    assert "picks are incomplete" in page.notices.pop()[1]
 
 
 def test_a_page_with_old_picks_does_not_overwrite_new_ones(viewed, copy, tmp_path):
@@ -300,7 +300,7 @@ def test_a_page_with_old_picks_does_not_overwrite_new_ones(viewed, copy, tmp_pat
     one, other = QuietCapturePage(viewer, 0), QuietCapturePage(viewer, 1)
     for opened in (one, other):
         opened.settle()
-    assert one.page.picks.picking.value and "all of them fit" in one.page.picks._list.content
+    assert one.page.picks.picking.value and "the picks are consistent" in one.page.picks._list.content
     one.press(one.page.picks.chosen, "U1")
     one.press(one.page.footage.steps, "+1")
     assert other.page.picks.book.selected is None and other.page.footage.frame == one.page.footage.frame - 1

@@ -210,7 +210,7 @@ def test_picks_made_in_the_page_build_a_rig(tab, folder, tmp_path):
             pixel = capture.cameras[camera].project(place)
             tab.click(page.layout.place(pixel))
             assert np.abs(np.subtract(pick.views[camera], pixel)).max() < 1.5
-    tab.said("all of them fit together")
+    tab.said("the picks are consistent")
     tab.picture("capture_picks")
     before = (folder / "capture.toml").read_text()
     tab.press("write to the capture file")

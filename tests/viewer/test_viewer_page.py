@@ -191,7 +191,7 @@ def test_a_baked_motion_is_chosen_played_round_and_stopped(quiet):
 def test_bad_files_are_messages_and_the_page_lives_on(quiet, name, content, words):
     quiet.enter(quiet.page.files.load, UploadedFile(name, content))
     title, body = quiet.notices[-1]
-    assert title == "That did not work" and words in body and "/tmp" not in body
+    assert title == "Failed" and words in body and "/tmp" not in body
     quiet.enter(quiet.page.files.load, UploadedFile("good.csv", b"frame,d1,d2,d3\n0,1,0,0\n9,9,0,0\n"))
     assert quiet.page.motion.source.value == "good.csv" and quiet.page.session.d[0] == 1.0
 

@@ -9,7 +9,7 @@ from jawusd.formats.coverage import uncovered_percent
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, TRACKED, Tracks
 from jawusd.geometry import make_transform, random_rotation, transform_points
-from jawusd.viewer.picking import FOV_RAD, PickBook, PickingLayout, eye_to_see, hit_vertex, region_around
+from jawusd.viewer.picking import FOV_RAD, PickBook, PickingLayout, fit_view, hit_vertex, region_around
 from jawusd.viewer.take_plots import CoveragePlot, frame_words, frames_to_inspect
 
 
@@ -42,18 +42,18 @@ def test_what_is_missing_is_said_and_not_written():
     assert "upper teeth: 0 picks" in book.lacks()
     with pytest.raises(ValueError, match="no pick is selected"):
         book.see("a", 20, (1.0, 2.0))
-    with pytest.raises(ValueError, match="cannot be written yet"):
+    with pytest.raises(ValueError, match="picks are incomplete"):
         book.bootstrap()
     book = filled()
     book.add("lower", 99)
-    assert book.lacks().startswith("L4 is seen by 0")
+    assert book.lacks().startswith("L4 has views in 0")
     book.remove()
     assert book.lacks() == ""
 
 
 def test_pixels_of_two_frames_do_not_mix():
     book = filled()
-    with pytest.raises(ValueError, match="belong to frame 20, this is frame 21"):
+    with pytest.raises(ValueError, match="belong to frame 20, not 21"):
         book.see("a", 21, (1.0, 2.0))
     assert book.frame == 20
     book.clear()
@@ -106,7 +106,7 @@ def test_the_eye_sees_every_point_and_stands_no_farther_than_needed():
     rng = np.random.default_rng(2)
     for aspect in (0.6, 1.7):
         points, away, up = rng.normal(0, 40, (30, 3)), rng.normal(size=3), np.array([0.0, -1.0, 0.0])
-        eye, target = eye_to_see(points, away, up, aspect)
+        eye, target = fit_view(points, away, up, aspect)
         forward = (target - eye) / np.linalg.norm(target - eye)
         right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
         top = np.cross(right, forward)

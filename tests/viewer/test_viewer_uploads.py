@@ -50,7 +50,7 @@ def test_names_of_uploads_name_no_files(name, quiet, folder):
 @pytest.mark.parametrize("name", ["x.usda", "x." + "y" * 300, "..", "", "x.csv.exe", "x.json\0"])
 def test_other_types_are_refused(name, quiet):
     quiet.enter(quiet.page.files.load, UploadedFile(name, TABLE))
-    assert quiet.notices[-1][0] == "That did not work" and "none of .json, .csv" in quiet.notices[-1][1]
+    assert quiet.notices[-1][0] == "Failed" and "not a .json or .csv file" in quiet.notices[-1][1]
 
 
 def test_uploads_have_a_size(quiet):
@@ -72,4 +72,4 @@ def test_one_upload_at_a_time(quiet):
 
 def test_widgets_that_take_no_files_get_none(quiet):
     send(quiet, start(quiet.page.pose.sliders[0], "a", 100), start(quiet.page.files.name, "b", 100))
-    assert pending(quiet) == {} and "takes no such files" in quiet.notices[-1][1]
+    assert pending(quiet) == {} and "does not accept that file" in quiet.notices[-1][1]

@@ -1,5 +1,5 @@
 "use strict";
-// The captured take in 3-D: own WebGL2, nothing loaded. All coordinates are mm in the anatomical frame.
+// Replay of the captured take in plain WebGL2, without external resources. Coordinates are mm in the anatomical frame.
 (() => {
   const box = document.getElementById("replay");
   if (!box) return;
@@ -19,7 +19,7 @@
     canvas.hidden = true;
   }
 
-  // -- matrices, column by column as WebGL wants them --------------------------------------------------------------
+  // -- matrices, column-major as in WebGL --------------------------------------------------------------
   const multiply = (a, b) => {
     const out = new Float32Array(16);
     for (let c = 0; c < 4; c++)
@@ -61,7 +61,7 @@
   const views = { front: [0, 0.05], left: [Math.PI / 2, 0.05], right: [-Math.PI / 2, 0.05], top: [0, 1.5] };
   const camera = (aspect) => {
     const [cy, sy, cx, sx] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
-    // x to the subject's left: seen from the front it points to the right of the picture
+    // x points to the subject's left, which is right in a front view
     const view = new Float32Array([cy, -sx * sy, cx * sy, 0, 0, cx, sx, 0, -sy, -sx * cy, cx * cy, 0, 0, 0, -away, 1]);
     for (let r = 0; r < 3; r++)
       view[12 + r] -= view[r] * centre[0] + view[4 + r] * centre[1] + view[8 + r] * centre[2];
@@ -73,7 +73,7 @@
   };
 
   // -- drawing -------------------------------------------------------------------------------------------------------
-  // Bone that nearly coincides with a scan, as roots and sockets do, is compared as if it lay this far behind [mm].
+  // Depth offset of bone that nearly coincides with a scan, as roots and sockets do [mm].
   const BEHIND = { bone: 1.5, tooth: 0, gum: 0 };
   const vertexShader = `#version 300 es
     in vec3 place; in vec3 normal; uniform mat4 all, body, view; uniform float behind, slope; out vec3 n;
@@ -121,7 +121,7 @@
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   };
   let traceArray = null, traceBuffer = null;
-  const drawTrace = (poses, point, color) => { // where a landmark was in the second before
+  const drawTrace = (poses, point, color) => { // path of a landmark over the last second
     const places = [];
     for (let k = Math.max(0, now - Math.round(data.fps)); k <= now; k++)
       if (known(poses, k)) places.push(...moved(poses, k, point));
@@ -156,7 +156,7 @@
     gl.uniform1f(at.lit, 1);
     gl.uniform1f(at.slope, lens[10]);
     const body = known(poses, now) ? rigid(poses, now) : null;
-    for (const glassy of [false, true]) { // the skull last: what shines through it must be there already
+    for (const glassy of [false, true]) { // the translucent skull is drawn last
       for (const part of parts) {
         if ((part.name === "skull") !== glassy || (part.moves && !body)) continue;
         gl.uniformMatrix4fv(at.body, false, part.moves ? body : identity);
