@@ -217,7 +217,7 @@ class _Segmentation:
         self._new_segmenters(poses)
         colours = {name: segmenter.colours for name, segmenter in self._segmenters.items()}
         state = ColourStates(self._folder, colours)
-        before = state.take_up(done, step)
+        before = state.restore(done, step)
         self._journal.drop(range(before + step if before is not None else start + step, done + step, step))
         if before is None:  # colours come from the poses found in the first frame
             before = start
@@ -233,7 +233,7 @@ class _Segmentation:
                 _, record = next(follow)
             if (record.status == LOST).any():  # colours from where no teeth are would spoil all that follows
                 for name, model in colours.items():
-                    model.take_up(*known[name])
+                    model.restore(*known[name])
             state.keep(frame, step)
             self._write(frame, record, shown.segments)
             self._advance("segment", len(self._journal.entries))

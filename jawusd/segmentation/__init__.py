@@ -1,1 +1,4 @@
-"""Masks of both arches from footage, guided by projected scans."""
+"""Segment both arches in footage, guided by the projected scans.
+
+Produces mask files that a person can edit; imports no other stage.
+"""

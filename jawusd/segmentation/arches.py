@@ -1,4 +1,4 @@
-"""Arches."""
+"""Both arches in one picture: projected crowns, the three-way cut, and the cost of colour, position and edges."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from jawusd.meshes.raster import draw_depth_labels
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 
 OTHER, UPPER, LOWER = 0, 1, 2
-_TAU = _SIGMA = 0.35  # steps of the primal-dual iteration: their product times 8, the norm of the gradient, stays < 1
-_NEVER = 30.0  # log-odds that no colour overcomes
-_FEWEST_OPEN = 20  # pixels between the arches; with fewer the border stays
+_TAU = _SIGMA = 0.35  # step sizes of the primal-dual iteration; convergence needs tau sigma 8 < 1
+_NEVER = 30.0  # log-odds of a hard constraint
+_FEWEST_OPEN = 20  # fewest undecided pixels between the arches to re-estimate their border
 _ARCH_BLUR_PX = 0.8  # softens the border between the arches to fractions of a pixel
 
 
 @dataclass(frozen=True, eq=False)
 class ScanSurface:
-    """Hold one arch ready to be drawn."""
+    """Scan of one arch, split for rasterisation."""
 
     vertices: Array  # scan coordinates [mm], shape (V, 3)
     crown_faces: NDArray[np.int32]  # faces of the teeth, int32, shape (F, 3)
-    gum_faces: NDArray[np.int32]  # faces that only hide what lies behind them, int32, shape (G, 3)
+    gum_faces: NDArray[np.int32]  # other faces, which only occlude, int32, shape (G, 3)
 
     @classmethod
     def of(cls, mesh: Mesh) -> ScanSurface:
-        """Split a teeth scan at the line where most corners of a face are tooth."""
+        """Split a teeth scan into faces with mostly tooth corners and the others."""
         crown = crown_face_mask(mesh)
         return cls(mesh.vertices, mesh.faces[crown], mesh.faces[~crown])
 
@@ -43,21 +43,21 @@ class ScanSurface:
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """Hold what is expected where in a picture; px are pixels of that picture."""
+    """Expected crowns in a picture; px are pixels of that picture."""
 
-    labels: NDArray[np.uint8]  # OTHER, UPPER or LOWER where that arch's crowns are nearest, shape (h, w)
+    labels: NDArray[np.uint8]  # visible crowns: OTHER, UPPER or LOWER, shape (h, w)
     # signed distance to the outline of each arch's visible crowns, positive inside, shape (2, h, w)
     inside_px: NDArray[np.float32]
 
 
 def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> Expectation:
-    """Draw both arches in poses (2, 4, 4), T_world_upper and T_world_lower, as a pinhole camera sees them."""
+    """Render both arches at poses (2, 4, 4), T_world_upper and T_world_lower, in a pinhole camera."""
     labels = draw_crowns(scans, poses, camera)
     return Expectation(labels, np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)]))
 
 
 def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> NDArray[np.uint8]:
-    """Return OTHER, UPPER or LOWER where that arch's crowns are nearest, shape (h, w)."""
+    """Return the label of the visible crown per pixel, OTHER, UPPER or LOWER, shape (h, w)."""
     width, height = camera.size_px
     inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     for scan, pose, label in zip(scans, poses, (UPPER, LOWER), strict=True):
@@ -69,7 +69,7 @@ def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Ca
 
 
 def _signed_distance(region: Mask) -> NDArray[np.float32]:
-    """Return the distance to the outline of a region, positive inside [px]; far outside where there is none."""
+    """Return the signed distance to a region's outline, positive inside [px]; large and negative if it is empty."""
     if not region.any():
         return np.full(region.shape, -1e3, np.float32)
     inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
@@ -87,8 +87,8 @@ def _iterate(
 ) -> None:
     """Run the first-order primal-dual iteration (Chambolle and Pock 2011) of the relaxed Potts energy.
 
-    cost (3, h, w), edge (2, h, w) weights of the links to the right and down; u (3, h, w) in and out; spans (h, 2)
-    columns of each row that are in play, all others stay as they are.
+    cost (3, h, w); edge (2, h, w), weights of the links to the right and down; u (3, h, w), in and out; spans (h, 2),
+    range of free columns per row, all others are fixed.
     """
     n, h, w = cost.shape
     px, py = np.zeros_like(u), np.zeros_like(u)
@@ -129,7 +129,7 @@ def _iterate(
 
 @numba.njit(nogil=True, cache=True)
 def _to_simplex(a: np.float32, b: np.float32, c: np.float32) -> tuple[np.float32, np.float32, np.float32]:
-    """Return the nearest three shares that are not negative and sum to one."""
+    """Project three values onto the probability simplex."""
     high = max(a, b, c)
     low = min(a, b, c)
     mid = a + b + c - high - low
@@ -149,23 +149,23 @@ def cut_three_ways(
     free: Mask,
     steps: int,
 ) -> NDArray[np.float32]:
-    """Return the shares of the labels, not negative, sum 1, shape (3, h, w), of the cheapest cut.
+    """Return the label weights of the minimal cut, non-negative with sum 1, shape (3, h, w).
 
-    The cost is that of the labels plus the weighted length of the borders between them: the convex relaxation of the
-    Potts model with separate labels (Zach et al. 2008), links to the right and down.
+    The energy is the cost of the labels plus the weighted length of the borders between them: the convex relaxation of
+    the Potts model with separate labels (Zach et al. 2008), with links to the right and down.
 
     Args:
         cost: cost of each label per pixel, shape (3, h, w).
-        edge: price of a border between a pixel and its right and lower neighbour, shape (2, h, w).
-        start: first guess of the shares, shape (3, h, w).
-        free: pixels whose label is open, shape (h, w); the others keep the first guess.
+        edge: cost of a border between a pixel and its right and lower neighbour, shape (2, h, w).
+        start: initial label weights, shape (3, h, w).
+        free: pixels to label, shape (h, w); the others keep their initial weights.
     """
     u = np.ascontiguousarray(start, np.float32).copy()
     spans = np.zeros((cost.shape[1], 2), np.int64)
     for y in np.flatnonzero(free.any(1)):
         columns = np.flatnonzero(free[y])
         spans[y] = columns[0], columns[-1] + 1
-    # Each border is one of two labels, and counts once.
+    # Each border belongs to two labels but counts once.
     half = np.ascontiguousarray(0.5 * edge, np.float32)
     _iterate(np.ascontiguousarray(cost, np.float32), half, u, spans, steps)
     return u
@@ -173,13 +173,13 @@ def cut_three_ways(
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """Hold what a person drew in a working picture."""
+    """Annotations in a working picture."""
 
-    known: Mask  # where a person marked each arch as tooth or not, shape (2, h, w)
-    share: NDArray[np.float32]  # of tooth there, shape (2, h, w)
+    known: Mask  # annotated pixels of each arch, shape (2, h, w)
+    share: NDArray[np.float32]  # annotated tooth coverage, shape (2, h, w)
 
     def pinned(self, shares: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return shares of both arches, shape (2, h, w), replaced by what a person drew where it is known."""
+        """Return coverages of both arches, shape (2, h, w), with annotated pixels replaced by the annotation."""
         shares = np.where(self.known, self.share, shares)
         other = self.known & (self.share > 0.5)
         return np.where(other[::-1] & ~self.known, 0, shares)
@@ -193,13 +193,13 @@ def learn_colours(
     px_per_mm: float,
     weight: float = 1.0,
 ) -> None:
-    """Let a colour model see a picture, shape (h, w, 3), with the crowns where they are expected."""
+    """Update a colour model with a picture, shape (h, w, 3), and the expected position of the crowns."""
     nearest = expected.inside_px.max(0) / px_per_mm
     model.learn(rgb, nearest > config.inner_mm, nearest < -config.outer_mm, weight)
 
 
 def doubted_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
-    """Return the log-odds of being tooth by colours alone, less the log-odds demanded of them, shape (h, w)."""
+    """Return the log-odds of tooth by colour alone minus the required threshold, shape (h, w)."""
     demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
     return model.log_odds(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
 
@@ -213,11 +213,11 @@ def cut_arches(
     reach_mm: float,
     seeds: Seeds | None = None,
 ) -> NDArray[np.float32]:
-    """Segment a picture (h, w, 3); return the shares of both arches, 0 .. 1, shape (2, h, w).
+    """Segment a picture (h, w, 3); return the coverage of both arches, 0 .. 1, shape (2, h, w).
 
     Args:
-        reach_mm: how far teeth may lie outside their projection.
-        seeds: what a person drew, which no colour overrides.
+        reach_mm: largest distance of teeth outside their projection.
+        seeds: annotations, which act as hard constraints.
     """
     inside = expected.inside_px / px_per_mm
     odds = doubted_odds(rgb, model, config)
@@ -246,10 +246,10 @@ def part_arches(
     config: SegmentationConfig,
     px_per_mm: float,
 ) -> NDArray[np.float32]:
-    """Return the shares of both arches, shape (2, h, w), with the border between them drawn by edges among teeth only.
+    """Return the coverage of both arches, shape (2, h, w), with the border between them re-estimated from edges.
 
-    The sum of both is kept. Teeth over teeth show a far weaker edge than teeth over lips. Beside the latter it would
-    count for nothing: the border would stay where it was expected, and poses would follow their own prediction.
+    The sum of both is unchanged. Edges between upper and lower teeth are much weaker than those between teeth and lips.
+    A common edge weight would ignore them: the border would stay at its prediction and bias the poses towards it.
     """
     inside = expected.inside_px / px_per_mm
     teeth = shares.sum(0)
@@ -275,10 +275,9 @@ def part_arches(
 
 
 def _edge_prices(rgb: NDArray[np.uint8], config: SegmentationConfig, where: Mask | None = None) -> NDArray[np.float32]:
-    """Return what a border costs between each pixel and its right and lower neighbour, shape (2, h, w).
+    """Return the cost of a border between each pixel and its right and lower neighbour, shape (2, h, w).
 
-    The contrast that counts as an edge follows the picture's own (Boykov and Jolly 2001), or that of a part of it,
-    shape (h, w).
+    The contrast is normalised by that of the picture (Boykov and Jolly 2001), or of a part of it, shape (h, w).
     """
     smooth = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), (0, 0), 0.8).astype(np.float32)
     out = np.full((2, *rgb.shape[:2]), config.border, np.float32)

@@ -1,4 +1,4 @@
-"""Borders between teeth and surroundings, moved to where the picture changes, to fractions of a pixel."""
+"""Sub-pixel refinement of mask borders to edges of the picture."""
 
 from __future__ import annotations
 
@@ -11,31 +11,30 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Mask
 from jawusd.segmentation.colours import SegmentationConfig, shadeless
 
-_EVEN = 1e-4  # variance of the logs that is added [-]: half an 8-bit step
-_FEWEST = 100  # fewest pixels that give the spread of colours
-_ARCH_BLUR_PX = 0.8  # softens the border between the arches to fractions of a pixel
-_FAR_BLUR_PX = 2.0  # finds the nearer arch for pixels that have become teeth
+_EVEN = 1e-4  # variance added to log colours [-]: half an 8-bit step
+_FEWEST = 100  # fewest pixels for a covariance of colours
+_ARCH_BLUR_PX = 0.8  # blur that makes the border between the arches soft
+_FAR_BLUR_PX = 2.0  # blur that assigns new tooth pixels to the nearer arch
 
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Hold the comparison of every pixel with the colours on both sides of the border."""
+    """Comparison of every pixel with the colours on both sides of the border."""
 
-    share: NDArray[np.float32]  # of tooth, half way between the sides 0.5, shape (h, w)
-    # standard deviations between the sides, 0 where one of them is not near, shape (h, w)
+    share: NDArray[np.float32]  # tooth coverage, 0.5 midway between the sides, shape (h, w)
+    # separation of the sides in standard deviations, 0 without both sides nearby, shape (h, w)
     contrast: NDArray[np.float32]
 
 
 def settle_borders(
     shares: NDArray[np.float32], rgb: NDArray[np.uint8], config: SegmentationConfig, px_per_mm: float
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Return shares (2, h, w) with soft borders, half at the outline, and where a border would show, shape (h, w).
+    """Return coverages (2, h, w) with soft borders, 0.5 at the outline, and where borders are visible, shape (h, w).
 
-    Teeth are separated from surroundings once more, along their border, by the local colours on either side. Colours
-    learned over the take decide what is tooth, but not where exactly it ends, as the middle between two colours
-    differs from place to place. Fisher's discriminant between the means on both sides, weighted by how much
-    colours spread on one side, finds it (the local region statistics of Lankton & Tannenbaum 2008). Where the sides do
-    not differ the border stays, and a part with such a border most of the way round is no tooth.
+    Along the border, teeth are separated from their surroundings again by the local colours on both sides. The colours
+    learned over the take decide what is tooth but not its exact end, since the midpoint between two colours varies
+    locally. Fisher's discriminant between the local means finds it (local region statistics, Lankton & Tannenbaum
+    2008). Where the sides do not differ the border is unchanged; parts with mostly such borders are discarded.
     """
     colours = _blurred(shadeless(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1
@@ -59,13 +58,13 @@ def _blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]
 
 
 def _signed_distance(region: Mask) -> NDArray[np.float32]:
-    """Return the distance to the other kind of pixel, positive inside the region [px]."""
+    """Return the signed distance to the region's outline, positive inside [px]."""
     inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
     return inner - cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
 
 
 def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], window: int) -> _Sides | None:
-    """Compare every pixel with the mean colours on both sides of the border; None if one side is missing."""
+    """Compare every pixel with the local mean colours on both sides of the border; None if one side is empty."""
     near = np.abs(inside) < window / 2
     sides = ((inside > 1) & near, (inside < -1) & near)
     means = [_mean_near(side, colours, window) for side in sides]
@@ -82,7 +81,7 @@ def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], wi
 
 
 def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[NDArray[np.float32], Mask]:
-    """Return the mean colour of one side around every pixel, and where enough of that side is near."""
+    """Return the local mean colour of one side at every pixel, and where enough of that side is nearby."""
     weight = side.astype(np.float32)
     count = cv2.boxFilter(weight, -1, (window, window), normalize=False)
     total = cv2.boxFilter(colours * weight[..., None], -1, (window, window), normalize=False)
@@ -90,7 +89,7 @@ def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[N
 
 
 def _unfounded(teeth: Mask, clear: Mask, config: SegmentationConfig) -> Mask:
-    """Return which pixels belong to specks, and to parts with hardly a border in the picture, shape (h, w)."""
+    """Return the pixels of specks and of parts with hardly any visible border, shape (h, w)."""
     count, parts, stats, _ = cv2.connectedComponentsWithStats(teeth.astype(np.uint8))
     outline = teeth & (cv2.erode(teeth.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     length = np.bincount(parts[outline], minlength=count)

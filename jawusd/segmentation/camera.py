@@ -1,4 +1,4 @@
-"""Segment the pictures of one camera, frame after frame."""
+"""Segment the pictures of one camera, frame by frame."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from jawusd.segmentation.learn import Example, cut_picture
 from jawusd.segmentation.picture import PictureFrame, Window
 
 _ARCHES = (0, 1)
-_EVERY = 20  # of so many crown vertices one is projected to find the window
+_EVERY = 20  # stride of the crown vertices projected to find the window
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Hold both arches in one picture."""
+    """Segmentation of both arches in one picture."""
 
-    camera: Camera  # the pinhole camera of the window
-    masks: NDArray[np.uint8]  # shares of the upper and lower arch, 255 = all, uint8, shape (2, h, w)
-    present: Mask  # which arches are in sight at all, shape (2,)
-    # by how much colours look more like teeth inside the outline, per arch, -1 .. 1; NaN where there is none
+    camera: Camera  # pinhole camera of the window
+    masks: NDArray[np.uint8]  # coverage of the upper and lower arch, 0..255, uint8, shape (2, h, w)
+    present: Mask  # which arches are visible, shape (2,)
+    # contrast of tooth likelihood across the outline, per arch, -1 .. 1; NaN without an outline
     contrast: Array
-    # how much of each arch's mask is not where the crowns were expected, as a share; NaN without a mask
+    # fraction of each arch's mask outside the expected crowns; NaN without a mask
     unexpected: Array
-    # pixels of each arch's outline that show in the picture, that do not, and that border the other arch, shape (2, 3)
+    # outline pixels of each arch that are visible edges, that are not, and that border the other arch, shape (2, 3)
     outline: NDArray[np.int64]
-    # what was segmented, and what was expected there
+    # the segmented window and the expected crowns
     window: Window
     expected: Expectation
 
     def only(self, arches: Mask) -> Segment:
-        """Return the same without the masks of other arches than some, shape (2,)."""
+        """Return the segment with only the masks of some arches, shape (2,)."""
         if arches.all():
             return self
         masks = np.where(arches[:, None, None], self.masks, np.uint8(0))
@@ -57,14 +57,14 @@ class Segment:
 
 
 class CameraSegmenter:
-    """Segment both arches in one camera's pictures.
+    """Segmentation of both arches in one camera's pictures.
 
     Attributes:
-        colours: what was learned about them so far.
+        colours: the colour model learned so far.
     """
 
     def __init__(self, source: Camera, meshes: Sequence[Mesh], poses: Array, config: SegmentationConfig) -> None:
-        """Prepare for a take with the upper and lower scan, and their poses (2, 4, 4) in the world at some time."""
+        """Prepare with the upper and lower scan, and their poses (2, 4, 4) in the world at any time of the take."""
         self._config = config
         upper, lower = meshes
         self._scans = ScanSurface.of(upper), ScanSurface.of(lower)
@@ -73,7 +73,7 @@ class CameraSegmenter:
         self.colours = ColourModel(config.memory_frames)
 
     def adopt(self, config: SegmentationConfig) -> None:
-        """Use other numbers from now on."""
+        """Replace the configuration."""
         self._config = config
 
     def segment(
@@ -83,11 +83,11 @@ class CameraSegmenter:
         turn: int,
         keys: Sequence[Key | None] = (None, None),
     ) -> Segment | None:
-        """Segment a picture (H, W, 3) RGB as recorded; None if the teeth are out of sight.
+        """Segment a recorded RGB picture (H, W, 3); None if the teeth are out of view.
 
         Args:
-            poses: T_world_upper, T_world_lower as expected, shape (2, 4, 4).
-            turn: 0 for predicted poses, then 1 and so on as they get better.
+            poses: expected T_world_upper, T_world_lower, shape (2, 4, 4).
+            turn: iteration; 0 for predicted poses, then 1 and so on as they are refined.
         """
         c = self._config
         window = self._frame.window(image, self._around(poses), c.margin_mm)
@@ -98,11 +98,11 @@ class CameraSegmenter:
         if turn == 0 or not self.colours.is_trained():
             self._learn(window, expected, keys, seeds)
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
-        # Outlines made here are steadier than drawn ones, and the tracker compares them with one another: a
-        # finished mask replaces a cut only where it fails.
+        # Computed outlines are more consistent over time than annotated ones, which matters to the tracker: a
+        # finished mask replaces a computed one only if it is wrong.
         drawn = seeds.share if seeds is not None and seeds.known.all() else None
         guide = None if drawn is not None else seeds
-        # Borders settle in the first turn too: the tracker takes rougher outlines than usual for a lost arch.
+        # Refine borders in the first iteration too: the tracker interprets rough outlines as a lost arch.
         shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide)
         if drawn is not None and _overlap(shares, drawn) < c.key_overlap:
             shares = drawn
@@ -112,16 +112,16 @@ class CameraSegmenter:
         return Segment(window.camera, masks, present, contrast, unexpected, _outline(masks, clear), window, expected)
 
     def recorded(self, segment: Segment) -> list[NDArray[np.uint8]]:
-        """Return the masks of both arches as recorded, (H, W) uint8, 0 or 255."""
+        """Return the masks of both arches in recorded pixels, (H, W) uint8, 0 or 255."""
         return [self._frame.recorded(mask.astype(np.float32) / 255, segment.window) for mask in segment.masks]
 
     def _around(self, poses: Array) -> Array:
         return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ARCHES])
 
     def study(self, image: ColourPicture, poses: Array, keys: Sequence[Key | None]) -> Example | None:
-        """Learn the colours of a picture for which a person drew, and return it as an example.
+        """Learn the colours of an annotated picture at aligned poses, and return it as an example.
 
-        The poses are aligned ones. None if the masks are not finished, or the teeth out of sight.
+        Return None if the masks are not finished or the teeth are out of view.
         """
         window = self._frame.window(image, self._around(poses), self._config.margin_mm)
         if window is None:
@@ -134,7 +134,7 @@ class CameraSegmenter:
         return Example(window, expected, seeds.share, self.colours, self._frame.px_per_mm)
 
     def _seeds(self, window: Window, keys: Sequence[Key | None]) -> Seeds | None:
-        """Return what a person drew as it shows in a window."""
+        """Return the annotations in a window."""
         if all(key is None for key in keys):
             return None
         known, share = np.zeros((2, *window.rgb.shape[:2]), bool), np.zeros((2, *window.rgb.shape[:2]), np.float32)
@@ -145,7 +145,7 @@ class CameraSegmenter:
         return Seeds(known | all(key is not None and key.finished for key in keys), share)
 
     def _learn(self, window: Window, expected: Expectation, keys: Sequence[Key | None], seeds: Seeds | None) -> None:
-        """Update the colours with a picture, and above all with what a person drew in it."""
+        """Update the colours with a picture, with a higher weight for annotations."""
         c = self._config
         if not all(key is not None and key.finished for key in keys):
             learn_colours(self.colours, window.rgb, expected, c, self._frame.px_per_mm)
@@ -156,7 +156,7 @@ class CameraSegmenter:
             self.colours.learn(window.rgb, cv2.erode(teeth, kernel) > 0, outer, c.key_weight)
 
     def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> Array:
-        """Return how much likelier teeth are just inside the outline of an arch than just outside of both."""
+        """Return the difference of tooth likelihood just inside an arch's outline and just outside both arches."""
         odds = self.colours.log_odds(window.rgb)
         share = 1 / (1 + np.exp(-odds))
         teeth = (masks.max(0) > 127).astype(np.uint8)
@@ -173,7 +173,7 @@ class CameraSegmenter:
 
 
 def _overlap(shares: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
-    """Return the smaller intersection over union of both arches with what was drawn."""
+    """Return the smaller intersection over union of both arches with the annotation."""
     a, b = shares > 0.5, drawn > 0.5
     return float(((a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)).min())
 

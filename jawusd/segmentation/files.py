@@ -1,4 +1,4 @@
-"""Files."""
+"""Mask files: their paths, writing masks, annotated masks, and contact sheets."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from jawusd.media.pictures import read_gray
 
 ARCHES = ("upper", "lower")
 PATTERN = "%06d.png"
-_UNKNOWN = 128  # gray value of strokes where nothing was drawn
-_STROKES_UNKNOWN = 0.5  # share of such pixels that makes a picture one of strokes
+_UNKNOWN = 128  # gray value of pixels without annotation
+_STROKES_UNKNOWN = 0.5  # fraction of such pixels from which a picture contains strokes
 _COLUMNS = 3
 _TILE_PX = (480, 270)
-_MARGIN = 0.15  # of the teeth's extent, left around them
+_MARGIN = 0.15  # relative to the extent of the teeth
 
 
 def mask_pattern(folder: Path, camera: str, arch: str) -> Path:
-    """Return the file pattern of a camera's masks of an arch, numbered by its own frames."""
+    """Return the file pattern of a camera's masks of an arch, numbered by the camera's frames."""
     return folder / camera / arch / PATTERN
 
 
 def mask_path(folder: Path, camera: str, arch: str, own: int) -> Path:
-    """Return the file of one mask."""
+    """Return the path of one mask."""
     return folder / camera / arch / (PATTERN % own)
 
 
@@ -45,33 +45,33 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    # Run lengths suit masks: a twentieth of the time of the default, and files as small.
+    # Run-length encoding takes a twentieth of the default's time for files of the same size.
     settings = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
     write_bytes_atomic(path, cv2.imencode(".png", mask, settings)[1].tobytes())
 
 
 @dataclass(frozen=True, eq=False)
 class Key:
-    """Hold what a person drew for one arch in one picture."""
+    """Annotation of one arch in one picture."""
 
     mask: NDArray[np.uint8]  # 255 = tooth, (H, W) uint8
-    # 255 where the mask holds, (H, W) uint8: everywhere in a finished mask, else under strokes
+    # 255 at annotated pixels, (H, W) uint8: everywhere in a finished mask, otherwise under strokes
     known: NDArray[np.uint8]
-    finished: bool  # whether it holds everywhere
+    finished: bool  # whether all pixels are annotated
 
 
 class KeyMasks:
-    """Read what a person drew for some frames, in folders named like those that are written.
+    """Annotations of some frames, in folders named like those that are written.
 
-    A picture is a finished mask, or, where at least half of it has the gray value 128, strokes: 255 on teeth of the
-    arch, 0 on anything else, 128 where nothing was drawn.
+    A picture is a finished mask or, if at least half of it has the gray value 128, strokes: 255 on teeth of the arch, 0
+    on anything else, 128 where nothing was drawn.
     """
 
     def __init__(self, folder: Path | None, sizes_px: dict[str, tuple[int, int]]) -> None:
-        """Find the pictures CAMERA/upper/%06d.png and CAMERA/lower/%06d.png of a folder; None holds none.
+        """Find the pictures CAMERA/upper/%06d.png and CAMERA/lower/%06d.png of a folder, if any.
 
         Raises:
-            CaptureError: the folder is missing or holds nothing for these cameras.
+            CaptureError: the folder is missing or contains nothing for these cameras.
         """
         self._folder, self._sizes_px = folder, sizes_px
         self._masks: dict[tuple[str, str], PngMasks] = {}
@@ -84,18 +84,18 @@ class KeyMasks:
                     self._masks[camera, arch] = PngMasks(pattern, size, is_other=_is_strokes)
         if not self._masks:
             raise CaptureError(
-                f"holds no masks of {', '.join(sizes_px)}.",
+                f"contains no masks of {', '.join(sizes_px)}.",
                 path=folder,
-                hint="Name them CAMERA/upper/000123.png and CAMERA/lower/000123.png by the camera's own frames.",
+                hint="Name them CAMERA/upper/000123.png and CAMERA/lower/000123.png, by the camera's frame numbers.",
             )
 
     def frames(self, camera: str) -> list[int]:
-        """Return a camera's own frames for which anything was drawn."""
+        """Return the annotated frames of a camera, in its own numbers."""
         files = [path for arch in ARCHES if self._folder for path in (self._folder / camera / arch).glob("*.png")]
         return sorted({int(path.stem) for path in files if path.stem.isdecimal()})
 
     def of(self, camera: str, own: int) -> list[Key | None]:
-        """Return what was drawn for both arches on a camera's own frame, None where there is nothing.
+        """Return the annotation of both arches at a camera's own frame, None for an arch without one.
 
         Raises:
             CaptureError: a picture cannot be decoded or has the wrong size.
@@ -112,9 +112,9 @@ class KeyMasks:
             if gray.shape[::-1] != tuple(self._sizes_px[camera]):
                 size = self._sizes_px[camera]
                 raise CaptureError(
-                    f"the strokes are {gray.shape[1]} x {gray.shape[0]} px, the pictures {size[0]} x {size[1]} px.",
+                    f"the strokes are {gray.shape[1]} x {gray.shape[0]} px, the pictures are {size[0]} x {size[1]} px.",
                     path=path,
-                    hint="Draw them over a frame of the video at its own size.",
+                    hint="Draw them over a frame of the video at its original size.",
                 )
             known = np.where(np.abs(gray.astype(int) - _UNKNOWN) > 64, 255, 0).astype(np.uint8)
             return Key(np.where(gray > _UNKNOWN, 255, 0).astype(np.uint8) & known, known, False)
@@ -123,14 +123,14 @@ class KeyMasks:
 
 
 def _is_strokes(picture: RawImage) -> bool:
-    """Tell whether a picture, (h, w) or with channels, holds strokes and not a finished mask."""
+    """Return whether a picture, (h, w) or with channels, contains strokes rather than a finished mask."""
     return bool((picture == _UNKNOWN).mean() >= _STROKES_UNKNOWN)
 
 
 def write_sheet(
     path: Path, shown: Sequence[tuple[str, int, str]], videos: Mapping[str, ClipSource | Path], folder: Path
 ) -> None:
-    """Write a PNG with a tile per (camera, its own frame, remark), upper and lower arch outlined.
+    """Write a PNG with one tile per (camera, own frame, remark), with both arches outlined.
 
     Raises:
         CaptureError: a picture or mask cannot be decoded.
@@ -148,7 +148,7 @@ def write_sheet(
 
 
 def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None], caption: str) -> NDArray[np.uint8]:
-    """Return a picture with its masks outlined, cut to them and captioned, RGB."""
+    """Return an RGB picture cropped to its masks, outlined and captioned."""
     extent = np.zeros(picture.shape[:2], bool)
     for _, mask, colour in zip(ARCHES, masks, (UPPER_COLOUR, LOWER_COLOUR), strict=True):
         if mask is not None:
@@ -160,7 +160,7 @@ def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None],
 
 
 def _cut(picture: NDArray[np.uint8], extent: Mask) -> NDArray[np.uint8]:
-    """Return the part of a picture around what is marked, of the tile's shape as far as the picture reaches."""
+    """Crop a picture around the marked pixels, with the aspect ratio of a tile where possible."""
     if not extent.any():
         return picture
     rows, columns = np.flatnonzero(extent.any(1)), np.flatnonzero(extent.any(0))

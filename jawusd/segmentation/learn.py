@@ -1,4 +1,4 @@
-"""Learn the numbers of the energy, and how wide a person draws, from finished masks of a few frames."""
+"""Learn the weights of the energy, and the outline offset of the annotator, from finished masks of a few frames."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from jawusd.segmentation.border import settle_borders
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.picture import Window
 
-_FACTORS = (0.5, 2.0)  # tried on every number
+_FACTORS = (0.5, 2.0)  # tried for every weight
 _NUMBERS = ("border", "place_per_mm", "rows_per_mm")
-_DOUBTS = (-1.0, 1.0)  # added to the doubt
-_WIDER = np.arange(-6, 7) * 0.05  # tried as shares by which outlines are moved
-_LEAST_GAIN = 0.01  # share of the disagreement that a change must remove: less is chance
+_DOUBTS = (-1.0, 1.0)  # tried as changes of the doubt
+_WIDER = np.arange(-6, 7) * 0.05  # tried as outward shifts of outlines
+_LEAST_GAIN = 0.01  # smallest relative improvement that is not chance
 
 
 class LearnedNumbers(TypedDict):
-    """What was learned: changed numbers, the mean disagreement (1 - intersection over union) before and after."""
+    """Changed weights, and the mean error (1 - intersection over union) before and after."""
 
     numbers: dict[str, object]
     disagreement: list[float]
@@ -32,17 +32,17 @@ class LearnedNumbers(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """Hold a picture with finished masks."""
+    """A picture with finished masks."""
 
-    # the picture, and where crowns are expected in it
+    # the picture and the expected crowns
     window: Window
     expected: Expectation
-    drawn: NDArray[np.float32]  # shares of both arches, shape (2, h, w)
+    drawn: NDArray[np.float32]  # annotated coverage of both arches, shape (2, h, w)
     colours: ColourModel  # the colours of its camera
     px_per_mm: float  # resolution of the picture
 
     def cut(self, config: SegmentationConfig) -> NDArray[np.float32]:
-        """Return the shares of both arches, shape (2, h, w), that are found without the drawn masks."""
+        """Segment without the annotated masks; return the coverage of both arches, shape (2, h, w)."""
         where = (self.window, self.expected, self.colours, config, self.px_per_mm)
         return cut_picture(*where, config.reach_mm[-1], None)[0]
 
@@ -56,9 +56,9 @@ def cut_picture(
     reach_mm: float,
     seeds: Seeds | None,
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Cut both arches out of a picture, settle their borders and keep what a person drew.
+    """Segment both arches, refine their borders and keep annotations.
 
-    Returns the shares of both arches, shape (2, h, w), and where borders show, shape (h, w).
+    Return the coverage of both arches, shape (2, h, w), and where borders are visible, shape (h, w).
     """
     shares = cut_arches(window.rgb, expected, colours, config, px_per_mm, reach_mm, seeds)
     shares, clear = settle_borders(shares, window.rgb, config, px_per_mm)
@@ -68,7 +68,7 @@ def cut_picture(
 
 
 def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tuple[SegmentationConfig, LearnedNumbers]:
-    """Choose the numbers, one after the other, whose masks agree best with drawn ones; return what changed too."""
+    """Optimise the weights one after the other for agreement with annotated masks; also return the changes."""
     best, cuts = config, [example.cut(config) for example in examples]
     before = least = _disagreement(examples, cuts)
     for trial in _trials(config):
@@ -97,7 +97,7 @@ def _trials(config: SegmentationConfig) -> Iterator[SegmentationConfig]:
 
 
 def _widened(shares: NDArray[np.float32], wider: tuple[float, float]) -> NDArray[np.float32]:
-    """Return shares with outlines moved by fractions of their soft border; arches keep the border between them."""
+    """Return coverages with outlines moved by fractions of their soft border, except between the arches."""
     if not any(wider):
         return shares
     alone = shares[::-1] < 0.05

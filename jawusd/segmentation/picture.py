@@ -1,4 +1,4 @@
-"""Pictures."""
+"""Pictures of all cameras per instant, and windows around the teeth, undistorted and reduced."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from jawusd.media.clip import Clip
 from jawusd.media.pixels import ColourPicture
 from jawusd.media.working_view import WorkingView, remap
 
-_NODE_PX = 8  # spacing of undistorted positions; the lens is smooth in between
-_CHUNK = 16  # instants held at once when going backwards: 50 MB per full HD camera
+_NODE_PX = 8  # grid spacing of the undistortion map
+_CHUNK = 16  # instants buffered when reading backwards: 50 MB per full HD camera
 
 Pictures: TypeAlias = "dict[str, ColourPicture | None]"
 _Frames = range  # inside the class below, `range` is its method
@@ -25,18 +25,18 @@ _Frames = range  # inside the class below, `range` is its method
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Hold a part of a working picture."""
+    """A part of a working picture."""
 
-    camera: Camera  # the pinhole camera of the part
-    rgb: NDArray[np.uint8]  # its pixels, 8 bit, shape (h, w, 3)
-    corner: tuple[int, int]  # its first column and row in the working picture [px]
+    camera: Camera  # pinhole camera of the part
+    rgb: NDArray[np.uint8]  # pixels, 8 bit, shape (h, w, 3)
+    corner: tuple[int, int]  # first column and row in the working picture [px]
 
 
 class PictureFrame:
-    """Cut windows around the teeth out of one camera's pictures."""
+    """Windows around the teeth in one camera's pictures."""
 
     def __init__(self, source: Camera, centre_world: Array, px_per_mm: float) -> None:
-        """Choose the working size by the resolution at the teeth, at centre_world (3,) [mm]; never enlarge."""
+        """Choose the working size by the resolution at the teeth, centre_world (3,) [mm], without upsampling."""
         recorded = float(np.sqrt(source.K[0, 0] * source.K[1, 1]) / source.depth(centre_world))
         scale = min(1.0, px_per_mm / recorded)
         self.px_per_mm = recorded * scale
@@ -46,7 +46,7 @@ class PictureFrame:
         self._back = _positions(source, self._working.camera)
 
     def window(self, image: ColourPicture, points_world: Array, margin_mm: float) -> Window | None:
-        """Return what surrounds world points (N, 3) [mm] in a recorded RGB picture (H, W, 3); None if out of sight."""
+        """Return the window around world points (N, 3) [mm] in a recorded picture (H, W, 3), None if out of view."""
         camera = self._working.camera
         seen = camera.project_pinhole(points_world[camera.depth(points_world) > 0])
         if not len(seen):
@@ -63,12 +63,12 @@ class PictureFrame:
         return Window(cropped, part, (int(low[0]), int(low[1])))
 
     def given(self, mask: NDArray[np.uint8], window: Window) -> NDArray[np.uint8]:
-        """Return what a recorded mask, (H, W) uint8, shows in a window, shape (h, w)."""
+        """Return the part of a recorded mask, (H, W) uint8, in a window, shape (h, w)."""
         (x, y), (width, height) = window.corner, window.camera.size_px
         return self._working.part(mask, (slice(y, y + height), slice(x, x + width)))
 
     def recorded(self, shares: NDArray[np.float32], window: Window) -> NDArray[np.uint8]:
-        """Return the mask at recorded size, 0 or 255, of a window's shares of teeth, shape (h, w)."""
+        """Convert a window's tooth coverage, shape (h, w), to a mask at recorded size, 0 or 255."""
         nodes = self._back[::_NODE_PX, ::_NODE_PX] - np.array(window.corner, np.float32)
         limit = np.array(shares.shape[::-1], np.float32) + _NODE_PX
         inside: Mask = np.all((nodes > -_NODE_PX) & (nodes < limit), axis=2)
@@ -82,7 +82,7 @@ class PictureFrame:
 
 
 def _positions(source: Camera, working: Camera) -> NDArray[np.float32]:
-    """Return the working pixel under each recorded pixel, shape (H, W, 2)."""
+    """Return the working pixel of each recorded pixel, shape (H, W, 2)."""
     width, height = source.size_px
     columns, rows = (np.arange(0, size + _NODE_PX, _NODE_PX) for size in (width, height))
     grid = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
@@ -94,32 +94,32 @@ def _positions(source: Camera, working: Camera) -> NDArray[np.float32]:
 
 
 class ColourFootage:
-    """Read the pictures of one instant in all cameras, in either direction."""
+    """Pictures of all cameras, readable in both directions."""
 
     def __init__(self, videos: Mapping[str, Clip], offsets: Mapping[str, int]) -> None:
-        """Take the videos and, by the same names, reference frame minus own frame number."""
+        """Open with the videos and, by the same names, reference frame minus own frame number."""
         self._videos, self._offsets = dict(videos), dict(offsets)
 
     def own(self, name: str, frame: int) -> int | None:
-        """Return the picture of a camera at a frame of the reference camera; None where it has none."""
+        """Return the picture index of a camera at a frame of the reference camera; None if it has none."""
         return self._videos[name].timeline.picture(frame - self._offsets[name])
 
     def number(self, name: str, frame: int) -> int | None:
-        """Return the number in its files of a camera's picture at a frame of the reference camera, as masks have it."""
+        """Return the file number of a camera's picture at a frame of the reference camera, as used by masks."""
         return self._videos[name].timeline.number(frame - self._offsets[name])
 
     def range(self) -> tuple[int, int]:
-        """Return the first frame that two cameras show, and one past the last."""
+        """Return the first frame shown by two cameras, and one past the last."""
         starts = sorted(self._offsets[name] for name in self._videos)
         stops = sorted(self._offsets[name] + video.timeline.count for name, video in self._videos.items())
         return max(0, starts[min(1, len(starts) - 1)]), stops[-min(2, len(stops))]
 
     def at(self, frame: int) -> Pictures:
-        """Return the RGB pictures (H, W, 3) of one frame of the reference camera, None where there is none."""
+        """Return the RGB pictures (H, W, 3) of one frame of the reference camera, None for a missing one."""
         return next(self.walk(range(frame, frame + 1)))[1]
 
     def walk(self, frames: _Frames) -> Iterator[tuple[int, Pictures]]:
-        """Yield frames with their pictures; a range that runs backwards is read forwards in parts.
+        """Yield frames with their pictures; a descending range is read forwards in chunks.
 
         Raises:
             CaptureError: a picture cannot be decoded.

@@ -1,6 +1,6 @@
-"""Find both rows of teeth in a picture of a mouth that nothing is known of: a first look, to begin a search with.
+"""Find both rows of teeth in a picture without prior knowledge, to initialise a search.
 
-Teeth are brighter and less red than all that surrounds them; between rows that are apart, it is dark or red.
+Teeth are brighter and less red than their surroundings; the gap between open rows is dark or red.
 """
 
 from __future__ import annotations
@@ -15,31 +15,30 @@ from scipy import ndimage
 
 from jawusd.base.arrays import Array, Mask
 
-_WIDTH_PX = 480  # of the picture that is worked on
-# Teeth are found by brightness less redness, CIELAB L* - 2.5 a*. Levels of it that are tried, as percentiles of the
-# picture, and the percentile of the picture that counts as white.
+_WIDTH_PX = 480  # working width
+# Teeth are found by thresholding lightness minus redness, CIELAB L* - 2.5 a*: weight of a*, thresholds to try as
+# percentiles of the picture, and the percentile that counts as white.
 _REDNESS, _LEVELS, _BRIGHTEST = 2.5, (40, 55, 65, 72, 78, 83, 87, 90, 92, 94, 96), 99.5
-# Of what surrounds teeth, so much must be redder by a difference of a*, or darker by a factor.
+# Fraction of the surroundings that must be redder by a difference of a*, or darker by a factor.
 _UNLIKE, _REDDER, _DARKER = 0.6, 3.0, 0.3
-_LEAST_AREA, _MOST_AREA = 0.0015, 0.2  # share of the picture that teeth cover
-_CLOSE_PX, _NEAR_PX, _FAR_PX = 4, 3, 12  # gaps closed between teeth; ring around them that is looked at
-# How far rows are apart at most, in widths of a row; of parts of teeth the least area, in shares of a row's; how
-# bright they are, from surroundings to the teeth found first, and how far they stand out from what is around them, in
-# shares of the teeth found first: wet lips and chins do less.
+_LEAST_AREA, _MOST_AREA = 0.0015, 0.2  # limits of the picture area covered by teeth
+_CLOSE_PX, _NEAR_PX, _FAR_PX = 4, 3, 12  # closing radius, and ring around teeth used as surroundings
+# Largest distance of the rows in row widths; smallest area of a part relative to a row; and, relative to the teeth
+# found first, the smallest brightness and contrast of a part, which wet lips and chins do not reach.
 _ROWS_APART, _LEAST_PART, _AS_BRIGHT, _LIKE = 1.0, 0.02, 0.65, 0.5
-# Lines between the rows: tilts over half the width in shares of it, sags in shares of the height; the least share of
+# Lines between the rows: tilts relative to half the width, sags relative to the height, and the smallest fraction of
 # the teeth on either side.
 _TILTS, _SAGS, _LEAST_SHARE = np.linspace(-0.3, 0.3, 21), np.linspace(-0.4, 0.4, 13), 0.2
-_LINE_PX = (-1, 0, 1)  # rows around a line that should be gap
+_LINE_PX = (-1, 0, 1)  # pixel rows around a line that should be gap
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Hold both rows of teeth in a picture.
+    """Both rows of teeth in a picture.
 
     Attributes:
         masks: upper and lower row, 0 or 255, shape (2, H, W).
-        bridged: share of the line between them that is no gap, 0 .. 1: 0 for rows that are apart.
+        bridged: fraction of the line between them that is not gap, 0 .. 1; 0 for open rows.
     """
 
     masks: NDArray[np.uint8]
@@ -47,7 +46,7 @@ class Rows:
 
 
 def tooth_rows(rgb: NDArray[np.uint8]) -> Rows | None:
-    """Return the rows of teeth of an RGB picture (H, W, 3), upright; None where nothing looks like teeth."""
+    """Return the rows of teeth in an upright RGB picture (H, W, 3); None if nothing looks like teeth."""
     height, width = rgb.shape[:2]
     small = cv2.resize(rgb, (_WIDTH_PX, max(8, round(height * _WIDTH_PX / width))), interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(small, (0, 0), 1.0).astype(np.float32)
@@ -68,7 +67,7 @@ def tooth_rows(rgb: NDArray[np.uint8]) -> Rows | None:
 
 
 def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
-    """Return the pixels of the teeth, and the level they stand above."""
+    """Return the pixels of the teeth and their threshold."""
     best: tuple[float, float, float, Mask] | None = None
     for level in np.percentile(toothlike, _LEVELS).tolist():
         above = ndimage.binary_opening(toothlike > level, np.ones((2, 2)))
@@ -85,7 +84,7 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
     if best is None:
         return None
     _, inside, outside, group = best
-    level = (inside + outside) / 2  # highlights on lips are above the lower one too
+    level = (inside + outside) / 2  # highlights on lips exceed the lower threshold
     parts, count = ndimage.label(toothlike > level)
     like = ndimage.median(toothlike, parts, np.arange(count + 1)) > outside + _AS_BRIGHT * (inside - outside)
     own = np.bincount(parts.ravel(), group.ravel(), count + 1) > 0.5 * np.bincount(parts.ravel())
@@ -104,12 +103,12 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
 
 
 def _distance(away: Mask) -> NDArray[np.float32]:
-    """Return how far it is from every pixel to the nearest one that is not `away`, along rows and columns [px]."""
+    """Return the city-block distance of every pixel to the nearest one outside `away` [px]."""
     return np.asarray(cv2.distanceTransform(away.astype(np.uint8), cv2.DIST_L1, 3), np.float32)
 
 
 def _closed(mask: Mask) -> Mask:
-    """Return a mask with small gaps closed; beyond the picture nothing is."""
+    """Return a mask with small gaps closed; pixels outside the picture count as background."""
     grown = np.pad(_distance(~mask) <= _CLOSE_PX, 1)
     return (_distance(grown) > _CLOSE_PX)[1:-1, 1:-1]
 
@@ -126,7 +125,7 @@ def _standing_out(
     toothlike: Array,
     redness: Array,
 ) -> tuple[float, float]:
-    """Return how much a group looks like teeth, and the ring around it; nothing if that is neither redder nor dark."""
+    """Return the contrast of a group and its ring; None if the ring is neither redder nor darker."""
     rows, columns = box
     around = (
         slice(max(rows.start - _FAR_PX, 0), rows.stop + _FAR_PX),
@@ -145,7 +144,7 @@ def _standing_out(
 
 
 def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
-    """Return the parts over, under and in a group of teeth that may be teeth by their size and place."""
+    """Return the parts above, below and inside a group of teeth that may be teeth by size and position."""
     rows, columns = np.nonzero(group)
     reach = _ROWS_APART * (np.ptp(columns) + 1)
     around = np.zeros(parts.shape, bool)
@@ -159,7 +158,7 @@ def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
 
 
 def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None:
-    """Return upper and lower row (2, h, w), parted by the line with most gap, and the share of it that is none."""
+    """Split teeth into upper and lower row (2, h, w) at the line with most gap; also return its bridged fraction."""
     rows, columns = np.nonzero(teeth)
     first, last, top, bottom = columns.min(), columns.max(), rows.min(), rows.max()
     lines = top + _lines(int(last - first + 1), int(bottom - top + 1))  # (N, width)
@@ -172,7 +171,7 @@ def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None
     if not len(fair):
         return None
     lines = lines[fair]
-    near = np.mean([np.roll(bright, -k, axis=0) for k in _LINE_PX], axis=0)  # of the rows around each pixel
+    near = np.mean([np.roll(bright, -k, axis=0) for k in _LINE_PX], axis=0)  # mean over the rows around each pixel
     bridged = near[lines[:, taken], across[taken]].mean(1)
     best = int(bridged.argmin())
     below = np.zeros(teeth.shape, bool)
@@ -182,7 +181,7 @@ def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None
 
 @lru_cache(maxsize=8)
 def _lines(width: int, height: int) -> NDArray[np.int64]:
-    """Return lines across a box, the rows at each column, shape (N, width)."""
+    """Return candidate lines across a box as the row at each column, shape (N, width)."""
     place = np.linspace(-1.0, 1.0, width)
     middles = np.arange(0.15 * height, 0.9 * height, 1.0)
     middle, tilt, sag = (grid.reshape(-1, 1) for grid in np.meshgrid(middles, _TILTS * width / 2, _SAGS * height))

@@ -252,11 +252,11 @@ def test_colours_go_on_where_they_stopped(tmp_path):
         ColourStates(tmp_path, {"cam0": model}).keep(frame, 1)
     fresh = ColourModel(10.0)
     states = ColourStates(tmp_path, {"cam0": fresh})
-    assert states.take_up(9, 1) is None
-    assert states.take_up(5, -1) is None
+    assert states.restore(9, 1) is None
+    assert states.restore(5, -1) is None
     assert not fresh.is_trained()
-    assert states.take_up(7, 1) == 6  # frame 7 is on record, its colours are not
-    assert states.take_up(5, 1) == 5
+    assert states.restore(7, 1) == 6  # frame 7 is on record, its colours are not
+    assert states.restore(5, 1) == 5
     assert np.array_equal(fresh.log_odds(rgb), model.log_odds(rgb))
 
 
@@ -265,10 +265,10 @@ def test_damaged_colours_are_done_again(tmp_path):
     states = ColourStates(tmp_path, {"cam0": model})
     for frame in (5, 6):
         states.keep(frame, 1)
-    assert states.take_up(6, 1) == 6
+    assert states.restore(6, 1) == 6
     for path in state_files(tmp_path):  # only that of frame 6, then both
         path.write_bytes(path.read_bytes()[:-40])
-        assert states.take_up(6, 1) == (5 if path == state_files(tmp_path)[0] else None)
+        assert states.restore(6, 1) == (5 if path == state_files(tmp_path)[0] else None)
 
 
 def test_a_folder_without_key_masks_is_refused(tmp_path):

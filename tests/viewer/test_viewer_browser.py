@@ -301,7 +301,7 @@ def test_a_bad_file_is_a_message_and_the_page_lives_on(tab, tmp_path):
     bad = tmp_path / "bad.json"
     bad.write_text('{"fps": 24, "keys": [{"frame": 0}]}')
     chooser.set_input_files(bad)
-    tab.said("bad.json: keys.0.d")
+    tab.said("bad.json: keys, entry 1: d")
     worse = tmp_path / "worse.json"
     worse.write_bytes(b"\xff\xfe\x00rubbish")
     chooser.set_input_files(worse)

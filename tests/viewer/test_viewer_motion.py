@@ -53,7 +53,7 @@ def test_a_clip_bridges_lost_frames_and_holds_its_ends():
 def test_clips_without_motion_or_order_are_refused():
     with pytest.raises(FormatError, match="nothing to play"):
         Clip.of("empty", np.arange(2), np.full((2, 3), np.nan), 24)
-    with pytest.raises(FormatError, match="do not rise"):
+    with pytest.raises(FormatError, match="do not increase"):
         Clip.of("odd", np.array([2, 1]), np.zeros((2, 3)), 24)
 
 

@@ -180,10 +180,10 @@ def test_a_baked_motion_is_chosen_played_round_and_stopped(quiet):
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("bad.json", b'{"fps": 24, "keys": [{"frame": 0}]}', "bad.json: keys.0.d"),
+        ("bad.json", b'{"fps": 24, "keys": [{"frame": 0}]}', "bad.json: keys, entry 1: d"),
         ("bad.json", b"\xff\xfe\x00", "UTF-16"),
         ("bad.csv", b"frame,d1\n0,1\n", 'no column "d2"'),
-        ("bad.csv", b"frame,d1,d2,d3\n4,1,0,0\n4,1,0,0\n", "do not rise"),
+        ("bad.csv", b"frame,d1,d2,d3\n4,1,0,0\n4,1,0,0\n", "do not increase"),
         ("empty.csv", b"", "is empty"),
         ("../../x.usdc", b"PXR-USDC", "x.usdc"),
     ],

@@ -161,7 +161,7 @@ def test_dragging_keys_along_the_timeline_is_one_step(session):
     for last in (12, 16, 20):
         session.move_keys([0, last], 5)
         np.testing.assert_allclose(session.d, [50 / last, 0, 0])
-    with pytest.raises(FormatError, match="frame of its own"):
+    with pytest.raises(FormatError, match="every key needs its own frame"):
         session.move_keys([20, 20], 5)
     assert session.undo() and session.work == before
 

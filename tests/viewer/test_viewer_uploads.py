@@ -56,16 +56,16 @@ def test_other_types_are_refused(name, quiet):
 def test_uploads_have_a_size(quiet):
     load = quiet.page.files.load
     send(quiet, start(load, "announced", MOST_BYTES + 1))
-    assert pending(quiet) == {} and f"at most {MOST_BYTES}" in quiet.notices[-1][1]
+    assert pending(quiet) == {} and f"limit is {MOST_BYTES}" in quiet.notices[-1][1]
     send(quiet, start(load, "sent", 10))
     send(quiet, _messages.FileTransferPart(load._impl.uuid, "sent", 0, bytes(MOST_BYTES + 1)))
-    assert pending(quiet) == {} and f"at most {MOST_BYTES}" in quiet.notices[-1][1]
+    assert pending(quiet) == {} and f"limit is {MOST_BYTES}" in quiet.notices[-1][1]
 
 
 def test_one_upload_at_a_time(quiet):
     load = quiet.page.files.load
     send(quiet, *(start(load, f"number {k}", 2 * len(TABLE)) for k in range(50)))
-    assert list(pending(quiet)) == ["number 0"] and "another file" in quiet.notices[-1][1]
+    assert list(pending(quiet)) == ["number 0"] and "another upload" in quiet.notices[-1][1]
     send(quiet, *(_messages.FileTransferPart(load._impl.uuid, "number 0", k, TABLE) for k in range(2)))
     assert pending(quiet) == {}
 
