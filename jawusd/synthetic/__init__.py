@@ -1,1 +1,4 @@
-"""The synthetic person: a jaw that moves like a human one, its anatomy, and captures of it with known truth."""
+"""Synthetic persons: jaw motion, anatomy, and rendered captures with ground truth.
+
+The kinematics share nothing with the models that jawusd fits; imports no other stage.
+"""

@@ -1,4 +1,4 @@
-"""The bones and teeth of a synthetic person, fitted to that person's joint, teeth in occlusion at identity."""
+"""Bones and teeth of a synthetic person, matching the person's joint, in occlusion at the identity pose."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _SAMPLES_PER_EDGE = 5
 
 
 class Occlusion:
-    """The occlusal side of the upper crowns as a height map, and the vertices of the lower crowns."""
+    """Height map of the occlusal side of the upper crowns, and the vertices of the lower crowns."""
 
     def __init__(self, upper: DentalArch, lower: DentalArch) -> None:
-        """Map the upper crowns; both arches in the scan frame, in occlusion."""
+        """Build the height map; both arches are in the scan frame, in occlusion."""
         samples = _samples(upper)
         self._low = samples[:, [0, 2]].min(0)
         cells = np.floor((samples[:, [0, 2]] - self._low) / _CELL_MM).astype(int)
@@ -39,9 +39,9 @@ class Occlusion:
         self._tooth = lower.tooth
 
     def gaps(self, T_skull_mandible: ArrayLike) -> Array:
-        """Return the smallest vertical gap of each lower tooth to the upper crowns [mm] in one pose (4, 4).
+        """Return the smallest vertical gap between each lower tooth and the upper crowns [mm] in one pose (4, 4).
 
-        Shape (2, 7), left 1..7 then right 1..7; negative inside a crown, inf for a tooth without an upper crown above.
+        Shape (2, 7), left 1..7 then right 1..7; negative inside a crown, inf for a tooth without an opposing crown.
         """
         teeth = [[side * (k + 1) for k in range(7)] for side in (1, -1)]
         return np.array([[self._gap(T_skull_mandible, self._points[self._tooth == k]) for k in half] for half in teeth])
@@ -73,8 +73,8 @@ class PersonAnatomy:
 def build_anatomy(person: Person) -> PersonAnatomy:
     """Build the teeth and bones of a person.
 
-    The lower front teeth are placed by the person's overbite and overjet; the lower back teeth are raised until they
-    meet the upper ones.
+    The person's overbite and overjet determine the lower front teeth; the lower back teeth are raised until they touch
+    the upper ones.
     """
     rng = np.random.default_rng([person.seed, 0xA1A7])
     quadratic, quartic = rng.uniform(0.0160, 0.0180), rng.uniform(2.7e-5, 3.1e-5)
@@ -92,7 +92,7 @@ def build_anatomy(person: Person) -> PersonAnatomy:
 
 
 def lifted_bite(person: Person, occlusion: Occlusion, controls: Array, extra_mm: Array) -> Array:
-    """Return controls (F, 3) with the opening raised where teeth would penetrate; see `Person.pose_with_extra`."""
+    """Return controls (F, 3) with the opening increased where teeth would penetrate; see `Person.pose_with_extra`."""
     lifted = controls.copy()
     for i in range(len(lifted)):
         while lifted[i, 0] < 0.2 and occlusion.gap(person.pose_with_extra(lifted[i], extra_mm[i])) < 0.0:
@@ -101,7 +101,7 @@ def lifted_bite(person: Person, occlusion: Occlusion, controls: Array, extra_mm:
 
 
 def _samples(arch: DentalArch) -> Array:
-    """Points spread over all crown triangles, closer than a cell, (N, 3)."""
+    """Sample all crown triangles more densely than the height map's cells, shape (N, 3)."""
     faces = arch.mesh.faces[arch.tooth[arch.mesh.faces[:, 0]] != 0]
     corners = arch.mesh.vertices[faces]
     n = _SAMPLES_PER_EDGE

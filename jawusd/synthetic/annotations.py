@@ -1,4 +1,4 @@
-"""Masks and picks."""
+"""Annotations of a synthetic capture: masks with the defects of manual segmentation, and initial picks."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from jawusd.geometry.points import meet_triangles
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.surfaces import vertex_normals
 
-# Size of the jitter [px] and of its cells at a picture height of 1080; a constant share, the rest correlated in time.
+# Amplitude and cell size of the jitter [px] at a picture height of 1080; the constant fraction of its variance and the
+# temporal correlation of the rest.
 _WOBBLE_PX, _CELL_PX = 0.7, 36.0
 _REFERENCE_HEIGHT = 1080.0
 _CONSTANT_SHARE = 0.5
 _KEEP = 0.6
 _HOLE_CHANCE, _SPECK_CHANCE = 0.12, 0.08
 _FINE = 4
-# A pick lies this far inside the picture, and on a surface inclined to the ray by at most about 70 degrees.
+# Smallest distance of a pick to the picture border, and smallest cosine between ray and normal (about 70 degrees).
 _BORDER_PX = 10.0
 _FACING = 0.35
-# Another surface this much nearer to the camera hides a point.
+# A surface closer to the camera by more than this hides a point.
 _CLEARANCE_MM = 0.05
 _TIPS_PER_TOOTH = 6
 
 
 class Outline:
-    """The jitter of one mask's outline over time, as a displacement field."""
+    """Jitter of a mask's outline over time as a displacement field."""
 
     def __init__(self, size_px: tuple[int, int], rng: np.random.Generator) -> None:
-        """Start the jitter of masks of a width and height."""
+        """Initialise for masks of a width and height."""
         scale = size_px[1] / _REFERENCE_HEIGHT
         self._rng = rng
         cells = tuple(int(np.ceil(s / (_CELL_PX * scale))) + 3 for s in size_px[::-1])
@@ -42,7 +43,7 @@ class Outline:
         self._varying = rng.normal(size=(*cells, 2))
 
     def next(self) -> Array:
-        """Return the displacement field of the next frame [px], shape (rows, columns, 2), over the picture."""
+        """Return the displacement field over the picture for the next frame [px], shape (rows, columns, 2)."""
         fresh = self._rng.normal(size=self._varying.shape)
         self._varying = _KEEP * self._varying + np.sqrt(1.0 - _KEEP**2) * fresh
         field = np.sqrt(_CONSTANT_SHARE) * self._constant + np.sqrt(1.0 - _CONSTANT_SHARE) * self._varying
@@ -51,7 +52,7 @@ class Outline:
 
 
 def _refined(field: Array, axis: int) -> Array:
-    """Interpolate along an axis with cosine weights; the inverse norm keeps the variance even between the nodes."""
+    """Interpolate along an axis with cosine weights, normalised to keep the variance constant between nodes."""
     t = np.arange(_FINE) / _FINE
     b = 0.5 - 0.5 * np.cos(np.pi * t)
     a = 1.0 - b
@@ -63,7 +64,7 @@ def _refined(field: Array, axis: int) -> Array:
 
 
 def drawn_mask(coverage: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Return a mask (h, w), 0 or 255, from the coverage (h, w), 0..255, at times with a small hole or speck."""
+    """Return a mask (h, w), 0 or 255, from the coverage (h, w), 0..255, sometimes with a small hole or speck."""
     mask = coverage > 127
     hole, speck = rng.random() < _HOLE_CHANCE, rng.random() < _SPECK_CHANCE
     place, radius = rng.random(2), rng.uniform(1.2, 3.5, 2) * len(mask) / _REFERENCE_HEIGHT * 1.5
@@ -86,7 +87,7 @@ def _ellipse(mask: Mask, row: float, column: float, radius: Array, value: bool) 
 
 @dataclass(frozen=True)
 class SeenVertex:
-    """A vertex of a scan and its pixels: (camera, x, y) of two cameras."""
+    """A vertex of a scan and its pixels (camera, x, y) in two cameras."""
 
     vertex: int
     views: tuple[tuple[str, float, float], ...]
@@ -101,15 +102,15 @@ def choose_picks(
     noise_px: float,
     rng: np.random.Generator,
 ) -> list[SeenVertex]:
-    """Choose `count` well spread tips and corners of teeth that are visible in at least two cameras.
+    """Choose `count` well distributed tips and corners of teeth that are visible in at least two cameras.
 
     Args:
         T_world_arch: pose of the arch, shape (4, 4).
-        occluders: meshes that may hide the teeth, world coordinates; the arch itself included.
+        occluders: meshes that may hide the teeth, including the arch itself, in world coordinates.
         noise_px: standard deviation of the picked pixels, per axis.
 
     Raises:
-        ValueError: fewer vertices are visible in two cameras.
+        ValueError: too few vertices are visible in two cameras.
     """
     candidates = _tips(arch)
     points = transform_points(T_world_arch, arch.mesh.vertices[candidates])
@@ -117,7 +118,7 @@ def choose_picks(
     facing = np.stack([_seen(camera, points, normals, occluders) for camera in cameras], -1)
     good = np.flatnonzero((facing > 0).sum(-1) >= 2)
     if len(good) < count:
-        raise ValueError(f"only {len(good)} tips of teeth are seen by two cameras, {count} are needed")
+        raise ValueError(f"only {len(good)} tips of teeth are visible in two cameras, {count} are needed")
     picks = []
     for i in spread_out(points[good], count):
         k = good[i]
@@ -130,7 +131,7 @@ def choose_picks(
 
 
 def _tips(arch: DentalArch) -> NDArray[np.int64]:
-    """Vertices at the occlusal end of the crowns, on the facial side: what a person would click on."""
+    """Return vertices at the occlusal end of the crowns on the facial side, where a person would click."""
     vertices = arch.mesh.vertices
     up = 1.0 if vertices[arch.tooth == 0, 1].mean() < vertices[arch.tooth != 0, 1].mean() else -1.0
     chosen = []
@@ -143,7 +144,7 @@ def _tips(arch: DentalArch) -> NDArray[np.int64]:
 
 
 def _seen(camera: Camera, points: Array, normals: Array, occluders: list[Mesh]) -> Array:
-    """How squarely a camera sees points: cosine of normal and ray, 0 where hidden or turned away, shape (N,)."""
+    """Return the cosine between normals and rays of a camera, 0 for hidden or averted points, shape (N,)."""
     eye = camera.centre_world()
     rays = eye - points
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -153,7 +154,7 @@ def _seen(camera: Camera, points: Array, normals: Array, occluders: list[Mesh]) 
     facing[((pixels < _BORDER_PX) | (pixels > limit)).any(1)] = 0.0
     facing[facing < _FACING] = 0.0
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in occluders])
-    # A triangle can hide a point only if the bounding box of its corners in the picture contains the point.
+    # A triangle can hide a point only if its bounding box in the picture contains the point.
     pixels_of_corners = camera.project_pinhole(corners)
     low, high = pixels_of_corners.min(1), pixels_of_corners.max(1)
     at = camera.project_pinhole(points)
@@ -164,7 +165,7 @@ def _seen(camera: Camera, points: Array, normals: Array, occluders: list[Mesh]) 
 
 
 def _hits(point: Array, eye: Array, corners: Array) -> bool:
-    """Tell whether a triangle (N, 3, 3) lies between a point and the eye."""
+    """Return whether any of the triangles (N, 3, 3) lies between a point and the camera."""
     direction = eye - point
     u, v, along = meet_triangles(point, direction, corners)
     nearest = _CLEARANCE_MM / np.linalg.norm(direction)
@@ -172,7 +173,7 @@ def _hits(point: Array, eye: Array, corners: Array) -> bool:
 
 
 def spread_out(points: Array, count: int) -> list[int]:
-    """Return the indices of well spread points (N, 3): farthest-point choice, from the one farthest off the middle."""
+    """Select points (N, 3) by farthest-point sampling, starting with the one farthest from the mean; return indices."""
     chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)
     while len(chosen) < count:

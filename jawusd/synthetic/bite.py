@@ -1,4 +1,4 @@
-"""Both arches of a person, the lower one settled on the upper one: contact without deep interpenetration."""
+"""Both arches of a person in occlusion: contact without deep penetration."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from jawusd.synthetic.teeth import LOWER, UPPER
 
 # Heights of the upper edges and cusps over the plane of the first incisors [mm].
 _UPPER_TIPS_MM = -np.array([0.0, 0.5, 0.2, 0.3, 0.4, 0.6, 1.0])
-# How the lower teeth go over from the incisors' overjet and height to the back teeth's, first incisor to second molar.
+# Blend from the overjet and height of the incisors (0) to those of the back teeth (1), first incisor to second molar.
 _BACK_SHARE = np.array([0.0, 0.05, 0.2, 0.45, 0.7, 0.9, 1.0])
 _FRONT_TEETH = 3
 _GAP_MM = 0.03
-_PREMOLARS_REACH_MM = 1.0  # how far premolars grow to meet the other arch in an open bite
+_PREMOLARS_REACH_MM = 1.0  # largest eruption of premolars in an open bite
 _MOLARS_REACH_MM = 4.0
 
 
@@ -29,13 +29,13 @@ class Bite:
     upper: DentalArch
     lower: DentalArch
     occlusion: Occlusion
-    overbite_mm: float  # as reached, between the edges of the first incisors
+    overbite_mm: float  # actual overbite between the edges of the first incisors
     overjet_mm: float
     incisor: Array  # lower incisal point, shape (3,)
 
 
 def build_bite(traits: Traits) -> Bite:
-    """Build both arches of a person and settle the lower teeth on the upper ones."""
+    """Build both arches of a person and bring the lower teeth into contact with the upper ones."""
     shape = ArchShape(traits.quadratic_per_mm, traits.quartic_per_mm3, 0.0, np.zeros((2, 7)), 0.0)
     curve = traits.spee_mm * np.sin(np.linspace(0.0, np.pi, 7))
     upper_seats = seats(UPPER, traits.upper, _UPPER_TIPS_MM + traits.upper.rise_mm - 0.5 * curve, np.zeros((2, 7)), 0.0)
@@ -52,12 +52,12 @@ def build_bite(traits: Traits) -> Bite:
         placed = seats(LOWER, traits.lower, tips, base - wished, 0.0)
         return placed, build(placed, line, traits, traits.lower, False, traits.gums)
 
-    for _ in range(3):  # raised teeth meet other parts of the upper ones
+    for _ in range(3):  # raised teeth touch other parts of the upper ones
         _, lower = lower_arch()
         tips = tips + _moves(Occlusion(upper, lower).gaps(np.eye(4)), traits)
     placed, lower = lower_arch()
     occlusion = Occlusion(upper, lower)
-    # Whatever touches first stops the others.
+    # The first contact stops the closing.
     gap = occlusion.gap(np.eye(4)) - _GAP_MM
     raised = lower.mesh.vertices + [0.0, gap, 0.0]
     lower = DentalArch(type(lower.mesh)(raised, lower.mesh.faces, lower.mesh.colors), lower.tooth)
@@ -73,15 +73,15 @@ def build_bite(traits: Traits) -> Bite:
 
 
 def _moves(gaps: Array, traits: Traits) -> Array:
-    """Return how far each lower tooth is raised (+) to its contact or lowered (-) out of a tooth, shape (2, 7) [mm]."""
+    """Return how far each lower tooth is raised into contact (+) or lowered out of a tooth (-), shape (2, 7) [mm]."""
     free = gaps - _GAP_MM
     reach = np.array([0.0] * _FRONT_TEETH + [_PREMOLARS_REACH_MM] * 2 + [_MOLARS_REACH_MM] * 2)
     if traits.overbite_mm > 0.5:
         reach[_FRONT_TEETH:] = _MOLARS_REACH_MM
     moves = np.where(np.isfinite(free), np.minimum(free, reach), 0.0)
-    # The four incisors stay in line.
+    # The four incisors stay aligned.
     moves[:, :2] = moves[:, :2].min()
-    # A tooth without an opponent keeps up with its neighbours.
+    # A tooth without an opposing tooth follows its neighbours.
     for half in (0, 1):
         met = np.isfinite(free[half]) & (np.arange(7) >= _FRONT_TEETH)
         if met.any():

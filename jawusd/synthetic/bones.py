@@ -1,7 +1,7 @@
 """The mandible and the adjacent parts of the skull: fossa and eminence, cheekbone, upper jaw bone; without teeth.
 
-The joint surfaces follow the person's kinematics: condyles that roll along them describe the paths of
-`jawusd.synthetic.kinematics`. All are in the scan frame [mm], in the closed bite.
+The joint surfaces follow the person's kinematics: condyles that slide along them trace the paths of
+`jawusd.synthetic.kinematics`. Everything is in the scan frame [mm], in the closed bite.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _AROUND = 24
 
 
 def build_mandible(joint: Joint) -> Mesh:
-    """Build the mandible without teeth: body, rami, coronoid processes, condyles; closed parts that overlap."""
+    """Build the mandible without teeth from overlapping closed parts: body, rami, coronoid processes, condyles."""
     parts = [_body(joint)]
     for side, centre in zip((1.0, -1.0), joint.condyles, strict=True):
         parts += [_ramus(joint, side, centre), _condyle(side, centre), _coronoid(side, centre)]
@@ -30,7 +30,7 @@ def build_mandible(joint: Joint) -> Mesh:
 
 
 def build_skull(joint: Joint) -> Mesh:
-    """Build the joint sockets, the cheekbones and the upper jaw bone; closed parts that overlap."""
+    """Build the skull from overlapping closed parts: joint sockets, cheekbones and upper jaw bone."""
     parts = [_maxilla(joint)]
     for k, side in enumerate((1.0, -1.0)):
         parts += [_socket(joint, k), _cheekbone(joint, k, side)]
@@ -40,7 +40,7 @@ def build_skull(joint: Joint) -> Mesh:
 def articular_surface(joint: Joint, side: int, slide_mm: Array) -> Array:
     """Return the sagittal section (y, z) of the socket's bone [mm], shape (..., 2), at forward slides (...).
 
-    It is the condyle's path moved out by the joint space; side 0 is left, 1 right.
+    It is the condyle's path offset by the joint space; side 0 is left, 1 right.
     """
     step = 1e-4
     slope = (eminence(joint, side, slide_mm + step) - eminence(joint, side, slide_mm - step)) / (2 * step)
@@ -56,14 +56,14 @@ def _mesh(part: tuple[Array, Faces]) -> Mesh:
 
 
 def _ovals(centres: Array, half_x: Array, half_z: Array, squareness: float = 0.8) -> tuple[Array, Faces]:
-    """Loft of level rounded rectangles: centres (R, 3), half sizes (R,) [mm]."""
+    """Loft horizontal rounded rectangles: centres (R, 3), half sizes (R,) [mm]."""
     x, z = superellipse(2 * np.pi * np.arange(_AROUND) / _AROUND, squareness)
     offsets = np.stack([half_x[:, None] * x, np.zeros((len(centres), _AROUND)), half_z[:, None] * z], -1)
     return loft(centres[:, None] + offsets)
 
 
 def _swept(path: Array, half_wide: Array, half_high: Array) -> tuple[Array, Faces]:
-    """Loft of upright ovals along a path (R, 3); half sizes across and upwards (R,) [mm]."""
+    """Loft upright ovals along a path (R, 3), with half widths and heights (R,) [mm]."""
     tangent = np.gradient(path, axis=0) * [1.0, 0.0, 1.0]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.stack([tangent[:, 2], np.zeros(len(path)), -tangent[:, 0]], -1)
@@ -74,7 +74,7 @@ def _swept(path: Array, half_wide: Array, half_high: Array) -> tuple[Array, Face
 
 
 def _spline(knots: Array, values: Array, at: Array) -> Array:
-    """Catmull-Rom interpolation of values (K, ...) at positions within the knots."""
+    """Interpolate values (K, ...) at positions within the knots with a Catmull-Rom spline."""
     slopes = np.gradient(values, knots, axis=0)
     i = np.clip(np.searchsorted(knots, at) - 1, 0, len(knots) - 2)
     h = (knots[i + 1] - knots[i])[:, None]
@@ -86,7 +86,7 @@ def _spline(knots: Array, values: Array, at: Array) -> Array:
 def _body(joint: Joint) -> tuple[Array, Faces]:
     """Return the horseshoe from ramus to ramus, below the lower gum."""
     x, y, z = joint.incisor
-    # x, middle height, z, half width, half height; from the chin to the left ramus
+    # x, y of the middle, z, half width, half height; from the chin to the left ramus
     half = np.array(
         [
             [0.0, y - 24.0, z - 5.5, 5.5, 10.5],
@@ -171,7 +171,7 @@ def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
         ],
         -1,
     )
-    # thick in the middle, thin towards the edges, domed over the fossa
+    # thick in the middle, thin at the edges, domed over the fossa
     along = np.linspace(-1.0, 1.0, 40)[:, None]
     thick = np.sqrt((1.0 - along**6) * (1.0 - (across / 12.0) ** 6) + 0.01)
     dome = 3.0 * np.exp(-(((slide[:, None] - 2.0) / 9.0) ** 2)) * np.cos(across / 12.0 * np.pi / 2)

@@ -1,4 +1,4 @@
-"""Write a synthetic capture: scans, videos, masks, boards, calibration, picks and the ground truth."""
+"""Write a synthetic capture: scans, videos, masks, boards, calibration, picks and ground truth."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ _SCANS = ("upper_teeth", "lower_teeth", "mandible", "skull")
 _PICKS = 4
 _PICK_NOISE_PX = 1.0
 _PICTURES_PER_BOARD = 2
-# Sensor noise [grey levels of 255]; a few patterns are shifted at random instead of drawing one per picture.
+# Sensor noise [grey levels of 255]: random shifts of a few patterns, instead of a new one per picture.
 _SENSOR_NOISE = 1.3
 _NOISE_PATTERNS = 5
 
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Choose the person and the size of a synthetic capture."""
+    """Person and size of a synthetic capture."""
 
     seed: int = 0  # of person and performance
     frames: int = 240  # tracked frames at 24 per second
@@ -71,12 +71,12 @@ class DemoConfig:
 
 
 def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Progress | None = None) -> Path:
-    """Record a synthetic person into a capture folder, replacing files of the same names; return capture.toml.
+    """Record a synthetic person into a capture folder, overwriting existing files; return the path of capture.toml.
 
-    Progress is counted in pictures, done and in all.
+    Progress is reported in pictures, done and total.
 
     Raises:
-        MissingDependencyError: there is no OpenGL without a display (EGL).
+        MissingDependencyError: there is no headless OpenGL (EGL).
         OutputError: the folder cannot be written.
     """
     folder = Path(folder)
@@ -99,7 +99,7 @@ def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Pro
 
 
 class _Recorder:
-    """Draw every picture of a capture and write the video files."""
+    """Renders every picture of a capture and writes the video files."""
 
     def __init__(
         self, folder: Path, config: DemoConfig, cameras: list[Camera], renderer: Renderer, progress: Progress | None
@@ -227,7 +227,7 @@ def _truth(person: Person, cameras: list[Camera], take: Take, T_world_board: Arr
 
 
 def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, list[SeenVertex]]) -> str:
-    """Text of capture.toml."""
+    """Return the text of capture.toml."""
     lines = [
         'format = "jawusd-capture/1"',
         f'name = "synthetic_{config.seed}"',

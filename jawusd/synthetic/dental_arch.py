@@ -1,4 +1,4 @@
-"""Dental arches: crowns set along a curve, and a scalloped gum that covers the crowns' bases.
+"""Dental arches: crowns placed along a curve, and a scalloped gum around their bases.
 
 Everything is built with the occlusal side up (x left, y occlusal, z anterior) and mirrored in y for the upper jaw.
 """
@@ -30,7 +30,7 @@ COLUMN_MM = 0.55
 
 @dataclass(frozen=True)
 class ArchShape:
-    """Form and position of one arch."""
+    """Shape and position of one arch."""
 
     quadratic_per_mm: float  # the line of edges and buccal cusps recedes by a x^2 + b x^4: a [1/mm]
     quartic_per_mm3: float  # b [1/mm^3]
@@ -42,17 +42,17 @@ class ArchShape:
 
 @dataclass(frozen=True, eq=False)
 class DentalArch:
-    """One arch with gum, scan frame."""
+    """One arch with gum in the scan frame."""
 
     mesh: Mesh  # crowns first, then gum; red, green and grey
     tooth: NDArray[np.int8]  # tooth of each vertex, 1..7 left and -1..-7 right from the midline, 0 gum, shape (V,)
 
 
 class ArchLine:
-    """A planar curve through the contact points, by arc length from the midline; positive to the left."""
+    """Planar curve through the contact points, by signed arc length from the midline, positive to the left."""
 
     def __init__(self, shape: ArchShape) -> None:
-        """Follow the contact points of an arch of that shape."""
+        """Compute the curve for an arch shape."""
         x = np.linspace(-40.0, 40.0, 8001)
         z = -shape.quadratic_per_mm * x**2 - shape.quartic_per_mm3 * x**4
         slope = -2 * shape.quadratic_per_mm * x - 4 * shape.quartic_per_mm3 * x**3
@@ -65,13 +65,13 @@ class ArchLine:
         self._normal = normal
 
     def at(self, s: Array) -> tuple[Array, Array]:
-        """Points and outward normals (x, z) at arc lengths, (..., 2) each."""
+        """Return points and outward normals (x, z) at arc lengths, (..., 2) each."""
         points = np.stack([np.interp(s, self._s, self._points[:, k]) for k in (0, 1)], -1)
         normal = np.stack([np.interp(s, self._s, self._normal[:, k]) for k in (0, 1)], -1)
         return points, normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
     def coordinates(self, xz: Array) -> tuple[Array, Array]:
-        """Arc length and outward offset of points (N, 2)."""
+        """Return arc length and outward offset of points (N, 2)."""
         s = np.empty(len(xz))
         for i in range(0, len(xz), 4000):
             part = xz[i : i + 4000]
@@ -90,7 +90,7 @@ def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float
         forms: tooth kinds from the first incisor to the second molar.
         cusp_slope: drop of the cusps per mm.
         upper: mirror it downwards.
-        seed: of positions and irregularities of the teeth, which do not depend on the tips.
+        seed: seed of the positions and irregularities of the teeth, independent of their tips.
     """
     rng = np.random.default_rng([seed, 0x7EE7, int(upper)])
     line = ArchLine(shape)
@@ -115,7 +115,7 @@ def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float
 
 
 def _centres(forms: tuple[CrownForm, ...]) -> Array:
-    """Arc length of the tooth middles on one side."""
+    """Return the arc length of the tooth centres on one side."""
     widths = np.array([form.width_mm - CONTACT_OVERLAP_MM for form in forms])
     return np.cumsum(widths) - widths / 2
 
@@ -123,7 +123,7 @@ def _centres(forms: tuple[CrownForm, ...]) -> Array:
 def _placed(
     local: Array, form: CrownForm, line: ArchLine, s: float, side: int, tip_mm: float, rng: np.random.Generator
 ) -> Array:
-    """Move a crown to its place, occlusal side up."""
+    """Transform a crown to its position, occlusal side up."""
     point, normal = line.at(np.array(s))
     distal = side * np.array([normal[1], 0.0, -normal[0]])
     facial = np.array([normal[0], 0.0, normal[1]])
@@ -137,7 +137,7 @@ def _placed(
 
 
 def crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
-    """Return red, and green on the facial side of the last millimetres of the six front teeth, shape (V, 3).
+    """Return vertex colours (V, 3): red, and green on the facial side of the tips of the six front teeth.
 
     Args:
         local: vertices in the crown frame, shape (V, 3).
@@ -152,7 +152,7 @@ def crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
 
 
 def _gum(forms: tuple[CrownForm, ...], shape: ArchShape, line: ArchLine, crowns: Array) -> tuple[Array, Faces]:
-    """Return a closed gum ridge: margins scalloped between the teeth, surface slightly outside the crowns."""
+    """Return a closed gum ridge with scalloped margins, slightly outside the crowns."""
     half = _centres(forms)[-1] + forms[-1].width_mm / 2 + 2.5
     s = np.linspace(-half, half, int(2 * half / COLUMN_MM))
     return gum_ridge(line, s, _margin(forms, shape, s), crowns)
@@ -168,7 +168,7 @@ def gum_ridge(line: ArchLine, s: Array, margin: Array, crowns: Array) -> tuple[A
     """
     crown_s, crown_n = line.coordinates(crowns[:, [0, 2]])
     facial, lingual = _crown_extent(s, margin, crown_s, crown_n, crowns[:, 1])
-    # Near the crest the gum follows every crown, further down only the arch as a whole.
+    # Near the crest the gum follows every crown, further down only the arch.
     follow = np.clip(1.0 + _GUM_SIDE[:, 1] / 5.0, 0.0, 1.0)
     sides = []
     for extent, sign in ((facial, 1.0), (lingual, -1.0)):
@@ -185,7 +185,7 @@ def gum_ridge(line: ArchLine, s: Array, margin: Array, crowns: Array) -> tuple[A
 
 
 def _margin(forms: tuple[CrownForm, ...], shape: ArchShape, s: Array) -> Array:
-    """Height of the gum margin: the gum line at each tooth, papillae in between."""
+    """Return the height of the gum margin: the gum line at each tooth, papillae in between."""
     height = np.array([form.height_mm for form in forms])
     centre = np.concatenate([side * _centres(forms) for side in (1, -1)])
     order = np.argsort(centre)
@@ -200,7 +200,7 @@ def _margin(forms: tuple[CrownForm, ...], shape: ArchShape, s: Array) -> Array:
 
 
 def _crown_extent(s: Array, margin: Array, crown_s: Array, crown_n: Array, crown_y: Array) -> tuple[Array, Array]:
-    """Outermost facial and lingual offset of the crowns at the margin, per column of the gum."""
+    """Return the largest facial and lingual offset of the crowns at the margin, per column of the gum."""
     facial, lingual = np.full(len(s), np.nan), np.full(len(s), np.nan)
     for i, (column, level) in enumerate(zip(s, margin, strict=True)):
         near = (np.abs(crown_s - column) < 0.8) & (np.abs(crown_y - level) < 1.2)
@@ -212,7 +212,7 @@ def _crown_extent(s: Array, margin: Array, crown_s: Array, crown_n: Array, crown
 
 
 def _averaged(values: Array, width: int) -> Array:
-    """Hann average along the arch, edges repeated."""
+    """Smooth along the arch with a Hann window and replicated edges."""
     width += 1 - width % 2
     kernel = np.hanning(width + 2)[1:-1]
     return np.convolve(np.pad(values, width // 2, mode="edge"), kernel / kernel.sum(), "valid")

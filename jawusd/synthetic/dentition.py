@@ -1,4 +1,8 @@
-"""Dentition."""
+"""Arches of arbitrary persons: traits, and teeth with individual size, position and gum line.
+
+The gum is a separate ridge around the crowns ("dipping"), a surface that continues each crown at its cervical line
+("continuous"), or missing from the scan ("crowns"). Built with the occlusal side up, like `dental_arch`.
+"""
 
 from __future__ import annotations
 
@@ -27,47 +31,47 @@ from jawusd.synthetic.teeth import CrownForm, crown
 Gums = Literal["dipping", "continuous", "crowns"]
 BITES = ("normal", "deep", "open", "edge to edge", "underbite", "large overjet", "crossbite")
 _AROUND = 36
-# Gum on a crown, from its cervical line down: distance outwards and height [mm].
+# Profile of the gum below a crown's cervical line: distance outwards and height [mm].
 _COLLAR = np.array([[0.05, -0.03], [0.22, -0.2], [0.5, -0.8], [0.8, -2.2], [1.1, -4.5], [0.9, -7.0]])
 _BRACKET_MM = np.array([3.0, 3.0, 1.8])
 
 
 @dataclass(frozen=True, eq=False)
 class ArchTraits:
-    """What is peculiar to one arch; arrays hold first incisor to second molar, left then right, shape (2, 7)."""
+    """Individual traits of one arch; arrays run from first incisor to second molar, left then right, shape (2, 7)."""
 
-    width_scale: Array  # tooth widths over the mean ones
-    height_scale: Array  # crown heights over the mean ones: worn, short or long crowns
-    shift_mm: Array  # towards the facial side of where a tooth would stand in line
-    turn_rad: Array  # about the tooth's axis
-    rise_mm: Array  # of edges and cusps over the occlusal curve
-    overlap_mm: Array  # of a tooth with its mesial neighbour; negative for a gap
-    present: Array  # 1 or 0 for a missing tooth
+    width_scale: Array  # tooth width relative to the mean
+    height_scale: Array  # crown height relative to the mean: worn, short or long crowns
+    shift_mm: Array  # facial offset from the arch line
+    turn_rad: Array  # rotation about the tooth's axis
+    rise_mm: Array  # height of edges and cusps over the occlusal curve
+    overlap_mm: Array  # overlap with the mesial neighbour; negative for a gap
+    present: Array  # 1, or 0 for a missing tooth
     brackets: bool  # on the facial faces of all teeth but the molars
 
 
 @dataclass(frozen=True, eq=False)
 class Traits:
-    """What distinguishes one mouth; lengths mm, angles rad, in a frame of x left, y up, z anterior."""
+    """Individual traits of a mouth; lengths mm, angles rad, frame x left, y up, z anterior."""
 
     seed: int
-    overbite_mm: float  # wished height of the lower incisal edges over the upper ones
-    overjet_mm: float  # wished distance of the lower incisal edges behind the upper ones
+    overbite_mm: float  # intended height of the lower incisal edges over the upper ones
+    overjet_mm: float  # intended distance of the lower incisal edges behind the upper ones
     buccal_mm: tuple[float, float]  # distance of the left and right lower back teeth inside the upper ones
     quadratic_per_mm: float
     quartic_per_mm3: float
     cusp_slope: float  # drop of the cusps per mm
     spee_mm: float  # depth of the occlusal curve
-    midline_mm: float  # of the lower arch to the left
-    skew: tuple[float, float]  # widening to the left, and forward lead of the left side, per mm
-    tilt: Array  # turn of the occlusal plane against the joint, shape (3, 3)
+    midline_mm: float  # shift of the lower arch to the left
+    skew: tuple[float, float]  # widening to the left, and forward shift of the left side, per mm
+    tilt: Array  # rotation of the occlusal plane relative to the joint, shape (3, 3)
     upper: ArchTraits
     lower: ArchTraits
     gums: Gums
 
     @property
     def bite(self) -> str:
-        """Return the kind of bite that was wished for, one of `BITES`."""
+        """Return the intended kind of bite, one of `BITES`."""
         if min(self.buccal_mm) < 0.5:
             return "crossbite"
         if self.overjet_mm < -0.8:
@@ -83,13 +87,13 @@ class Traits:
 
 @dataclass(frozen=True, eq=False)
 class Seat:
-    """One tooth of an arch and where it stands."""
+    """One tooth of an arch and its position."""
 
     form: CrownForm
     tooth: int  # 1..7 left, -1..-7 right
-    s_mm: float  # arc length of its middle
+    s_mm: float  # arc length of its centre
     tip_mm: float  # height of its edge or highest cusp
-    facial_mm: float  # outside the arch line
+    facial_mm: float  # offset outside the arch line
     turn_rad: float
     present: bool
 
@@ -97,7 +101,7 @@ class Seat:
 def seats(
     forms: tuple[CrownForm, ...], traits: ArchTraits, tips_mm: Array, facial_mm: Array, midline_s_mm: float
 ) -> list[Seat]:
-    """Return the teeth of an arch, missing ones included; `tips_mm` and `facial_mm` have shape (2, 7)."""
+    """Return the teeth of an arch, including missing ones; `tips_mm` and `facial_mm` have shape (2, 7)."""
     out = []
     for half, side in enumerate((1, -1)):
         edge = 0.0
@@ -127,14 +131,14 @@ def seats(
 
 
 def build(arch: list[Seat], line: ArchLine, person: Traits, traits: ArchTraits, upper: bool, gums: Gums) -> DentalArch:
-    """Build an arch, crowns first; the upper one points down.
+    """Build an arch, crowns first; the upper arch points down.
 
-    The gum of "crowns" is that of "continuous", for a scan that leaves it out (`without_gum`).
+    For "crowns" the gum is built as for "continuous"; `without_gum` removes it.
     """
     rng = np.random.default_rng([person.seed, 0xC20, int(upper)])
     standing = [seat for seat in arch if seat.present]
     rings, locals_ = [], []
-    for seat in arch:  # missing teeth draw their irregularities too, so that the others keep theirs
+    for seat in arch:  # missing teeth consume random numbers too, so that the others do not change
         local, _ = crown(seat.form, person.cusp_slope, rng)
         if seat.present:
             placed = _placed(local, seat, line)
@@ -156,7 +160,7 @@ def build(arch: list[Seat], line: ArchLine, person: Traits, traits: ArchTraits, 
             paint = crown_colors(loft(shape)[0], seat.form, k)
             gum_parts.append(_collar(cut[0]))
         if gums == "continuous":
-            faces = faces[(faces != len(vertices) - 2).all(1)]  # open at the cervical line, where the gum goes on
+            faces = faces[(faces != len(vertices) - 2).all(1)]  # open at the cervical line, where the gum continues
         parts.append((vertices, faces))
         colors.append(paint)
         tooth.append(np.full(len(vertices), seat.tooth))
@@ -181,7 +185,7 @@ def build(arch: list[Seat], line: ArchLine, person: Traits, traits: ArchTraits, 
 
 
 def without_gum(arch: DentalArch) -> Mesh:
-    """Return the crowns of an arch alone; they lie before the gum."""
+    """Return the crowns of an arch without gum."""
     first_gum = int(np.argmax(arch.tooth == 0)) if (arch.tooth == 0).any() else len(arch.tooth)
     faces = arch.mesh.faces[(arch.mesh.faces < first_gum).all(1)]
     colors = None if arch.mesh.colors is None else arch.mesh.colors[:first_gum]
@@ -189,7 +193,7 @@ def without_gum(arch: DentalArch) -> Mesh:
 
 
 def margin(arch: list[Seat], s: Array) -> Array:
-    """Return the height of the gum margin at arc lengths of any shape: the gum line at each tooth, papillae between."""
+    """Return the height of the gum margin at arc lengths (...): the gum line at each tooth, papillae in between."""
     order = sorted(arch, key=lambda seat: seat.s_mm)
     centre = np.array([seat.s_mm for seat in order])
     level = np.array([seat.tip_mm - seat.form.height_mm - 0.6 * (not seat.present) for seat in order])
@@ -201,7 +205,7 @@ def margin(arch: list[Seat], s: Array) -> Array:
 
 
 def _placed(local: Array, seat: Seat, line: ArchLine) -> Array:
-    """Move a crown to its seat."""
+    """Transform a crown to its position."""
     side = 1 if seat.tooth > 0 else -1
     point, normal = line.at(np.array(seat.s_mm))
     distal = side * np.array([normal[1], 0.0, -normal[0]])
@@ -216,7 +220,7 @@ def _placed(local: Array, seat: Seat, line: ArchLine) -> Array:
 
 
 def _above_margin(rings: Array, arch: list[Seat], line: ArchLine) -> tuple[Array, Array]:
-    """Cut rings (R, A, 3) at the gum margin; return the rings left and the ring position of each of their vertices."""
+    """Cut rings (R, A, 3) at the gum margin; return the remaining rings and the ring position of their vertices."""
     points = rings.reshape(-1, 3)
     s, _ = line.coordinates(points[:, [0, 2]])
     above = (points[:, 1] - margin(arch, s)).reshape(rings.shape[:2])
@@ -237,7 +241,7 @@ def _above_margin(rings: Array, arch: list[Seat], line: ArchLine) -> tuple[Array
 
 
 def _resampled(rings: Array, share: Array) -> Array:
-    """Interpolate rings (R, A, 3) along their columns at ring positions (N, A)."""
+    """Interpolate rings (R, A, 3) along columns at ring positions (N, A)."""
     low = np.minimum(share.astype(int), len(rings) - 2)
     columns = np.arange(rings.shape[1])
     weight = (share - low)[..., None]
@@ -245,7 +249,7 @@ def _resampled(rings: Array, share: Array) -> Array:
 
 
 def _collar(cervical: Array) -> tuple[Array, Faces]:
-    """Return the gum around one crown, from its cervical line (A, 3) outwards and down, closed below."""
+    """Return the gum around one crown, from its cervical line (A, 3) outwards and down, closed at the bottom."""
     outwards = cervical[:, [0, 2]] - cervical[:, [0, 2]].mean(0)
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
     even = cervical[:, 1].mean()
@@ -258,7 +262,7 @@ def _collar(cervical: Array) -> tuple[Array, Faces]:
         rings.append(ring)
     vertices, faces = loft(np.stack(rings[::-1]))
     top = len(vertices) - 1
-    return vertices, faces[(faces != top).all(1)]  # the crown goes on there
+    return vertices, faces[(faces != top).all(1)]  # open towards the crown
 
 
 def _bracket(rings: Array, seat: Seat, line: ArchLine) -> tuple[Array, Faces]:
@@ -282,7 +286,7 @@ def _bracket(rings: Array, seat: Seat, line: ArchLine) -> tuple[Array, Faces]:
 
 
 def _warped(vertices: Array, person: Traits) -> Array:
-    """Make an arch asymmetric; the same for both arches, so that they still fit."""
+    """Make an arch asymmetric, equally for both arches, so that they still occlude."""
     wide, lead = person.skew
     x = vertices[:, 0]
     return np.stack([x * (1.0 + wide * np.tanh(x / 15.0)), vertices[:, 1], vertices[:, 2] + lead * x], -1)

@@ -1,6 +1,6 @@
-"""Exercises of the jaw as control curves, and recordings of a person doing them.
+"""Jaw exercises as control curves, and recordings of a person performing them.
 
-Speeds and sizes follow chewing and clinical exercise data: chewing cycles of 0.6 to 1 s and 15 to 20 mm, border
+Speeds and amplitudes follow chewing and clinical exercise data: chewing cycles of 0.6 to 1 s and 15 to 20 mm, border
 movements of 3 to 4 s, all at 24 frames per second.
 """
 
@@ -19,7 +19,7 @@ from jawusd.synthetic.person import Person
 
 Kind = Literal["training", "hidden"]
 
-# The order of exercises; a recording repeats it until it is long enough.
+# Order of the exercises, repeated until the recording is long enough.
 _SCHEDULES: dict[str, tuple[str, ...]] = {
     "training": (
         "open", "lateral", "protrude", "open", "lateral", "sagittal border", "lateral half open",
@@ -36,26 +36,26 @@ _SCHEDULES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Recording:
-    """A person's exercises; poses are T_skull_mandible, shape (F, 4, 4)."""
+    """Recorded exercises of a person; poses are T_skull_mandible, shape (F, 4, 4)."""
 
     controls: Array  # opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3)
     phase: NDArray[np.str_]  # name of the exercise of each frame, shape (F,)
     T_manifold: Array  # poses of the controls alone
-    T_true: Array  # poses with the small extra movements
+    T_true: Array  # poses with small extra movements
     T_noisy: Array  # `T_true` with tracking noise
 
 
 def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", noise_scale: float = 1.0) -> Recording:
-    """Record a person doing exercises at 24 frames per second.
+    """Record the exercises of a person at 24 frames per second.
 
     Args:
         n_frames: number of frames; the paper trained on 833.
-        kind: "training": clinical exercises, chewing and speech; "hidden": another order, other sizes and random
-            motion through the whole envelope, for tests of models fitted to "training".
+        kind: "training": clinical exercises, chewing and speech; "hidden": a different order, other amplitudes and
+            random motion through the whole envelope, to test models fitted to "training".
         noise_scale: multiplies the tracking noise.
 
     Raises:
-        ValueError: unknown kind or less than one frame.
+        ValueError: the kind is unknown or there is less than one frame.
     """
     if kind not in _SCHEDULES:
         raise ValueError(f"kind must be one of {sorted(_SCHEDULES)}, got {kind!r}")
@@ -72,16 +72,16 @@ def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", no
 def schedule(
     names: tuple[str, ...], n_frames: int, rng: np.random.Generator, tempo: float = 1.0
 ) -> tuple[Array, NDArray[np.str_]]:
-    """Join exercises, repeated as needed, until the frames are filled.
+    """Concatenate exercises, repeating them as needed to fill the frames.
 
     Args:
-        tempo: factor on the speed of all exercises but chewing and speech.
+        tempo: speed factor of all exercises except chewing and speech.
 
     Returns:
         Controls with smoothed transitions, shape (F, 3), and the exercise of each frame, shape (F,).
 
     Raises:
-        ValueError: less than one frame.
+        ValueError: there is less than one frame.
     """
     if n_frames < 1:
         raise ValueError(f"a recording needs at least one frame, got {n_frames}")
@@ -96,7 +96,7 @@ def schedule(
 
 
 def smooth_noise(rng: np.random.Generator, n_frames: int, frames: float, n: int) -> Array:
-    """Return n unit-variance random curves with a correlation time in frames, shape (n_frames, n)."""
+    """Return n random curves of unit variance with a correlation time in frames, shape (n_frames, n)."""
     keep = np.exp(-1.0 / frames)
     steps = rng.normal(size=(n_frames, n)) * np.sqrt(1.0 - keep**2)
     curve = np.empty((n_frames, n))
@@ -113,7 +113,7 @@ def _faster(curve: Array, tempo: float) -> Array:
 
 
 def smoothed(curves: Array) -> Array:
-    """Return the seven-frame Hann average of curves (F, n) along time, since muscles move smoothly."""
+    """Smooth curves (F, n) in time with a seven-frame Hann window, since muscles move smoothly."""
     kernel = np.hanning(9)[1:-1]
     kernel = kernel / kernel.sum()
     padded = np.pad(curves, ((3, 3), (0, 0)), mode="edge")
@@ -121,7 +121,7 @@ def smoothed(curves: Array) -> Array:
 
 
 def _with_tracking_noise(person: Person, T: Array, rng: np.random.Generator, scale: float) -> Array:
-    """Rotate and translate each pose slightly about the middle of the lower dental arch."""
+    """Add a small random rotation and translation about the centre of the lower arch to each pose."""
     centre = person.joint.incisor + [0.0, -3.0, -20.0]
     R = so3_exp(rng.normal(size=(len(T), 3)) * person.noise.tracking_rad * scale)
     shift = rng.normal(size=(len(T), 3)) * person.noise.tracking_mm * scale
@@ -129,19 +129,20 @@ def _with_tracking_noise(person: Person, T: Array, rng: np.random.Generator, sca
 
 
 def _bump(n: int, power: float = 1.0) -> Array:
-    """Rise from 0 to 1 and fall back over n frames."""
+    """Return a bump from 0 to 1 and back over n frames."""
     return (0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n) / n)) ** power
 
 
 def _swing(n: int) -> Array:
-    """One period of a sine over n frames."""
+    """Return one period of a sine over n frames."""
     return np.sin(2 * np.pi * np.arange(n) / n)
 
 
 def _border(n: int, turn: float, end: int) -> tuple[Array, Array]:
-    """Trace a border: slide to one side closed, open along it, cross over and close along the other side.
+    """Trace the border: move to one side while closed, open along it, cross over and close along the other side.
 
-    The mandible crosses over in the share `turn` of the closing and returns to the middle in the last `end` frames.
+    The mandible crosses over during the fraction `turn` of the closing and returns to the middle in the last `end`
+    frames.
 
     Returns:
         Opening 0..1 and excursion -1..1, shape (n,) each.

@@ -1,10 +1,10 @@
-"""A temporomandibular joint: two condyles on curved eminences, steered by opening, lateral and protrusion controls.
+"""Temporomandibular joint: two condyles on curved eminences, driven by opening, lateral and protrusion controls.
 
 Frame: scan frame (x to the subject's left, y up, z anterior, mm), teeth in occlusion at identity. The mandible has four
-joint coordinates: the pitch about the condylar axis, the forward slide of each condyle, and the side shift. Heights
-follow from the eminences, the spread of the condyles from the constant distance between them, so every pose keeps both
-condyles on their slopes. The form (joint surfaces, guidance, ranges) follows textbook TMJ mechanics (Posselt 1952,
-Okeson 2019) and shares nothing with the models jawusd fits.
+joint coordinates: the pitch about the condylar axis, the forward slide of each condyle, and the side shift. The
+eminences determine the heights and the constant distance between the condyles their lateral positions, so both
+condyles stay on their slopes in every pose. Joint surfaces, guidance and ranges follow textbook TMJ mechanics
+(Posselt 1952, Okeson 2019) and share nothing with the models that jawusd fits.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry import make_transform, so3_exp
 
-# Pitch [rad] of one e-folding of the Gaussian with which the tooth guidance fades out.
+# Pitch [rad] over which the Gaussian tooth guidance falls by a factor of e.
 _CONTACT_FADE_RAD = np.deg2rad(4.0)
-# Rounding [mm] of the corners in the tooth guidance, since cusps are blunt.
+# Rounding of corners in the tooth guidance [mm], since cusps are blunt.
 _CUSP_ROUNDING_MM = 0.3
 
 
@@ -33,45 +33,45 @@ class Joint:
     eminence_width_mm: Array  # half width of the slope, shape (2,)
     eminence_start_mm: Array  # forward distance from rest to the steepest point, shape (2,)
     medial_slope: Array  # drop per medial mm, shape (2,)
-    bennett_rad: Array  # angle of each condyle's path to the sagittal plane when it is the balancing one, shape (2,)
-    side_shift_mm: Array  # immediate side shift when that side works, shape (2,)
-    lateral_max_mm: Array  # largest difference of the two slides when that side works, shape (2,)
-    lateral_shrink: float  # share of it that is lost at full opening
-    working_share: float  # share of that difference which the balancing condyle takes, closed
+    bennett_rad: Array  # angle of each condyle's path to the sagittal plane on the balancing side, shape (2,)
+    side_shift_mm: Array  # immediate side shift for each working side, shape (2,)
+    lateral_max_mm: Array  # largest difference of the two slides for each working side, shape (2,)
+    lateral_shrink: float  # fraction of it lost at full opening
+    working_share: float  # fraction of the difference taken by the balancing condyle when closed
     rotation_max_rad: float  # pitch at full opening
     rotation_bend: float  # curvature of pitch over opening (0: proportional)
     slide_open_mm: float  # forward slide at full opening
-    slide_limit_mm: float  # forward slide at which a condyle is stopped
-    slide_early: float  # share of the slide that follows the rotation from the first millimetre
-    slide_onset: float  # opening (0..1) over which that share sets in
+    slide_limit_mm: float  # largest forward slide of a condyle
+    slide_early: float  # fraction of the slide that follows the rotation from the start
+    slide_onset: float  # opening (0..1) over which that fraction ramps up
     protrusion_max_mm: float  # forward slide in full protrusion, closed
     retrusion_max_mm: float  # backward slide in full retrusion, closed
-    hinge_share: float  # share of the opening slide that retrusion reverses while the mouth is less than half open
-    deviation_mm: Array  # sideways deviation of the opening path: S-shaped and one-sided part, shape (2,)
+    hinge_share: float  # fraction of the opening slide reversed by retrusion below half opening
+    deviation_mm: Array  # lateral deviation of the opening path: S-shaped and one-sided part, shape (2,)
     protrusive_guidance: Array  # glide of the teeth: initial slope, later slope, transition [mm], shape (3,)
-    lateral_guidance: Array  # same for lateral movements, shape (3,)
+    lateral_guidance: Array  # the same for lateral movements, shape (3,)
 
     @property
     def lever_mm(self) -> float:
-        """Distance [mm] from the condylar axis forward to the lower incisors."""
+        """Return the forward distance from the condylar axis to the lower incisors [mm]."""
         return float(self.incisor[2] - self.condyles[:, 2].mean())
 
     @property
     def condylar_distance_mm(self) -> float:
-        """Distance [mm] between the condyle centres; the same in every pose."""
+        """Return the distance between the condyle centres [mm], the same in every pose."""
         return float(np.linalg.norm(self.condyles[0] - self.condyles[1]))
 
 
 def smoothstep(x: ArrayLike) -> Array:
-    """Blend from 0 to 1 over 0..1 with zero end slopes, any shape."""
+    """Blend from 0 to 1 over 0..1 with zero slope at the ends, any shape."""
     x = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
 def eminence(joint: Joint, side: int, slide_mm: ArrayLike, medial_mm: ArrayLike = 0.0) -> Array:
-    """Return the height [mm] of a condyle centre over its rest height, negative going down the eminence.
+    """Return the height of a condyle centre relative to rest [mm], negative down the eminence.
 
-    The sagittal section is an S (concave fossa, slope, convex crest) in closed form, flat far in front and behind.
+    The sagittal section is a closed-form S curve (concave fossa, slope, convex crest), flat far in front and behind.
 
     Args:
         side: 0 left, 1 right.
@@ -101,7 +101,7 @@ def joint_pose(
     distance = joint.condylar_distance_mm
     spread = np.full(pitch.shape, rest_axis[0])
     middle_x = (left[0] + right[0]) / 2 + shift
-    for _ in range(4):  # heights and spread depend on each other; each round gains two digits
+    for _ in range(4):  # heights and lateral positions are coupled; each iteration gains two digits
         y_left = left[1] + eminence(joint, 0, slides[..., 0], left[0] - middle_x - spread / 2) - lifts[..., 0]
         y_right = right[1] + eminence(joint, 1, slides[..., 1], middle_x - spread / 2 - right[0]) - lifts[..., 1]
         dy, dz = y_left - y_right, rest_axis[2] + slides[..., 0] - slides[..., 1]
@@ -145,14 +145,14 @@ def controlled_pose(
 
 
 def _coupling(joint: Joint, opening: Array) -> Array:
-    """Share of the opening slide at an opening: translation starts early but lags behind the rotation."""
+    """Return the fraction of the opening slide at an opening: translation starts early but lags behind the rotation."""
     onset = joint.slide_onset
     early = opening**2 * (1.0 + onset) / (opening + onset)
     return joint.slide_early * early + (1.0 - joint.slide_early) * smoothstep(opening)
 
 
 def _protrusive_range(joint: Joint, opening: Array, share: Array, protrusion: Array) -> Array:
-    """Forward or, for negative protrusion, backward room [mm] of both condyles."""
+    """Return the forward or, for negative protrusion, backward range of both condyles [mm]."""
     forward = joint.protrusion_max_mm * (1.0 - 0.85 * np.clip(share, 0.0, 1.1))
     hinge = joint.hinge_share * joint.slide_open_mm * share * (1.0 - smoothstep((opening - 0.3) / 0.5))
     backward = joint.retrusion_max_mm * (1.0 - np.clip(opening, 0.0, 1.0)) + 0.15 + hinge
@@ -160,7 +160,7 @@ def _protrusive_range(joint: Joint, opening: Array, share: Array, protrusion: Ar
 
 
 def _lateral_range(joint: Joint, opening: Array, mean_mm: Array, lateral: Array) -> Array:
-    """Largest difference of the slides [mm], also limited by the stop in front of the balancing condyle."""
+    """Return the largest difference of the slides [mm], also limited by the stop of the balancing condyle."""
     own = np.where(lateral > 0, joint.lateral_max_mm[0], joint.lateral_max_mm[1])
     own = own * (1.0 - joint.lateral_shrink * np.clip(opening, 0.0, 1.1) ** 1.1)
     room = (joint.slide_limit_mm + 1.2 - mean_mm) / (joint.working_share - 0.45 * smoothstep(opening))
@@ -168,7 +168,7 @@ def _lateral_range(joint: Joint, opening: Array, mean_mm: Array, lateral: Array)
 
 
 def _slides(mean_mm: Array, difference_mm: Array, balancing: Array) -> Array:
-    """Slides of the (left, right) condyle; in a movement to the left the right condyle is the balancing one."""
+    """Return the slides of the (left, right) condyle; the right condyle balances a movement to the left."""
     forward, backward = balancing * np.abs(difference_mm), (1.0 - balancing) * np.abs(difference_mm)
     to_left = difference_mm > 0
     left = mean_mm + np.where(to_left, -backward, forward)
@@ -177,9 +177,9 @@ def _slides(mean_mm: Array, difference_mm: Array, balancing: Array) -> Array:
 
 
 def _side_shift(joint: Joint, opening: Array, difference_mm: Array, balancing: Array) -> Array:
-    """Shift of the condylar midpoint to the left [mm]: Bennett movement and the wander of the opening path."""
+    """Return the left shift of the condylar midpoint [mm]: Bennett movement and deviation of the opening path."""
     size = np.abs(difference_mm)
-    # The Bennett angle is that of the balancing condyle's path: the right one in a movement to the left.
+    # The Bennett angle belongs to the balancing condyle: the right one in a movement to the left.
     tangent = np.tan(np.where(difference_mm > 0, joint.bennett_rad[1], joint.bennett_rad[0]))
     immediate = np.where(difference_mm > 0, joint.side_shift_mm[0], joint.side_shift_mm[1])
     bennett = tangent * balancing * size + immediate * np.tanh(size / 1.5) * (1.0 - smoothstep(opening / 0.6))
@@ -188,7 +188,7 @@ def _side_shift(joint: Joint, opening: Array, difference_mm: Array, balancing: A
 
 
 def _guided(joint: Joint, pitch: Array, slides: Array, forward_mm: Array, difference_mm: Array) -> Array:
-    """Pitch with tooth contact: near closure the incisors drop along the glide, whatever the condyles do."""
+    """Return the pitch with tooth contact: near closure the incisors follow the glide, independent of the condyles."""
     lateral_mm = difference_mm * joint.lever_mm / joint.condylar_distance_mm
     drop_mm = _glide(joint.protrusive_guidance, _soft_positive(forward_mm))
     drop_mm = drop_mm + _glide(joint.lateral_guidance, np.hypot(lateral_mm, _CUSP_ROUNDING_MM) - _CUSP_ROUNDING_MM)
@@ -198,11 +198,11 @@ def _guided(joint: Joint, pitch: Array, slides: Array, forward_mm: Array, differ
 
 
 def _glide(guidance: Array, distance_mm: Array) -> Array:
-    """Drop [mm] of the lower incisors after a glide: steep at first, flatter towards edge-to-edge."""
+    """Return the drop of the lower incisors after a glide [mm]: steep at first, flatter towards edge-to-edge."""
     steep, flat, transition_mm = guidance
     return flat * distance_mm + (steep - flat) * transition_mm * -np.expm1(-distance_mm / transition_mm)
 
 
 def _soft_positive(x: Array) -> Array:
-    """Positive part with a rounded corner, zero at zero."""
+    """Return the positive part with a rounded corner, zero at zero."""
     return (x + np.hypot(x, _CUSP_ROUNDING_MM) - _CUSP_ROUNDING_MM) / 2

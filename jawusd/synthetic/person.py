@@ -1,4 +1,12 @@
-"""Person."""
+"""A synthetic person: seeded joint parameters within human ranges, poses, and the set of possible poses.
+
+Ranges: opening and excursions after Hirsch et al. 2006 and Travers et al. 2000, condylar inclination and Bennett angle
+after Johnson and Winstanley 1997 and Cadiax studies, condylar travel after Muto and Kanazawa 1996.
+
+A pose is possible if it lies on the person's three-parameter manifold with controls inside their ranges. The nearest
+possible pose is found by bounded Gauss-Newton steps from the best node of a coarse grid, on distances of mandible
+points.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +26,17 @@ PoseFunction = Callable[[Array, Array, Array], Array]
 _LOWER = np.array([0.0, -1.0, -1.0])
 _UPPER = np.array([1.0, 1.0, 1.0])
 _GRID = (13, 9, 9)
-# Poses near zero protrusion, where the manifold has a kink in its controls, need the most steps.
+# Poses near zero protrusion need the most steps, since the manifold has a kink there.
 _STEPS = 30
 _DIFFERENCE = 1e-5
-# At these poses the gradients of the controls differ by a factor of ten; the damping is relative to each.
+# Relative damping per control: at these poses their gradients differ by a factor of ten.
 _DAMPING = 1e-3
 _CHUNK = 2000
 EnvelopeKind = Literal["box", "competing"]
 
 
 class Envelope:
-    """Possible controls of one person and the nearest possible pose."""
+    """Set of possible controls of one person, with projection onto it."""
 
     def __init__(self, pose: PoseFunction, points: Array, exponent: float | None) -> None:
         """Prepare the grid of start values.
@@ -47,7 +55,7 @@ class Envelope:
         self._grid_points = self._moved(self._grid, self._few)
 
     def limit(self, controls: Array) -> Array:
-        """Return controls (..., 3) inside the ranges: clipped, then lateral and protrusion scaled down together."""
+        """Return controls (..., 3) inside the ranges: clipped, then lateral and protrusion scaled down jointly."""
         controls = np.clip(controls, _LOWER, _UPPER)
         if self._exponent is None:
             return controls
@@ -59,7 +67,7 @@ class Envelope:
         return np.stack([controls[..., 0], lateral, protrusion], -1)
 
     def nearest(self, T: Array, bounded: bool) -> tuple[Array, Array]:
-        """Return controls (..., 3) and largest point distance [mm] (...) of the nearest pose of the manifold."""
+        """Return controls (..., 3) and largest point distance [mm] (...) of the nearest pose on the manifold."""
         flat = T.reshape(-1, 4, 4)
         parts = [self._nearest(flat[i : i + _CHUNK], bounded) for i in range(0, len(flat), _CHUNK)]
         if not parts:
@@ -68,12 +76,12 @@ class Envelope:
         return controls.reshape(*T.shape[:-2], 3), distance.reshape(T.shape[:-2])
 
     def _moved(self, controls: Array, points: Array) -> Array:
-        """Points (P, 3) under the poses of controls (N, 3), as (N, 3 P)."""
+        """Transform points (P, 3) by the poses of controls (N, 3), shape (N, 3 P)."""
         T = self._pose(controls[:, 0], controls[:, 1], controls[:, 2])
         return transform_points(T, points).reshape(len(controls), -1)
 
     def _start(self, T: Array) -> Array:
-        """Grid controls nearest to poses (N, 4, 4), as (N, 3)."""
+        """Return the grid controls nearest to poses (N, 4, 4), shape (N, 3)."""
         target = transform_points(T, self._few).reshape(len(T), -1)
         squares = (self._grid_points**2).sum(1) - 2 * target @ self._grid_points.T
         return self._grid[squares.argmin(1)]
@@ -102,7 +110,7 @@ class Envelope:
         return controls, distance
 
     def _step(self, controls: Array, error: Array, damping: Array, bounded: bool) -> Array:
-        """One damped Gauss-Newton step; controls at a bound whose gradient points outwards are fixed."""
+        """Take a damped Gauss-Newton step; controls at a bound with an outward gradient are fixed."""
         now = self._moved(controls, self._points)
         jacobian = np.stack(
             [(self._moved(controls + _DIFFERENCE * e, self._points) - now) / _DIFFERENCE for e in np.eye(3)], -1

@@ -1,7 +1,7 @@
 """Render the synthetic scene with OpenGL: colour pictures and exact teeth masks through distorted lenses.
 
-The scene is drawn without distortion at a multiple of the picture's size; every pixel of the picture then samples it
-along its distorted ray, so that straight edges of triangles bend as in the lens.
+The scene is rendered without distortion at a multiple of the picture's size. Every pixel of the picture then samples it
+along its distorted ray, so that straight edges bend as in a real lens.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jawusd.synthetic.soft_tissue import Surface
 from jawusd.synthetic.surfaces import vertex_normals
 
 NEAR_MM, FAR_MM = 80.0, 700.0
-#: Labels of surfaces; surfaces other than teeth occlude the teeth.
+#: Labels of surfaces; all surfaces occlude the teeth.
 OTHER, UPPER_TEETH, LOWER_TEETH = 0, 1, 2
 _NOTHING = 9.0
 _SCALE = 2
@@ -34,7 +34,7 @@ class Picture:
 
     Attributes:
         color: sRGB-like, shape (h, w, 3).
-        upper, lower: share of each pixel covered by visible upper and lower teeth, 0..255, shape (h, w).
+        upper, lower: coverage of each pixel by visible upper and lower teeth, 0..255, shape (h, w).
     """
 
     color: NDArray[np.uint8]
@@ -43,13 +43,13 @@ class Picture:
 
 
 class Renderer:
-    """Draw named surfaces through a set of cameras of one picture size; a context manager that frees the GL context."""
+    """Renders named surfaces through cameras of the same picture size; a context manager that frees the GL context."""
 
     def __init__(self, cameras: list[Camera]) -> None:
-        """Open a GL context without a window and prepare the cameras, all of the same size.
+        """Open a headless GL context and prepare the cameras, all of the same size.
 
         Raises:
-            MissingDependencyError: there is no EGL or no driver for it.
+            MissingDependencyError: EGL or its driver is missing.
             ValueError: the cameras differ in size.
         """
         if len({camera.size_px for camera in cameras}) != 1:
@@ -93,12 +93,12 @@ class Renderer:
         light: float = 1.0,
         jitter_px: tuple[Array, Array] | None = None,
     ) -> Picture:
-        """Draw a picture.
+        """Render a picture.
 
         Args:
             camera: index of the camera.
-            T_world_part: poses of the surfaces to draw, (4, 4) each; others are left out.
-            T_world_head: pose of the skull, shape (4, 4), for the depth of points in the mouth.
+            T_world_part: poses of the surfaces to draw, (4, 4) each; other surfaces are hidden.
+            T_world_head: pose of the skull, shape (4, 4), which determines the depth inside the mouth.
             light: brightness, 1 is normal.
             jitter_px: displacement fields of the upper and the lower mask [px], shape (gh, gw, 2) each, stretched over
                 the picture; None is zero.
@@ -177,9 +177,9 @@ class Renderer:
         self._lens_quad = gl.vertex_array(self._lens_program, [(corners, "2f", "in_corner")])
 
     def _projection(self, view: Camera) -> Array:
-        """Return the OpenGL clip matrix of the enlarged, widened pinhole picture, first row at the top."""
+        """Return the OpenGL clip matrix of the enlarged and padded pinhole picture, first row at the top."""
         (width, height), m = self._scene_size, self._margin
-        K = np.diag([_SCALE, _SCALE, 1.0]) @ view.K  # centres of pixels stay centres of scene pixels
+        K = np.diag([_SCALE, _SCALE, 1.0]) @ view.K  # pixel centres coincide with scene pixel centres
         out = np.zeros((4, 4))
         out[0] = [2 * K[0, 0] / width, 2 * K[0, 1] / width, 2 * (K[0, 2] + m + 0.5) / width - 1, 0]
         out[1] = [0, 2 * K[1, 1] / height, 2 * (K[1, 2] + m + 0.5) / height - 1, 0]
@@ -189,10 +189,10 @@ class Renderer:
         return out
 
     def _bend_texture(self, camera: Camera) -> moderngl.Texture:
-        """Displacement from recorded to pinhole pixels on a coarse grid; so smooth that linear reading is exact."""
+        """Return the displacement from recorded to pinhole pixels on a coarse grid, for linear sampling."""
         width, height = self._size
         columns, rows = -(-width // _BEND_STEP_PX), -(-height // _BEND_STEP_PX)
-        # Texel centres, in pixels of the picture.
+        # Texel centres in pixels of the picture.
         x = (np.arange(columns) + 0.5) * width / columns - 0.5
         y = (np.arange(rows) + 0.5) * height / rows - 0.5
         pixels = np.stack(np.meshgrid(x, y), -1)
@@ -210,7 +210,7 @@ class Renderer:
         return self._jitters[name]
 
     def _grain_texture(self) -> moderngl.Texture3D:
-        """Periodic smooth noise and its gradient in a cube, for the grain of skin."""
+        """Return a cube of periodic smooth noise and its gradient for the texture of skin."""
         n = 64
         rng = np.random.default_rng(0x5C1)
         frequency = np.fft.fftfreq(n) * n
@@ -253,13 +253,13 @@ class _Part:
         )
 
     def write(self, vertices: Array) -> None:
-        """Store positions and the normals that go with them."""
+        """Upload positions and the corresponding normals."""
         normals = vertex_normals(vertices, self._faces)
         self._moving.write(_bytes(np.concatenate([vertices, normals], axis=1)))
 
 
 def _write(program: moderngl.Program, name: str, matrix: Array) -> None:
-    """Set a matrix of a program, which GL stores column by column."""
+    """Set a matrix uniform, which GL stores in column-major order."""
     uniform = program[name]
     if isinstance(uniform, moderngl.Uniform):
         uniform.write(_bytes(matrix.T))
@@ -270,13 +270,13 @@ def _bytes(array: ArrayLike) -> bytes:
 
 
 def _context() -> moderngl.Context:
-    """Return a GL 3.3 context on EGL, which needs no display."""
+    """Return a headless GL 3.3 context on EGL."""
     try:
         context = moderngl.create_standalone_context(backend="egl", require=330)  # type: ignore[arg-type]  # backend is a name
     except Exception as error:  # moderngl raises bare exceptions with the loader's text
         raise MissingDependencyError(
-            f"rendering needs OpenGL 3.3 through EGL, which did not start ({error}).",
+            f"rendering needs OpenGL 3.3 through EGL, which failed to start ({error}).",
             hint="Install it, on Debian or Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri",
         ) from error
-    context.front_face = "cw"  # the pictures are drawn with their first row at the bottom of the target
+    context.front_face = "cw"  # pictures are rendered with their first row at the bottom of the target
     return context

@@ -1,6 +1,6 @@
 """GLSL programs of the renderer: scene, contact shadows, and the picture through the lens."""
 
-# The alpha channel of the scene carries the label of the surface.
+# The alpha channel of the scene stores the label of the surface.
 SCENE_VERTEX = """
 #version 330
 in vec3 in_position;
@@ -80,7 +80,7 @@ out vec2 at;
 void main() { at = 0.5 * in_corner + 0.5; gl_Position = vec4(in_corner, 0.0, 1.0); }
 """
 
-# Contact shadows: how much of the near surroundings stands in front of a point.
+# Contact shadows: fraction of the neighbourhood in front of a point.
 SHADOW_FRAGMENT = """
 #version 330
 in vec2 at;
@@ -109,7 +109,7 @@ void main() {
 }
 """
 
-# Undistorted pictures to the recorded one: colour, coverage of the upper and of the lower teeth.
+# Resamples the undistorted scene to the recorded picture: colour, and coverage by upper and lower teeth.
 LENS_FRAGMENT = """
 #version 330
 in vec2 at;

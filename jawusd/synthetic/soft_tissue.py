@@ -1,7 +1,7 @@
 """Lips, face, mouth lining, palate and tongue, which surround and occlude the teeth in pictures.
 
-The face is one grid of rings around the mouth, from the throat over the lining of the cheeks and the lips to the
-edge of the face. It is built in the scan frame for the closed bite and follows the mandible by linear blend skinning.
+The face is a single grid of rings around the mouth, from the throat over cheek lining and lips to the edge of the face.
+It is built in the scan frame for the closed bite and follows the mandible by linear blend skinning.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _THROAT = np.array([0.10, 0.025, 0.025])
 _TONGUE = np.array([0.72, 0.36, 0.35])
 _PALATE = np.array([0.70, 0.40, 0.38])
 
-# Midline profile of the face from the neck up, for lips drawn back: height and depth [mm].
+# Midline profile of the face from the neck up, with retracted lips: height and depth [mm].
 _PROFILE = np.array(
     [
         [-95.0, -58.0], [-75.0, -48.0], [-62.0, -34.0], [-54.0, -18.0], [-48.0, -6.5], [-42.0, 1.5], [-36.0, 5.0],
@@ -36,8 +36,8 @@ _PROFILE = np.array(
 # Rings of the mouth's lining: depth, half width, height up and down [mm].
 _LINING_RINGS = ((-78.0, 0.05, 0.05, 0.05), (-60.0, 36.0, 16.0, 16.0), (-24.0, 35.5, 18.0, 18.0))
 
-# Cross-section of a lip, from the wet side to the skin: distance from the edge outwards and height over the plane of
-# the edge [mm], and how much of it is red.
+# Cross-section of a lip, from the wet side to the skin: distance outwards from the edge, height over the plane of the
+# edge [mm], and redness.
 _LIP = np.array(
     [
         [4.5, -5.5, 1.0], [2.2, -4.2, 1.0], [0.7, -2.2, 1.0], [0.0, 0.0, 1.0], [0.5, 1.9, 1.0], [1.7, 3.4, 1.0],
@@ -48,12 +48,12 @@ _LIP = np.array(
 
 @dataclass(frozen=True)
 class LipState:
-    """The shape of the lips."""
+    """Shape of the lips."""
 
-    upper_mm: float  # height of the middle of the upper lip's edge over the upper incisal edge
-    lower_mm: float  # depth of the middle of the lower lip's edge below the lower incisal edge, moving with the jaw
+    upper_mm: float  # height of the upper lip's midpoint over the upper incisal edge
+    lower_mm: float  # depth of the lower lip's midpoint below the lower incisal edge, which moves with the jaw
     width_mm: float  # half distance between the corners
-    slant: float  # rise of the mouth per mm to the left
+    slant: float  # rise of the mouth line per mm to the left
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,19 +64,19 @@ class Surface:
     faces: Faces  # shape (F, 3)
     colors: Array  # linear diffuse reflectance, shape (V, 3), 0..1
     gloss: Array  # strength of the highlight, shape (V,), 0..1
-    skin: Array  # 1 where the surface has the grain of skin, 0 elsewhere, shape (V,)
-    inside: Array  # 1 in the mouth, where surfaces get less light with depth, shape (V,)
+    skin: Array  # 1 on skin texture, 0 elsewhere, shape (V,)
+    inside: Array  # 1 inside the mouth, where light falls off with depth, shape (V,)
 
 
 class Face:
     """Face, lips and mouth lining of one person as a grid of rings around the mouth."""
 
     def __init__(self, lower_incisor: Array) -> None:
-        """Prepare the grid for a lower incisal point (3,) in occlusion, scan frame [mm]."""
+        """Build the grid for a lower incisal point (3,) in occlusion, scan frame [mm]."""
         self._incisor_y = float(lower_incisor[1])
         angle = 2 * np.pi * (np.arange(_COLUMNS) + 0.5) / _COLUMNS
         self._cos, self._sin = np.cos(angle), np.sin(angle)
-        # The lower lip moves with the jaw, the corners by a third.
+        # The lower lip moves with the jaw, the mouth corners by a third of it.
         self._follow = smoothstep((0.35 - self._sin) / 0.95)
         lining_rows, lip_rows = 4, len(_LIP)
         self.rows = lining_rows + lip_rows + _SKIN_ROWS
@@ -100,7 +100,7 @@ class Face:
         edge = self._edge(lips)
         outwards = np.stack([self._cos * 0.8, self._sin], -1)
         outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-        # The red is narrow at the corners and widest in the middle of the lower lip.
+        # The vermilion is narrow at the corners and widest in the middle of the lower lip.
         size = (0.45 + 0.55 * np.abs(self._sin) ** 0.7) * np.where(self._sin < 0, 1.1, 0.95)
         base = _skin_depth(edge[:, 0], edge[:, 1]) - 4.2 - 1.5 * self._cos**8
         lip_rows = []
@@ -123,7 +123,7 @@ class Face:
         return (rest + weight * (moved.reshape(rest.shape) - rest)).reshape(-1, 3)
 
     def _edge(self, lips: LipState) -> Array:
-        """Edge of the mouth opening in the closed bite, (columns, 2) in x, y."""
+        """Return the edge of the mouth opening in the closed bite, (columns, 2) in x, y."""
         middle = -1.0
         upper, lower = lips.upper_mm - middle, middle - (self._incisor_y - lips.lower_mm)
         shape = np.abs(self._sin) ** 0.8
@@ -134,7 +134,7 @@ class Face:
         return np.stack([x, y + lips.slant * x], -1)
 
     def _lining(self, lip_inner: Array) -> Array:
-        """Rings of the mouth's lining from the throat to the wet side of the lips, (4, columns, 3)."""
+        """Return the rings of the mouth lining from the throat to the wet side of the lips, (4, columns, 3)."""
         rings = []
         for z, half_width, up, down in _LINING_RINGS:
             x = half_width * np.sign(self._cos) * np.abs(self._cos) ** 0.7
@@ -144,7 +144,7 @@ class Face:
         return np.stack(rings)
 
     def _skin_grid(self, border: Array) -> Array:
-        """Rings of skin from the border of the red to the edge of the face, (rows, columns, 3)."""
+        """Return the rings of skin from the vermilion border to the edge of the face, (rows, columns, 3)."""
         far = np.stack([70.0 * self._cos, np.where(self._sin > 0, 62.0, 72.0) * self._sin - 8.0], -1)
         share = (np.arange(1, _SKIN_ROWS + 1) / _SKIN_ROWS)[:, None, None] ** 1.35
         xy = border[None, :, :2] + share * (far - border[:, :2])
@@ -156,19 +156,19 @@ class Face:
 
 
 def _rounded(rings: Array) -> Array:
-    """Hann average of rings (R, A, 3) along themselves: no creases at the corners of the mouth."""
+    """Smooth rings (R, A, 3) along themselves with a Hann window, to avoid creases at the mouth corners."""
     kernel = np.hanning(13)[1:-1]
     kernel /= kernel.sum()
     return sum(k * np.roll(rings, i - 5, axis=1) for i, k in enumerate(kernel))
 
 
 def _skin_depth(x: Array, y: Array) -> Array:
-    """Depth z [mm] of the skin over the frontal plane, any shape."""
-    # Averaging hides the corners of the polygon.
+    """Return the depth z of the skin over the frontal plane [mm], any shape."""
+    # Averaging smooths the corners of the polygon.
     middle = np.mean([np.interp(y + shift, *_PROFILE.T) for shift in (-4.0, -2.0, 0.0, 2.0, 4.0)], axis=0)
     chin = smoothstep((-22.0 - y) / 20.0)
     z = middle - (0.0138 + 0.0045 * chin) * x**2 - 1.1e-6 * x**4
-    # The groove below the nose with its ridges, the nose, the folds from nose to mouth.
+    # Philtrum, nose and nasolabial folds.
     lip = np.exp(-(((y - 17.0) / 7.5) ** 2))
     z = z + lip * (0.7 * np.exp(-(((np.abs(x) - 5.0) / 2.6) ** 2)) - 0.8 * np.exp(-((x / 3.0) ** 2)))
     z = z + 15.0 * np.exp(-((x / 12.5) ** 2)) * smoothstep((y - 21.0) / 13.0)
@@ -193,7 +193,7 @@ def palate() -> Surface:
 
 
 def tongue(forward_mm: float, up_mm: float, side_mm: float) -> Surface:
-    """Return the tongue on the floor of the mouth, mandible frame: advanced, its tip raised and moved to the left."""
+    """Return the tongue in the mandible frame: moved forward, with its tip raised and moved to the left."""
     around, along = 40, 26
     u = 2 * np.pi * np.arange(around) / around
     t = np.linspace(0.0, 1.0, along)

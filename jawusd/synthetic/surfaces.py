@@ -1,4 +1,4 @@
-"""Building blocks of closed surfaces: grids, lofts, merged meshes."""
+"""Primitives of closed surfaces: grids, lofts, merged meshes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 
 
 def loft(rings: Array) -> tuple[Array, Faces]:
-    """Join stacked rings (R, A, 3) [mm] to a closed mesh with fans at both ends.
+    """Connect stacked rings (R, A, 3) [mm] to a closed mesh with fans at both ends.
 
     Returns:
         Vertices (R A + 2, 3) and faces (F, 3) with outward winding.
@@ -40,13 +40,13 @@ def loft(rings: Array) -> tuple[Array, Faces]:
 
 
 def outward(vertices: Array, faces: Faces) -> Faces:
-    """Return the faces of a closed mesh wound so that its signed volume is positive."""
+    """Return the faces of a closed mesh, wound so that its signed volume is positive."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return faces if np.einsum("ij,ij->", a, np.cross(b, c)) > 0 else faces[:, ::-1].copy()
 
 
 def merged(parts: Iterable[tuple[Array, Faces]]) -> tuple[Array, Faces]:
-    """Return meshes, each vertices (V, 3) and faces (F, 3), as one."""
+    """Concatenate meshes, each with vertices (V, 3) and faces (F, 3)."""
     vertices, faces, count = [], [], 0
     for v, f in parts:
         vertices.append(v)
@@ -56,7 +56,7 @@ def merged(parts: Iterable[tuple[Array, Faces]]) -> tuple[Array, Faces]:
 
 
 def superellipse(angle: Array, squareness: float) -> tuple[Array, Array]:
-    """Return the coordinates of a unit superellipse over the angle."""
+    """Return the coordinates of a unit superellipse at angles."""
     c, s = np.cos(angle), np.sin(angle)
     return np.sign(c) * np.abs(c) ** squareness, np.sign(s) * np.abs(s) ** squareness
 

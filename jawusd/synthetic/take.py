@@ -1,4 +1,8 @@
-"""Take."""
+"""The studio, a performance in front of its cameras, and the scene at any instant.
+
+A studio has three cameras about 200 mm from the mouth and a chessboard. A take samples jaw, head, lips, tongue and
+light; the scene poses the person's surfaces for an instant and renders them.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +23,11 @@ from jawusd.synthetic.render import LOWER_TEETH, UPPER_TEETH, Picture, Renderer
 from jawusd.synthetic.soft_tissue import Face, LipState, Surface, palate, tongue
 from jawusd.synthetic.surfaces import grid_faces
 
-#: The scan frame to the world (the frame of the first camera: x right, y down, z forward) with the head at rest.
+#: Scan frame to world with the head at rest; the world is the first camera's frame: x right, y down, z forward.
 T_WORLD_SCAN = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, -14.0, 214.0])
 BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM = 9, 6, 8.0
-# Focal length over picture width, and per camera: direction from the mouth [deg left, deg up], radial and tangential
-# distortion, offset of the principal point and of the focal length in shares of the picture width.
+# Focal length over picture width. Per camera: direction from the mouth [deg left, deg up], radial and tangential
+# distortion, and offsets of principal point and focal length relative to the picture width.
 _FOCAL = 1.494
 _CAMERAS = (
     ((0.0, 0.0), (-0.031, 0.012, 0.0003, -0.0004, 0.0), (0.0043, -0.0031), 1.000),
@@ -31,9 +35,9 @@ _CAMERAS = (
     ((-38.0, -6.0), (-0.034, 0.015, 0.0002, 0.0005, 0.0), (0.0026, 0.0048), 0.994),
 )
 FPS = 24.0
-#: Frames before the first and after the last tracked one, which contain the flashes.
+#: Frames before the first and after the last tracked frame, which contain the flashes.
 LEAD, TAIL = 20, 16
-#: Frames of the slightly open mouth and of the closed bite at the start of the tracked part.
+#: Frames of the slightly open mouth and of the closed bite at the start of the tracked range.
 OPEN_HOLD, REST_HOLD = 10, 12
 _DARK_FRAMES = 4
 _FLASH_START, _FLASH_BEFORE_END = 8, 10
@@ -56,7 +60,7 @@ def build_cameras(size_px: tuple[int, int]) -> list[Camera]:
     cameras = []
     for k, ((left, up), distortion, shift, zoom) in enumerate(_CAMERAS):
         a, b = np.deg2rad([left, up])
-        # The subject's left is on the right side of the first camera's picture.
+        # The subject's left is on the right in the first camera's picture.
         turn = so3_exp([0.0, -a, 0.0]) @ so3_exp([-b, 0.0, 0.0])
         T_world_cam = np.eye(4)
         if k:
@@ -74,7 +78,7 @@ def build_cameras(size_px: tuple[int, int]) -> list[Camera]:
 
 
 def board() -> Surface:
-    """Return the chessboard with a white rim, origin at its middle, x along the columns, facing -z."""
+    """Return the chessboard with a white rim, with the origin at its centre, x along the columns, facing -z."""
     columns, rows = BOARD_COLUMNS + 3, BOARD_ROWS + 3
     vertices, colors = [], []
     for i in range(rows):
@@ -90,19 +94,19 @@ def board() -> Surface:
 
 
 def board_poses(n: int, rng: np.random.Generator) -> Array:
-    """Return n random poses T_world_board (n, 4, 4) near the place of the mouth, in view of all cameras."""
+    """Return n random poses T_world_board (n, 4, 4) near the mouth, in view of all cameras."""
     centre = (T_WORLD_SCAN @ [0.0, -12.0, -10.0, 1.0])[:3]
     tilt = rng.uniform(-1.0, 1.0, (n, 3)) * np.deg2rad([24.0, 22.0, 14.0])
     shift = rng.uniform(-1.0, 1.0, (n, 3)) * [14.0, 8.0, 18.0]
     R = so3_exp(tilt)
-    # Every second pose is turned by 180 degrees.
+    # Every second pose is rotated by 180 degrees.
     R[1::2] = R[1::2] @ np.diag([-1.0, -1.0, 1.0])
     return make_transform(R, centre + shift)
 
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """A performance, sampled at the instants of the reference camera's frames."""
+    """A performance sampled at the frames of the reference camera."""
 
     first_instant: int  # reference frame number of the first instant; negative when another camera started earlier
     tracked: tuple[int, int]  # first and one past the last reference frame to be tracked
@@ -118,13 +122,13 @@ class Take:
 
 
 def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[int, ...], seed: int) -> Take:
-    """Return the exercises of a person as a take.
+    """Return a take of a person performing exercises.
 
     Args:
-        occlusion: contact of the teeth, which guides closed movements.
+        occlusion: tooth contacts, which guide closed movements.
         frames: number of tracked frames, more than the two holds at the start.
-        offsets: of the cameras; all their frames are covered.
-        seed: of exercises, head motion, lips and tongue.
+        offsets: camera offsets; the take covers the frames of all cameras.
+        seed: seed of exercises, head motion, lips and tongue.
     """
     rng = np.random.default_rng([seed, 0x7A6E])
     first = min(0, *offsets)
@@ -158,7 +162,7 @@ def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[in
 def _controls(
     person: Person, frames: int, start: int, n: int, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.str_], Mask]:
-    """Return controls and phase of every instant, and where the jaw is held still (1) at the closed bite."""
+    """Return controls and phase of every instant, and a weight of 1 where the jaw is held in the closed bite."""
     exercises = frames - OPEN_HOLD - REST_HOLD
     curves, names = schedule(_EXERCISES, exercises, rng, tempo=1.5)
     still = np.array([_HALF_OPEN, 0.0, 0.0])
@@ -174,14 +178,14 @@ def _controls(
 
 
 def _drift(n: int, rng: np.random.Generator, count: int) -> Array:
-    """Slow wandering of unit variance: a few sinusoids of 2 to 7 s, shape (n, count)."""
+    """Return slow drifts of unit variance: a few sinusoids of 2 to 7 s, shape (n, count)."""
     seconds = np.arange(n) / FPS
     period, phase = rng.uniform(2.0, 7.0, (4, count)), rng.uniform(0.0, 2 * np.pi, (4, count))
     return np.sin(2 * np.pi * seconds[:, None, None] / period + phase).sum(1) / np.sqrt(2.0)
 
 
 def _head(n: int, rng: np.random.Generator) -> Array:
-    """Head poses: a few millimetres and degrees about the atlas, shape (n, 4, 4)."""
+    """Return head poses that vary by a few millimetres and degrees about the atlas, shape (n, 4, 4)."""
     drift = _drift(n, rng, 6)
     R = so3_exp(drift[:, :3] * np.deg2rad([1.0, 1.3, 0.8]))
     pivot = np.array([0.0, 20.0, -95.0])
@@ -190,7 +194,7 @@ def _head(n: int, rng: np.random.Generator) -> Array:
 
 
 def _lips(controls: Array, phase: NDArray[np.str_], rng: np.random.Generator) -> list[LipState]:
-    """Lips drawn back to show the teeth, less so in chewing and speech."""
+    """Return the lips, retracted to show the teeth, less so in chewing and speech."""
     drift = _drift(len(controls), rng, 4)
     relaxed = smoothed(np.isin(phase, ["chew", "speech"]).astype(np.float64)[:, None])[:, 0]
     wide = smoothstep(controls[:, 0])
@@ -201,7 +205,7 @@ def _lips(controls: Array, phase: NDArray[np.str_], rng: np.random.Generator) ->
 
 
 def _tongue(controls: Array, rng: np.random.Generator) -> Array:
-    """Tongue at rest, now and then raised over the lower front teeth when the mouth is open; (n, 3) mm."""
+    """Return the tongue position, sometimes raised over the lower front teeth in an open mouth, (n, 3) mm."""
     drift = _drift(len(controls), rng, 2)
     room = smoothstep((controls[:, 0] - 0.12) / 0.3)
     raised = smoothstep((drift[:, 0] - 0.5) / 1.2) * room
@@ -209,7 +213,7 @@ def _tongue(controls: Array, rng: np.random.Generator) -> Array:
 
 
 class Scene:
-    """All surfaces of one person, ready to be drawn."""
+    """All surfaces of one person, ready to render."""
 
     def __init__(self, person: Person, anatomy: PersonAnatomy, renderer: Renderer) -> None:
         """Add the person's surfaces to the renderer."""
@@ -227,7 +231,7 @@ class Scene:
         renderer.add("tongue", tongue(0.0, 0.0, 0.0))
 
     def pose(self, take: Take, index: int) -> dict[str, Array]:
-        """Shape lips and tongue for an instant of a take and return the surfaces' poses T_world_part, (4, 4) each."""
+        """Deform lips and tongue for an instant of a take; return the poses T_world_part (4, 4) of all surfaces."""
         T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
         self._renderer.move("face", self._face.posed(take.lips[index], T_jaw))
         self._renderer.move("tongue", tongue(*take.tongue_mm[index]).vertices)
@@ -240,11 +244,11 @@ class Scene:
     def draw(
         self, camera: int, take: Take, index: int, poses: dict[str, Array], jitter_px: tuple[Array, Array] | None
     ) -> Picture:
-        """Draw an instant; `poses` as returned by `pose` for it, `jitter_px` as for `Renderer.render`."""
+        """Render an instant, with `poses` from `pose` and `jitter_px` as in `Renderer.render`."""
         return self._renderer.render(camera, poses, take.T_world_skull[index], float(take.light[index]), jitter_px)
 
     def occluders(self, take: Take, index: int) -> list[Mesh]:
-        """Return everything that can hide a tooth at an instant, in world coordinates [mm]."""
+        """Return all meshes that can hide a tooth at an instant, in world coordinates [mm]."""
         T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
         tongue_now = tongue(*take.tongue_mm[index])
         parts = (
@@ -257,7 +261,7 @@ class Scene:
 
 
 def _arch_surfaces(arch: DentalArch) -> tuple[Surface, Surface]:
-    """Crowns and gum of an arch in natural colours."""
+    """Return crowns and gum of an arch in natural colours."""
     tooth = arch.tooth != 0
     first_gum = int(np.argmin(tooth))
     vertices, faces = arch.mesh.vertices, arch.mesh.faces
@@ -267,7 +271,7 @@ def _arch_surfaces(arch: DentalArch) -> tuple[Surface, Surface]:
     for k in np.unique(arch.tooth[:first_gum]):
         own = arch.tooth[:first_gum] == k
         height = np.abs(vertices[:first_gum][own, 1])
-        share = (height - height.min()) / np.ptp(height)  # 0 at the end towards the other jaw
+        share = (height - height.min()) / np.ptp(height)  # 0 at the occlusal end
         colors[own] *= 1.0 - 0.16 * share[:, None] * np.array([0.6, 0.8, 1.3])
         if abs(k) == 3:
             colors[own] *= _CANINE_TINT

@@ -1,7 +1,7 @@
 """Tooth crowns as closed triangle meshes, from tables of widths, profiles and cusps.
 
-Crown frame: x distal, y towards the occlusal side (0 at the gum line), z facial, mm. Sizes follow the mean crown
-dimensions in textbooks of dental anatomy (Ash and Nelson).
+Crown frame: x distal, y towards the occlusal side (0 at the gum line), z facial, mm. Sizes are mean crown dimensions
+from textbooks of dental anatomy (Ash and Nelson).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.synthetic.surfaces import loft, superellipse
 
-#: Crown below the gum line [mm]; hidden by the gum.
+#: Part of the crown hidden below the gum line [mm].
 ROOT_MM = 2.5
 _AROUND = 36
 _SIDE_RINGS = 12
@@ -32,14 +32,14 @@ class CrownForm:
     depth_mm: float  # facio-lingual
     height_mm: float  # gum line to the highest cusp or the edge
     torque_deg: float  # tilt of the occlusal end towards the facial side
-    # of premolars and molars: x and z as shares of half the width and depth, and the depth below the highest cusp [mm];
-    # empty for incisors and canines
+    # cusps of premolars and molars: x and z relative to half the width and depth, and the depth below the highest cusp
+    # [mm]; empty for incisors and canines
     cusps: tuple[tuple[float, float, float], ...] = ()
-    tip_mm: float = 0.0  # height of a canine's tip over its shoulders; 0 for the others
+    tip_mm: float = 0.0  # height of a canine's tip over its shoulders; 0 for other teeth
 
     @property
     def tip_z_mm(self) -> float:
-        """Facial offset of the edge or the buccal cusps from the crown's middle [mm]."""
+        """Return the facial offset of the edge or the buccal cusps from the crown's centre [mm]."""
         if self.cusps:
             return 0.5 * self.depth_mm * max(z for _, z, _ in self.cusps)
         return self.depth_mm * float(_bezier(_EDGE_MIDDLE, np.array(1.0)))
@@ -69,12 +69,12 @@ LOWER = (
 )  # fmt: skip
 
 # Control values of Bezier profiles from the root end to the occlusal end.
-# Incisors and canines: half width over half the width; facial and lingual surface over the depth.
+# Incisors and canines: half width relative to half the width; facial and lingual surface relative to the depth.
 _FRONT_WIDTH = (0.62, 0.68, 0.80, 1.02, 1.06, 0.95)
 _FRONT_FACIAL = (0.38, 0.46, 0.58, 0.50, 0.42, 0.27)
 _FRONT_LINGUAL = (-0.40, -0.52, -0.56, -0.10, 0.02, 0.11)
 _EDGE_MIDDLE = tuple(0.5 * (f + g) for f, g in zip(_FRONT_FACIAL, _FRONT_LINGUAL, strict=True))
-# Premolars and molars: half width over half the width; facial and lingual surface over half the depth.
+# Premolars and molars: half width relative to half the width; facial and lingual surface relative to half the depth.
 _BACK_WIDTH = (0.74, 0.80, 0.92, 1.06, 1.04, 0.84)
 _BACK_FACIAL = (0.72, 0.84, 1.06, 1.04, 0.90, 0.66)
 _BACK_LINGUAL = (-0.72, -0.82, -0.98, -1.06, -0.98, -0.68)
@@ -87,12 +87,12 @@ def _bezier(control: tuple[float, ...], t: Array) -> Array:
 
 
 def _relative_width(control: tuple[float, ...], t: Array) -> Array:
-    """Width profile scaled to a maximum of 1, so that tables hold the width between contact points."""
+    """Return the width profile scaled to a maximum of 1, so that the tables contain widths between contact points."""
     return _bezier(control, t) / _bezier(control, np.linspace(0.0, 1.0, 101)).max()
 
 
 def crown(form: CrownForm, cusp_slope: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.int32]]:
-    """Build one crown with small individual irregularities; `cusp_slope` is the drop of back teeth's cusps per mm.
+    """Build one crown with small random irregularities; `cusp_slope` is the drop of the cusps of back teeth per mm.
 
     Returns:
         Vertices (V, 3) in the crown frame [mm] and outward counter-clockwise faces (F, 3) of a closed mesh.
@@ -103,7 +103,7 @@ def crown(form: CrownForm, cusp_slope: float, rng: np.random.Generator) -> tuple
 
 
 def _front_rings(form: CrownForm, angle: Array, rng: np.random.Generator) -> Array:
-    """Rings of an incisor or canine from root to edge, shape (R, A, 3)."""
+    """Return the rings of an incisor or canine from root to edge, shape (R, A, 3)."""
     x, z = superellipse(angle, 0.78)
     low, high = -ROOT_MM, form.height_mm - _EDGE_ROUNDING_MM
     t = np.linspace(0.0, 1.0, _SIDE_RINGS + 1)
@@ -127,7 +127,7 @@ def _front_rings(form: CrownForm, angle: Array, rng: np.random.Generator) -> Arr
 
 
 def _edge_drop(form: CrownForm, X: Array, rng: np.random.Generator) -> Array:
-    """Depth of the edge below its highest point [mm]: rounded corners, a canine's shoulders, a worn tilt."""
+    """Return the depth of the edge below its highest point [mm]: rounded corners, canine shoulders, tilt by wear."""
     relative = X / (0.5 * form.width_mm)
     tilt = 0.15 * rng.uniform(-1.0, 1.0) * relative
     if form.tip_mm:
@@ -138,7 +138,7 @@ def _edge_drop(form: CrownForm, X: Array, rng: np.random.Generator) -> Array:
 
 
 def _back_rings(form: CrownForm, angle: Array, cusp_slope: float) -> Array:
-    """Rings of a premolar or molar from root over the rim to the middle of the occlusal surface, shape (R, A, 3)."""
+    """Return the rings of a premolar or molar from root over the rim to the occlusal centre, shape (R, A, 3)."""
     x, z = superellipse(angle, 0.70)
     t = np.linspace(0.0, 1.0, _SIDE_RINGS + 1)
     half = 0.5 * form.width_mm * _relative_width(_BACK_WIDTH, t)
@@ -154,7 +154,7 @@ def _back_rings(form: CrownForm, angle: Array, cusp_slope: float) -> Array:
 
 
 def _occlusal(form: CrownForm, X: Array, Z: Array, slope: float) -> Array:
-    """Height of the occlusal surface: the smooth maximum of rounded cones forms ridges and grooves between cusps."""
+    """Return the height of the occlusal surface: a smooth maximum of rounded cones, with ridges and grooves."""
     k = _CUSP_SHARPNESS_PER_MM
     heights = []
     for x, z, lower in form.cusps:

@@ -264,7 +264,7 @@ def test_clips_of_variable_rate_are_matched_by_time(tmp_path):
             container.mux(stream.encode(None))
         paths.append(path)
     found = find_boards(NAMES, board(videos=tuple(paths)), quiet)
-    assert len(found.numbers) == 5 and "(c0 12, c1 10): 10 of like number or time" in found.notes[0]
+    assert len(found.numbers) == 5 and "(c0 12, c1 10): 10 with equal number or time" in found.notes[0]
     grid = corner_grid(board())
     for c, camera in enumerate(CAMERAS):
         for v, number in enumerate(found.numbers):
@@ -276,7 +276,7 @@ def test_clips_of_variable_rate_are_matched_by_time(tmp_path):
 def test_pictures_that_cannot_be_read_are_named(tmp_path):
     videos = write_pictures(tmp_path, pictures(board(), T_world_board=POSES[:2]))
     (tmp_path / "c0" / "board_0003.png").write_bytes(b"no picture")
-    with pytest.raises(CaptureError, match=r"board_0003\.png: is not a picture"):
+    with pytest.raises(CaptureError, match=r"board_0003\.png: is not a readable picture"):
         find_boards(NAMES, board(videos=videos), quiet)
     with pytest.raises(CaptureError, match="no file of the folder is named like"):
         find_boards(("c0",), board(videos=(tmp_path / "c1" / "bord_%04d.png",)), quiet)

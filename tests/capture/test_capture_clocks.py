@@ -101,7 +101,7 @@ def test_a_rate_that_no_file_states_is_said_to_be_assumed(tmp_path):
     pattern = write_sequence(tmp_path / "c", IMAGES, "png8")
     clips = {name: {"video": pattern, "timecode": code} for name, code in (("a", "01:00:00:10"), ("b", "01:00:00:13"))}
     found = estimate_offsets(capture(tmp_path, "timecode", clips, 50.0))
-    assert found.offsets == {"a": 0, "b": 3} and "count each of the 50 pictures" in found.notes[0]
+    assert found.offsets == {"a": 0, "b": 3} and "count 50 frames per second" in found.notes[0]
     assert estimate_offsets(capture(tmp_path, "timecode", clips, 25.0)).notes == ()
 
 
