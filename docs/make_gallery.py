@@ -22,11 +22,11 @@ from PIL import Image, ImageDraw, ImageFont
 import jawusd
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import load_capture
-from jawusd.formats.contact import DEEP, TOUCHING
+from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point
 from jawusd.media.overlay import placed_scans
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.paper.figures import condyle_figure
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.media import tracked_scans

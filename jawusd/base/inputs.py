@@ -1,15 +1,21 @@
-"""Which paths can be used: files to read are files, and OpenUSD follows no names with control characters."""
+"""Which paths may be used: regular files as inputs, names that OpenUSD can open, and allowed folders for stages."""
 
 from __future__ import annotations
 
 import os
 import unicodedata
+from collections.abc import Iterable
+from contextvars import ContextVar
 from pathlib import Path
 
 from jawusd.base.errors import FormatError, JawusdError
 from jawusd.base.guard import take_in_hand
 
 _LFS = b"version https://git-lfs"
+#: Environment variable that allows folders in every run, separated as in PATH.
+SETTING = "JAWUSD_ALLOW"
+
+_given: ContextVar[tuple[Path, ...]] = ContextVar("allowed_folders", default=())
 
 
 def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatError) -> None:
@@ -63,3 +69,19 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
             path=path,
             hint="Rename the folder; where its name is UTF-8, set PYTHONUTF8=1.",
         ) from None
+
+
+def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
+    """Allow folders, and those below them, instead of any allowed before; those of the setting stay allowed."""
+    _given.set(tuple(Path(folder).resolve() for folder in folders))
+
+
+def allowed_folders() -> list[Path]:
+    """Return the folders that are allowed, links resolved."""
+    named = [Path(folder).resolve() for folder in os.environ.get(SETTING, "").split(os.pathsep) if folder]
+    return [*_given.get(), *named]
+
+
+def is_allowed(path: Path) -> bool:
+    """Tell whether a file lies in an allowed folder, with links resolved."""
+    return any(path.resolve().is_relative_to(folder) for folder in allowed_folders())

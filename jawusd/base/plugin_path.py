@@ -1,4 +1,4 @@
-"""Where OpenUSD finds the codeless schema JawRigAPI, set before it is loaded: it looks only once."""
+"""Register the codeless schema JawRigAPI with OpenUSD, which searches its plugin path only once."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import os
 import sys
 from pathlib import Path
 
-#: The environment variable in which OpenUSD looks for plugins.
+#: The environment variable that holds OpenUSD's plugin path.
 VARIABLE = "PXR_PLUGINPATH_NAME"
 
-# In a wheel the files lie inside the package; in an editable install and a checkout, in the repository's `schemas`.
-_FOLDERS = (Path(__file__).parent / "rig" / "schemas", Path(__file__).parents[1] / "schemas")
+_PACKAGE = Path(__file__).parents[1]
+# In a wheel the files are inside the package; in an editable install or checkout, in the repository's `schemas`.
+_FOLDERS = (_PACKAGE / "rig" / "schemas", _PACKAGE.parent / "schemas")
 
 
 def schema_folder() -> Path | None:
@@ -19,9 +20,9 @@ def schema_folder() -> Path | None:
 
 
 def announce_schema() -> None:
-    """Let OpenUSD know the schema: by the environment before it is loaded, by its registry afterwards.
+    """Make the schema known to OpenUSD: through the environment before it is loaded, through its registry afterwards.
 
-    Costs nothing where OpenUSD is never loaded. Programs started from here inherit the environment.
+    Does not load OpenUSD. Child processes inherit the environment.
     """
     folder = schema_folder()
     if folder is None:

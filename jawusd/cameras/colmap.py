@@ -1,23 +1,24 @@
-"""Cameras of COLMAP: text models (https://colmap.github.io/format.html).
+"""Cameras of COLMAP: text models (https://colmap.github.io/format.html), read and written.
 
-`cameras.txt` holds lenses, `images.txt` two lines an image: rotation (w, x, y, z) and translation, world to camera, and
-the points that it sees, which may be left out. The centre of the top-left pixel is at (0.5, 0.5), OpenCV's at (0, 0).
+`cameras.txt` holds lenses, `images.txt` two lines per image: rotation (w, x, y, z) and translation, world to camera,
+and the image's points, which may be omitted. The centre of the top-left pixel is at (0.5, 0.5), OpenCV's at (0, 0).
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError, FormatError
+from jawusd.base.errors import CalibrationError, FormatError, OutputError
 from jawusd.base.tables import read_text
 from jawusd.cameras.parts import MOST_BYTES, CameraFormat, cameras_of_images, corner_matrix, files_in
-from jawusd.geometry import Camera, make_transform, matrix_from_wxyz
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, wxyz_from_matrix
 
 _FILES = ("cameras.txt", "images.txt")
 # Per model: which parameters are fx, fy, cx, cy and, from there on, OpenCV's distortion; SIMPLE ones share f.
@@ -31,6 +32,7 @@ _MODELS = {
 }
 _COUNTED = re.compile(r"^# Number of images: (\d+)", re.MULTILINE)
 _POINTS = re.compile(r"(?:\S+ \S+ -?\d+(?: |$))+")
+_LARGEST_SKEW = 1e-9
 
 
 def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
@@ -150,3 +152,33 @@ FORMAT = CameraFormat(
     lambda path, _: load_colmap(path if path.is_dir() else path.parent),
     lambda path: [(path if path.is_dir() else path.parent) / name for name in _FILES],
 )
+
+
+def save_colmap(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
+    """Write cameras as a COLMAP text model in mm, one picture `NAME.png` each; `points3D.txt` is empty.
+
+    Raises:
+        CalibrationError: a camera has skewed pixels, which COLMAP's models do not have.
+        OutputError: a file cannot be written.
+    """
+    lenses = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6"]
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
+    for number, camera in enumerate(cameras, start=1):
+        (fx, skew, cx), (_, fy, cy) = camera.K[:2]
+        if abs(skew) > _LARGEST_SKEW * fx:
+            raise CalibrationError(f"camera {camera.name} has skewed pixels, which COLMAP cannot express.")
+        lens = np.pad(camera.distortion, (0, 8 - camera.distortion.size))
+        values = np.concatenate([[fx, fy, cx + 0.5, cy + 0.5], lens])  # COLMAP counts from the corner of a pixel
+        shown = " ".join(repr(float(value)) for value in values)
+        lenses.append(f"{number} FULL_OPENCV {camera.size_px[0]} {camera.size_px[1]} {shown}")
+        T = camera.T_cam_world
+        pose = np.concatenate([wxyz_from_matrix(T[:3, :3]), T[:3, 3]])
+        images += [f"{number} {' '.join(repr(float(value)) for value in pose)} {number} {camera.name}.png", ""]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write here: {error.strerror}.", path=folder) from error
+    texts = {"cameras.txt": lenses, "images.txt": images, "points3D.txt": ["# no points"]}
+    for name, lines in texts.items():
+        write_text_atomic(folder / name, "\n".join(lines) + "\n")
+    return [folder / name for name in texts]

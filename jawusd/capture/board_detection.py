@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, CaptureError
 from jawusd.formats.capture import Boards
-from jawusd.formats.numbered import is_pattern, numbered_files
+from jawusd.formats.file_names import is_pattern, numbered_files
 from jawusd.media.display import to_display
-from jawusd.media.pictures import read_picture
-from jawusd.media.stored_picture import read_header, read_stored
+from jawusd.media.pictures import read_header, read_picture, read_stored
 from jawusd.media.video import Video
 
 Search = Callable[[NDArray[np.uint8]], Array | None]

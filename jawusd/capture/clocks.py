@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from jawusd.base.errors import CaptureError, SyncError
 from jawusd.capture.signals import Offset
 from jawusd.formats.capture import Capture
-from jawusd.formats.timecode import frame_of_timecode
+from jawusd.formats.clips import frame_of_timecode
 from jawusd.media.clip import Clip
 from jawusd.media.footage import open_clip
 

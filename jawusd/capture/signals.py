@@ -20,8 +20,8 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import SyncError
-from jawusd.media.audio import Sound
 from jawusd.media.clip import Clip
+from jawusd.media.containers import Sound
 
 _FIRST_WINDOW_S = 4.0  # initial search window at both ends; doubled until a flash is found
 _SPARSE = 8  # subsampling of pixels in both directions for the mean brightness

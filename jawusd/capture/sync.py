@@ -27,10 +27,9 @@ from jawusd.capture.signals import (
     on_grid,
 )
 from jawusd.formats.capture import Capture
-from jawusd.formats.clip_source import ClipSource
-from jawusd.formats.light_curve import LightCurve
-from jawusd.media.audio import Sound, read_sound
+from jawusd.formats.clips import ClipSource, LightCurve
 from jawusd.media.clip import Clip
+from jawusd.media.containers import Sound, read_sound
 from jawusd.media.footage import open_clip
 from jawusd.media.video import Video
 

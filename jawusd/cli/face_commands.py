@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jawusd.base.arrays import Array
     from jawusd.cli.motion import AuthoredMotion
     from jawusd.evaluator import JawRig
-    from jawusd.formats.arkit_mapping import ArkitMapping
+    from jawusd.formats.arkit import ArkitMapping
 
 _CLAMPED_MM = 0.005  # what is less shows as 0.00
 
@@ -51,8 +51,7 @@ def arkit_fit(
     """
     import jawusd
     from jawusd.fitting.face import fit_arkit
-    from jawusd.formats.arkit import read_arkit
-    from jawusd.formats.arkit_mapping import save_mapping
+    from jawusd.formats.arkit import read_arkit, save_mapping
 
     refuse_existing(out, force)
     loaded = jawusd.load(rig, prim=prim)
@@ -93,7 +92,7 @@ def arkit_table(
     Millimetres and degrees relative to the neutral face, about the point midway between the condyles, skull axes.
     """
     import jawusd
-    from jawusd.formats.joint_table import save_joint_table
+    from jawusd.formats.poses import save_joint_table
     from jawusd.pipeline.joint_table import joint_deltas
 
     refuse_existing(out, force)
@@ -167,7 +166,7 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
 
 def _own_mapping(rig: JawRig, path: Path) -> ArkitMapping:
     from jawusd.base.errors import FormatError
-    from jawusd.formats.arkit_mapping import load_mapping
+    from jawusd.formats.arkit import load_mapping
 
     own, actor = load_mapping(path), str(rig.meta.get("actor", ""))
     if own.actor != actor:

@@ -41,7 +41,7 @@ CaptureArg = Annotated[Path, typer.Argument(help="capture.toml, or the folder th
 
 
 def _allow(folders: list[Path] | None) -> list[Path] | None:
-    from jawusd.formats.allowed_folders import allow_folders
+    from jawusd.base.inputs import allow_folders
 
     allow_folders(folders or ())
     return folders

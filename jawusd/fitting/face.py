@@ -9,8 +9,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FittingError
 from jawusd.evaluator import JawRig
-from jawusd.formats.arkit import FaceCapture, shares_of
-from jawusd.formats.arkit_mapping import ArkitMapping, moved_terms
+from jawusd.formats.arkit import ArkitMapping, FaceCapture, moved_terms, shares_of
 from jawusd.geometry import transform_points
 
 _REST_SHARE = 0.1  # of the frames: those nearest to the closed bite show the neutral weights

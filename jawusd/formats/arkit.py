@@ -1,29 +1,38 @@
-"""Face captures of ARKit as Live Link Face exports them: a CSV table of blend shape weights with time codes.
+"""Face captures of ARKit, as Live Link Face exports them, and a person's mapping from their weights to d.
+
+A capture is a CSV table of blend shape weights with time codes:
 
     Timecode,BlendShapeCount,...,JawForward,JawRight,JawLeft,JawOpen,...
     14:03:52:28.207,61,...,0.01,0,0.02,0.31,...
 
-A time code is HH:MM:SS:FF.fff. FF counts at the rate of the time code, which need not be that of the samples: devices
-that take 60 samples a second on a code of 30 write `.50`, or every code twice. At 29.97 and 59.94 frames per second, it
-may leave out the first two or four numbers of every minute that is no tenth ("drop frame", SMPTE ST 12-1), to keep to
-the clock: a semicolon before the frames says so, and so do numbers left out. Column names count without regard to
-case, any other column is ignored. A row whose count is 0 is a moment without a face.
+A time code is HH:MM:SS:FF.fff. FF counts at the rate of the time code, which may differ from the sample rate: devices
+that record 60 samples per second with a 30 fps code write `.50`, or write every code twice. At 29.97 and 59.94 frames
+per second the code may skip the first two or four numbers of every minute that is not a multiple of ten ("drop frame",
+SMPTE ST 12-1). A semicolon before the frames, or skipped numbers, mark this. Column names are case-insensitive, other
+columns are ignored. A row whose count is 0 shows no face.
+
+The mapping is a JSON file, format jawusd-arkit/1.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError
-from jawusd.base.tables import TextTable, check_width, read_table
+from jawusd.base.tables import TextTable, check_width, read_table, read_text
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.text import parse_model
 
 JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
 _TIME, _COUNT = "timecode", "blendshapecount"
@@ -38,6 +47,10 @@ _MOST_STEPS_OFF = 2.0  # of the step from one second to the next, from that with
 # to mean and deviation, go far beyond.
 _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
+_MAX_MAPPING_BYTES = 1 << 20
+_WITHIN = "numbers within +-10000"
+_Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e4, le=1e4)]
+_Weights = tuple[_Number, _Number, _Number, _Number]
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,3 +250,57 @@ def _frames(
         row = int(np.argmax(steps <= 0)) + 1
         raise FormatError(f"{table.named(row, column)} does not come after the row before.", path=table.path)
     return frames - frames[0]
+
+
+class ArkitMapping(BaseModel):
+    """Hold what the weights of one person mean; four numbers are of JawOpen, JawLeft, JawRight, JawForward.
+
+    d = rest_mm + (gain_mm + u_open * opened_gain_mm) @ u, where u is how far each weight is from its neutral value,
+    less the dead zone, and 0 inside of it; u_open is JawOpen's. What a gain says of another direction than its weight's
+    own is the cross-talk; opened gains, because reach to the sides and forward changes as the jaw opens.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: Literal["jawusd-arkit/1"] = Field("jawusd-arkit/1", description='"jawusd-arkit/1"')
+    actor: str = Field(description="the actor's name")
+    neutral: _Weights = Field(description=f"four {_WITHIN}")
+    dead_zone: tuple[Annotated[_Number, Field(ge=0)], ...] = Field(
+        min_length=4, max_length=4, description=f"four {_WITHIN}, none below 0"
+    )
+    rest_mm: tuple[_Number, _Number, _Number] = Field(description=f"three {_WITHIN} [mm]")
+    gain_mm: tuple[_Weights, _Weights, _Weights] = Field(description=f"three rows of four {_WITHIN} [mm]")
+    opened_gain_mm: tuple[_Weights, _Weights, _Weights] = Field(description=f"three rows of four {_WITHIN} [mm]")
+
+    def d(self, weights: Array) -> Array:
+        """Return the jaw parameters [mm], shape (..., 3), of weights (..., 4); NaN gives NaN."""
+        gains = np.concatenate([self.gain_mm, self.opened_gain_mm], axis=1)
+        moved = moved_terms(weights, np.array(self.neutral), np.array(self.dead_zone))
+        return np.array(self.rest_mm) + moved @ gains.T
+
+
+def moved_terms(weights: Array, neutral: Array, dead_zone: Array) -> Array:
+    """Return u and u_open * u of weights (..., 4), see `ArkitMapping`, shape (..., 8)."""
+    change = weights - neutral
+    u = np.sign(change) * np.maximum(np.abs(change) - dead_zone, 0.0)
+    return np.concatenate([u, u[..., :1] * u], axis=-1)
+
+
+def load_mapping(path: str | os.PathLike[str]) -> ArkitMapping:
+    """Read a mapping.
+
+    Raises:
+        FormatError: not such a file; the message names the entry.
+    """
+    path = Path(path)
+    hint = "Such a file is written by `jawusd arkit-fit`."
+    return parse_model(read_text(path, _MAX_MAPPING_BYTES), path, ArkitMapping, hint)
+
+
+def save_mapping(path: str | os.PathLike[str], mapping: ArkitMapping) -> None:
+    """Write a mapping atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_text_atomic(path, json.dumps(mapping.model_dump(mode="json"), indent=1) + "\n")

@@ -1,16 +1,49 @@
-"""What the keys of a capture.toml mean, and the list of all of them, made from the models that read the file."""
+"""The keys of a capture.toml: their reference, and validation errors that name table, key, value and what is allowed.
+
+Both are derived from the pydantic models that read the file.
+"""
 
 from __future__ import annotations
 
+import difflib
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
+
+_CLOSE = 0.6  # similarity of a misspelt key to the one meant, by difflib's ratio: "mask" and "masks" have 0.89
+_ALLOWED_SHOWN = 300  # characters
+
+Location = tuple[int | str, ...]
+#: Kinds of pydantic's errors in plain words; the limits stand in the error's context, by the name in braces.
+_WORDS = {
+    "greater_than": "must be more than {gt:g}",
+    "greater_than_equal": "must be {ge:g} or more",
+    "less_than": "must be less than {lt:g}",
+    "less_than_equal": "must be {le:g} or less",
+    "literal_error": "must be {expected}",
+    "string_pattern_mismatch": "has letters that are not allowed, or none; allowed are {signs}",
+    "string_too_short": "is empty",
+    "too_short": "has {actual_length} entries, {min_length} or more are needed",
+    "too_long": "has {actual_length} entries, at most {max_length} are allowed",
+    "missing": "is missing",
+    "too_few": "has too few entries",
+}
+_NEEDED = (
+    (("float", "finite"), "a number is needed"),
+    (("int",), "a whole number is needed"),
+    (("string",), 'text in quotes is needed, as "left"'),
+    (("path",), 'a path in quotes is needed, as "left.mp4"'),
+    (("bool",), "true or false is needed"),
+    (("tuple", "list"), "a list in brackets is needed"),
+    (("model", "dict"), "a table is needed"),
+)
 
 
 @dataclass(frozen=True)
@@ -134,3 +167,171 @@ def reference_lines(listed: list[KeyEntry], width: int = 100) -> list[str]:
         if entry.key.example:
             lines.append(f"      {entry.name} = {entry.key.example}")
     return lines[1:]
+
+
+def problems_of(
+    error: ValidationError, model: type[BaseModel], data: Mapping[str, object]
+) -> list[tuple[str, str | None]]:
+    """Return what is wrong, each as a sentence that names table and key, and what to do, None if that is plain.
+
+    Args:
+        error: raised when `data`, read from the file, was given to `model`.
+    """
+    found = error.errors()
+    unknown = [(problem["loc"][:-1], str(problem["loc"][-1])) for problem in found if _is_unknown(problem["type"])]
+    deeper = {problem["loc"][:depth] for problem in found for depth in range(len(problem["loc"]))}
+    out = []
+    for problem in sorted(found, key=lambda problem: not _is_unknown(problem["type"])):
+        location, kind = problem["loc"], problem["type"]
+        if kind == "too_short" and location in deeper:
+            continue  # wrong entries are not counted
+        if _is_unknown(kind):
+            out.append(_unknown_key(str(location[-1]), location[:-1], model, place(location[:-1], data)))
+        elif kind == "missing" and any(
+            table == location[:-1] and _meant(key, [str(location[-1])]) for table, key in unknown
+        ):
+            continue  # a misspelt key also makes the right one missing; the misspelling is the cause
+        else:
+            out.append(_wrong_value(problem, location, model, data))
+    return out
+
+
+def _is_unknown(kind: str) -> bool:
+    return kind == "extra_forbidden"
+
+
+def place(location: Location, data: Mapping[str, object]) -> str:
+    """Return a table as the file writes it: `[scans]`, `[[camera]] 2 ("left")`, `[[bootstrap.upper]] 1, views 2`."""
+    if not location:
+        return ""
+    at: object = data
+    names: list[str] = []
+    counted = ""
+    for part in location:
+        if isinstance(part, int):
+            at = at[part] if isinstance(at, list) and part < len(at) else None
+            named = at.get("name") if isinstance(at, dict) else None
+            label = f' ("{named}")' if isinstance(named, str) else ""
+            where = f"[[{'.'.join(names)}]]" if not counted else f"{counted}, {' '.join(names)}"
+            counted, names = f"{where.rstrip()} {part + 1}{label}", []
+        else:
+            at = at.get(part) if isinstance(at, dict) else None
+            names.append(part)
+    if counted:
+        return f"{counted}, {'.'.join(names)}" if names else counted
+    return f"[{'.'.join(names)}]"
+
+
+def _unknown_key(key: str, table: Location, model: type[BaseModel], where: str) -> tuple[str, str | None]:
+    """Say that a key is not known, which are, and which one may be meant."""
+    allowed = [name for name in _keys(_model_at(table, model)) if name != "folder"]
+    top = [name for name in _keys(model) if name != "folder"]
+    inside = f"{where}: " if where else ""
+    meant = _meant(key, allowed)
+    elsewhere = "" if meant or not where else next((name for name in top if name == key), "")
+    if meant:
+        advice = f'Did you mean "{meant}"?'
+    elif elsewhere:
+        advice = f'"{key}" stands at the top of the file, before the first [table].'
+    elif owner := _owner(key, model):
+        advice = f'"{key}" belongs to {owner}.'
+    else:
+        advice = "See `jawusd init --reference`."
+    listed = ", ".join(allowed if table else ["format", "units", *allowed])
+    return f'{inside}there is no key "{key}"; allowed are {listed[:_ALLOWED_SHOWN]}.', advice
+
+
+def _wrong_value(
+    problem: Mapping[str, object], location: Location, model: type[BaseModel], data: Mapping[str, object]
+) -> tuple[str, str | None]:
+    kind, given = str(problem["type"]), problem.get("input")
+    context = problem.get("ctx")
+    values: dict[str, object] = context if isinstance(context, dict) else {}
+    while location and isinstance(location[-1], int) and kind == "missing":
+        location, kind, values = location[:-1], "too_few", {}
+    if not location or isinstance(location[-1], int) or (kind == "value_error" and _model_at(location, model)):
+        name, said = "", place(location, data)
+    else:
+        name = str(location[-1])
+        said = f"{place(location[:-1], data)} {name}".strip()
+    if kind == "value_error":
+        inside = f"{said}: " if said else ""
+        return f"{inside}{str(values.get('error', problem['msg'])).rstrip('.')}.", None
+    if kind in ("tuple_type", "list_type") and isinstance(given, dict):
+        return f"[{name}] is one table; write [[{name}]], with double brackets, for each one.", None
+    field = _field_at(location, model)
+    below, many = (None, False) if field is None else table_model(field)
+    key = Key("") if field is None else describe_key(field)
+    if below is not None and not key.meaning and kind == "missing":
+        return f"[[{name}]] is missing." if many else f"[{name}] is missing.", "See `jawusd init --reference`."
+    words = _WORDS.get(kind)
+    if "pattern" in values:
+        values = {**values, "signs": _signs(str(values["pattern"]))}
+    text = words.format(**{"actual_length": "too many", **values}) if words else _needed(kind, str(problem["msg"]))
+    unit = f" ({key.unit})" if key.unit and (" number " in text or kind.startswith(("greater", "less"))) else ""
+    shows_form = kind not in ("too_long", "too_short", "string_too_short")
+    hint = f"For example: {name} = {key.example}." if key.example and shows_form else None
+    return f"{said or 'the file'}{_found(kind, given)} {text}{unit}.".replace("'", '"'), hint
+
+
+def _signs(pattern: str) -> str:
+    """Return what a pattern of one class of signs allows, in words; another pattern as it is."""
+    inside = re.fullmatch(r"\^\[(.+)\]\+\$", pattern)
+    if inside is None:
+        return f"{pattern.strip('^$')}"
+    signs = [sign.removeprefix("\\") for sign in re.findall(r"\w-\w|\\?.", inside[1])]
+    return " ".join("blanks" if sign == " " else sign for sign in signs)
+
+
+def _found(kind: str, given: object) -> str:
+    if kind in ("missing", "too_few", "too_short", "too_long") or isinstance(given, dict | list | tuple):
+        return "" if kind in _WORDS else ":"
+    shown = json.dumps(given, ensure_ascii=False) if isinstance(given, str | bool | int | float) else str(given)
+    return f" = {shown:.80}" if kind in _WORDS else f" = {shown:.80}:"
+
+
+def _needed(kind: str, message: str) -> str:
+    for kinds, words in _NEEDED:
+        if kind.startswith(kinds):
+            return words
+    return message[:1].lower() + message[1:]
+
+
+def _meant(key: str, allowed: Iterable[str]) -> str:
+    """Return the allowed key most like a misspelt one, "" if none is."""
+    plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in allowed}
+    close = difflib.get_close_matches(re.sub(r"[^a-z0-9]", "", key.lower()), plain, n=1, cutoff=_CLOSE)
+    return plain[close[0]] if close else ""
+
+
+def _keys(model: type[BaseModel] | None) -> list[str]:
+    return [] if model is None else [field.alias or name for name, field in model.model_fields.items()]
+
+
+def _model_at(table: Location, model: type[BaseModel]) -> type[BaseModel] | None:
+    """Return the model of the table at a location."""
+    at: type[BaseModel] | None = model
+    for part in table:
+        if isinstance(part, str):
+            field = _named(part, at)
+            at = None if field is None else table_model(field)[0]
+    return at
+
+
+def _field_at(location: Location, model: type[BaseModel]) -> FieldInfo | None:
+    return _named(location[-1], _model_at(location[:-1], model)) if location else None
+
+
+def _named(key: int | str, model: type[BaseModel] | None) -> FieldInfo | None:
+    fields = {} if model is None else model.model_fields
+    return next((field for name, field in fields.items() if key in (name, field.alias)), None)
+
+
+def _owner(key: str, model: type[BaseModel]) -> str:
+    """Return the table that has a key, as the file writes it, "" if none has."""
+    for name, field in model.model_fields.items():
+        below, many = table_model(field)
+        if below is not None and key in _keys(below):
+            written = field.alias or name
+            return f"[[{written}]]" if many else f"[{written}]"
+    return ""

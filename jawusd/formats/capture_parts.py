@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from jawusd.formats.capture_keys import Key
-from jawusd.formats.clip_source import ClipSource
+from jawusd.formats.clips import ClipSource
 
 
 class Strict(BaseModel):

@@ -12,9 +12,8 @@ from typing import TypeVar
 from pydantic import BaseModel
 
 from jawusd.base.errors import CaptureError, JawusdError
-from jawusd.formats.capture_errors import Location, place
-from jawusd.formats.file_kinds import wrong_kind
-from jawusd.formats.numbered import is_pattern
+from jawusd.formats.capture_keys import Location, place
+from jawusd.formats.file_names import is_pattern, wrong_kind
 
 M = TypeVar("M", bound=BaseModel)
 _MOVE = "Move the file inside, or allow it with --allow-outside."

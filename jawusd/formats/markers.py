@@ -25,7 +25,7 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FormatError, UnitsError
 from jawusd.base.tables import read_text, split_rows, to_numbers
-from jawusd.formats.numbered import is_pattern, numbered_files
+from jawusd.formats.file_names import is_pattern, numbered_files
 
 READ = (
     "Read are C3D, TSV of Qualisys Track Manager (3D), TRC, CSV of Vicon Nexus (Trajectories), probes of ArtiSynth, "

@@ -1,8 +1,9 @@
-"""A triangle mesh as the layers exchange it, and which of its faces are crowns."""
+"""A triangle mesh as the layers exchange it, its crown faces, and the colours of contacts between teeth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,3 +100,19 @@ def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
 def crown_face_mask(mesh: Mesh) -> Mask:
     """Return which faces of a teeth scan belong to crowns, shape (F,): those with two or three tooth corners."""
     return (tooth_labels(mesh) != GUM)[mesh.faces].sum(axis=1) >= 2
+
+
+class Mark(NamedTuple):
+    """Say what a colour means."""
+
+    color: tuple[int, int, int]  # red, green, blue, 0 to 255
+    meaning: str
+    apart_mm: float  # surfaces nearer than this have it; of teeth that run too deep, beyond the closed bite
+
+
+DEEP = Mark((120, 40, 200), "deeper than in the closed bite", -0.15)
+TOUCHING = (
+    Mark((200, 20, 30), "touching", 0.05),
+    Mark((240, 120, 30), "within 0.2 mm", 0.2),
+    Mark((250, 205, 70), "within 0.5 mm", 0.5),
+)

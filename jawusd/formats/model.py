@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take, upgraded_model
 from jawusd.formats.atomic import write_npz_atomic
-from jawusd.formats.header import ModelHeader, check_header
+from jawusd.formats.text import ModelHeader, check_header
 
 FAMILY, VERSION = "jawusd-model", 2
 _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_trained")

@@ -1,14 +1,23 @@
-"""Poses and parameters as tables: CSV of any locale (see `jawusd.base.tables`) with a header, or JSON alike.
+"""Poses and parameters as tables: CSV of any locale (see `jawusd.base.tables`) with a header, or JSON.
 
 Poses:      frame, m00, m01, ... m33   (row-major T_skull_mandible [mm])
         or  frame, tx, ty, tz, qw, qx, qy, qz   (scalar-first quaternion)
 Parameters: frame, d1, d2, d3   [mm]
+
+The joint table gives the transform of the mandible joint per ARKit shape, for rigs that add joint deltas:
+
+    shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,qz,clamped_mm
+    JawOpen,0.5,...
+
+Translations [mm] and rotations are relative to the neutral face, about the joint, in the axes of the skull frame (those
+of `actor_skel.usdc`). Rotations are given twice: as angles about fixed x, then y, then z, and as a quaternion.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +29,7 @@ from jawusd.base.tables import TextTable, read_table, read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_json
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
+from jawusd.geometry.quaternion import wxyz_from_matrix
 
 MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
@@ -28,6 +38,7 @@ _MAX_BYTES = 1 << 30
 # A matrix written with 5 decimals is rigid to about this.
 _RIGID_TOLERANCE = 1e-3
 _ZERO_QUATERNION = 1e-6
+_JOINT_COLUMNS = "shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,qz,clamped_mm"
 
 
 def _read_table(path: Path) -> TextTable:
@@ -213,3 +224,39 @@ def write_table(
     for frame, row in zip(frames, values, strict=True):
         lines.append(",".join([str(int(frame)), *(repr(float(value)) for value in row)]))
     write_text_atomic(path, "\n".join([*lines, ""]))
+
+
+@dataclass(frozen=True, eq=False)
+class JointDelta:
+    """Hold what one shape does to the joint."""
+
+    shape: str  # as ARKit names it
+    weight: float  # 0 .. 1
+    d: Array  # the pose [mm], shape (3,)
+    translation_mm: Array  # of the joint, skull axes, shape (3,)
+    rotation: Array  # skull axes, shape (3, 3)
+    clamped_mm: float  # by which d was brought inside the bound
+
+
+def save_joint_table(path: str | os.PathLike[str], rows: Iterable[JointDelta]) -> None:
+    """Write a table atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    lines = [_JOINT_COLUMNS]
+    for row in rows:
+        sizes = [*row.d, *row.translation_mm, *np.rad2deg(fixed_angles(row.rotation))]
+        places = [(size, 6) for size in sizes] + [(part, 9) for part in wxyz_from_matrix(row.rotation)]
+        numbers = [f"{round(float(value), digits) + 0.0:.9g}" for value, digits in [*places, (row.clamped_mm, 6)]]
+        lines.append(",".join([row.shape, f"{row.weight:g}", *numbers]))
+    write_text_atomic(path, "\n".join(lines) + "\n")
+
+
+def fixed_angles(R: Array) -> Array:
+    """Return the angles [rad] about the fixed axes x, then y, then z, shape (3,), R = Rz Ry Rx (3, 3).
+
+    J. J. Craig, "Introduction to Robotics", eq. 2.66, for turns about y of less than a quarter.
+    """
+    about_y = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
+    return np.array([np.arctan2(R[2, 1], R[2, 2]), about_y, np.arctan2(R[1, 0], R[0, 0])])

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.errors import CaptureError
 from jawusd.formats.capture import CameraSource
-from jawusd.media.footage import open_clip
-from jawusd.media.frame_reader import FrameReader
+from jawusd.media.footage import FrameReader, open_clip
 from jawusd.media.masks import mask_size_px, open_masks
 
 #: Gray of masks of the upper and the lower teeth, and of what is neither.

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import JawusdError
+from jawusd.formats.file_names import gaps
 from jawusd.formats.finding import Finding
-from jawusd.formats.numbered import gaps
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT, Clip
 from jawusd.media.picture_sequence import PictureSequence
 

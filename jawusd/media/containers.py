@@ -1,14 +1,20 @@
-"""Open files of pictures and sound: one that is what it holds, and names no others."""
+"""Open media files: containers limited to one self-contained file, decodable codecs, and sound as one channel."""
 
 from __future__ import annotations
 
 import os
 import zlib
+from typing import NamedTuple
 
 import av
+import numpy as np
+from numpy.typing import NDArray
 
-from jawusd.media.pictures import MOST_PX
+from jawusd.base.errors import CaptureError
+from jawusd.base.inputs import check_input
 
+#: Most pixels of a picture, four times 8K: a few bytes can declare one that fills the memory.
+MOST_PX = 1 << 27
 #: Formats of one file. FFmpeg also follows playlists (HLS, DASH, concat, SDP), which name other files and addresses.
 FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "mxf", "flv", "ogg", "asf", "nut",
@@ -29,6 +35,7 @@ PICTURES = (
 _STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
 _STRICT_CODECS = ("hevc", "mjpeg", "png")
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
+_NAMES = ("h264", "hevc", "prores", "dnxhd", "ffv1", "vp9", "av1", "mjpeg", "png", "tiff", "exr", "dpx")
 
 
 def open_container(
@@ -67,3 +74,50 @@ def slices_are_whole(packet: bytes) -> bool:
             return False
         end -= size
     return end == 0
+
+
+def decodable() -> dict[str, bool]:
+    """Return whether each codec that footage comes in can be decoded, by ffmpeg's name."""
+    return {name: _has(name) for name in _NAMES}
+
+
+def _has(name: str) -> bool:
+    try:
+        av.Codec(name, "r")
+    except (av.FFmpegError, ValueError):
+        return False
+    return True
+
+
+class Sound(NamedTuple):
+    """Hold the sound of a file."""
+
+    samples: NDArray[np.float32]  # one channel, shape (n,)
+    rate_hz: int  # samples per second
+    start_s: float  # presentation time of the first sample in the file [s]
+
+
+def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
+    """Return the first sound track of a file, None if it carries none.
+
+    Raises:
+        CaptureError: the file or its sound cannot be decoded.
+    """
+    parts: list[NDArray[np.float32]] = []
+    start_s = 0.0
+    check_input(path, CaptureError)
+    try:
+        with open_container(path) as container:
+            if not container.streams.audio:
+                return None
+            resampler = av.AudioResampler(format="flt", layout="mono", rate=rate_hz)
+            for frame in container.decode(container.streams.audio[0]):
+                if not parts and frame.pts is not None and frame.time_base is not None:
+                    start_s = float(frame.pts * frame.time_base)
+                parts += [piece.to_ndarray()[0] for piece in resampler.resample(frame)]
+            parts += [piece.to_ndarray()[0] for piece in resampler.resample(None)]
+    except (av.FFmpegError, OSError) as error:
+        raise CaptureError(
+            f"its sound cannot be decoded ({error.strerror}).", path=path, hint="Copy it again from the camera."
+        ) from error
+    return Sound(np.concatenate(parts), rate_hz, start_s) if parts else None

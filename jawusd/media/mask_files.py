@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.errors import CaptureError
-from jawusd.formats.numbered import numbered_files
+from jawusd.formats.file_names import numbered_files
 from jawusd.media.mask_levels import MaskImage, RawImage
 from jawusd.media.mask_source import SourceLevels, load_png, mask_video, png_levels, video_levels
 from jawusd.media.pictures import read_palette_numbers

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 
 from jawusd.base.errors import CaptureError
-from jawusd.media.level_search import NotMasks, find_levels
-from jawusd.media.mask_levels import MaskLevels, RawImage, spread_of_colours
+from jawusd.media.mask_levels import MaskLevels, NotMasks, RawImage, find_levels, spread_of_colours
 from jawusd.media.pictures import has_palette, read_palette_numbers, read_picture
 from jawusd.media.pixels import Colour
 from jawusd.media.video import Video

@@ -13,8 +13,8 @@ from types import TracebackType
 
 from jawusd.base.errors import CaptureError
 from jawusd.formats.capture import CameraSource
-from jawusd.formats.clip_source import ClipSource
-from jawusd.formats.numbered import is_pattern
+from jawusd.formats.clips import ClipSource
+from jawusd.formats.file_names import is_pattern
 from jawusd.media.footage import open_clip
 from jawusd.media.mask_files import LabelValues, PngMasks, VideoMasks
 from jawusd.media.mask_levels import MaskImage, MaskLevels

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.errors import CaptureError
-from jawusd.formats.clip_source import ClipSource
-from jawusd.formats.numbered import numbered_files
+from jawusd.formats.clips import ClipSource
+from jawusd.formats.file_names import numbered_files
 from jawusd.media.clip import Clip, VideoFrame
 from jawusd.media.display import to_display
+from jawusd.media.pictures import StoredPicture, read_header, read_stored
 from jawusd.media.pixels import Colour, Slices, coloured
-from jawusd.media.stored_picture import StoredPicture, read_header, read_stored
 from jawusd.media.timeline import Timeline
 
 #: Rate where neither the capture nor the files say one: the least usual that people mean.

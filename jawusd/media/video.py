@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from jawusd.base.errors import CaptureError, naming_file
 from jawusd.base.inputs import check_input, why_unreadable
-from jawusd.formats.quicktime import timecode_rates
+from jawusd.formats.clips import timecode_rates
 from jawusd.media.clip import Clip, VideoFrame
-from jawusd.media.containers import open_container, slices_are_whole
+from jawusd.media.containers import MOST_PX, open_container, slices_are_whole
 from jawusd.media.display import to_display
-from jawusd.media.pictures import MOST_PX
 from jawusd.media.pixels import Colour, ColourPicture, DecodedPicture, Slices, coloured, converted, deep_rgb, turn_deg
 from jawusd.media.timeline import Timeline
 

@@ -1,4 +1,4 @@
-"""Bring pictures to the undistorted working size the tracker computes at."""
+"""Resample pictures to the undistorted working size of the tracker."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.base.arrays import Mask
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry.camera import Camera
 from jawusd.media.pixels import ColourPicture, DecodedPicture, Slices
 
@@ -155,3 +155,16 @@ class WorkingView:
             last = int(where[-1] + 1) * _NODE_PX // self._samples
             spans.append(slice(max(first, 0), min(last + 1, limit)))
         return spans[0], spans[1]
+
+
+def warp_nearest(
+    picture: NDArray[np.uint8] | NDArray[np.float32], to_picture: Array, out: NDArray[np.uint8] | NDArray[np.float32]
+) -> None:
+    """Write what lies nearest to where each pixel comes from, 0 beyond the picture.
+
+    Args:
+        picture: shape (H, W).
+        to_picture: from pixels of `out` to those of the picture, shape (2, 3).
+        out: receives, of the picture's type, shape (h, w).
+    """
+    cv2.warpAffine(picture, to_picture, out.shape[::-1], out, cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)

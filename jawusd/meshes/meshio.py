@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError, explain_missing_packages
 from jawusd.base.inputs import check_input, why_unreadable
-from jawusd.formats.file_kinds import MESHES
+from jawusd.formats.file_names import MESHES
 from jawusd.formats.mesh import Mesh, tooth_labels, without_loose
 from jawusd.formats.mesh_data import NO_COLOUR, MeshData
 from jawusd.formats.mesh_obj import read_obj

@@ -1,7 +1,7 @@
-"""Tell crown and gum of a teeth scan apart by its shape.
+"""Separate crown and gum of a teeth scan by its shape, and by its colours where these differ.
 
-Scans come in two kinds. Where crowns are pieces of their own, the pieces say which is which. Where one surface covers
-crowns and gum, the line between them is the crease around every crown.
+Scans come in two kinds. Where crowns are separate components, each component is crown or gum. Where one surface covers
+crowns and gum, the boundary between them is the crease around every crown.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import GUM, TOOTH, Mesh
-from jawusd.meshes.scan_colours import crown_by_colour
 from jawusd.meshes.scan_surface import ScanSurface
 from jawusd.meshes.scan_tops import Tops, biting_direction, topped_by, tops
 from jawusd.meshes.scan_walk import CreaseWalk
@@ -39,6 +38,12 @@ _COARSE_MM = 1.2  # edges of this length hide a gum line [mm]: what looks like c
 # Pieces that begin this far above the lower end of the crown they lie at are on it (brackets), not around it (gum)
 # [share of the crown's height].
 _ON_CROWN = 0.2
+# Colours are used where the redness of the highest places and of places far from them differs by so many of its
+# standard deviations there; stone casts and untextured scans stay below.
+_LEAST_CONTRAST = 4.0
+_FAR_BELOW_MM = 9.0  # below the highest place around, few crowns go on
+_FEWEST = 50  # vertices of either kind
+_GRAIN = 0.003  # of 8 bit colours
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,3 +158,26 @@ def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
     out = crown.copy()
     out[scrap] = crown[~scrap][nearest]
     return out
+
+
+def crown_by_colour(colors: NDArray[np.uint8], surface: ScanSurface, seen: Tops) -> Array | None:
+    """Return how likely each vertex of the surface is crown by its colour, 0 .. 1, shape (v,).
+
+    None where the colours say nothing.
+
+    Args:
+        colors: red, green, blue per vertex of the scan, shape (V, 3).
+    """
+    count = len(surface.vertices)
+    total = np.maximum(colors.sum(axis=1, dtype=np.float64), 1.0)
+    redness = (colors[:, 0].astype(np.float64) - colors[:, 1]) / total
+    number = np.maximum(np.bincount(surface.of_vertex, minlength=count), 1)
+    redness = np.bincount(surface.of_vertex, redness, count) / number
+    gum = seen.gum | (seen.below > _FAR_BELOW_MM)
+    if min(seen.crown.sum(), gum.sum()) < _FEWEST:
+        return None
+    crown_red, gum_red = float(np.median(redness[seen.crown])), float(np.median(redness[gum]))
+    spread = [float(np.median(np.abs(redness[part] - np.median(redness[part])))) for part in (seen.crown, gum)]
+    if gum_red - crown_red < _LEAST_CONTRAST * (1.4826 * max(spread) + _GRAIN):
+        return None
+    return np.clip((gum_red - redness) / (gum_red - crown_red), 0.0, 1.0)

@@ -60,8 +60,7 @@ def bake_subject(
         RigError, OutputError: the rig cannot be written.
     """
     from jawusd.fitting.fit import with_speeds
-    from jawusd.meshes.decimation import bone_proxy_of, proxy_of
-    from jawusd.meshes.mesh_cleaning import manifold
+    from jawusd.meshes.remeshing import bone_proxy_of, manifold, proxy_of
     from jawusd.rig.bake import bake_rig
     from jawusd.rig.layout import prim_name_of
 

@@ -14,10 +14,9 @@ from jawusd.base.errors import SyncError, TrackingError, explain_missing_package
 from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
-from jawusd.formats.clip_source import ClipSource
-from jawusd.formats.header import Frames
-from jawusd.formats.light_curve import LightCurve
+from jawusd.formats.clips import ClipSource, LightCurve
 from jawusd.formats.mesh import Mesh
+from jawusd.formats.text import Frames
 from jawusd.geometry import Camera
 from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.state import Progress

@@ -9,7 +9,7 @@ import numpy as np
 
 from jawusd.base.errors import OutputError
 from jawusd.cameras.calibration import save_calibration
-from jawusd.cameras.colmap_write import save_colmap
+from jawusd.cameras.colmap import save_colmap
 from jawusd.cameras.files import lacks_sizes, load_cameras_file
 from jawusd.geometry import Camera
 

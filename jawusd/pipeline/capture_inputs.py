@@ -9,7 +9,7 @@ from pathlib import Path
 from jawusd.base.errors import CaptureError
 from jawusd.cameras.files import calibration_files
 from jawusd.formats.capture import Capture, load_capture
-from jawusd.formats.numbered import is_pattern, numbered_files
+from jawusd.formats.file_names import is_pattern, numbered_files
 from jawusd.formats.scan_labels import labels_path
 from jawusd.pipeline.meshes import BONES
 from jawusd.pipeline.scan_labels import TEETH

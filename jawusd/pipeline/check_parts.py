@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Literal
 
 from jawusd.base.errors import JawusdError
 from jawusd.formats.capture import CameraSource, Capture
+from jawusd.formats.file_names import is_pattern
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.numbered import is_pattern
 from jawusd.geometry import Camera
 
 if TYPE_CHECKING:
     from jawusd.media.clip import Clip
-    from jawusd.media.mask_samples import MaskSamples
+    from jawusd.media.mask_survey import MaskSamples
     from jawusd.tracking.contour.scan import Scan
 
 Size = tuple[int, int]

@@ -122,8 +122,7 @@ def boards(parts: Parts) -> Iterator[Finding]:
 
 def masks(parts: Parts) -> Iterator[Finding]:
     """Look at some masks of every camera."""
-    from jawusd.media.mask_samples import sample_masks
-    from jawusd.media.mask_survey import survey_masks
+    from jawusd.media.mask_survey import sample_masks, survey_masks
     from jawusd.media.masks import mask_size_px
 
     capture = parts.given

@@ -75,7 +75,7 @@ def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture,
         RigError: The scans do not show them.
     """
     from jawusd.media.overlay import encode_jpeg
-    from jawusd.meshes.contact_map import ContactMap
+    from jawusd.meshes.contact import ContactMap
 
     rig = JawRig(model.arrays, model.meta)
     drawn, closed = ContactMap(teeth_of(rig, subject.meshes)), rig.ranges(0.0)

@@ -123,7 +123,7 @@ def _graphics() -> str:
 def _codecs() -> dict[str, bool]:
     if find_spec("av") is None:
         return {}
-    from jawusd.media.codecs import decodable
+    from jawusd.media.containers import decodable
 
     return decodable()
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
 from jawusd.formats.capture_template import CameraSketch
-from jawusd.formats.file_kinds import MESHES, PICTURES, VIDEOS
-from jawusd.formats.numbered import groups
+from jawusd.formats.file_names import MESHES, PICTURES, VIDEOS, groups
 
 _CALIBRATIONS = (".toml", ".json", ".xml", ".csv", ".yaml", ".yml", ".txt", ".usda", ".usdc", ".usd", ".nk")
 _FEWEST_PICTURES = 5  # fewer numbered pictures are no sequence

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from jawusd.evaluator import JawRig
-from jawusd.formats.arkit import shares_of
-from jawusd.formats.arkit_mapping import ArkitMapping
-from jawusd.formats.joint_table import JointDelta
+from jawusd.formats.arkit import ArkitMapping, shares_of
+from jawusd.formats.poses import JointDelta
 
 SHAPES = ("JawOpen", "JawLeft", "JawRight", "JawForward")
 _WEIGHTS = (0.5, 1.0)  # motion bends, so that a full shape is not twice a half one

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from jawusd.base.errors import CaptureError, FormatError, explain_missing_packages
 from jawusd.formats.capture import Capture
-from jawusd.formats.coverage import uncovered_percent, worst_frames
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.report import Overlay, ReplayPart
-from jawusd.formats.tracks import Tracks
+from jawusd.formats.tracks import Tracks, uncovered_percent, worst_frames
 from jawusd.geometry import Camera, transform_points
 from jawusd.pipeline.cameras import load_cameras, tracked_cameras
 from jawusd.pipeline.meshes import load_meshes, registered_meshes
@@ -189,7 +188,7 @@ def write_plates(
         OutputError: the files cannot be written.
     """
     from jawusd.media.picture_sequence import PictureSequence
-    from jawusd.media.plates import PlateWriter
+    from jawusd.media.writers import PlateWriter
     from jawusd.rig.cameras import LIGHT_PLATE, PLATE
 
     cameras, videos = open_footage(capture)
@@ -242,6 +241,6 @@ def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
 
 
 def _small(mesh: Mesh) -> Mesh:
-    from jawusd.meshes.decimation import decimated
+    from jawusd.meshes.remeshing import decimated
 
     return Mesh(*decimated(mesh.vertices, mesh.faces, min(_MOST_FACES, len(mesh.faces))))

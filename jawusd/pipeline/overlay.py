@@ -69,7 +69,7 @@ def _write_cameras(
     capture: Capture, offsets: Mapping[str, int], tracks: Tracks, folder: Path, progress: Progress
 ) -> None:
     from jawusd.media.overlay import save_png, tracking_sheet
-    from jawusd.media.video_writer import VideoWriter
+    from jawusd.media.writers import VideoWriter
 
     cameras, videos = open_footage(capture, tracks)
     scans = tracked_scans(capture, tracks)
@@ -107,8 +107,8 @@ def _write_side_by_side(
     capture: Capture, offsets: Mapping[str, int], tracks: Tracks, path: Path, progress: Progress
 ) -> None:
     from jawusd.media.overlay import placed_scans
-    from jawusd.media.status_bar import StatusBar
-    from jawusd.media.video_writer import VideoWriter
+    from jawusd.media.side_by_side import StatusBar
+    from jawusd.media.writers import VideoWriter
 
     scans = tracked_scans(capture, tracks)
     wall = open_wall(capture, offsets, tracks, scans, TILE_PX)

@@ -11,10 +11,9 @@ import numpy as np
 
 from jawusd.base.errors import FormatError, OutputError, explain_missing_packages, naming_file
 from jawusd.formats.capture import Capture
-from jawusd.formats.coverage import worst_frames
 from jawusd.formats.performance import SolveState
 from jawusd.formats.report import Overlay, SolveReportData
-from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.formats.tracks import Tracks, load_tracks, worst_frames
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras, tracked_cameras
 from jawusd.pipeline.capture_inputs import open_capture

@@ -124,7 +124,7 @@ class BuildState:
         Raises:
             FormatError: it is of another kind.
         """
-        from jawusd.formats.header import of_kind  # which few commands need
+        from jawusd.formats.text import of_kind  # which few commands need
 
         record = self.stages.get(stage)
         return None if record is None else of_kind(record.result, kind, stage, self.folder / BUILD_FILE, _AGAIN)

@@ -14,10 +14,19 @@ from typing_extensions import TypedDict
 from jawusd.base.errors import TrackingError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
-from jawusd.formats.coverage import used_coverage
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import JawModel
-from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Registration, Tracks, TrackStatus, save_tracks
+from jawusd.formats.tracks import (
+    LOST,
+    PARTIAL,
+    RECOVERED,
+    LostReason,
+    Registration,
+    Tracks,
+    TrackStatus,
+    save_tracks,
+    used_coverage,
+)
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import Size, load_cameras, rescaled_cameras

@@ -21,7 +21,7 @@ from jawusd.pipeline.bake import DEFAULT_FPS
 from jawusd.pipeline.contact import teeth_of
 
 if TYPE_CHECKING:
-    from jawusd.meshes.contact_map import ContactMap
+    from jawusd.meshes.contact import ContactMap
     from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import Viewer
     from jawusd.viewer.viewed import Look, ViewedActor
@@ -91,7 +91,7 @@ class ContactView:
 
     @cached_property
     def _map(self) -> ContactMap:
-        from jawusd.meshes.contact_map import ContactMap
+        from jawusd.meshes.contact import ContactMap
         from jawusd.rig.geo import read_geometry
 
         return ContactMap(teeth_of(self._rig, read_geometry(self._path, self._prim)))

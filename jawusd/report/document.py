@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from jawusd.base.errors import shown
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.contact import DEEP, TOUCHING
 from jawusd.formats.finding import Finding
+from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.facts import TracksFacts, model_facts, sync_facts, tracks_facts

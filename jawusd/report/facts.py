@@ -6,8 +6,8 @@ from typing import cast
 
 from typing_extensions import TypedDict
 
-from jawusd.formats.header import Frames
 from jawusd.formats.report import ReportData
+from jawusd.formats.text import Frames
 from jawusd.formats.tracks import Registration
 
 ErrorTable = dict[str, dict[str, float]]

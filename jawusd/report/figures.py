@@ -17,10 +17,9 @@ from jawusd.base.errors import shown
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.motions import motions_of_poses
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.formats.coverage import used_coverage
-from jawusd.formats.light_curve import LightCurve
+from jawusd.formats.clips import LightCurve
 from jawusd.formats.model import JawModel
-from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks, used_coverage
 from jawusd.geometry import so3_log, transform_point, transform_points
 from jawusd.report.style import (
     BLACK,

@@ -19,9 +19,8 @@ from jawusd.base.errors import FormatError
 from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
-from jawusd.formats.performance import STATE_WORDS, SolveState
+from jawusd.formats.performance import STATE_WORDS, SolvedJaw, SolveState
 from jawusd.formats.report import SolveReportData
-from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.report.document import own_file, page_environment
 from jawusd.report.figures import farther, legend_beside, runs, thinned

@@ -10,10 +10,9 @@ from typing_extensions import TypedDict
 
 from jawusd.base.arrays import Mask
 from jawusd.evaluator import JawRig
-from jawusd.formats.coverage import used_coverage
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
-from jawusd.formats.tracks import LOST, RECOVERED, Tracks
+from jawusd.formats.tracks import LOST, RECOVERED, Tracks, used_coverage
 from jawusd.report.facts import model_facts, sync_facts, tracks_facts
 
 #: Grades, best first; "open" means that there is nothing to judge.

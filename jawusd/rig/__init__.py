@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from jawusd.rig.schema import register_schema, schema_is_live
 
 if TYPE_CHECKING:
-    from jawusd.formats.allowed_folders import allow_folders
+    from jawusd.base.inputs import allow_folders
     from jawusd.rig.animation import write_animation, write_splines
     from jawusd.rig.nvidia import find_nvidia_validator, nvidia_findings
     from jawusd.rig.read import describe, load_rig
@@ -36,7 +36,7 @@ __all__ = [
 
 _MODULES = {
     "Finding": "jawusd.rig.validate",
-    "allow_folders": "jawusd.formats.allowed_folders",
+    "allow_folders": "jawusd.base.inputs",
     "describe": "jawusd.rig.read",
     "find_nvidia_validator": "jawusd.rig.nvidia",
     "load_rig": "jawusd.rig.read",

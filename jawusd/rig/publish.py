@@ -10,8 +10,7 @@ from pathlib import Path
 from pxr import Sdf, UsdUtils
 
 from jawusd.base.errors import RigError
-from jawusd.base.inputs import check_input
-from jawusd.formats.allowed_folders import is_allowed
+from jawusd.base.inputs import check_input, is_allowed
 from jawusd.formats.atomic import atomic_path
 from jawusd.rig.checksums import record_checksums
 from jawusd.rig.layers import named_after, write_layer

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base import errors, guard
+from jawusd.base.inputs import SETTING, allowed_folders
 from jawusd.evaluator import JawRig
-from jawusd.formats.allowed_folders import SETTING, allowed_folders
 
 #: Limits of the process: memory [GB], processor time and waiting, for slow disks [s]. Rigs take 0.3 GB and 1 s.
 MOST_MEMORY_GB, MOST_CPU_S, MOST_WAIT_S = 4, 10, 60

@@ -11,7 +11,7 @@ from pxr import Ar, Sdf, Tf, Usd
 
 from jawusd.base.errors import FormatError, RigError
 from jawusd.base.guard import most_cpu, out_of_memory, take_in_hand
-from jawusd.formats.allowed_folders import is_allowed
+from jawusd.base.inputs import is_allowed
 from jawusd.rig.asset_paths import (
     asset_paths,
     clip_templates,
@@ -114,7 +114,7 @@ def check_reach(path: Path) -> list[Sdf.Layer]:
     Paths count as OpenUSD finds them: absolute ones, by search paths, and by expressions with variables.
     Layers that only use a rig (animation, shots) may name it outside their folder, and nothing else, in values neither:
     what values name is read (ONNX) and packed (pictures). Files that a rig's layers name must lie in the rig's folder,
-    with links resolved. Any may lie in folders that were allowed, see `formats.allowed_folders`.
+    with links resolved. Any may lie in folders that were allowed, see `base.inputs`.
 
     Returns:
         The layers, which stay loaded as long as they are referenced.

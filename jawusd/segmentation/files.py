@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Mask
 from jawusd.base.errors import CaptureError
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.formats.clip_source import ClipSource
+from jawusd.formats.clips import ClipSource
 from jawusd.media.footage import open_clip
 from jawusd.media.mask_files import PngMasks
 from jawusd.media.mask_levels import RawImage

@@ -16,7 +16,7 @@ from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.annotations import Outline, SeenVertex, choose_picks, drawn_mask
 from jawusd.synthetic.person import Person

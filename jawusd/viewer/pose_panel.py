@@ -13,7 +13,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.contact import AUTHORED_MM
-from jawusd.formats.contact import DEEP, TOUCHING
+from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.geometry import LANDMARKS
 from jawusd.viewer.plots import GREEN, VERMILION
 from jawusd.viewer.readouts import Readout

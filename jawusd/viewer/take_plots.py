@@ -7,10 +7,8 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.verdicts import place as place_of
-from jawusd.formats.coverage import uncovered_percent, worst_frames
-from jawusd.formats.performance import STATE_COLOURS, STATE_WORDS, SolveState
-from jawusd.formats.solved import SolvedJaw
-from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
+from jawusd.formats.performance import STATE_COLOURS, STATE_WORDS, SolvedJaw, SolveState
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks, uncovered_percent, worst_frames
 from jawusd.viewer.plots import (
     BLUE,
     CURVE_COLORS,

@@ -19,7 +19,7 @@ from subjects.scanner import Scanner, encoded
 from jawusd.cameras.calibration import load_calibration, save_calibration
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, transform_points
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.meshes.meshio import load_mesh
 
 ROWS = ("upper", "lower")

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jawusd.base.errors import CalibrationError
 from jawusd.cameras.calibration import load_calibration, save_calibration
-from jawusd.cameras.colmap_write import save_colmap
+from jawusd.cameras.colmap import save_colmap
 from jawusd.cameras.files import calibration_files, lacks_sizes, load_cameras_file
 
 SIZE = (1920, 1080)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from jawusd.base.errors import CalibrationError, FormatError, JawusdError, RigError
 from jawusd.cameras.calibration import load_calibration, save_calibration
-from jawusd.cameras.colmap_write import save_colmap
+from jawusd.cameras.colmap import save_colmap
 from jawusd.cameras.files import calibration_files, load_cameras_file
 from jawusd.cli.main import app
 from jawusd.geometry import Camera, make_transform

@@ -13,7 +13,7 @@ from jawusd.base.errors import CalibrationError, CaptureError
 from jawusd.capture.board_detection import edge_width_px
 from jawusd.capture.boards import find_boards
 from jawusd.formats.capture import Boards
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 CAMERAS = studio(lens=(0.0, 0.0))[:2]
 NAMES = ("c0", "c1")

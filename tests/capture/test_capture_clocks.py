@@ -9,8 +9,7 @@ from clip_files import counting_at, with_exr_header, write_prores, write_sequenc
 from jawusd.base.errors import SyncError
 from jawusd.capture.sync import estimate_offsets
 from jawusd.formats.capture import Capture
-from jawusd.formats.clip_source import ClipSource
-from jawusd.formats.timecode import frame_of_timecode
+from jawusd.formats.clips import ClipSource, frame_of_timecode
 from jawusd.media.footage import open_clip
 from jawusd.media.masks import MaskReader
 

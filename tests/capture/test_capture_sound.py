@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve, resample_poly
 from jawusd.base.errors import CaptureError, SyncError
 from jawusd.capture.signals import RATE_HZ, Step, match_sounds, match_steps, on_grid
 from jawusd.capture.sync import align_videos, light_curve
-from jawusd.media.audio import Sound, read_sound
+from jawusd.media.containers import Sound, read_sound
 from jawusd.media.timeline import Timeline
 from jawusd.media.video import Video
 

@@ -9,7 +9,7 @@ from jawusd.base.errors import SyncError
 from jawusd.capture.signals import Step, find_steps, match_steps
 from jawusd.capture.sync import align_videos, estimate_offsets
 from jawusd.formats.capture import Capture
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 FPS = 24.0
 FLASHES = ((10.3, 16.0), (371.0, 378.4))  # dark, in frames of the reference camera

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from jawusd.base.errors import CaptureError, SyncError
 from jawusd.cameras.calibration import load_calibration
 from jawusd.cli.main import app
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 
 def film(path, start, fps=24.0):

@@ -29,10 +29,9 @@ from jawusd.cli.main import app
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.__main__ import main as evaluator_main
 from jawusd.formats.model import JawModel, save_model
-from jawusd.formats.performance import SolveState
+from jawusd.formats.performance import SolvedJaw, SolveState
 from jawusd.formats.poses import write_parameters, write_poses
-from jawusd.formats.solved import SolvedJaw
-from jawusd.media.status_bar import StatusBar
+from jawusd.media.side_by_side import StatusBar
 from jawusd.pipeline.library import retarget
 from jawusd.plugins import extension
 from jawusd.report.solve_page import seen_figure

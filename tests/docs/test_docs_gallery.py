@@ -12,7 +12,7 @@ from package_copy import ROOT
 from PIL import Image
 
 import jawusd
-from jawusd.formats.contact import TOUCHING
+from jawusd.formats.mesh import TOUCHING
 
 FOLDER = ROOT / "docs" / "gallery"
 MOST_BYTES = 2_000_000

@@ -22,7 +22,7 @@ import numpy as np
 from pxr import Sdf
 from jawusd.base.errors import OutputError
 from jawusd.formats.atomic import write_npz_atomic, write_text_atomic
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.rig.layers import new_layer, write_layer
 
 def layer(size):

@@ -14,7 +14,7 @@ from package_copy import ROOT
 
 from jawusd.base.errors import OutputError
 from jawusd.formats.atomic import refuse_existing, write_bytes_atomic, write_npz_atomic, write_text_atomic
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.report.style import new_figure, save_figure
 from jawusd.rig.layers import new_layer, write_layer
 

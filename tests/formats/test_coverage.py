@@ -3,7 +3,7 @@
 import numpy as np
 from report_data import report_data
 
-from jawusd.formats.coverage import uncovered_percent, worst_frames
+from jawusd.formats.tracks import uncovered_percent, worst_frames
 from jawusd.pipeline.media import chosen_frames
 from jawusd.viewer.take_plots import frames_to_inspect
 

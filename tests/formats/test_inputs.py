@@ -16,7 +16,7 @@ from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.model import load_model
 from jawusd.formats.poses import read_parameters, read_poses
 from jawusd.formats.tracks import load_tracks
-from jawusd.media.audio import read_sound
+from jawusd.media.containers import read_sound
 from jawusd.media.pictures import read_gray
 from jawusd.media.video import Video
 from jawusd.meshes.meshio import load_mesh

@@ -13,7 +13,7 @@ from example_tracks import make_tracks
 from jawusd.base.errors import FormatError, UnitsError, VersionError
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.model import JawModel, load_model, save_model
-from jawusd.formats.solved import SolvedJaw
+from jawusd.formats.performance import SolvedJaw
 from jawusd.formats.tracks import LostReason, TrackStatus, load_tracks, save_tracks
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from jawusd.base.errors import FormatError
-from jawusd.formats.arkit_mapping import load_mapping
+from jawusd.formats.arkit import load_mapping
 from jawusd.formats.keys import load_keys
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.poses import read_parameters

@@ -5,7 +5,7 @@ from itertools import count
 import pytest
 
 from jawusd.base.errors import CaptureError
-from jawusd.formats.timecode import frame_of_timecode
+from jawusd.formats.clips import frame_of_timecode
 
 
 @pytest.mark.parametrize(("fps", "number", "dropped"), [(30000 / 1001, 30, 2), (60000 / 1001, 60, 4)])

@@ -5,7 +5,7 @@ import shutil
 import pytest
 from reach_driver import GOLDEN, STRACE, watch, write_rigs
 
-from jawusd.formats.allowed_folders import SETTING
+from jawusd.base.inputs import SETTING
 
 pytestmark = pytest.mark.skipif(STRACE is None, reason="strace is not installed")
 

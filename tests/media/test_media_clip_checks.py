@@ -8,7 +8,7 @@ from damaged_clips import packets, with_zeros, write_gray
 from jawusd.media import clip_checks
 from jawusd.media.clip_checks import decoded_findings, rate_findings
 from jawusd.media.video import Video
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 
 def clip(path, fps=24.0, count=30):

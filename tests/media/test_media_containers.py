@@ -10,9 +10,9 @@ import pytest
 from package_copy import ROOT
 
 from jawusd.base.errors import CaptureError
-from jawusd.media import pictures, stored_picture, video
-from jawusd.media.audio import read_sound
-from jawusd.media.pictures import MOST_PX, read_gray
+from jawusd.media import pictures, video
+from jawusd.media.containers import MOST_PX, read_sound
+from jawusd.media.pictures import read_gray
 from jawusd.media.video import Video
 
 VIDEO = ROOT / "examples" / "capture" / "video" / "cam0.mp4"
@@ -78,17 +78,17 @@ def test_huge_frames_of_sequences_are_refused_before_they_are_decoded(suffix, tm
         stream.width, stream.height, stream.pix_fmt = 64, 80, kind
         frame = av.VideoFrame.from_ndarray(np.zeros((80, 64, 3), np.uint8), "rgb24").reformat(format=kind)
         out.mux([*stream.encode(frame), *stream.encode(None)])
-    assert stored_picture.read_stored(path).pixels.shape == (80, 64, 3)
-    monkeypatch.setattr(stored_picture, "MOST_STORED_PX", 64 * 80 - 1)
+    assert pictures.read_stored(path).pixels.shape == (80, 64, 3)
+    monkeypatch.setattr(pictures, "MOST_STORED_PX", 64 * 80 - 1)
     with pytest.raises(CaptureError, match="more than 5119 px"):
-        stored_picture.read_stored(path)
+        pictures.read_stored(path)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes of POSIX")
 def test_headers_of_pipes_are_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "0001.exr")
     with pytest.raises(CaptureError, match="is not a file"):
-        stored_picture.read_header(tmp_path / "0001.exr")
+        pictures.read_header(tmp_path / "0001.exr")
 
 
 def test_a_header_that_announces_more_than_memory_is_none(tmp_path):

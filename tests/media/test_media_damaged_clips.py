@@ -6,9 +6,9 @@ import pytest
 from damaged_clips import packets, with_zeros, write_clip
 
 from jawusd.base.errors import CaptureError
-from jawusd.media.stored_picture import read_stored
+from jawusd.media.pictures import read_stored
 from jawusd.media.video import Video
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 THREADS = (1, 2, 8)
 

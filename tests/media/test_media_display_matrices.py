@@ -7,8 +7,7 @@ from PIL import Image
 
 from jawusd.base.errors import CaptureError
 from jawusd.media.clip_checks import decoded_findings
-from jawusd.media.pictures import read_picture
-from jawusd.media.stored_picture import read_stored
+from jawusd.media.pictures import read_picture, read_stored
 from jawusd.media.video import Video
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jawusd.base.errors import CaptureError
-from jawusd.media.frame_reader import FrameReader
+from jawusd.media.footage import FrameReader
 from jawusd.media.video import Video
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 COUNT = 90
 

@@ -12,7 +12,7 @@ from jawusd.base.errors import CaptureError, FormatError
 from jawusd.formats.capture import CameraSource, load_capture
 from jawusd.media.masks import MaskReader, open_masks
 from jawusd.media.timeline import Timeline
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 SIZE = (64, 48)
 COUNT = 8

@@ -17,7 +17,7 @@ from jawusd.base.errors import CaptureError
 from jawusd.media.masks import MaskReader, mask_size_px
 from jawusd.media.pictures import read_gray
 from jawusd.media.timeline import Timeline
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 SIZE = (64, 40)
 BLACK = (3, 9)

@@ -12,7 +12,7 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform
 from jawusd.media import overlay
 from jawusd.media.backdrop import Backdrop
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 SIZE = (160, 120)
 K = np.array([[160.0, 0, 80], [0, 160, 60], [0, 0, 1]])

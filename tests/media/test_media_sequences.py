@@ -10,13 +10,13 @@ import pytest
 from clip_files import KINDS, with_exr_header, write_picture, write_prores, write_sequence
 
 from jawusd.base.errors import CaptureError
-from jawusd.formats.clip_source import ClipSource
-from jawusd.formats.numbered import gaps, groups, numbered_files
+from jawusd.formats.clips import ClipSource
+from jawusd.formats.file_names import gaps, groups, numbered_files
 from jawusd.media.clip_checks import rate_findings
 from jawusd.media.display import to_display
 from jawusd.media.footage import open_clip
-from jawusd.media.stored_picture import read_header, read_stored
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.pictures import read_header, read_stored
+from jawusd.media.writers import VideoWriter
 
 SIZE = (48, 64)
 

@@ -12,7 +12,7 @@ import pytest
 from jawusd.base.errors import CaptureError
 from jawusd.media.pixels import TO_RGB
 from jawusd.media.video import Video
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 SIZE = (96, 64)
 

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from jawusd.formats.contact import TOUCHING
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import TOUCHING, Mesh
 from jawusd.geometry import transform_points
-from jawusd.meshes.contact import NoContact, find_teeth
-from jawusd.meshes.contact_map import ContactMap
+from jawusd.meshes.contact import ContactMap, NoContact, find_teeth
 from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.person import Person
 

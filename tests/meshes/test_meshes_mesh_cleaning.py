@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from jawusd.formats.mesh import Mesh
-from jawusd.meshes.mesh_cleaning import manifold
+from jawusd.meshes.remeshing import manifold
 
 
 def checked(mesh):

@@ -5,8 +5,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 
 from jawusd.formats.mesh import BOUNDARY, GUM, TOOTH, Mesh, crown_face_mask
-from jawusd.meshes.decimation import bone_proxy_of, proxy_of
-from jawusd.meshes.mesh_cleaning import manifold
+from jawusd.meshes.remeshing import bone_proxy_of, manifold, proxy_of
 
 
 def torus(count=(240, 80)):

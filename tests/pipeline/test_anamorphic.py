@@ -6,7 +6,7 @@ import pytest
 from jawusd.base.errors import CalibrationError
 from jawusd.cameras.calibration import save_calibration
 from jawusd.geometry import Camera
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 

@@ -170,7 +170,7 @@ def missing_mask_folder(folder):
 
 
 def masks_of_another_size(folder):
-    from jawusd.media.video_writer import VideoWriter
+    from jawusd.media.writers import VideoWriter
 
     path = next((folder / "masks").rglob("*.mkv"))
     path.unlink()

@@ -18,7 +18,7 @@ from jawusd.base.errors import CaptureError
 from jawusd.capture.mask_checks import exchanged_by_frames
 from jawusd.formats.capture import load_capture
 from jawusd.formats.finding import Finding
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.pipeline import check as checks
 from jawusd.pipeline.build import BuildOptions, build
 from jawusd.pipeline.check import check_capture
@@ -307,7 +307,7 @@ def test_the_program_prints_findings_and_leaves_with_5(capture):
 
 def test_a_black_picture_in_between_does_not_end_the_masks(tmp_path):
     from jawusd.formats.capture_parts import CameraSource, Masks
-    from jawusd.media.mask_samples import sample_masks
+    from jawusd.media.mask_survey import sample_masks
 
     for k in range(40):
         picture = np.zeros((90, 160), np.uint8)

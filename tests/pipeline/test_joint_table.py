@@ -8,8 +8,8 @@ from example_rig import FPS, example_rig, mandible_vertices, moved
 from pxr import Usd, UsdSkel
 from scipy.spatial.transform import Rotation
 
-from jawusd.formats.arkit_mapping import ArkitMapping
-from jawusd.formats.joint_table import save_joint_table
+from jawusd.formats.arkit import ArkitMapping
+from jawusd.formats.poses import save_joint_table
 from jawusd.pipeline.joint_table import SHAPES, joint_deltas
 from jawusd.rig.skel import write_skel
 

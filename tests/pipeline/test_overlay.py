@@ -11,11 +11,10 @@ import trimesh
 
 from jawusd.base.errors import CalibrationError, CaptureError, OutputError
 from jawusd.cameras.calibration import save_calibration
-from jawusd.formats.performance import STATE_COLOURS, SolveState
-from jawusd.formats.solved import SolvedJaw
+from jawusd.formats.performance import STATE_COLOURS, SolvedJaw, SolveState
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform, relative_pose
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.overlay import TILE_PX, overlay_files, write_overlay
 

@@ -10,7 +10,7 @@ import pytest
 
 from jawusd.cameras.calibration import save_calibration
 from jawusd.geometry import Camera, make_transform
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.media import write_plates
 from jawusd.rig.cameras import PLATE
@@ -88,7 +88,7 @@ def test_plates_of_light_are_light(capture, tmp_path):
     """The same ball as EXR far above white: undistorted, and as bright as it was."""
     from clip_files import write_picture
 
-    from jawusd.media.stored_picture import read_stored
+    from jawusd.media.pictures import read_stored
     from jawusd.media.video import Video
     from jawusd.rig.cameras import LIGHT_PLATE
 

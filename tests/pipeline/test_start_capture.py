@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from jawusd.base.errors import CaptureError
 from jawusd.cli.main import app
 from jawusd.formats.capture import read_capture
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.pipeline.folder_files import camera_names, find_files, pair
 from jawusd.pipeline.start_capture import start_capture, start_lines, write_start
 

@@ -15,7 +15,7 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 
 import jawusd
 from jawusd.base.errors import FormatError, ResourceError, RigError
-from jawusd.formats.allowed_folders import SETTING
+from jawusd.base.inputs import SETTING
 from jawusd.rig import arrays, separate, untrusted
 from jawusd.rig.geo import read_geometry, read_gum
 from jawusd.rig.read import describe, load_rig, open_stage

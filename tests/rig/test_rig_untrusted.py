@@ -8,7 +8,7 @@ import pytest
 from pxr import Sdf, Usd
 
 from jawusd.base.errors import RigError
-from jawusd.formats.allowed_folders import SETTING
+from jawusd.base.inputs import SETTING
 from jawusd.rig import describe, untrusted
 from jawusd.rig.asset_paths import file_of
 from jawusd.rig.package import write_package

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 
 HEAD = """format = "jawusd-capture/1"
 name = "x"

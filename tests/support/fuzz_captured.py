@@ -171,7 +171,7 @@ def read_png(place, path):
 
 
 def write_videos(folder):
-    from jawusd.media.video_writer import VideoWriter
+    from jawusd.media.writers import VideoWriter
 
     folder.mkdir(parents=True)
     for name, lossless in (("mask.mkv", True), ("mask.mp4", False)):
@@ -182,7 +182,7 @@ def write_videos(folder):
 
 
 def read_video(place, path):
-    from jawusd.media.audio import read_sound
+    from jawusd.media.containers import read_sound
     from jawusd.media.masks import MaskReader
     from jawusd.media.video import Video
 

@@ -12,7 +12,7 @@ from subjects.scanner import Scanner, encoded
 from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
 from jawusd.geometry import LANDMARKS, transform_point, transform_points
-from jawusd.media.video_writer import VideoWriter
+from jawusd.media.writers import VideoWriter
 from jawusd.meshes.raster import draw_depth_labels
 from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.annotations import choose_picks

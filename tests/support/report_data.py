@@ -9,9 +9,8 @@ from example_rig import example_meshes, example_motion
 from jawusd.evaluator import JawRig
 from jawusd.formats.experiments import CondylePath, Coverage, Distances, Experiments, ParameterPath
 from jawusd.formats.model import JawModel
-from jawusd.formats.performance import SolveState
+from jawusd.formats.performance import SolvedJaw, SolveState
 from jawusd.formats.report import CameraFacts, Origin, Overlay, ReplayPart, ReportData, RigFacts, SolveReportData
-from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, TRACKED, Tracks
 from jawusd.paper.figures import inline_figures
 from jawusd.report import document as report_document

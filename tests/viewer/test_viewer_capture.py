@@ -15,8 +15,7 @@ from viewed_example import FIRST, STOP, copy_example, quiet, truth, write_true_t
 from viser._messages import FileTransferStartUpload
 
 from jawusd.formats.capture import load_capture
-from jawusd.formats.performance import STATE_COLOURS, SolveState
-from jawusd.formats.solved import SolvedJaw
+from jawusd.formats.performance import STATE_COLOURS, SolvedJaw, SolveState
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.geometry import transform_point, transform_points
 from jawusd.pipeline.view_capture import viewed_capture

@@ -5,9 +5,8 @@ import pytest
 import trimesh
 
 from jawusd.formats.capture import Bootstrap
-from jawusd.formats.coverage import uncovered_percent
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import LOST, TRACKED, Tracks
+from jawusd.formats.tracks import LOST, TRACKED, Tracks, uncovered_percent
 from jawusd.geometry import make_transform, random_rotation, transform_points
 from jawusd.viewer.picking import FOV_RAD, PickBook, PickingLayout, fit_view, hit_vertex, region_around
 from jawusd.viewer.take_plots import CoveragePlot, frame_words, frames_to_inspect

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.media.warp import warp_nearest
+from jawusd.media.working_view import warp_nearest
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V, X, Y, Z, contour_samples
 from jawusd.tracking.contour.scan import ARCHES, Scan

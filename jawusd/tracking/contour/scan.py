@@ -15,8 +15,8 @@ from jawusd.base.errors import TrackingError
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.geometry import transform_point
 from jawusd.geometry.points import welded
-from jawusd.meshes.decimation import decimated_scan
 from jawusd.meshes.raster import draw_depth_labels, draw_silhouette, project, words_for
+from jawusd.meshes.remeshing import decimated_scan
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments
 
 #: Vertex indices of faces, or other index tables for compiled code.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.formats.mesh import GUM, Mesh, tooth_labels
-from jawusd.meshes.decimation import decimated
+from jawusd.meshes.remeshing import decimated
 from jawusd.synthetic.dental_arch import GREY, RED
 from jawusd.synthetic.surfaces import Faces, merged, vertex_normals
 

@@ -1,7 +1,7 @@
-"""Numbered files, as sequences of pictures are stored: which names belong to a pattern, and which number each has.
+"""File names: the kind that a suffix states, and numbered files such as image sequences.
 
-Patterns, in the last part of a path: `%06d` or `%d` as printf has them, `####` with a sign per digit, or a glob with
-`*` or `?`, of whose files the last digits of the name count. Folders are never searched below.
+A pattern stands in the last part of a path: `%06d` or `%d` as in printf, `####` with one sign per digit, or a glob with
+`*` or `?`, where the last digits of the name are the number. Subfolders are not searched.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import fnmatch
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from jawusd.base.errors import CaptureError
 
@@ -18,6 +18,26 @@ _PRINTF = re.compile(r"%(?:0(\d+))?d")
 _HASHES = re.compile(r"#+")
 _DIGITS = re.compile(r"(\d+)(?=\D*$)")
 _GAPS_SHOWN = 4
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mxf", ".mts", ".mpg", ".y4m")
+PICTURES = (".png", ".tif", ".tiff", ".exr", ".dpx", ".jpg", ".jpeg")
+MESHES = (".ply", ".stl", ".obj", ".dcm")
+
+# What keys of a capture.toml cannot name, by what they are for.
+_WRONG = {
+    "scans": (("a video", VIDEOS), ("a picture", PICTURES)),
+    "footage": (("a mesh", MESHES), ("a calibration", (".toml", ".json", ".xml", ".csv", ".yml", ".yaml"))),
+    "calibration": (("a mesh", MESHES), ("a video", VIDEOS), ("a picture", PICTURES)),
+}
+_NEEDED = {
+    "scans": "a mesh is needed (.ply, .stl, .obj or .dcm)",
+    "footage": "a video or numbered pictures are needed",
+    "calibration": "a calibration is needed; clips of a board go into [boards] videos",
+}
+_GROUPS = {
+    **dict.fromkeys(("upper_teeth", "lower_teeth", "mandible", "skull"), "scans"),
+    **dict.fromkeys(("video", "videos", "upper", "lower"), "footage"),
+    "calibration": "calibration",
+}
 
 
 def is_pattern(path: Path) -> bool:
@@ -117,3 +137,17 @@ def _offer(folder: Path) -> str:
     if not found:
         return "Correct the path in capture.toml."
     return f"There is {' and '.join(sorted(found, key=lambda key: -len(found[key]))[:2])}."
+
+
+def wrong_kind(key: str, path: PurePath) -> str | None:
+    """Return what a file is that a key of capture.toml cannot name, and what is needed; None if it may be named.
+
+    Args:
+        key: that names the file: `upper_teeth`, `video`, `calibration`, ...
+        path: the file; its suffix tells.
+    """
+    group = _GROUPS.get(key, "")
+    for kind, suffixes in _WRONG.get(group, ()):
+        if path.suffix.lower() in suffixes:
+            return f"is {kind}; {_NEEDED[group]}."
+    return None

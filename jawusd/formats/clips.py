@@ -1,0 +1,149 @@
+"""Clips of a capture: where they are and how they are read, their brightness over time, and their time codes.
+
+Time code, SMPTE ST 12-1, counts frames since midnight. Numbers after "HH:MM:SS:" count the frames of a second. At
+29.97, 59.94 and 119.88 frames per second the count may skip the first two, four or eight numbers of every minute that
+is not a multiple of ten ("drop frame", written with ";" or "." before the frames), so that it follows the clock.
+
+Rates of time code tracks are read from QuickTime and MP4 files, as FFmpeg does not report them: Apple, "QuickTime File
+Format Specification", atoms and timecode sample description.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError
+
+_CODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.,])(\d{2,3})")
+_PER_DAY_HOURS = 24
+_PATH = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
+_HEAD, _LONG_HEAD = 8, 16  # bytes of an atom's size and type; of one of more than 4 GB
+_TO_ENTRIES = 8  # version, flags and count of a table
+_MOST_ATOMS = 100_000  # a damaged file has no end of them
+
+
+@dataclass(frozen=True)
+class ClipSource:
+    """Hold a video or a pattern of numbered pictures, and what the files themselves may not say.
+
+    Attributes:
+        path: the file, or a pattern as in `formats.file_names`.
+        fps: rate of numbered pictures; a video has its own.
+        colour_space: "display", "linear", "cineon" or a name of the OpenColorIO config; None lets the files decide.
+        colour_config: OpenColorIO config.
+        pixel_aspect: width of a pixel over its height; None lets the file decide.
+        timecode: of the first picture; "" lets the file decide.
+    """
+
+    path: Path
+    fps: float | None = None
+    colour_space: str | None = None
+    colour_config: Path | None = None
+    pixel_aspect: float | None = None
+    timecode: str = ""
+
+    @property
+    def is_light(self) -> bool:
+        """Tell whether the pictures are light in fractions, as only EXR holds it."""
+        return self.path.suffix.lower() == ".exr"
+
+
+@dataclass(frozen=True, eq=False)
+class LightCurve:
+    """Hold the brightness of one clip."""
+
+    times_s: Array  # presentation time of every picture after the first one [s], shape (n,)
+    frames: NDArray[np.int64]  # its frame on the clip's even grid, shape (n,)
+    brightness: Array  # its mean brightness, 0 .. 255, shape (n,)
+    # when the light suddenly went off, and on [frames], shapes (a,), (b,)
+    off_frames: Array
+    on_frames: Array
+
+
+def frame_of_timecode(text: str, fps: float) -> int:
+    """Return how many frames a time code counts since midnight.
+
+    Args:
+        text: HH:MM:SS:FF, or with ";" or "." before FF if frame numbers are dropped.
+        fps: frames per second; of a rate like 23.976 time codes count 24 numbers.
+
+    Raises:
+        CaptureError: it is no time code, or none of this rate.
+    """
+    found = _CODE.fullmatch(text.strip())
+    if found is None:
+        raise CaptureError(f'the time code "{text:.40}" is not HH:MM:SS:FF.')
+    hours, minutes, seconds, frame = (int(found[k]) for k in (1, 2, 3, 5))
+    number = math.ceil(fps - 0.01)
+    if hours >= _PER_DAY_HOURS or minutes > 59 or seconds > 59 or frame >= number:
+        raise CaptureError(
+            f'the time code "{text}" cannot be: at {fps:g} frames per second the last one is 23:59:59:{number - 1:02}.'
+        )
+    total = (3600 * hours + 60 * minutes + seconds) * number + frame
+    if found[4] == ":":
+        return total
+    if number not in (30, 60, 120):
+        raise CaptureError(
+            f'the time code "{text}" drops frame numbers; that is done at 29.97, 59.94 and 119.88, not at {fps:g}.'
+        )
+    dropped = number // 15
+    if frame < dropped and seconds == 0 and minutes % 10:
+        raise CaptureError(f'the time code "{text}" is left out in drop-frame counting.')
+    whole = 60 * hours + minutes
+    return total - dropped * (whole - whole // 10)
+
+
+def timecode_rates(path: str | os.PathLike[str]) -> list[Fraction]:
+    """Return how many frames per second the time code tracks of a file count; none where it has none, or is another.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with open(path, "rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        return [rate for place in _atoms(file, 0, size, _PATH) if (rate := _rate(file, place))]
+
+
+def _atoms(file: BinaryIO, start: int, stop: int, path: tuple[bytes, ...]) -> Iterator[int]:
+    """Yield where the contents of atoms begin that lie on a path of types."""
+    for _ in range(_MOST_ATOMS):
+        file.seek(start)
+        head = file.read(_LONG_HEAD)
+        if stop - start < _HEAD or len(head) < _HEAD:
+            return
+        size, kind = struct.unpack_from(">I4s", head)
+        inside = start + _HEAD
+        if size == 1 and len(head) == _LONG_HEAD:
+            size, inside = struct.unpack_from(">Q", head, _HEAD)[0], start + _LONG_HEAD
+        end = min(stop, start + size) if size else stop
+        if end < inside:
+            return
+        if kind == path[0]:
+            if len(path) == 1:
+                yield inside
+            else:
+                yield from _atoms(file, inside, end, path[1:])
+        start = end
+
+
+def _rate(file: BinaryIO, place: int) -> Fraction | None:
+    """Return the rate in the first entry of a table of sample descriptions; None if it is no time code."""
+    file.seek(place + _TO_ENTRIES)
+    entry = file.read(34)
+    if len(entry) < 33 or entry[4:8] != b"tmcd":
+        return None
+    # After type, index and flags: units per second, and those of a frame.
+    scale, duration = struct.unpack_from(">2I", entry, 24)
+    return Fraction(scale, duration) if scale and duration else None
