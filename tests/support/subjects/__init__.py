@@ -1,1 +1,1 @@
-"""Random subjects for tests and benchmarks: mouths, scanners, annotators, short captures."""
+"""Random subjects for tests and benchmarks: mouths, scanners, annotators and short captures with ground truth."""

@@ -1,4 +1,4 @@
-"""Annotator."""
+"""Annotator model: gum line bias, edge bias, temporal jitter and gross errors of hand-drawn masks."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 
 REFERENCE_HEIGHT = 1080.0
-#: How many times finer than the mask's pixels a hand is drawn, an odd number: otherwise offsets of less than half a
-#: pixel would do nothing, and larger ones move straight edges by a whole pixel but oblique ones by less.
+#: Supersampling factor of the masks, an odd number. Without it, offsets of less than half a pixel would have no effect,
+#: and larger ones would move straight edges by a whole pixel but oblique ones by less.
 FINER = 3
-_KEEP = 0.6  # of the wobble that changes, from frame to frame
-_LEAST_SCALE = 0.45  # hands do not get finer without end as pictures get smaller
+_KEEP = 0.6  # frame-to-frame correlation of the varying jitter
+_LEAST_SCALE = 0.45  # lower limit of the scale; annotators do not get more precise on small pictures
 _NEAR_GUM_MM, _AWAY_FROM_GUM_MM = 0.8, 1.5
 _GROSS = ("half", "cut", "blob")
 
 
 @dataclass(frozen=True, eq=False)
 class Annotator:
-    """The habits of a person who draws masks; px are those of a picture 1080 px high."""
+    """Habits of an annotator; px refer to a picture 1080 px high."""
 
-    gum_mm: Array  # where the gum line is drawn, + into the gum, upper and lower arch, shape (2,)
-    gum_tooth_mm: Array  # added to it per arch and tooth (left 1..7, right 1..7), shape (2, 14)
-    edge_px: float  # all other edges, + outside
-    camera_px: Array  # added to all edges per camera, shape (C,)
+    gum_mm: Array  # offset of the gum line, + into the gum, upper and lower arch, shape (2,)
+    gum_tooth_mm: Array  # additional offset per arch and tooth (left 1..7, right 1..7), shape (2, 14)
+    edge_px: float  # offset of all other edges, + outwards
+    camera_px: Array  # additional offset of all edges per camera, shape (C,)
     wobble_px: float
-    cell_px: float  # correlation length of the wobble
-    constant_share: float  # of the wobble's variance that is the same in all frames
-    papilla: float  # share of the gum between two teeth that is drawn as teeth, 0..1
-    sliver_px: float  # narrower parts are left out
-    missing: float  # share of masks that were not drawn
-    gross: float  # share of masks that are grossly wrong
+    cell_px: float  # correlation length of the jitter
+    constant_share: float  # fraction of the jitter's variance that is constant over time
+    papilla: float  # fraction of the papilla between two teeth drawn as teeth, 0..1
+    sliver_px: float  # narrower parts are omitted
+    missing: float  # fraction of missing masks
+    gross: float  # fraction of grossly wrong masks
 
     @property
     def kind(self) -> str:
-        """Return the habit that stands out, for tables."""
+        """Return the dominant habit, for tables."""
         if np.abs(self.gum_tooth_mm).max() > 0:
             return "gum by tooth"
         if np.abs(self.gum_mm).max() > 0.05:
@@ -47,7 +47,7 @@ class Annotator:
 
 
 def draw_annotator(seed: int, cameras: int) -> Annotator:
-    """Draw a person's habits from a seed, for a number of cameras."""
+    """Draw a random annotator for a number of cameras."""
     rng = np.random.default_rng([seed, 0xA220])
     by_tooth = rng.random() < 0.4
     return Annotator(
@@ -66,12 +66,12 @@ def draw_annotator(seed: int, cameras: int) -> Annotator:
 
 
 class Hand:
-    """One annotator's hand on the masks of one arch in one camera, frame after frame."""
+    """Sequence of masks of one arch in one camera by one annotator."""
 
     def __init__(
         self, annotator: Annotator, arch: int, camera: int, size_px: tuple[int, int], rng: np.random.Generator
     ) -> None:
-        """Start drawing masks of a width and height."""
+        """Initialise for masks of a width and height."""
         self._who, self._arch, self._camera, self._rng = annotator, arch, camera, rng
         self._size = size_px
         self._scale = FINER * max(size_px[1] / REFERENCE_HEIGHT, _LEAST_SCALE)
@@ -83,14 +83,14 @@ class Hand:
     def draw(
         self, tooth: NDArray[np.uint8], gum: Mask, window: tuple[int, int], px_per_mm: float
     ) -> NDArray[np.uint8] | None:
-        """Return the mask (h, w) as this person draws it, None if they forget it.
+        """Return the mask (h, w) as drawn by this annotator, None if it is missing.
 
         Args:
-            tooth: 1..14 where a tooth of the arch is seen, 0 elsewhere: part of a picture that is `FINER` times finer
-                than the mask, shape (rows, columns).
-            gum: where gum of the arch is seen, same shape.
-            window: first column and row of that part, which are multiples of `FINER`.
-            px_per_mm: of that picture at the teeth.
+            tooth: 1..14 on visible teeth of the arch, 0 elsewhere; part of a picture supersampled by `FINER`, shape
+                (rows, columns).
+            gum: visible gum of the arch, same shape.
+            window: first column and row of that part, multiples of `FINER`.
+            px_per_mm: resolution of that picture at the teeth.
         """
         who, rng = self._who, self._rng
         self._varying = _KEEP * self._varying + np.sqrt(1.0 - _KEEP**2) * rng.normal(size=self._varying.shape)
@@ -100,7 +100,7 @@ class Hand:
         part = self._outline(tooth, gum, window, px_per_mm)
         if wrong:
             part = _spoilt(part, rng)
-        part = part[FINER // 2 :: FINER, FINER // 2 :: FINER]  # centres of the mask's pixels
+        part = part[FINER // 2 :: FINER, FINER // 2 :: FINER]  # centres of mask pixels
         mask = np.zeros(self._size[::-1], np.uint8)
         row, column = window[1] // FINER, window[0] // FINER
         mask[row : row + part.shape[0], column : column + part.shape[1]] = np.where(part, 255, 0)
@@ -130,19 +130,19 @@ class Hand:
     def _fields(
         self, window: tuple[int, int], shape: tuple[int, ...]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return wobble and taste, of about unit variance, over the window."""
+        """Return temporal jitter and constant bias over the window, each of about unit variance."""
         share = self._who.constant_share
         nodes = np.sqrt(share) * self._constant + np.sqrt(1.0 - share) * self._varying
         column, row, rows, columns = (k // FINER for k in (*window, *shape))
         out = []
         for layer in nodes:
             field = smooth_field(layer, self._cell / FINER, self._size)[row : row + rows, column : column + columns]
-            # Cubic interpolation between independent nodes lowers the variance to about 0.55.
+            # Cubic interpolation between independent nodes reduces the variance to about 0.55.
             out.append(enlarged(1.35 * field, FINER))
         return out[0], out[1]
 
     def _by_tooth(self, tooth: NDArray[np.uint8], scale: float) -> NDArray[np.float32]:
-        """Spread the teeth's own gum offsets [mm] over their surroundings."""
+        """Extend the gum offsets of the teeth [mm] to their surroundings."""
         offsets = np.concatenate([[0.0], self._who.gum_tooth_mm[self._arch]]).astype(np.float32)
         if not offsets.any():
             return np.zeros(tooth.shape, np.float32)
@@ -152,7 +152,7 @@ class Hand:
 
 
 def _spoilt(mask: Mask, rng: np.random.Generator) -> Mask:
-    """Return a grossly wrong mask: half of it gone, or a large foreign patch."""
+    """Return a grossly wrong mask: half of it missing, or a large extra patch."""
     rows, columns = np.nonzero(mask)
     if not len(rows):
         return mask
@@ -170,7 +170,7 @@ def _spoilt(mask: Mask, rng: np.random.Generator) -> Mask:
 
 
 def outside_px(mask: Mask) -> NDArray[np.float32]:
-    """Return the signed distance of every pixel (h, w) from the outline of a mask [px], negative inside."""
+    """Return the signed distance of every pixel (h, w) to a mask's outline [px], negative inside."""
     inside = mask.astype(np.uint8)
     if not inside.any():
         return np.full(mask.shape, np.inf, np.float32)
@@ -179,35 +179,35 @@ def outside_px(mask: Mask) -> NDArray[np.float32]:
 
 
 def blurred(values: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
-    """Return the Gaussian average of a picture (h, w)."""
+    """Return a picture (h, w) blurred by a Gaussian."""
     return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma_px), np.float32)
 
 
 def closed(mask: Mask, width_px: float) -> Mask:
-    """Return a mask with gaps up to a width filled (morphological closing by a disc)."""
+    """Return the morphological closing of a mask by a disc: gaps up to a width are filled."""
     return _less(~_less(~mask, 0.5 * width_px), 0.5 * width_px)
 
 
 def opened(mask: Mask, width_px: float) -> Mask:
-    """Return a mask without parts narrower than a width (morphological opening by a disc)."""
+    """Return the morphological opening of a mask by a disc: parts narrower than a width are removed."""
     return ~_less(~_less(mask, 0.5 * width_px), 0.5 * width_px)
 
 
 def _less(mask: Mask, radius_px: float) -> Mask:
-    """Return a mask without what lies within a radius of its outline; the picture's border is none."""
+    """Erode a mask by a radius, except at the picture's border."""
     inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
     return np.asarray(inside - 0.5 > radius_px)
 
 
 def smooth_field(nodes: Array, cell_px: float, size_px: tuple[int, int]) -> NDArray[np.float32]:
-    """Interpolate values at the nodes (rows, columns) of a grid to a picture of a width and height, by cubics."""
+    """Interpolate grid values (rows, columns) cubically to a picture of a width and height."""
     height, width = int(np.ceil(nodes.shape[0] * cell_px)), int(np.ceil(nodes.shape[1] * cell_px))
     field = cv2.resize(nodes.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
     return np.ascontiguousarray(field[: size_px[1], : size_px[0]], np.float32)
 
 
 def enlarged(field: NDArray[np.float32], times: int) -> NDArray[np.float32]:
-    """Return a smooth picture (h, w) with so many times more pixels along either side."""
+    """Upsample a smooth picture (h, w) by a factor in both directions."""
     return np.asarray(cv2.resize(field, None, fx=times, fy=times, interpolation=cv2.INTER_LINEAR), np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Whatever wrote the scans: file format, paint, number of faces, and the dirt that scanners leave."""
+"""Scanner model: file format, vertex colours, number of faces, noise and mesh defects of scans."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ FORMATS = ("ply", "ply-ascii", "stl", "stl-ascii", "obj")
 
 @dataclass(frozen=True)
 class Scanner:
-    """How scans are written."""
+    """Properties of a scanner's files."""
 
     format: str  # one of `FORMATS`
     paint: Paint
-    faces: int  # about as many per arch
-    noise_mm: float  # along the normals
-    dirt: bool  # loose pieces, degenerate and duplicate faces
+    faces: int  # approximate number per arch
+    noise_mm: float  # standard deviation along the normals
+    dirt: bool  # add loose pieces, degenerate and duplicate faces
 
     @property
     def suffix(self) -> str:
-        """Return the suffix of the files."""
+        """Return the file suffix."""
         return "." + self.format.partition("-")[0]
 
 
 def draw_scanner(seed: int, unpainted: float = 0.0) -> Scanner:
-    """Draw a scanner from a seed; `unpainted` is the share of those without paint."""
+    """Draw a random scanner; `unpainted` is the probability of scans without vertex colours."""
     rng = np.random.default_rng([seed, 0x5CA2])
     bare = rng.random() < unpainted
     paint: Paint = ("natural" if rng.random() < 0.5 else "none") if bare else "painted"
@@ -50,10 +50,10 @@ def draw_scanner(seed: int, unpainted: float = 0.0) -> Scanner:
 
 
 def scanned(mesh: Mesh, scanner: Scanner, rng: np.random.Generator) -> Mesh:
-    """Return a painted arch as a scanner delivers it: vertices as a reader of the file will count them.
+    """Return a coloured arch as delivered by a scanner, with vertices numbered as by a reader of the file.
 
     Raises:
-        ValueError: the arch has no paint.
+        ValueError: the arch has no vertex colours.
     """
     vertices, faces, colors = mesh.vertices, mesh.faces, mesh.colors
     if colors is None:
@@ -135,7 +135,7 @@ def _ply_ascii(mesh: Mesh) -> bytes:
 
 
 def _welded(vertices: Array, faces: Faces, colors: NDArray[np.uint8]) -> tuple[Array, Faces, NDArray[np.uint8]]:
-    """Let parts that meet share their vertices, which take the paint of the first part: the crown."""
+    """Merge coincident vertices of adjacent parts; they take the colour of the first part, the crown."""
     _, first, index = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
     joined = index.reshape(-1)[faces].astype(np.int32)
     a, b, c = joined.T
@@ -143,7 +143,7 @@ def _welded(vertices: Array, faces: Faces, colors: NDArray[np.uint8]) -> tuple[A
 
 
 def _subdivided(vertices: Array, faces: Faces, colors: NDArray[np.uint8]) -> tuple[Array, Faces, NDArray[np.uint8]]:
-    """Cut every face into four; a new vertex takes its colour from the corner of its edge with the lower number."""
+    """Split every face into four; a new vertex takes its colour from the edge's corner with the lower index."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     unique, index = np.unique(edges, axis=0, return_inverse=True)
     middle = (index.reshape(-1, 3) + len(vertices)).astype(np.int32)
@@ -155,7 +155,7 @@ def _subdivided(vertices: Array, faces: Faces, colors: NDArray[np.uint8]) -> tup
 
 
 def _thinned(mesh: Mesh, count: int) -> tuple[Array, Faces, NDArray[np.uint8]]:
-    """Collapse edges of each colour apart, so that the lines between colours stay."""
+    """Decimate each colour separately, so that the lines between colours are preserved."""
     if mesh.colors is None:
         raise ValueError("the arch has no paint")
     label = tooth_labels(mesh) != GUM
@@ -175,7 +175,7 @@ def _thinned(mesh: Mesh, count: int) -> tuple[Array, Faces, NDArray[np.uint8]]:
 def _dirty(
     vertices: Array, faces: Faces, colors: NDArray[np.uint8], rng: np.random.Generator
 ) -> tuple[Array, Faces, NDArray[np.uint8]]:
-    """Add duplicate and degenerate faces, and loose grey crumbs near the gum."""
+    """Add duplicate and degenerate faces, and loose grey fragments near the gum."""
     pick = faces[rng.integers(len(faces), size=40)]
     degenerate = pick.copy()
     degenerate[:, 2] = degenerate[:, 1]

@@ -1,6 +1,7 @@
-"""Captures of anybody: short takes of persons over the human range, with masks drawn by anybody, and their truth.
+"""Random-subject captures: short takes of random persons with random annotators, and their ground truth.
 
-No pictures: masks come from the rasteriser, crowns, gum, lips and tongue hiding one another. Seconds per person.
+There are no pictures: masks are rasterised directly, with occlusion by crowns, gum, lips and tongue. A capture takes
+seconds.
 """
 
 from __future__ import annotations
@@ -36,23 +37,23 @@ JAWS = ("upper", "lower")
 _GUMS, _SOFT = (40, 80), 90  # labels: teeth 1..14 and 41..54, gums of the arches, soft tissue
 _PAD_PX = 24
 
-#: A surface in the world: vertices, and faces with their label.
+#: A surface in the world: vertices, and faces with labels.
 Surfaces = list[tuple[Array, list[tuple[NDArray[np.int32], int]]]]
 
 
 @dataclass(frozen=True)
 class ShortConfig:
-    """Choose a person and the size of the take."""
+    """Person and size of a take."""
 
     seed: int
     frames: int = 14
-    unpainted: float = 0.0  # share of scanners without paint
-    without_picks: float = 0.15  # share of captures in which the teeth must be searched
+    unpainted: float = 0.0  # probability of scans without vertex colours
+    without_picks: float = 0.15  # probability of captures without picks, in which the teeth must be searched
 
 
 @dataclass(frozen=True, eq=False)
 class ShortCapture:
-    """Everything that was drawn for one capture."""
+    """All random choices of one capture."""
 
     config: ShortConfig
     traits: Traits
@@ -61,14 +62,14 @@ class ShortCapture:
     annotator: Annotator
     cameras: list[Camera]
     offsets: list[int]  # frame k of a camera shows the instant of frame k + offset of the first one
-    delays: Array  # and so much later [frames], shape (C,)
+    delays: Array  # additional delay [frames], shape (C,)
     motion: Motion
-    T_scan_bite: Array  # the scanner's frame, shape (4, 4)
+    T_scan_bite: Array  # bite frame to the scanner's frame, shape (4, 4)
     scans: tuple[Mesh, Mesh]  # as delivered, in the scanner's frame
 
     @property
     def arches(self) -> tuple[DentalArch, DentalArch]:
-        """Return both arches in the bite's frame."""
+        """Return both arches in the bite frame."""
         return self.bite.upper, self.bite.lower
 
     @cached_property
@@ -83,7 +84,7 @@ class ShortCapture:
 
 
 def draw_capture(config: ShortConfig) -> ShortCapture:
-    """Draw person, scanner, annotator, cameras and take."""
+    """Draw a random person, scanner, annotator, cameras and take."""
     rng = np.random.default_rng([config.seed, 0x5C09])
     traits = draw_traits(config.seed)
     bite = build_bite(traits)
@@ -115,7 +116,7 @@ def draw_capture(config: ShortConfig) -> ShortCapture:
 
 
 def write_short_capture(folder: str | os.PathLike[str], config: ShortConfig) -> ShortCapture:
-    """Write a capture folder with scans, masks, calibration, picks, capture.toml and truth; return what was drawn.
+    """Write a capture folder with scans, masks, calibration, picks, capture.toml and truth; return the random choices.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -134,10 +135,9 @@ def write_short_capture(folder: str | os.PathLike[str], config: ShortConfig) -> 
 
 
 def labelled(capture: ShortCapture, camera: int, t: float, finer: int = 1) -> Drawn:
-    """Draw who is seen where at a time: labels (rows, columns), first column and row of the part, inverse depth.
+    """Rasterise the visible labels at a time: labels (rows, columns), first column and row of the part, inverse depth.
 
-    The picture has so many times more pixels across than the camera's; the part begins and ends with a whole one of
-    these.
+    The picture is supersampled by `finer`; the part starts and ends at whole camera pixels.
     """
     given, T_skull = capture.cameras[camera], capture.motion.head(t)
     view = given.scaled((finer * given.size_px[0], finer * given.size_px[1]))

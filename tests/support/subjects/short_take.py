@@ -1,4 +1,7 @@
-"""Short take."""
+"""Short takes of random persons: cameras, jaw and head motion, and initial picks.
+
+A take has a closed bite, opening, both sides and protrusion, with a moving head.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,9 @@ from jawusd.synthetic.soft_tissue import LipState
 
 #: Labels (rows, columns), first column and row of that part of the picture, inverse depth (rows, columns) [1/mm].
 Drawn = tuple[NDArray[np.uint8], tuple[int, int], NDArray[np.float32]]
-#: First label of the teeth of each arch; 14 follow one another.
+#: First label of the 14 teeth of each arch.
 TEETH_FROM = (1, 41)
-#: Vertex of a scan and its pixels: (camera, x, y) of two cameras.
+#: Vertex of a scan and its pixels (camera, x, y) in two cameras.
 ShortPick = tuple[int, list[tuple[str, float, float]]]
 
 _PICKS = 4
@@ -29,8 +32,8 @@ SIZES_PX = ((640, 360), (960, 540), (1280, 720), (1920, 1080))
 _TARGET_MM = np.array([0.0, -9.0, -12.0])
 _LIFT_STEP, _MOST_LIFT = 0.004, 0.35
 _TOUCH_MM = -0.02
-_LIFT_FRAMES = 4  # within which the jaw is lifted out of a contact
-_LEAST_MOVE, _WHOLE_MOVE = 4, 8  # frames of the shortest movement, and of one over the whole range
+_LIFT_FRAMES = 4  # duration of opening before a tooth contact
+_LEAST_MOVE, _WHOLE_MOVE = 4, 8  # frames of the shortest movement, and of a movement over the full range
 #: Frames of the closed bite at the start.
 CLOSED_FRAMES = 3
 _PIVOT_MM = np.array([0.0, 20.0, -95.0])
@@ -45,20 +48,20 @@ def pick_ends(
     seen: Sequence[Drawn],
     rng: np.random.Generator,
 ) -> list[ShortPick]:
-    """Choose four well spread ends of teeth of a scan; none if too few are seen by two cameras.
+    """Choose four well distributed tooth tips of a scan; none if too few are visible in two cameras.
 
     Args:
         row: 0 upper, 1 lower.
         pose: T_world_scan, shape (4, 4).
         T_bite_scan: scan to (left, up, front) axes, shape (4, 4).
-        seen: who is seen where, per camera.
+        seen: visible labels per camera.
     """
     world = transform_points(pose, mesh.vertices)
     visible = np.stack([_visible(camera, world, *drawn, row) for camera, drawn in zip(cameras, seen, strict=True)], 1)
     good = np.flatnonzero(visible.sum(1) >= 2)
     if len(good) < _PICKS:
         return []
-    # What a person clicks on: the ends of the teeth, towards the other arch.
+    # A person clicks on the tips of the teeth, towards the other arch.
     height = transform_points(T_bite_scan, mesh.vertices[good])[:, 1] * (1.0 if row else -1.0)
     good = good[height >= np.quantile(height, 0.6)] if len(good) > 200 else good
     out = []
@@ -87,7 +90,7 @@ def _visible(
     depth: NDArray[np.float32],
     row: int,
 ) -> NDArray[np.bool_]:
-    """Tell which points (N, 3) of an arch's crowns a camera sees."""
+    """Return which points (N, 3) of an arch's crowns are visible in a camera."""
     at = np.rint(camera.project(world)).astype(int) - window
     inside = np.asarray(((at >= 2) & (at < np.array(labels.shape[::-1]) - 2)).all(1))
     at = np.where(inside[:, None], at, 0)
@@ -99,10 +102,10 @@ def _visible(
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Poses of one person over a take, at any time in frames of the reference camera."""
+    """Poses of a person over a take, at any time in frames of the reference camera."""
 
     joint: Joint
-    controls: Array  # opening, lateral, protrusion per frame, lifted out of tooth contact, shape (F, 3)
+    controls: Array  # opening, lateral, protrusion per frame, without tooth penetration, shape (F, 3)
     T_world_head: Array  # pose of the head at rest, shape (4, 4)
     head_phase: Array  # of the head's motion, shape (6,)
     head_rate: float  # rad per frame
@@ -110,14 +113,14 @@ class Motion:
     tongue_mm: Array  # forward, up, left, while open, shape (3,)
 
     def jaw(self, t: float) -> Array:
-        """Return T_skull_mandible (4, 4) in the bite's frame."""
+        """Return T_skull_mandible (4, 4) in the bite frame."""
         now = _between(self.controls, t)
         pose = controlled_pose(self.joint, *now.tolist())
         still = controlled_pose(self.joint, 0.0, 0.0, 0.0)
         return np.asarray(pose @ se3_inverse(still))
 
     def head(self, t: float) -> Array:
-        """Return T_world_skull (4, 4) for the bite's frame."""
+        """Return T_world_skull (4, 4) for the bite frame."""
         wave = np.sin(self.head_rate * t * np.array([1.0, 0.8, 1.2, 0.9, 1.1, 0.7]) + self.head_phase)
         turn = so3_exp(wave[:3] * np.deg2rad([1.6, 2.2, 1.2]))
         shift = wave[3:] * [2.0, 1.2, 2.0]
@@ -125,14 +128,14 @@ class Motion:
 
 
 def draw_cameras(rng: np.random.Generator) -> tuple[list[Camera], Array]:
-    """Return two to four cameras and the place of the head T_world_bite (4, 4); the world is the first one's frame."""
+    """Return two to four cameras and the head pose T_world_bite (4, 4); the world is the first camera's frame."""
     count = int(rng.choice([2, 3, 4], p=[0.1, 0.75, 0.15]))
     size = SIZES_PX[int(rng.choice(4, p=[0.2, 0.35, 0.3, 0.15]))]
     apart = rng.uniform(26.0, 48.0)
     around = {2: (-0.45, 0.45), 3: (0.0, 1.0, -1.0), 4: (0.0, 1.0, -1.0, 0.3)}[count]
     above = {2: (0.0, 0.0), 3: (0.0, 0.1, -0.1), 4: (-0.15, 0.0, 0.0, 0.6)}[count]
     distance = rng.uniform(150.0, 600.0)
-    span = rng.uniform(88.0, 140.0)  # what the picture's width shows at the teeth [mm]
+    span = rng.uniform(88.0, 140.0)  # width of the picture at the teeth [mm]
     T_cams: list[Array] = []
     cameras = []
     for k in range(count):
@@ -147,7 +150,7 @@ def draw_cameras(rng: np.random.Generator) -> tuple[list[Camera], Array]:
 
 
 def _looking(azimuth: float, height: float, distance: float, roll: float) -> Array:
-    """Return T_cam_bite of a camera that looks at the teeth from a direction (to the left, up)."""
+    """Return T_cam_bite of a camera that looks at the teeth from a direction (left, up)."""
     towards = np.array([np.sin(azimuth) * np.cos(height), np.sin(height), np.cos(azimuth) * np.cos(height)])
     right = np.cross([0.0, -1.0, 0.0], -towards)
     right /= np.linalg.norm(right)
@@ -156,7 +159,7 @@ def _looking(azimuth: float, height: float, distance: float, roll: float) -> Arr
 
 
 def _camera(name: str, size: tuple[int, int], focal: float, rng: np.random.Generator) -> Camera:
-    """Return a camera at the origin; its lens bends the corners by -3 to +1.5 %."""
+    """Return a camera at the origin with a distortion of -3 to +1.5 % at the corners."""
     width, height = size
     corner = (width**2 + height**2) / (4.0 * focal**2)
     bend = rng.uniform(-0.03, 0.015)
@@ -167,7 +170,7 @@ def _camera(name: str, size: tuple[int, int], focal: float, rng: np.random.Gener
 
 
 def draw_motion(joint: Joint, bite: Bite, T_world_head: Array, frames: int, rng: np.random.Generator) -> Motion:
-    """Draw a take of so many frames; movements are lifted until the teeth pass one another."""
+    """Draw a random take; the opening is increased where teeth would penetrate."""
     joint = replace(joint, incisor=bite.incisor)
     controls = _exercise(frames, rng)
     lift = np.zeros(frames)
@@ -187,9 +190,9 @@ def draw_motion(joint: Joint, bite: Bite, T_world_head: Array, frames: int, rng:
 
 
 def _exercise(frames: int, rng: np.random.Generator) -> Array:
-    """Return opening, lateral and protrusion per frame, shape (F, 3): opening, then what there is time for.
+    """Return opening, lateral and protrusion per frame, shape (F, 3): opening, then further movements if time permits.
 
-    Scaled to what a jaw does in that time: at 24 frames/s it opens by up to some 100 mm/s.
+    Amplitudes are limited to realistic speeds: at 24 frames/s, up to about 100 mm/s of opening.
     """
     side = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.55)
     others = np.array([[0.12, side, 0.0], [0.1, -side, 0.1], [0.1, 0.0, rng.uniform(0.4, 0.8)]])
@@ -203,14 +206,14 @@ def _exercise(frames: int, rng: np.random.Generator) -> Array:
 
 
 def _evenly(lift: Array) -> Array:
-    """Return the least even curve that is nowhere below a lift per frame, shape (F,)."""
+    """Return a smooth upper envelope of a lift per frame, shape (F,)."""
     apart = np.abs(np.subtract.outer(np.arange(len(lift)), np.arange(len(lift))))
     share = np.where(apart < _LIFT_FRAMES, np.cos(0.5 * np.pi * apart / _LIFT_FRAMES) ** 2, 0.0)
     return np.asarray((share * lift).max(axis=1), np.float64)
 
 
 def _between(rows: Array, t: float) -> Array:
-    """Interpolate rows (F, n) smoothly in time, never beyond the two neighbours (Fritsch & Butland 1984)."""
+    """Interpolate rows (F, n) monotonically in time (Fritsch & Butland 1984)."""
     step = np.diff(rows, axis=0)
     product, total = step[:-1] * step[1:], step[:-1] + step[1:]
     inner = np.where(product > 0, 2.0 * product / np.where(product > 0, total, 1.0), 0.0)

@@ -13,13 +13,13 @@ from jawusd.synthetic.dentition import ArchTraits, Gums, Traits
 
 #: Intended vertical and horizontal distance of the incisal edges [mm]; the settled bite may end elsewhere.
 OVERBITE_MM, OVERJET_MM = (-3.0, 8.0), (-3.0, 10.0)
-_USUAL_SHARE = 0.4  # of persons with a usual bite; the others spread over all of the range
+_USUAL_SHARE = 0.4  # fraction of persons with a usual bite; the others cover the whole range
 _BUCCAL_MM = 2.8  # distance of the lower buccal cusps inside the upper ones
 _FRONT = (1, 2, 3)
 
 
 def draw_traits(seed: int) -> Traits:
-    """Draw one person."""
+    """Draw the traits of one random person."""
     rng = np.random.default_rng([seed, 0xB17E])
     overbite, overjet = _incisors(rng)
     side = rng.random()
@@ -54,13 +54,13 @@ def draw_traits(seed: int) -> Traits:
 
 def _gums(rng: np.random.Generator, overjet_mm: float) -> Gums:
     kinds: tuple[Gums, ...] = ("dipping", "continuous", "crowns")
-    # A ridge of one cross-section does not follow arches that recede far in front.
+    # A ridge of constant cross-section does not follow arches with strongly receding front teeth.
     share = [0.42, 0.46, 0.12] if overjet_mm < 6.0 else [0.0, 0.8, 0.2]
     return kinds[int(rng.choice(3, p=share))]
 
 
 def _incisors(rng: np.random.Generator) -> tuple[float, float]:
-    """Overbite and overjet [mm]; teeth cannot overlap much where their edges meet."""
+    """Draw overbite and overjet [mm]; the overbite is limited near edge-to-edge."""
     if rng.random() < _USUAL_SHARE:
         overbite, overjet = rng.normal(2.6, 1.0), rng.normal(2.8, 0.9)
     else:
