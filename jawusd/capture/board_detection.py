@@ -37,7 +37,7 @@ def detector(boards: Boards) -> Search:
     return _charuco(boards) if boards.pattern == "charuco" else _chessboard(boards)
 
 
-def shown_instead(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: bool) -> str | None:
+def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: bool) -> str | None:
     """Return the board that gray pictures (h, w) show if it differs from the one described, else None.
 
     Args:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import CalibrationError
-from jawusd.capture.board_detection import BoardClip, corners_and_width, detector, sharpness, shown_instead
+from jawusd.capture.board_detection import BoardClip, corners_and_width, detector, different_board, sharpness
 from jawusd.formats.capture import Boards
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT
 
@@ -23,7 +23,7 @@ _BLUR_RATIO, _BLUR_LIMITS_PX = 1.5, (4.0, 8.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class BoardDetections:
     """Detected board corners."""
 
     names: tuple[str, ...]  # camera names, C of them
@@ -54,7 +54,7 @@ def board_symmetries(boards: Boards) -> list[NDArray[np.int64]]:
     return [np.rot90(grid, turn).ravel() for turn in turns]
 
 
-def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int, int], None]) -> Sightings:
+def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int, int], None]) -> BoardDetections:
     """Select sharp pictures from each camera's board clip and find the corners in them.
 
     Raises:
@@ -88,7 +88,7 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
     corners[blurred] = np.nan
     used = (seen & ~blurred).any(0)
     numbers = np.array(chosen)
-    return Sightings(
+    return BoardDetections(
         names,
         tuple(clip.size_px for clip in clips),
         numbers[used],
@@ -143,7 +143,7 @@ def _refuse_other_board(name: str, clip: BoardClip, chosen: list[int], boards: B
     if not missed and boards.pattern == "chessboard":
         return  # part of a different ChArUco board may match the described one
     some = [image for _, image in clip.pictures(chosen[:: max(1, len(chosen) // _LOOKED_AT)])]
-    if (other := shown_instead(some, boards, missed)) is not None:
+    if (other := different_board(some, boards, missed)) is not None:
         raise CalibrationError(
             f"{other}.",
             camera=name,

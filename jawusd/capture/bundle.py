@@ -16,7 +16,7 @@ from scipy.sparse import csr_matrix
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
-from jawusd.capture.initial_guess import FirstGuess
+from jawusd.capture.initial_guess import InitialGuess
 from jawusd.geometry import hat, make_transform, so3_exp, so3_left_jacobian, so3_log
 
 _LENS = 6  # fx, fy, cx, cy, k1, k2
@@ -41,7 +41,7 @@ class Bundle:
     covariance: Array  # of these parameters, shape (12 C - 6, 12 C - 6)
 
 
-def adjust(start: FirstGuess, points_mm: Array) -> Bundle:
+def adjust(start: InitialGuess, points_mm: Array) -> Bundle:
     """Adjust, discard outlier corners, and adjust again; points_mm (N, 3) are the corners on the board.
 
     Raises:
@@ -95,7 +95,7 @@ class _Problem:
         # Per camera, the view and corner of each observed point.
         self.points = [np.nonzero(seen) for seen in self.seen]
 
-    def pack(self, start: FirstGuess) -> Array:
+    def pack(self, start: InitialGuess) -> Array:
         """Return the unknowns of an initial guess: lenses, poses of cameras 1.., poses of boards."""
         lens = np.stack([start.K[:, 0, 0], start.K[:, 1, 1], start.K[:, 0, 2], start.K[:, 1, 2]], axis=1)
         T = np.concatenate([start.T_cam_world[1:], start.T_world_board[self.views]])

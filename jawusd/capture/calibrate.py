@@ -10,9 +10,9 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
-from jawusd.capture.boards import Sightings, board_points, board_symmetries, find_boards
+from jawusd.capture.boards import BoardDetections, board_points, board_symmetries, find_boards
 from jawusd.capture.bundle import Bundle, adjust
-from jawusd.capture.initial_guess import guess_cameras
+from jawusd.capture.initial_guess import initial_cameras
 from jawusd.capture.scale import (
     ScaleCheck,
     ShapeError,
@@ -91,11 +91,11 @@ def calibrate_capture(
             hint="Film a chessboard at the position of the teeth and name the clips there, or give a calibration file.",
         )
     names = tuple(camera.name for camera in capture.cameras)
-    return calibrate_sightings(find_boards(names, capture.boards, progress), capture, scans, scale_without_picks)
+    return calibrate_detections(find_boards(names, capture.boards, progress), capture, scans, scale_without_picks)
 
 
-def calibrate_sightings(
-    sightings: Sightings,
+def calibrate_detections(
+    detections: BoardDetections,
     capture: Capture,
     scans: Mapping[str, Array],
     scale_without_picks: MeasureScale | None = None,
@@ -109,19 +109,21 @@ def calibrate_sightings(
     if boards is None:
         raise CalibrationError("has no [boards].", path=capture.folder / "capture.toml")
     points = board_points(boards)
-    start = guess_cameras(sightings.names, sightings.sizes_px, sightings.corners_px, points, board_symmetries(boards))
+    start = initial_cameras(
+        detections.names, detections.sizes_px, detections.corners_px, points, board_symmetries(boards)
+    )
     bundle = adjust(start, points)
     lenses = np.hstack([bundle.distortion, np.zeros((len(bundle.K), 3))])
     cameras = [
         Camera(name, size, K, lens, T)
-        for name, size, K, lens, T in zip(sightings.names, sightings.sizes_px, bundle.K, lenses, bundle.T_cam_world)
+        for name, size, K, lens, T in zip(detections.names, detections.sizes_px, bundle.K, lenses, bundle.T_cam_world)
     ]
     scale = check_scale(cameras, capture.bootstrap, scans, boards.square_mm)
     if scale.ratio is None and scale_without_picks is not None:
         scale = scale_without_picks(cameras, scale)
     centre, source = mouth_centre(cameras, capture.bootstrap, bundle.T_world_board)
     expected = expected_shape_error(cameras, bundle, centre) if len(cameras) > 1 else float("nan")
-    figures = {camera.name: _camera_figures(c, camera, bundle, sightings) for c, camera in enumerate(cameras)}
+    figures = {camera.name: _camera_figures(c, camera, bundle, detections) for c, camera in enumerate(cameras)}
     shape = board_shape_error(cameras, bundle, points, centre)
     report = CalibrationReport(
         figures,
@@ -132,12 +134,12 @@ def calibrate_sightings(
         source,
         scale,
         tuple(_advice(figures, bundle, points, centre, expected)),
-        (*sightings.notes, *_notes(sightings, bundle, scale)),
+        (*detections.notes, *_notes(detections, bundle, scale)),
     )
     return cameras, report
 
 
-def _camera_figures(c: int, camera: Camera, bundle: Bundle, sightings: Sightings) -> CameraFigures:
+def _camera_figures(c: int, camera: Camera, bundle: Bundle, detections: BoardDetections) -> CameraFigures:
     seen = np.isfinite(bundle.corners_px[c, ..., 0])
     pixels = bundle.corners_px[c][seen]
     cells = np.floor(pixels / camera.size_px * _GRID).astype(int)
@@ -151,8 +153,8 @@ def _camera_figures(c: int, camera: Camera, bundle: Bundle, sightings: Sightings
         "rms_px": float(np.sqrt(np.nansum(bundle.residuals_px[c] ** 2) / max(1, seen.sum()))),
         "coverage": len(covered) / (_GRID[0] * _GRID[1]),
         "empty_corners": empty,
-        "blurred": sightings.blurred[camera.name],
-        "missed": sightings.missed[camera.name],
+        "blurred": detections.blurred[camera.name],
+        "missed": detections.missed[camera.name],
     }
 
 
@@ -194,12 +196,13 @@ def _advice(
     return advice
 
 
-def _notes(sightings: Sightings, bundle: Bundle, scale: ScaleCheck) -> list[str]:
+def _notes(detections: BoardDetections, bundle: Bundle, scale: ScaleCheck) -> list[str]:
     notes = []
-    lost = int(np.isfinite(sightings.corners_px[..., 0]).sum() - np.isfinite(bundle.corners_px[..., 0]).sum())
+    lost = int(np.isfinite(detections.corners_px[..., 0]).sum() - np.isfinite(bundle.corners_px[..., 0]).sum())
     if lost:
         notes.append(
-            f"{lost} of {int(np.isfinite(sightings.corners_px[..., 0]).sum())} corners are outliers and were discarded."
+            f"{lost} of {int(np.isfinite(detections.corners_px[..., 0]).sum())} corners are outliers and were "
+            "discarded."
         )
     if scale.ratio is None:
         notes.append(f"the scale relies on [boards] square_mm alone: {scale.reason}.")

@@ -90,7 +90,7 @@ def _fold(camera: Camera) -> float | None:
 
 def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
     """Yield findings about cameras that do not look at the same point as the others."""
-    target = aimed_at(cameras)
+    target = common_target(cameras)
     for camera in cameras:
         depth = float(camera.depth(target))
         if not _NEAREST_MM <= depth <= _FARTHEST_MM:
@@ -119,7 +119,7 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
         )
 
 
-def aimed_at(cameras: Sequence[Camera]) -> Array:
+def common_target(cameras: Sequence[Camera]) -> Array:
     """Return the point closest to the optical axes of all cameras [mm], shape (3,)."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for camera in cameras:

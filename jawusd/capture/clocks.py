@@ -17,7 +17,7 @@ _NEARLY_WHOLE = 0.01
 _FASTEST_USUAL = 30.5  # frames per second; above it, two or four pictures often share a time code
 
 
-def refuse_other_rates(clips: Mapping[str, Clip], reference: str) -> None:
+def check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
     """Check that all clips have the frame rate of the reference camera.
 
     Raises:
@@ -46,7 +46,7 @@ def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ..
         if camera.clip is None:
             raise SyncError("has no video, so it has no clock to synchronise by.", camera=camera.name, path=path)
         clips[camera.name] = open_clip(camera.clip)
-    refuse_other_rates(clips, capture.reference)
+    check_frame_rates(clips, capture.reference)
     by_code = capture.sync.method == "timecode"
     starts = _timecodes(clips) if by_code else _numbers(capture, clips)
     reference = starts[capture.reference]

@@ -31,7 +31,7 @@ _SIZES = (50, 100, 250, 1000)  # OpenCV's smaller dictionaries are prefixes of t
 
 
 @dataclass(frozen=True, eq=False)
-class FirstGuess:
+class InitialGuess:
     """Initial values of the bundle adjustment."""
 
     K: Array  # intrinsic matrices [px], shape (C, 3, 3)
@@ -41,13 +41,13 @@ class FirstGuess:
     corners_px: Array  # corners in a common order, NaN where hidden or inconsistent, shape (C, V, N, 2)
 
 
-def guess_cameras(
+def initial_cameras(
     names: tuple[str, ...],
     sizes_px: tuple[tuple[int, int], ...],
     corners_px: Array,
     points_mm: Array,
     symmetries: list[NDArray[np.int64]],
-) -> FirstGuess:
+) -> InitialGuess:
     """Calibrate each camera separately, then estimate the camera poses from shared views.
 
     Args:
@@ -82,7 +82,7 @@ def guess_cameras(
         orders = dict(agreed)
         for c in seen:
             corners[c, v] = corners_px[c, v, symmetries[orders[c]]] if c in orders else np.nan
-    return FirstGuess(K, distortion, T_cam_world, T_world_board, corners)
+    return InitialGuess(K, distortion, T_cam_world, T_world_board, corners)
 
 
 def _single_camera(
@@ -177,7 +177,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
 
 
 @dataclass(frozen=True)
-class BoardSeen:
+class DetectedBoard:
     """Board found in clips: inner corners of a chessboard, or a dictionary of markers."""
 
     pattern: str
@@ -186,7 +186,7 @@ class BoardSeen:
     dictionary: str | None = None
 
 
-def seen_board(pictures: Iterable[NDArray[np.uint8]]) -> BoardSeen | None:
+def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
     """Return the board that most gray pictures (h, w) show; None if no two agree."""
     boards: Counter[tuple[int, int]] = Counter()
     markers: Counter[str] = Counter()
@@ -203,9 +203,9 @@ def seen_board(pictures: Iterable[NDArray[np.uint8]]) -> BoardSeen | None:
     family, times = markers.most_common(1)[0] if markers else ("", 0)
     if times >= _FEWEST_PICTURES:
         size = next(size for size in _SIZES if size > highest[family])
-        return BoardSeen("charuco", dictionary=f"DICT_{family}_{size}")
+        return DetectedBoard("charuco", dictionary=f"DICT_{family}_{size}")
     (cols, rows), times = boards.most_common(1)[0] if boards else ((0, 0), 0)
-    return BoardSeen("chessboard", cols, rows) if times >= _FEWEST_PICTURES else None
+    return DetectedBoard("chessboard", cols, rows) if times >= _FEWEST_PICTURES else None
 
 
 def _shrunk(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

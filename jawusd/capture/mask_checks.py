@@ -18,7 +18,7 @@ from jawusd.geometry import Camera, triangulate
 #: First and last frame with a mask of the upper and of the lower teeth, in the camera's own numbers; None if empty.
 Ranges = tuple[tuple[int, int] | None, tuple[int, int] | None]
 #: Centre of all teeth pixels at one instant by camera [px], shape (2,).
-Middles = Mapping[str, Array]
+MaskCentres = Mapping[str, Array]
 
 # Largest distance of the two rays through the mask centres [mm]; the visible part of the teeth differs between views.
 # No false alarm on 70 valid synthetic persons, with at most 10.4 mm.
@@ -27,7 +27,7 @@ _RAYS_MM = 15.0
 _SEEN_MM = (10.0, 90.0)
 
 
-def exchanged_by_frames(
+def swapped_cameras(
     ranges: Mapping[str, Ranges], offsets: Mapping[str, int], first: int, stop: int
 ) -> list[tuple[str, str]]:
     """Return pairs of cameras whose masks start and end with the take only when swapped.
@@ -47,7 +47,7 @@ def exchanged_by_frames(
     return [(a, b) for a, b in combinations(wrong, 2) if fits(a, b) and fits(b, a)]
 
 
-def middles_findings(cameras: Mapping[str, Camera], middles: Sequence[Sequence[Middles]]) -> Iterator[Finding]:
+def centre_findings(cameras: Mapping[str, Camera], middles: Sequence[Sequence[MaskCentres]]) -> Iterator[Finding]:
     """Yield findings about cameras whose mask centres contradict those of other cameras.
 
     Args:
@@ -83,7 +83,7 @@ def middles_findings(cameras: Mapping[str, Camera], middles: Sequence[Sequence[M
     )
 
 
-def seen_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -> Iterator[Finding]:
+def width_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -> Iterator[Finding]:
     """Yield findings about masks whose width, at the triangulated depth, is not that of teeth.
 
     Args:

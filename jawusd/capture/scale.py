@@ -79,10 +79,10 @@ def check_scale(
     off = np.concatenate(residuals)
     freedom = max(1, len(off) - 7 * len(squares))
     sigma = float(np.sqrt((off @ off) / freedom / sum(weights)))
-    return judged_scale(ratio, sigma, square_mm)
+    return checked_scale(ratio, sigma, square_mm)
 
 
-def judged_scale(ratio: float, sigma: float, square_mm: float) -> ScaleCheck:
+def checked_scale(ratio: float, sigma: float, square_mm: float) -> ScaleCheck:
     """Check a measured size ratio of the teeth (measured / scanned) against the square size.
 
     Raises:

@@ -153,7 +153,7 @@ def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[lis
     return pairs, float(np.abs(best - exact).max()), exact
 
 
-def on_grid(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
+def to_frames(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
     """Convert the times of steps from picture indices to frame numbers; numbers (n,) are the pictures' frames."""
     out = []
     for step in steps:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.errors import SyncError
-from jawusd.capture.clocks import offsets_by_clock, refuse_other_rates
+from jawusd.capture.clocks import check_frame_rates, offsets_by_clock
 from jawusd.capture.signals import (
     RATE_HZ,
     Offset,
@@ -24,7 +24,7 @@ from jawusd.capture.signals import (
     match_sounds,
     match_steps,
     mean_brightness,
-    on_grid,
+    to_frames,
 )
 from jawusd.formats.capture import Capture
 from jawusd.formats.clips import ClipSource, LightCurve
@@ -98,7 +98,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
     opened = {name: open_clip(clip) for name, clip in videos.items()}
     hint = _offsets_hint(videos)
     rate = opened[reference].timeline.rate
-    refuse_other_rates(opened, reference)
+    check_frame_rates(opened, reference)
     notes = _missing_pictures(opened)
     with ThreadPoolExecutor(max_workers=len(opened)) as pool:
         dark = None
@@ -106,7 +106,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
             found = dict(zip(opened, pool.map(find_flashes, opened.values())))
             dark = next((name for name in opened if found[name].reason), None)
         if by_light and dark is None:
-            steps = {name: on_grid(found[name].steps, video.timeline.numbers) for name, video in opened.items()}
+            steps = {name: to_frames(found[name].steps, video.timeline.numbers) for name, video in opened.items()}
             offsets = {
                 name: _against(name, reference, video, hint, partial(match_steps, steps[name], steps[reference], rate))
                 for name, video in opened.items()
@@ -138,7 +138,7 @@ def light_curve(clip: Path | ClipSource) -> LightCurve:
     video = open_clip(clip)
     brightness = np.array([mean_brightness(frame.image) for frame in video.frames(threads=1)])
     numbers = video.timeline.numbers
-    steps = on_grid(find_steps(brightness), numbers)
+    steps = to_frames(find_steps(brightness), numbers)
     off, on = (np.array([step.time_frames for step in steps if step.rising == rising]) for rising in (False, True))
     return LightCurve(video.times_s, numbers, brightness, off, on)
 

@@ -98,7 +98,7 @@ def _scale_by_masks(
     Raises:
         CalibrationError: the teeth come out with another size than their scans.
     """
-    from jawusd.capture.scale import ScaleCheck, judged_scale
+    from jawusd.capture.scale import ScaleCheck, checked_scale
     from jawusd.tracking.initialization.scale_search import seen_size
 
     if capture.boards is None or sum(camera.masks is not None for camera in capture.cameras) < 2:
@@ -112,7 +112,7 @@ def _scale_by_masks(
         why = f"{by_picks.reason}, and the teeth could not be searched in the masks ({error.statement().rstrip('.')})"
         return ScaleCheck(None, None, why)
     progress("size of the teeth", 1, 1)
-    return judged_scale(ratio, _SIZE_SIGMA, capture.boards.square_mm)
+    return checked_scale(ratio, _SIZE_SIGMA, capture.boards.square_mm)
 
 
 def calibration_lines(report: CalibrationSummary) -> list[str]:

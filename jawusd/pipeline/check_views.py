@@ -177,7 +177,7 @@ def synchronisation(parts: Parts) -> Iterator[Finding]:
 
 def frames(parts: Parts) -> Iterator[Finding]:
     """Look whether the frames that the capture names exist."""
-    from jawusd.capture.mask_checks import exchanged_by_frames
+    from jawusd.capture.mask_checks import swapped_cameras
 
     capture = parts.given
     count = _frame_count(parts, capture.reference)
@@ -208,7 +208,7 @@ def frames(parts: Parts) -> Iterator[Finding]:
             message = f"none of its {own} frames lies within the frames of the take, by its offset of {offset:+d}"
             yield Finding("offset_wrong", "error", message, offset, camera=name, path=parts.description)
     ranges = {name: sample.first_last for name, sample in parts.samples.items() if name in offsets}
-    for a, b in exchanged_by_frames(ranges, offsets, first, stop):
+    for a, b in swapped_cameras(ranges, offsets, first, stop):
         message = (
             f"the masks of cameras {a} and {b} are exchanged: by their offsets, each has masks of all frames of the "
             "take only if it takes those of the other"
@@ -240,7 +240,7 @@ def _mask_ranges(parts: Parts, first: int, stop: int) -> Iterator[Finding]:
 
 def views(parts: Parts) -> Iterator[Finding]:
     """Look whether the cameras see the teeth at one place, of the size of teeth."""
-    from jawusd.capture.mask_checks import middles_findings, seen_findings
+    from jawusd.capture.mask_checks import centre_findings, width_findings
 
     reference = parts.samples.get(parts.given.reference)
     if reference is None or reference.first_frame is None:
@@ -253,8 +253,8 @@ def views(parts: Parts) -> Iterator[Finding]:
         guesses = [_teeth(parts, cameras, instant, guess) for guess in parts.offset_guesses()]
         middles.append([{name: found.mean(0) for name, found in guess.items()} for guess in guesses])
         pixels.append(guesses[-1])
-    yield from middles_findings(cameras, middles)
-    yield from seen_findings(cameras, max(pixels, key=lambda guess: sum(map(len, guess.values()))))
+    yield from centre_findings(cameras, middles)
+    yield from width_findings(cameras, max(pixels, key=lambda guess: sum(map(len, guess.values()))))
 
 
 def _teeth(parts: Parts, cameras: Mapping[str, Camera], instant: int, offsets: Mapping[str, int]) -> dict[str, Array]:

@@ -38,7 +38,7 @@ from jawusd.pipeline.state import (
     no_progress,
 )
 from jawusd.pipeline.subject import Subject, subject_of_build
-from jawusd.report.facts import SyncFacts
+from jawusd.report.headers import SyncHeader
 from jawusd.report.verdicts import BuildVerdict
 
 T = TypeVar("T")
@@ -136,7 +136,7 @@ def _without_pictures(
         actor=subject.name,
         tracks=tracks,
         model=model,
-        sync=facts.state.result("sync", SyncFacts) or {},
+        sync=facts.state.result("sync", SyncHeader) or {},
         cameras=attempt("cameras", left_out, lambda: _cameras(facts)) or (),
         inferred=tuple(fit_summary(model).get("inferred", ())),
         seconds={name: record.seconds for name, record in facts.state.stages.items() if name != "report"},
@@ -274,7 +274,7 @@ def recorded_offsets(state: BuildState) -> dict[str, int]:
     Raises:
         FormatError: build.json is damaged.
     """
-    return (state.result("sync", SyncFacts) or {}).get("offsets", {})
+    return (state.result("sync", SyncHeader) or {}).get("offsets", {})
 
 
 def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:

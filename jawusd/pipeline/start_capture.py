@@ -212,17 +212,17 @@ def _named_as_calibrated(
 def _board(
     folder: Path, cameras: Sequence[CameraSketch], square_mm: float | None, calibrated: bool, out: CaptureStart
 ) -> BoardSketch | None:
-    from jawusd.capture.initial_guess import BoardSeen, seen_board
+    from jawusd.capture.initial_guess import DetectedBoard, detect_board
 
     clips = [camera.board for camera in cameras if camera.board is not None]
     if not clips:
         return None
-    seen: list[BoardSeen] = []
+    seen: list[DetectedBoard] = []
     for clip in clips:
         video = next(iter(_opened(folder, [clip], out).values()), None)
-        if video is not None and (found := seen_board(_some_pictures(video))) is not None:
+        if video is not None and (found := detect_board(_some_pictures(video))) is not None:
             seen.append(found)
-    board = max(seen, key=seen.count, default=BoardSeen("chessboard"))
+    board = max(seen, key=seen.count, default=DetectedBoard("chessboard"))
     sketch = BoardSketch(board.pattern, board.cols, board.rows, square_mm, board.dictionary)
     if calibrated:
         return sketch

@@ -20,11 +20,11 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
-from jawusd.report.facts import TracksFacts, model_facts, sync_facts, tracks_facts
 from jawusd.report.figures import human_ranges, model_figure, tracking_figure
+from jawusd.report.headers import TracksHeader, model_header, sync_header, tracks_header
 from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
-from jawusd.report.verdicts import MARKS, WORDS, BuildVerdict, in_short, judge, overall
+from jawusd.report.verdicts import MARKS, WORDS, BuildVerdict, judge, overall, summary
 
 _LISTED = 60  # most frame ranges listed
 _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
@@ -43,7 +43,7 @@ def write_document(
         OutputError: the file cannot be written.
     """
     write_text_atomic(path, document(data, figures))
-    return in_short(judge(data))
+    return summary(judge(data))
 
 
 def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> str:
@@ -58,8 +58,8 @@ def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> s
             overall=overall(verdicts),
             words=WORDS,
             marks=MARKS,
-            style=own_file("report.css"),
-            script=own_file("replay.js"),
+            style=package_file("report.css"),
+            script=package_file("replay.js"),
             replay=replay_data(data),
             figures=draw_figures(data) if figures is None else figures,
             pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
@@ -102,7 +102,7 @@ def figure(value: float) -> str:
     return f"{value:.3f}" if math.isfinite(value) else "\u2013"
 
 
-def own_file(name: str) -> Markup:
+def package_file(name: str) -> Markup:
     """Return a text file of this package as trusted HTML."""
     return Markup(resources.files("jawusd.report").joinpath("page", name).read_text(encoding="utf-8"))
 
@@ -122,7 +122,7 @@ def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict
         "holdout": ("held out", "poses of parts of the take that were held out of the fit, one part at a time"),
         "trimmed": ("outliers", "poses excluded from the fit as outliers"),
     }
-    tables = model_facts(data).get("errors", {})
+    tables = model_header(data).get("errors", {})
     return [
         (*names[key], [(place, tables[key][place]) for place in _PLACES if place in tables[key]])
         for key in names
@@ -132,7 +132,7 @@ def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict
 
 def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
     """Return (reason, count, frames as text) of frames that were lost, regularised, or excluded from the fit."""
-    tracks, meta = data.tracks, model_facts(data)
+    tracks, meta = data.tracks, model_header(data)
     lists = {"lost by the tracker": tracks.frames[np.any(tracks.status == LOST, axis=1)]}
     for arch, name in enumerate(("upper", "lower")):
         for reason in list(LostReason)[1:]:
@@ -165,7 +165,7 @@ def _findings(data: ReportData) -> list[str]:
 
 def _start(data: ReportData) -> str:
     """Return how tracking was initialised."""
-    start = tracks_facts(data).get("start", {})
+    start = tracks_header(data).get("start", {})
     if not start:
         return "not recorded"
     text = f"by {start.get('by')}, on frame {start.get('frame')}"
@@ -181,7 +181,7 @@ def _start(data: ReportData) -> str:
 
 def _cameras(data: ReportData) -> list[dict[str, str]]:
     """Return a table row per camera: footage, masks, and corrections of the calibration."""
-    meta, offsets = tracks_facts(data), sync_facts(data).get("offsets", {})
+    meta, offsets = tracks_header(data), sync_header(data).get("offsets", {})
     known = {camera.name: camera for camera in data.cameras}
     extrinsics = meta.get("extrinsics", {})
     rows = []
@@ -212,7 +212,7 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
     return rows
 
 
-def _drawn(meta: TracksFacts, camera: str) -> str:
+def _drawn(meta: TracksHeader, camera: str) -> str:
     """Return the offset of the mask outlines from the teeth in a camera, upper and lower arch."""
     edges, gum = meta.get("outline_bias_px", {}).get(camera), meta.get("gum_bias_px", {}).get(camera)
     if edges is None or gum is None:
@@ -222,7 +222,7 @@ def _drawn(meta: TracksFacts, camera: str) -> str:
 
 def _bite(data: ReportData) -> str:
     """Return what the take shows about the annotated gum line and about the closed bite."""
-    meta, said = tracks_facts(data), []
+    meta, said = tracks_header(data), []
     if "gum_line_mm" in meta:
         upper, lower = meta["gum_line_mm"]
         said.append(

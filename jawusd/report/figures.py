@@ -89,7 +89,9 @@ def model_figure(model: JawModel) -> Figure:
     figure, axes = new_figure(11.0, 5.6, 3, 1, sharex=True, height_ratios=[1.5, 1, 1])
     shown = (("d1 opening", BLACK, "-"), ("d2 laterotrusion", BLUE, "--"), ("d3 protrusion", VERMILION, ":"))
     for index, (name, color, style) in enumerate(shown):
-        axes[0].plot(*thinned(model.frames, model.d[:, index], farther), style, color=color, lw=1.2, label=name)
+        axes[0].plot(
+            *thinned(model.frames, model.d[:, index], larger_magnitude), style, color=color, lw=1.2, label=name
+        )
     axes[0].set_ylabel("parameter [mm]")
     axes[1].plot(*thinned(model.frames, model.residual_mm, np.fmax), color=BLUE, lw=1, label="pose to model")
     axes[1].axhline(rig.limits.residual_mm, color=VERMILION, lw=1, ls="--", label="limit of a valid pose")
@@ -133,7 +135,7 @@ def _mean_of_known(values: Array, axis: int) -> Array:
         return np.nanmean(values, axis=axis)
 
 
-def farther(a: Array, b: Array) -> Array:
+def larger_magnitude(a: Array, b: Array) -> Array:
     """Return the value with the larger magnitude, ignoring NaN."""
     return np.where(np.isnan(a) | (np.abs(b) > np.abs(a)), b, a)
 

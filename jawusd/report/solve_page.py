@@ -22,8 +22,8 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.performance import STATE_WORDS, SolvedJaw, SolveState
 from jawusd.formats.report import SolveReportData
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.report.document import own_file, page_environment
-from jawusd.report.figures import farther, legend_beside, runs, thinned
+from jawusd.report.document import package_file, page_environment
+from jawusd.report.figures import larger_magnitude, legend_beside, runs, thinned
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, VERMILION, inline_svg, new_figure
 
 #: Colours of the states: close to those in the pictures, and legible on light and dark pages.
@@ -44,7 +44,7 @@ def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
         at, low = thinned(frames, value - _BAND * sigma, np.fmin)
         high = thinned(frames, value + _BAND * sigma, np.fmax)[1]
         axis.fill_between(at, low, high, color=ink, alpha=0.25, linewidth=0, label="95 % (2 sigma)")
-        axis.plot(*thinned(frames, value, farther), color=ink, lw=1.2, label="solved")
+        axis.plot(*thinned(frames, value, larger_magnitude), color=ink, lw=1.2, label="solved")
         axis.set_ylabel(f"{name} [mm]")
     for name, ink, style, sigma in zip(("d1", "d2", "d3"), _INKS, _STYLES, solved.sigma_mm.T, strict=True):
         axes[3].plot(*thinned(frames, np.maximum(sigma, 1e-4), np.fmax), style, color=ink, lw=1.1, label=name)
@@ -157,7 +157,7 @@ def solve_page(data: SolveReportData) -> str:
         .get_template("solve.html.j2")
         .render(
             data=data,
-            style=own_file("report.css"),
+            style=package_file("report.css"),
             counts=_counts(solved),
             sentence=_sentence(solved, bool(findings)),
             jaw=_jaw_rows(solved),

@@ -198,7 +198,7 @@ def learn_colours(
     model.learn(rgb, nearest > config.inner_mm, nearest < -config.outer_mm, weight)
 
 
-def doubted_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
+def excess_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
     """Return the log-odds of tooth by colour alone minus the required threshold, shape (h, w)."""
     demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
     return model.log_odds(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
@@ -220,7 +220,7 @@ def cut_arches(
         seeds: annotations, which act as hard constraints.
     """
     inside = expected.inside_px / px_per_mm
-    odds = doubted_odds(rgb, model, config)
+    odds = excess_odds(rgb, model, config)
     cost = np.zeros((3, *rgb.shape[:2]), np.float32)
     apart = np.clip(config.rows_per_mm * (inside[0] - inside[1]) / 2, -3, 3)
     for label, arch, sign in ((UPPER, 0, 1.0), (LOWER, 1, -1.0)):
@@ -239,7 +239,7 @@ def cut_arches(
     return shares[1:]
 
 
-def part_arches(
+def separate_arches(
     shares: NDArray[np.float32],
     rgb: NDArray[np.uint8],
     expected: Expectation,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Mask
-from jawusd.segmentation.colours import SegmentationConfig, shadeless
+from jawusd.segmentation.colours import SegmentationConfig, log_chroma
 
 _EVEN = 1e-4  # variance added to log colours [-]: half an 8-bit step
 _FEWEST = 100  # fewest pixels for a covariance of colours
@@ -26,7 +26,7 @@ class _Sides:
     contrast: NDArray[np.float32]
 
 
-def settle_borders(
+def refine_borders(
     shares: NDArray[np.float32], rgb: NDArray[np.uint8], config: SegmentationConfig, px_per_mm: float
 ) -> tuple[NDArray[np.float32], Mask]:
     """Return coverages (2, h, w) with soft borders, 0.5 at the outline, and where borders are visible, shape (h, w).
@@ -36,7 +36,7 @@ def settle_borders(
     locally. Fisher's discriminant between the local means finds it (local region statistics, Lankton & Tannenbaum
     2008). Where the sides do not differ the border is unchanged; parts with mostly such borders are discarded.
     """
-    colours = _blurred(shadeless(rgb), config.border_blur_px)
+    colours = _blurred(log_chroma(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1
     inside = _signed_distance(shares.sum(0) > 0.5)
     sides = _compare_sides(inside, colours, window)
@@ -45,7 +45,7 @@ def settle_borders(
     clear = sides.contrast > config.border_contrast
     moved = clear & (np.abs(inside) < band)
     teeth = np.where(moved, np.clip(sides.share, 0, 1), inside > 0).astype(np.float32)
-    teeth[_unfounded(teeth > 0.5, clear, config)] = 0.0
+    teeth[_spurious(teeth > 0.5, clear, config)] = 0.0
     near = [_blurred(share, _ARCH_BLUR_PX) for share in shares]
     far = [_blurred(share, _FAR_BLUR_PX) for share in shares]
     upper, lower = np.where(near[0] + near[1] > 0.2, near, far)
@@ -88,7 +88,7 @@ def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[N
     return np.asarray(total / np.maximum(count, 1)[..., None], np.float32), np.asarray(count >= window)
 
 
-def _unfounded(teeth: Mask, clear: Mask, config: SegmentationConfig) -> Mask:
+def _spurious(teeth: Mask, clear: Mask, config: SegmentationConfig) -> Mask:
     """Return the pixels of specks and of parts with hardly any visible border, shape (h, w)."""
     count, parts, stats, _ = cv2.connectedComponentsWithStats(teeth.astype(np.uint8))
     outline = teeth & (cv2.erode(teeth.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)

@@ -147,7 +147,7 @@ class ColourModel:
         return self._table
 
 
-def shadeless(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+def log_chroma(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the logs of lightness, red over green and blue over green of an 8-bit picture, shape (h, w, 3)."""
     red, green, blue = (_LOGS[rgb[..., k]] for k in range(3))
     return np.stack([(red + green + blue) / 3, red - green, blue - green], axis=-1)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Mask
-from jawusd.segmentation.arches import Expectation, Seeds, cut_arches, part_arches
-from jawusd.segmentation.border import settle_borders
+from jawusd.segmentation.arches import Expectation, Seeds, cut_arches, separate_arches
+from jawusd.segmentation.border import refine_borders
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.picture import Window
 
@@ -61,8 +61,8 @@ def cut_picture(
     Return the coverage of both arches, shape (2, h, w), and where borders are visible, shape (h, w).
     """
     shares = cut_arches(window.rgb, expected, colours, config, px_per_mm, reach_mm, seeds)
-    shares, clear = settle_borders(shares, window.rgb, config, px_per_mm)
-    shares = part_arches(shares, window.rgb, expected, config, px_per_mm)
+    shares, clear = refine_borders(shares, window.rgb, config, px_per_mm)
+    shares = separate_arches(shares, window.rgb, expected, config, px_per_mm)
     shares = _widened(shares, config.wider)
     return (shares if seeds is None else seeds.pinned(shares)), clear
 

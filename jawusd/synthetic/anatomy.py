@@ -91,7 +91,7 @@ def build_anatomy(person: Person) -> PersonAnatomy:
     return PersonAnatomy(upper, lower, build_mandible(person.joint), build_skull(person.joint), Occlusion(upper, lower))
 
 
-def lifted_bite(person: Person, occlusion: Occlusion, controls: Array, extra_mm: Array) -> Array:
+def opened_bite(person: Person, occlusion: Occlusion, controls: Array, extra_mm: Array) -> Array:
     """Return controls (F, 3) with the opening increased where teeth would penetrate; see `Person.pose_with_extra`."""
     lifted = controls.copy()
     for i in range(len(lifted)):

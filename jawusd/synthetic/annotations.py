@@ -86,7 +86,7 @@ def _ellipse(mask: Mask, row: float, column: float, radius: Array, value: bool) 
 
 
 @dataclass(frozen=True)
-class SeenVertex:
+class VisibleVertex:
     """A vertex of a scan and its pixels (camera, x, y) in two cameras."""
 
     vertex: int
@@ -101,7 +101,7 @@ def choose_picks(
     count: int,
     noise_px: float,
     rng: np.random.Generator,
-) -> list[SeenVertex]:
+) -> list[VisibleVertex]:
     """Choose `count` well distributed tips and corners of teeth that are visible in at least two cameras.
 
     Args:
@@ -126,7 +126,7 @@ def choose_picks(
         for c in sorted(np.argsort(-facing[k])[:2]):
             x, y = cameras[c].project(points[k]) + rng.normal(0.0, noise_px, 2)
             views.append((cameras[c].name, float(x), float(y)))
-        picks.append(SeenVertex(int(candidates[k]), tuple(views)))
+        picks.append(VisibleVertex(int(candidates[k]), tuple(views)))
     return picks
 
 

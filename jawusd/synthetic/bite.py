@@ -9,7 +9,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.synthetic.anatomy import Occlusion
 from jawusd.synthetic.dental_arch import ArchLine, ArchShape, DentalArch
-from jawusd.synthetic.dentition import Seat, Traits, build, seats
+from jawusd.synthetic.dentition import PlacedTooth, Traits, build, placed_teeth
 from jawusd.synthetic.teeth import LOWER, UPPER
 
 # Heights of the upper edges and cusps over the plane of the first incisors [mm].
@@ -38,7 +38,9 @@ def build_bite(traits: Traits) -> Bite:
     """Build both arches of a person and bring the lower teeth into contact with the upper ones."""
     shape = ArchShape(traits.quadratic_per_mm, traits.quartic_per_mm3, 0.0, np.zeros((2, 7)), 0.0)
     curve = traits.spee_mm * np.sin(np.linspace(0.0, np.pi, 7))
-    upper_seats = seats(UPPER, traits.upper, _UPPER_TIPS_MM + traits.upper.rise_mm - 0.5 * curve, np.zeros((2, 7)), 0.0)
+    upper_seats = placed_teeth(
+        UPPER, traits.upper, _UPPER_TIPS_MM + traits.upper.rise_mm - 0.5 * curve, np.zeros((2, 7)), 0.0
+    )
     upper = build(upper_seats, ArchLine(shape), traits, traits.upper, True, traits.gums)
     base = float(np.clip(traits.overjet_mm, -2.0, 6.0))
     line = ArchLine(
@@ -48,8 +50,8 @@ def build_bite(traits: Traits) -> Bite:
     front = traits.overbite_mm + (1.5 - traits.overbite_mm) * np.array([0.0, 0.1, 0.5])
     tips = np.tile(np.concatenate([front, np.full(4, -1.5)]), (2, 1)) + traits.lower.rise_mm * (np.arange(7) > 0)
 
-    def lower_arch() -> tuple[list[Seat], DentalArch]:
-        placed = seats(LOWER, traits.lower, tips, base - wished, 0.0)
+    def lower_arch() -> tuple[list[PlacedTooth], DentalArch]:
+        placed = placed_teeth(LOWER, traits.lower, tips, base - wished, 0.0)
         return placed, build(placed, line, traits, traits.lower, False, traits.gums)
 
     for _ in range(3):  # raised teeth touch other parts of the upper ones

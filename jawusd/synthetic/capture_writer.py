@@ -18,7 +18,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
 from jawusd.media.writers import VideoWriter
 from jawusd.synthetic.anatomy import build_anatomy
-from jawusd.synthetic.annotations import Outline, SeenVertex, choose_picks, drawn_mask
+from jawusd.synthetic.annotations import Outline, VisibleVertex, choose_picks, drawn_mask
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.render import Picture, Renderer
 from jawusd.synthetic.take import (
@@ -115,7 +115,7 @@ class _Recorder:
         self._rng = [np.random.default_rng([config.seed, 0xCA3, k]) for k in range(len(cameras))]
         shape = (_NOISE_PATTERNS, config.size_px[1], config.size_px[0], 3)
         self._grain = np.rint(self._rng[0].normal(0.0, _SENSOR_NOISE, shape)).astype(np.int8)
-        self.picks: dict[str, list[SeenVertex]] = {}
+        self.picks: dict[str, list[VisibleVertex]] = {}
 
     def performance(self, scene: Scene, take: Take) -> None:
         """Record the exercises with videos and masks, and the picks of the first tracked frame."""
@@ -226,7 +226,7 @@ def _truth(person: Person, cameras: list[Camera], take: Take, T_world_board: Arr
     }
 
 
-def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, list[SeenVertex]]) -> str:
+def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, list[VisibleVertex]]) -> str:
     """Return the text of capture.toml."""
     lines = [
         'format = "jawusd-capture/1"',

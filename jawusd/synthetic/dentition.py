@@ -86,7 +86,7 @@ class Traits:
 
 
 @dataclass(frozen=True, eq=False)
-class Seat:
+class PlacedTooth:
     """One tooth of an arch and its position."""
 
     form: CrownForm
@@ -98,9 +98,9 @@ class Seat:
     present: bool
 
 
-def seats(
+def placed_teeth(
     forms: tuple[CrownForm, ...], traits: ArchTraits, tips_mm: Array, facial_mm: Array, midline_s_mm: float
-) -> list[Seat]:
+) -> list[PlacedTooth]:
     """Return the teeth of an arch, including missing ones; `tips_mm` and `facial_mm` have shape (2, 7)."""
     out = []
     for half, side in enumerate((1, -1)):
@@ -116,7 +116,7 @@ def seats(
             )
             taken = own.width_mm - CONTACT_OVERLAP_MM - float(traits.overlap_mm[half, k])
             out.append(
-                Seat(
+                PlacedTooth(
                     own,
                     side * (k + 1),
                     midline_s_mm + side * (edge + taken / 2),
@@ -130,7 +130,9 @@ def seats(
     return out
 
 
-def build(arch: list[Seat], line: ArchLine, person: Traits, traits: ArchTraits, upper: bool, gums: Gums) -> DentalArch:
+def build(
+    arch: list[PlacedTooth], line: ArchLine, person: Traits, traits: ArchTraits, upper: bool, gums: Gums
+) -> DentalArch:
     """Build an arch, crowns first; the upper arch points down.
 
     For "crowns" the gum is built as for "continuous"; `without_gum` removes it.
@@ -192,7 +194,7 @@ def without_gum(arch: DentalArch) -> Mesh:
     return Mesh(arch.mesh.vertices[:first_gum], faces, colors)
 
 
-def margin(arch: list[Seat], s: Array) -> Array:
+def margin(arch: list[PlacedTooth], s: Array) -> Array:
     """Return the height of the gum margin at arc lengths (...): the gum line at each tooth, papillae in between."""
     order = sorted(arch, key=lambda seat: seat.s_mm)
     centre = np.array([seat.s_mm for seat in order])
@@ -204,7 +206,7 @@ def margin(arch: list[Seat], s: Array) -> Array:
     return np.interp(s, centre, level) + np.interp(s, centre, rise) * across**2.6
 
 
-def _placed(local: Array, seat: Seat, line: ArchLine) -> Array:
+def _placed(local: Array, seat: PlacedTooth, line: ArchLine) -> Array:
     """Transform a crown to its position."""
     side = 1 if seat.tooth > 0 else -1
     point, normal = line.at(np.array(seat.s_mm))
@@ -219,7 +221,7 @@ def _placed(local: Array, seat: Seat, line: ArchLine) -> Array:
     return (local - tip) @ (axes @ turn).T + position
 
 
-def _above_margin(rings: Array, arch: list[Seat], line: ArchLine) -> tuple[Array, Array]:
+def _above_margin(rings: Array, arch: list[PlacedTooth], line: ArchLine) -> tuple[Array, Array]:
     """Cut rings (R, A, 3) at the gum margin; return the remaining rings and the ring position of their vertices."""
     points = rings.reshape(-1, 3)
     s, _ = line.coordinates(points[:, [0, 2]])
@@ -265,7 +267,7 @@ def _collar(cervical: Array) -> tuple[Array, Faces]:
     return vertices, faces[(faces != top).all(1)]  # open towards the crown
 
 
-def _bracket(rings: Array, seat: Seat, line: ArchLine) -> tuple[Array, Faces]:
+def _bracket(rings: Array, seat: PlacedTooth, line: ArchLine) -> tuple[Array, Faces]:
     """Return a small box on the facial face of a crown."""
     _, normal = line.at(np.array(seat.s_mm))
     facial = np.array([normal[0], 0.0, normal[1]])

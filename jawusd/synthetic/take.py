@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
-from jawusd.synthetic.anatomy import Occlusion, PersonAnatomy, lifted_bite
+from jawusd.synthetic.anatomy import Occlusion, PersonAnatomy, opened_bite
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.exercises import schedule, smooth_noise, smoothed
 from jawusd.synthetic.kinematics import smoothstep
@@ -137,7 +137,7 @@ def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[in
     controls, phase, held = _controls(person, frames, start, n, rng)
     extra_mm = smooth_noise(rng, n, 8.0, 3) * [person.noise.side_mm, person.noise.lift_mm, person.noise.lift_mm]
     extra_mm *= 1.0 - held[:, None]
-    controls = lifted_bite(person, occlusion, controls, extra_mm)
+    controls = opened_bite(person, occlusion, controls, extra_mm)
     T_jaw = person.pose_with_extra(controls, extra_mm)
     dark = np.array([[_FLASH_START, 0], [LEAD + frames + TAIL - _FLASH_BEFORE_END, 0]])
     dark[:, 1] = dark[:, 0] + _DARK_FRAMES

@@ -70,7 +70,7 @@ class CapturePage:
 
     def _turn_camera(self) -> None:
         if self.picks.picking.value and self.footage.view in self._capture.sizes_px:
-            self.picks.book.turn_to(self.footage.view)
+            self.picks.book.select_incomplete(self.footage.view)
         self.turn()
 
     def refresh(self) -> None:
@@ -88,12 +88,12 @@ class CapturePage:
         while self.drawn != self._wanted:
             wanted, aim = self._wanted, self._aim
             self._aim = False
-            slow = asyncio.get_running_loop().call_later(_SLOW_S, self.footage.say_loading, True)
+            slow = asyncio.get_running_loop().call_later(_SLOW_S, self.footage.show_loading, True)
             with errors_shown(self.client):
                 await self._fit_picks()
                 await self._draw_once(aim)
             slow.cancel()
-            self.footage.say_loading(False)
+            self.footage.show_loading(False)
             self.drawn = wanted
 
     async def _draw_once(self, aim: bool) -> None:
@@ -172,9 +172,9 @@ class CapturePage:
     async def _fit_picks(self) -> None:
         """Fit poses to the picks if they have changed and are complete."""
         book = self.picks.book
-        if book.lacks() or book.frame is None:
+        if book.missing() or book.frame is None:
             if self._of_picks is not None:
-                self.picks.say_fit("")
+                self.picks.show_fit("")
             self._of_picks = None
             return
         picks = book.bootstrap()
@@ -183,10 +183,10 @@ class CapturePage:
         try:
             poses, wrong = await asyncio.to_thread(self._capture.poses_of_picks, picks)
             self._of_picks = picks, poses
-            self.picks.say_fit(f"inconsistent picks: {', '.join(wrong)}" if wrong else "the picks are consistent")
+            self.picks.show_fit(f"inconsistent picks: {', '.join(wrong)}" if wrong else "the picks are consistent")
         except JawusdError as error:
             self._of_picks = picks, None
-            self.picks.say_fit(error.statement())
+            self.picks.show_fit(error.statement())
 
     def _lay_out(self, view: str, frame: int) -> PickingLayout:
         """Return the layout of a camera's picture, or of all of them."""

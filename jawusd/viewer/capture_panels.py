@@ -13,7 +13,7 @@ from jawusd.viewer.picking import SIDES, PickBook
 from jawusd.viewer.plots import plot_seek
 from jawusd.viewer.take_plots import CoveragePlot, SolvePlot, frame_words, frames_to_inspect
 from jawusd.viewer.viewed import Look, ViewedCapture
-from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, enable, guarded, say, small_text
+from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, enable, guarded, notify, small_text
 
 SPACE, ALL = "3-D", "all cameras"
 _LOOKS: dict[str, Look] = {"outlines of the teeth": "outlines", "tinted teeth": "tinted", "footage alone": "footage"}
@@ -112,7 +112,7 @@ class FootagePanel:
         """Update the widgets from view and frame."""
         self._show(self.frame)
 
-    def say_loading(self, loading: bool) -> None:
+    def show_loading(self, loading: bool) -> None:
         """Show or hide the note that a picture is being decoded."""
         if loading != self._loading:
             self._loading = loading
@@ -225,7 +225,7 @@ class PicksPanel:
         self.write.on_click(guarded(client, self._write))
         self.refresh()
 
-    def say_fit(self, words: str) -> None:
+    def show_fit(self, words: str) -> None:
         """Show a sentence about the consistency of the picks."""
         self._fit = words
         self.refresh()
@@ -237,18 +237,18 @@ class PicksPanel:
         if self.chosen.options != (_NONE, *names):
             self.chosen.options = (_NONE, *names)
         assign(self.chosen, _NONE if book.selected is None else names[book.selected])
-        some, lacks = bool(book.picks), book.lacks()
+        some, missing = bool(book.picks), book.missing()
         enable(self.picking, not self._footage.on_wall)
         enable(self.sides, self.scans_shown)
         enable(self.chosen, some)
         enable(self.edit, some)
         enable(self.go, book.frame is not None)
-        enable(self.write, not lacks)
+        enable(self.write, not missing)
         lines = [f"frame {book.frame}" if book.frame is not None else "no pixels yet"]
         for number, pick in enumerate(book.picks):
             text = f"{names[number]}, vertex {pick.vertex}: {', '.join(pick.views) or 'no pixels yet'}"
             lines.append(f"<b>{text}</b>" if number == book.selected else text)
-        lines.append(lacks or "complete")
+        lines.append(missing or "complete")
         if self._fit:
             lines.append(self._fit)
         self._list.content = small_text("<br>".join(lines))
@@ -267,7 +267,7 @@ class PicksPanel:
 
     async def _remove(self, event: Choice) -> None:
         if event.target.value == "pixel":
-            self.book.forget_view(self._footage.view)
+            self.book.remove_pixel(self._footage.view)
         elif event.target.value == "pick":
             self.book.remove()
         else:
@@ -284,4 +284,4 @@ class PicksPanel:
         await asyncio.to_thread(self._capture.save_picks, picks, self._saved)
         self._saved = picks
         count = f"{len(picks.upper)} upper and {len(picks.lower)} lower picks"
-        say(self._client, "Written", f"{count}, frame {picks.frame}")
+        notify(self._client, "Written", f"{count}, frame {picks.frame}")

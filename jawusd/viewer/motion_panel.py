@@ -18,7 +18,7 @@ from jawusd.viewer.motion import Clip, KeyTrack, Player, with_key, without_key
 from jawusd.viewer.plots import Plot, curve_plot, plot_seek, with_playhead
 from jawusd.viewer.session import Interpolation, Session
 from jawusd.viewer.viewed import ViewedActor
-from jawusd.viewer.widgets import Choice, assign, guarded, limit_uploads, named, say
+from jawusd.viewer.widgets import Choice, assign, guarded, limit_uploads, named, notify
 
 KEYS = "keys"
 _LENGTH = 100
@@ -242,7 +242,7 @@ class FilePanel:
                     self._session.load_keys(load_keys(path))
             except FormatError as error:
                 raise FormatError(error.message, path=name, hint=error.hint) from error
-        say(self._client, "Loaded", name)
+        notify(self._client, "Loaded", name)
         self._changed()
 
     async def _write(self, _: object) -> None:
@@ -251,7 +251,7 @@ class FilePanel:
         self._motion.offer_clips()
         outside = int((self._session.rig.margin(clip.d) < -1e-6).sum())
         warning = f" {outside} of its {len(clip.d)} samples lie outside the bound." if outside else ""
-        say(self._client, "Written", f"{path}.{warning}")
+        notify(self._client, "Written", f"{path}.{warning}")
 
     async def _save_csv(self, _: object) -> None:
         clip = self._to_export()

@@ -93,11 +93,11 @@ class PickBook:
         rest = [*range(self.selected + 1, len(self.picks)), *range(self.selected)]
         self.selected = next((k for k in rest if camera not in self.picks[k].views), self.selected)
 
-    def turn_to(self, camera: str) -> None:
+    def select_incomplete(self, camera: str) -> None:
         """Select the first pick without a pixel in a camera, if any."""
         self.selected = next((k for k, pick in enumerate(self.picks) if camera not in pick.views), self.selected)
 
-    def forget_view(self, camera: str) -> None:
+    def remove_pixel(self, camera: str) -> None:
         """Remove the selected pick's pixel in a camera."""
         if self.selected is not None:
             self.picks[self.selected].views.pop(camera, None)
@@ -115,7 +115,7 @@ class PickBook:
         """Delete all picks."""
         self.picks, self.frame, self.selected = [], None, None
 
-    def lacks(self) -> str:
+    def missing(self) -> str:
         """Return what is missing before the picks can be written; "" when they are complete."""
         for arch in ARCHES:
             whole = sum(len(pick.views) >= _FEWEST_VIEWS for pick in self.picks if pick.arch == arch)
@@ -130,9 +130,9 @@ class PickBook:
         """Return the picks in the form of the capture file.
 
         Raises:
-            ValueError: the picks are incomplete; see `lacks`.
+            ValueError: the picks are incomplete; see `missing`.
         """
-        lacking = self.lacks()
+        lacking = self.missing()
         if lacking or self.frame is None:
             raise ValueError(f"the picks are incomplete: {lacking}")
         upper, lower = (tuple(_finished(pick) for pick in self.picks if pick.arch == arch) for arch in ARCHES)

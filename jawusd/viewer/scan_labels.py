@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Indices, Mask
 from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh
 from jawusd.viewer.viewed import ViewedCapture
-from jawusd.viewer.widgets import Choice, enable, guarded, say, small_text
+from jawusd.viewer.widgets import Choice, enable, guarded, notify, small_text
 
 #: Label painted by each button.
 BRUSHES = {"crown": TOOTH, "gum": GUM, "base": BASE}
@@ -163,7 +163,7 @@ class ScanLabelsPanel:
             paths.append(await asyncio.to_thread(self._capture.save_labels, arch, labels.copy()))
             self.brush.saved(arch)
         self._say_state()
-        say(
+        notify(
             self._client,
             "Written",
             f"{' and '.join(path.name for path in paths)}; run track or build again to use them",

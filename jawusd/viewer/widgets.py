@@ -82,7 +82,7 @@ def small_text(html: str, style: str = "") -> str:
     return f'<div style="font-size:12px;padding:2px 12px;{style}">{html}</div>'
 
 
-def say(client: viser.ClientHandle, title: str, body: str, *, bad: bool = False) -> None:
+def notify(client: viser.ClientHandle, title: str, body: str, *, bad: bool = False) -> None:
     """Show a message in a page; failures (`bad`) stay until they are closed."""
     client.add_notification(title, body, color="red" if bad else "teal", auto_close_seconds=None if bad else 5.0)
 
@@ -93,10 +93,10 @@ def errors_shown(client: viser.ClientHandle) -> Iterator[None]:
     try:
         yield
     except (JawusdError, ValueError) as error:
-        say(client, "Failed", str(error), bad=True)
+        notify(client, "Failed", str(error), bad=True)
     except Exception as error:
         log.exception("unexpected error in the viewer")
-        say(client, "Unexpected error", f"{type(error).__name__}: {error}", bad=True)
+        notify(client, "Unexpected error", f"{type(error).__name__}: {error}", bad=True)
 
 
 def guarded(
@@ -142,7 +142,7 @@ def limit_uploads(client: viser.ClientHandle, button: viser.GuiUploadButtonHandl
     def drop(transfer: str, why: str) -> None:
         state = pending.pop(transfer, None)
         if state is not None:
-            say(client, "Failed", f"{state['filename'][-_MOST_LETTERS:]}: {why}", bad=True)
+            notify(client, "Failed", f"{state['filename'][-_MOST_LETTERS:]}: {why}", bad=True)
 
     async def started(_: int, message: _messages.FileTransferStartUpload) -> None:
         if button is None or message.source_component_uuid != button._impl.uuid:

@@ -46,7 +46,7 @@ from jawusd.pipeline.subject import Subject, _measured, subject_of_capture
 from jawusd.rig.author import decoder_layer
 from jawusd.rig.sampling import sample_valid
 from jawusd.rig.table import DecoderTable
-from jawusd.synthetic.anatomy import build_anatomy, lifted_bite
+from jawusd.synthetic.anatomy import build_anatomy, opened_bite
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 
@@ -158,7 +158,7 @@ def cases(options: argparse.Namespace) -> Iterator[Case]:
         person = Person(seed)
         anatomy = build_anatomy(person)
         controls, none = record(person, FRAMES, seed).controls, np.zeros((FRAMES, 3))
-        poses = person.pose_with_extra(lifted_bite(person, anatomy.occlusion, controls, none), none)
+        poses = person.pose_with_extra(opened_bite(person, anatomy.occlusion, controls, none), none)
         meshes = {"upper_teeth": anatomy.upper.mesh, "lower_teeth": anatomy.lower.mesh, "mandible": anatomy.mandible}
         yield Case(f"person {seed}", Subject(f"person {seed}", np.eye(4), person.landmarks, meshes), poses)
     for seed in range(options.persons - options.persons // 2):

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from boards import CENTRE, board, capture_of, opencv_pixels, poses, sightings, studio
+from boards import CENTRE, board, capture_of, detections, opencv_pixels, poses, studio
 from scipy.spatial.transform import Rotation
 
 from jawusd.base.errors import CalibrationError
-from jawusd.capture.boards import Sightings, board_points, board_symmetries
+from jawusd.capture.boards import BoardDetections, board_points, board_symmetries
 from jawusd.capture.bundle import _Problem
-from jawusd.capture.calibrate import calibrate_capture, calibrate_sightings
-from jawusd.capture.initial_guess import guess_cameras
+from jawusd.capture.calibrate import calibrate_capture, calibrate_detections
+from jawusd.capture.initial_guess import initial_cameras
 from jawusd.geometry import se3_inverse, triangulate
 
 CAMERAS = studio()
@@ -26,15 +26,15 @@ def distance_error(found, truth, radius=15.0):
 
 
 def altered(found, **changes):
-    fields = {name: getattr(found, name) for name in Sightings.__dataclass_fields__}
-    return Sightings(**(fields | changes))
+    fields = {name: getattr(found, name) for name in BoardDetections.__dataclass_fields__}
+    return BoardDetections(**(fields | changes))
 
 
 @pytest.mark.parametrize(("cols", "rows", "turns"), [(9, 6, (0, 2)), (7, 7, (0, 1, 2, 3)), (8, 6, (0, 2))])
 def test_distances_survive_whatever_order_the_corners_come_in(tmp_path, cols, rows, turns):
     rng = np.random.default_rng(0)
     boards = board(cols=cols, rows=rows)
-    found = sightings(CAMERAS, boards, poses(24, rng), rng)
+    found = detections(CAMERAS, boards, poses(24, rng), rng)
     corners = found.corners_px.copy()
     for c in range(3):
         for v in range(24):
@@ -42,7 +42,8 @@ def test_distances_survive_whatever_order_the_corners_come_in(tmp_path, cols, ro
             corners[c, v] = np.rot90(grid, turns[rng.integers(len(turns))]).reshape(-1, 2)
     corners[1, 3, 5] += 30  # a corner mistaken for another thing
     corners[2, 4:7] = np.nan  # views one camera missed
-    cameras, report = calibrate_sightings(altered(found, corners_px=corners), capture_of(CAMERAS, boards, tmp_path), {})
+    capture = capture_of(CAMERAS, boards, tmp_path)
+    cameras, report = calibrate_detections(altered(found, corners_px=corners), capture, {})
     assert distance_error(cameras, CAMERAS) < 0.02
     assert np.array_equal(cameras[0].T_cam_world, np.eye(4)) and [c.name for c in cameras] == ["c0", "c1", "c2"]
     assert all(0.12 < figures["rms_px"] < 0.16 for figures in report.cameras.values())  # 0.1 px per axis
@@ -55,8 +56,8 @@ def test_the_expected_error_is_what_repeated_calibrations_show(tmp_path):
     boards, errors, expected = board(), [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        found = sightings(CAMERAS, boards, poses(14, rng), rng, noise_px=0.3)
-        cameras, report = calibrate_sightings(found, capture_of(CAMERAS, boards, tmp_path), {})
+        found = detections(CAMERAS, boards, poses(14, rng), rng, noise_px=0.3)
+        cameras, report = calibrate_detections(found, capture_of(CAMERAS, boards, tmp_path), {})
         errors.append(distance_error(cameras, CAMERAS, radius=35.0))
         expected.append(report.expected_shape_mm)
     assert 0.4 < np.mean(expected) / np.mean(errors) < 2.5
@@ -64,9 +65,9 @@ def test_the_expected_error_is_what_repeated_calibrations_show(tmp_path):
 
 def test_the_jacobian_is_the_slope_of_the_residuals():
     rng, boards = np.random.default_rng(1), board()
-    found = sightings(CAMERAS, boards, poses(8, rng), rng)
+    found = detections(CAMERAS, boards, poses(8, rng), rng)
     points = board_points(boards)
-    start = guess_cameras(found.names, found.sizes_px, found.corners_px, points, board_symmetries(boards))
+    start = initial_cameras(found.names, found.sizes_px, found.corners_px, points, board_symmetries(boards))
     problem = _Problem(start.corners_px, points)
     x = problem.pack(start)
     J = problem.jacobian(x).toarray()
@@ -79,25 +80,25 @@ def test_the_jacobian_is_the_slope_of_the_residuals():
 
 def test_clips_that_are_not_simultaneous_are_refused(tmp_path):
     rng, boards = np.random.default_rng(2), board()
-    found = sightings(CAMERAS, boards, poses(20, rng), rng)
+    found = detections(CAMERAS, boards, poses(20, rng), rng)
     corners = found.corners_px.copy()
     corners[1] = np.roll(corners[1], 3, axis=0)  # as if cut at the beginning
     with pytest.raises(CalibrationError, match=r"c0 and c1 are inconsistent.*of 20 agree.*synchronous"):
-        calibrate_sightings(altered(found, corners_px=corners), capture_of(CAMERAS, boards, tmp_path), {})
+        calibrate_detections(altered(found, corners_px=corners), capture_of(CAMERAS, boards, tmp_path), {})
 
 
 def test_too_few_views_are_refused_per_camera_and_per_pair(tmp_path):
     rng, boards = np.random.default_rng(3), board()
-    found = sightings(CAMERAS, boards, poses(20, rng), rng)
+    found = detections(CAMERAS, boards, poses(20, rng), rng)
     few, apart = found.corners_px.copy(), found.corners_px.copy()
     few[1, 5:] = np.nan
     apart[0, 12:] = np.nan
     apart[1, :10] = np.nan
     apart[2, 12:] = np.nan
     with pytest.raises(CalibrationError, match=r"camera c1: .* in 5 pictures, at least 6 .*40 poses"):
-        calibrate_sightings(altered(found, corners_px=few), capture_of(CAMERAS, boards, tmp_path), {})
+        calibrate_detections(altered(found, corners_px=few), capture_of(CAMERAS, boards, tmp_path), {})
     with pytest.raises(CalibrationError, match=r"c1 shares 2 sharp board views with"):
-        calibrate_sightings(altered(found, corners_px=apart), capture_of(CAMERAS, boards, tmp_path), {})
+        calibrate_detections(altered(found, corners_px=apart), capture_of(CAMERAS, boards, tmp_path), {})
 
 
 def picked(rng, noise_px=1.0):
@@ -121,16 +122,16 @@ def picked(rng, noise_px=1.0):
 def test_a_wrong_square_size_is_told_by_the_teeth(tmp_path):
     rng = np.random.default_rng(4)
     scans, picks = picked(rng)
-    found = sightings(CAMERAS, board(), poses(20, rng), rng)
-    _, report = calibrate_sightings(found, capture_of(CAMERAS, board(), tmp_path, picks), scans)
+    found = detections(CAMERAS, board(), poses(20, rng), rng)
+    _, report = calibrate_detections(found, capture_of(CAMERAS, board(), tmp_path, picks), scans)
     assert report.scale.ratio == pytest.approx(1.0, abs=0.03) and report.mouth_from == "the picked teeth"
     wrong = board(square_mm=6.0)
     with pytest.raises(CalibrationError, match=r"1\.\d+ times their scan.*of 6 mm would have to be (4\.9|5\.0)"):
-        calibrate_sightings(found, capture_of(CAMERAS, wrong, tmp_path, picks), scans)
-    _, unchecked = calibrate_sightings(found, capture_of(CAMERAS, wrong, tmp_path), scans)
+        calibrate_detections(found, capture_of(CAMERAS, wrong, tmp_path, picks), scans)
+    _, unchecked = calibrate_detections(found, capture_of(CAMERAS, wrong, tmp_path), scans)
     assert any("square_mm alone" in note for note in unchecked.notes)
     scans, careless = picked(rng, noise_px=60.0)
-    _, unsure = calibrate_sightings(found, capture_of(CAMERAS, board(), tmp_path, careless), scans)
+    _, unsure = calibrate_detections(found, capture_of(CAMERAS, board(), tmp_path, careless), scans)
     assert unsure.scale.ratio is None and "too inaccurate" in unsure.scale.reason
 
 
@@ -138,21 +139,21 @@ def test_a_wrong_square_size_is_told_by_the_teeth(tmp_path):
 def test_advice_names_what_was_done_badly(tmp_path):
     rng, boards = np.random.default_rng(5), board()
     capture = capture_of(CAMERAS, boards, tmp_path)
-    found = sightings(CAMERAS, boards, poses(45, rng, CENTRE + [-8, -6, 0]), rng)
-    well = calibrate_sightings(found, capture, {})[1]
+    found = detections(CAMERAS, boards, poses(45, rng, CENTRE + [-8, -6, 0]), rng)
+    well = calibrate_detections(found, capture, {})[1]
     assert not any("views of the board" in a or "mm from the mouth" in a for a in well.advice)
     far = poses(20, rng, CENTRE + [0, 0, 90.0])
-    advice = " ".join(calibrate_sightings(sightings(CAMERAS, boards, far, rng), capture, {})[1].advice)
+    advice = " ".join(calibrate_detections(detections(CAMERAS, boards, far, rng), capture, {})[1].advice)
     assert "uses 20 views" in advice and "mm from the mouth" in advice
-    noisy = sightings(CAMERAS, boards, poses(45, rng), rng, noise_px=0.8)
-    advice = " ".join(calibrate_sightings(noisy, capture, {})[1].advice)
+    noisy = detections(CAMERAS, boards, poses(45, rng), rng, noise_px=0.8)
+    advice = " ".join(calibrate_detections(noisy, capture, {})[1].advice)
     assert "px rms (good is below 0.5)" in advice and "% of the picture" in advice
 
 
 def test_one_camera_alone_is_calibrated(tmp_path):
     rng, boards = np.random.default_rng(6), board(videos=("a",))
-    found = sightings(CAMERAS[:1], boards, poses(20, rng), rng)
-    cameras, report = calibrate_sightings(found, capture_of(CAMERAS[:1], boards, tmp_path), {})
+    found = detections(CAMERAS[:1], boards, poses(20, rng), rng)
+    cameras, report = calibrate_detections(found, capture_of(CAMERAS[:1], boards, tmp_path), {})
     assert cameras[0].K[0, 0] == pytest.approx(900, rel=0.01)
     assert report.board_shape.distances == 0 and np.isnan(report.expected_shape_mm)
 
@@ -165,8 +166,8 @@ def test_a_capture_without_boards_is_refused(tmp_path):
 
 def test_world_is_the_first_camera(tmp_path):
     rng, boards = np.random.default_rng(7), board()
-    found = sightings(CAMERAS, boards, poses(40, rng), rng, noise_px=0.02)
-    cameras, _ = calibrate_sightings(found, capture_of(CAMERAS, boards, tmp_path), {})
+    found = detections(CAMERAS, boards, poses(40, rng), rng, noise_px=0.02)
+    cameras, _ = calibrate_detections(found, capture_of(CAMERAS, boards, tmp_path), {})
     for a, b in zip(cameras, CAMERAS, strict=True):
         gap = a.T_cam_world @ se3_inverse(b.T_cam_world)
         assert np.degrees(Rotation.from_matrix(gap[:3, :3]).magnitude()) < 0.1

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jawusd.capture.camera_checks import aimed_at, camera_findings
-from jawusd.capture.mask_checks import middles_findings, seen_findings
+from jawusd.capture.camera_checks import camera_findings, common_target
+from jawusd.capture.mask_checks import centre_findings, width_findings
 from jawusd.geometry import Camera, make_transform, se3_exp
 
 SIZE = (1280, 720)
@@ -47,7 +47,7 @@ def in_metres():
 
 def test_good_cameras_are_not_accused():
     assert kinds(CAMERAS) == set()
-    assert np.linalg.norm(aimed_at(CAMERAS) - TEETH) < 1e-6
+    assert np.linalg.norm(common_target(CAMERAS) - TEETH) < 1e-6
 
 
 @pytest.mark.parametrize(
@@ -74,26 +74,26 @@ def middles(cameras, place=TEETH):
 def test_masks_that_see_one_place_are_accepted_and_a_turned_camera_is_accused():
     table = {c.name: c for c in CAMERAS}
     instants = [[middles(CAMERAS, TEETH + [k, 2 * k, k])] for k in range(5)]
-    assert not list(middles_findings(table, instants))
+    assert not list(centre_findings(table, instants))
     turned = {**table, "cam1": replace(CAMERAS[1], T_cam_world=se3_exp([0.12, 0, 0, 0, 0, 0]) @ CAMERAS[1].T_cam_world)}
-    (found,) = middles_findings(turned, instants)
+    (found,) = centre_findings(turned, instants)
     assert found.kind == "cameras_contradict" and found.camera == "cam1" and found.value > found.limit
 
 
 def test_the_best_guess_of_the_offsets_counts():
     table = {c.name: c for c in CAMERAS}
     wrong = {name: px + [0, 150.0 if name == "cam1" else 0] for name, px in middles(CAMERAS).items()}
-    assert list(middles_findings(table, [[wrong]]))
-    assert not list(middles_findings(table, [[wrong, middles(CAMERAS)]]))
+    assert list(centre_findings(table, [[wrong]]))
+    assert not list(centre_findings(table, [[wrong, middles(CAMERAS)]]))
 
 
 def test_teeth_of_impossible_size_are_told():
     table = {c.name: c for c in CAMERAS}
     mouth = TEETH + np.random.default_rng(0).uniform(-1, 1, (400, 3)) * [22, 5, 8]
-    assert not list(seen_findings(table, {c.name: c.project(mouth) for c in CAMERAS}))
+    assert not list(width_findings(table, {c.name: c.project(mouth) for c in CAMERAS}))
     in_cm = {
         c.name: replace(c, T_cam_world=make_transform(c.T_cam_world[:3, :3], c.T_cam_world[:3, 3] / 10))
         for c in CAMERAS
     }
-    (found,) = seen_findings(in_cm, {c.name: c.project(mouth) for c in CAMERAS})
+    (found,) = width_findings(in_cm, {c.name: c.project(mouth) for c in CAMERAS})
     assert found.kind == "teeth_size" and found.value < found.limit

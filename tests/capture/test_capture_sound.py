@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import fftconvolve, resample_poly
 
 from jawusd.base.errors import CaptureError, SyncError
-from jawusd.capture.signals import RATE_HZ, Step, match_sounds, match_steps, on_grid
+from jawusd.capture.signals import RATE_HZ, Step, match_sounds, match_steps, to_frames
 from jawusd.capture.sync import align_videos, light_curve
 from jawusd.media.containers import Sound, read_sound
 from jawusd.media.timeline import Timeline
@@ -191,7 +191,7 @@ def test_pictures_fall_on_the_frames_they_were_taken_at(tick_s: float, fps: floa
 def test_a_step_in_a_gap_does_not_mislead() -> None:
     # Frames 10 to 12 are missing: the light went off somewhere from 10 to 13.
     numbers = np.append(np.arange(10), np.arange(13, 60))
-    placed = on_grid([Step(10.0, False), Step(20.4, True)], numbers)
+    placed = to_frames([Step(10.0, False), Step(20.4, True)], numbers)
     assert [(s.time_frames, s.slack_frames) for s in placed] == [(13.0, 3.0), (pytest.approx(23.4), 0.0)]
     reference = [Step(16.0, False), Step(28.4, True)]
     assert match_steps(placed, reference, 24.0).frames == 5

@@ -15,7 +15,7 @@ import trimesh
 from package_copy import ROOT
 
 from jawusd.base.errors import CaptureError
-from jawusd.capture.mask_checks import exchanged_by_frames
+from jawusd.capture.mask_checks import swapped_cameras
 from jawusd.formats.capture import load_capture
 from jawusd.formats.finding import Finding
 from jawusd.media.writers import VideoWriter
@@ -229,11 +229,11 @@ def test_the_reference_camera_may_lack_the_last_masks(capture):
 def test_masks_numbered_for_another_camera_are_exchanged():
     offsets = {"cam0": 0, "cam1": 4, "cam2": -3}
     right = {name: ((10 - offset, 29 - offset), None) for name, offset in offsets.items()}
-    assert exchanged_by_frames(right, offsets, 10, 30) == []
+    assert swapped_cameras(right, offsets, 10, 30) == []
     wrong = {**right, "cam0": right["cam2"], "cam2": right["cam0"]}
-    assert exchanged_by_frames(wrong, offsets, 10, 30) == [("cam0", "cam2")]
+    assert swapped_cameras(wrong, offsets, 10, 30) == [("cam0", "cam2")]
     short = {**right, "cam1": ((12, 20), (12, 20)), "cam2": (None, None)}  # no exchange explains that
-    assert exchanged_by_frames(short, offsets, 10, 30) == []
+    assert swapped_cameras(short, offsets, 10, 30) == []
 
 
 def test_a_full_disk_is_told(tmp_path, monkeypatch):

@@ -8,8 +8,8 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from jawusd.base.errors import CaptureError
 from jawusd.geometry import Camera
-from jawusd.segmentation.arches import LOWER, UPPER, Expectation, Seeds, cut_arches, cut_three_ways, part_arches
-from jawusd.segmentation.border import settle_borders
+from jawusd.segmentation.arches import LOWER, UPPER, Expectation, Seeds, cut_arches, cut_three_ways, separate_arches
+from jawusd.segmentation.border import refine_borders
 from jawusd.segmentation.colours import ColourModel, ColourStates, SegmentationConfig, state_files
 from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
 from jawusd.segmentation.learn import Example, learn_numbers
@@ -110,7 +110,7 @@ def test_borders_settle_where_the_picture_changes():
     rgb = np.clip(clean + rng.normal(0, 4, clean.shape), 0, 255).astype(np.uint8)
     small = (away < -2).astype(np.float32)
     small[4:14, 100:112] = 1.0  # a part without any border in the picture
-    shares, clear = settle_borders(np.stack([small, np.zeros_like(small)]), rgb, SegmentationConfig(), 7.2)
+    shares, clear = refine_borders(np.stack([small, np.zeros_like(small)]), rgb, SegmentationConfig(), 7.2)
     assert shares[1].max() == 0
     assert not (shares[0][:16, 98:] > 0.5).any()
     found = np.abs(shares[0].sum() - tooth.sum()) / tooth.sum()
@@ -123,7 +123,7 @@ def test_what_has_no_border_in_the_picture_is_no_tooth():
     rgb = painted(np.random.default_rng(3), (60, 80), (150, 140, 130), 2)
     shares = np.zeros((2, 60, 80), np.float32)
     shares[0, 20:40, 20:60] = 1.0
-    settled, clear = settle_borders(shares, rgb, SegmentationConfig(), 7.2)
+    settled, clear = refine_borders(shares, rgb, SegmentationConfig(), 7.2)
     assert not (settled > 0.5).any()
     assert not clear[15:45].any()
 
@@ -220,7 +220,7 @@ def test_rows_part_where_teeth_meet_and_not_where_they_were_expected():
     inside = np.stack([np.minimum(y - 15, expected_y - y), np.minimum(75 - y, y - expected_y)]).astype(np.float32)
     labels = np.select([inside[0] > 0, inside[1] > 0], [UPPER, LOWER]).astype(np.uint8)
     shares = np.stack([teeth & (y <= expected_y), teeth & (y > expected_y)]).astype(np.float32)
-    found = part_arches(shares, rgb, Expectation(labels, inside), SegmentationConfig(), 7.2)
+    found = separate_arches(shares, rgb, Expectation(labels, inside), SegmentationConfig(), 7.2)
     assert np.allclose(found.sum(0), shares.sum(0), atol=1e-5)
     edge = (found[0] > 0.5).sum(0) + 16
     assert edge.min() >= 42 and edge.max() <= 46  # expected it would be 48

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from jawusd.capture.boards import Sightings
+from jawusd.capture.boards import BoardDetections
 from jawusd.formats.capture import Boards, Capture
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
 
@@ -48,7 +48,7 @@ def opencv_pixels(camera, points_world):
     return cv2.projectPoints(points_world, cv2.Rodrigues(R)[0], t, camera.K, camera.distortion)[0].reshape(-1, 2)
 
 
-def sightings(cameras, boards, T_world_board, rng, noise_px=0.1):
+def detections(cameras, boards, T_world_board, rng, noise_px=0.1):
     """Return what a detector would find."""
     grid = corner_grid(boards)
     corners = np.array(
@@ -56,7 +56,7 @@ def sightings(cameras, boards, T_world_board, rng, noise_px=0.1):
     ) + rng.normal(0, noise_px, (len(cameras), len(T_world_board), len(grid), 2))
     names = tuple(c.name for c in cameras)
     nothing = {name: [] for name in names}
-    return Sightings(
+    return BoardDetections(
         names, tuple(c.size_px for c in cameras), np.arange(len(T_world_board)), corners, nothing, nothing, ()
     )
 

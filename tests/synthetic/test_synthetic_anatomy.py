@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from jawusd.geometry import anatomical_frame, find_landmarks, transform_points
-from jawusd.synthetic.anatomy import PersonAnatomy, build_anatomy, lifted_bite
+from jawusd.synthetic.anatomy import PersonAnatomy, build_anatomy, opened_bite
 from jawusd.synthetic.bones import JOINT_SPACE_MM
 from jawusd.synthetic.dental_arch import GREEN, GREY, RED, DentalArch
 from jawusd.synthetic.person import Person
@@ -106,7 +106,7 @@ def test_lifted_bite_removes_collisions_and_little_else() -> None:
     anatomy = build_anatomy(person)
     controls = np.concatenate([np.linspace([0, -0.6, 0], [0, 0.6, 0], 13), np.linspace([0, 0, 0], [0.5, 0, 1], 7)])
     still = np.zeros((20, 3))
-    lifted = lifted_bite(person, anatomy.occlusion, controls, still)
+    lifted = opened_bite(person, anatomy.occlusion, controls, still)
     before = [anatomy.occlusion.gap(T) for T in person.pose_with_extra(controls, still)]
     after = [anatomy.occlusion.gap(T) for T in person.pose_with_extra(lifted, still)]
     assert min(before) < 0.0 <= min(after)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
-from subjects.annotator import FINER, Hand, draw_annotator
+from subjects.annotator import FINER, MaskDrawer, draw_annotator
 from subjects.scanner import FORMATS, Scanner, encoded, scanned
 from subjects.short_capture import ShortConfig, write_short_capture
 from subjects.traits import draw_traits
@@ -187,7 +187,7 @@ def test_annotators_draw_gum_and_edges_where_they_see_them(gum_mm: float, edge_p
         tooth[FINER * 100 + part : FINER * 200 + part, FINER * 100 : FINER * 300] = 1
         gum = np.zeros(tooth.shape, bool)
         gum[FINER * 60 : FINER * 100 + part, FINER * 100 : FINER * 300] = True
-        hand = Hand(who, 0, 0, (1920, 1080), np.random.default_rng(0))
+        hand = MaskDrawer(who, 0, 0, (1920, 1080), np.random.default_rng(0))
         column = np.flatnonzero(hand.draw(tooth, gum, (0, 0), FINER * 10.0)[:300, 200])
         first.append(column[0])
         last.append(column[-1])

@@ -19,7 +19,7 @@ def filled():
         for vertex in (3, 5, 7):
             book.add(arch, vertex)
     for camera in ("a", "b"):
-        book.turn_to(camera)
+        book.select_incomplete(camera)
         for k in range(6):
             book.see(camera, 20, (10.0 * k, 5.0))
     return book
@@ -38,16 +38,16 @@ def test_picks_are_made_in_order_and_become_a_bootstrap():
 
 def test_what_is_missing_is_said_and_not_written():
     book = PickBook()
-    assert "upper teeth: 0 picks" in book.lacks()
+    assert "upper teeth: 0 picks" in book.missing()
     with pytest.raises(ValueError, match="no pick is selected"):
         book.see("a", 20, (1.0, 2.0))
     with pytest.raises(ValueError, match="picks are incomplete"):
         book.bootstrap()
     book = filled()
     book.add("lower", 99)
-    assert book.lacks().startswith("L4 has views in 0")
+    assert book.missing().startswith("L4 has views in 0")
     book.remove()
-    assert book.lacks() == ""
+    assert book.missing() == ""
 
 
 def test_pixels_of_two_frames_do_not_mix():
@@ -61,7 +61,7 @@ def test_pixels_of_two_frames_do_not_mix():
     book.selected = 0
     book.see("b", 30, (3.0, 4.0))  # the only pick moves to the other frame, without the pixel of the first
     assert book.frame == 30 and book.picks[0].views == {"b": (3.0, 4.0)}
-    book.forget_view("b")
+    book.remove_pixel("b")
     book.remove()
     assert book.picks == [] and book.frame is None and book.selected is None
 

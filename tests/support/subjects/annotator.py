@@ -65,7 +65,7 @@ def draw_annotator(seed: int, cameras: int) -> Annotator:
     )
 
 
-class Hand:
+class MaskDrawer:
     """Sequence of masks of one arch in one camera by one annotator."""
 
     def __init__(

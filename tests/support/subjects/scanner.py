@@ -57,7 +57,7 @@ def scanned(mesh: Mesh, scanner: Scanner, rng: np.random.Generator) -> Mesh:
     """
     vertices, faces, colors = mesh.vertices, mesh.faces, mesh.colors
     if colors is None:
-        raise ValueError("the arch has no paint")
+        raise ValueError("the arch has no vertex colours")
     while len(faces) * 4 <= scanner.faces:
         vertices, faces, colors = _subdivided(vertices, faces, colors)
     if len(faces) > scanner.faces:
@@ -157,7 +157,7 @@ def _subdivided(vertices: Array, faces: Faces, colors: NDArray[np.uint8]) -> tup
 def _thinned(mesh: Mesh, count: int) -> tuple[Array, Faces, NDArray[np.uint8]]:
     """Decimate each colour separately, so that the lines between colours are preserved."""
     if mesh.colors is None:
-        raise ValueError("the arch has no paint")
+        raise ValueError("the arch has no vertex colours")
     label = tooth_labels(mesh) != GUM
     crown = label[mesh.faces].sum(1) >= 2
     parts, colors = [], []

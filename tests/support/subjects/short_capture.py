@@ -26,7 +26,7 @@ from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.dentition import Traits, without_gum
 from jawusd.synthetic.person import draw_joint
 from jawusd.synthetic.soft_tissue import Face, palate, tongue
-from subjects.annotator import FINER, Annotator, Hand, draw_annotator, write_mask
+from subjects.annotator import FINER, Annotator, MaskDrawer, draw_annotator, write_mask
 from subjects.scanner import Scanner, draw_scanner, encoded, scanned
 from subjects.short_take import TEETH_FROM, Drawn, Motion, ShortPick, draw_cameras, draw_motion, pick_ends, pick_lines
 from subjects.traits import draw_traits
@@ -195,7 +195,7 @@ def _write_masks(folder: Path, capture: ShortCapture) -> None:
     config, who = capture.config, capture.annotator
     for c, camera in enumerate(capture.cameras):
         rngs = [np.random.default_rng([config.seed, 0xA5C, c, row]) for row in (0, 1)]
-        hands = [Hand(who, row, c, camera.size_px, rngs[row]) for row in (0, 1)]
+        hands = [MaskDrawer(who, row, c, camera.size_px, rngs[row]) for row in (0, 1)]
         for jaw in JAWS:
             (folder / "masks" / camera.name / jaw).mkdir(parents=True, exist_ok=True)
         for k in range(config.frames):

@@ -13,7 +13,7 @@ from jawusd.formats.tracks import Registration
 ErrorTable = dict[str, dict[str, float]]
 
 
-class SyncFacts(TypedDict, total=False):
+class SyncHeader(TypedDict, total=False):
     """Result of the synchronisation, by camera."""
 
     method: str
@@ -21,7 +21,7 @@ class SyncFacts(TypedDict, total=False):
     confidence: dict[str, float]
 
 
-class StartFacts(TypedDict, total=False):
+class StartHeader(TypedDict, total=False):
     """Initialisation of the tracking."""
 
     by: str
@@ -29,7 +29,7 @@ class StartFacts(TypedDict, total=False):
     picks_left_out: dict[str, list[int]]
 
 
-class ExtrinsicsFacts(TypedDict, total=False):
+class ExtrinsicsHeader(TypedDict, total=False):
     """Corrections of the camera poses by tracking, by camera."""
 
     corrected: bool
@@ -37,11 +37,11 @@ class ExtrinsicsFacts(TypedDict, total=False):
     moves_mm: dict[str, list[float]]
 
 
-class TracksFacts(TypedDict, total=False):
+class TracksHeader(TypedDict, total=False):
     """Header of tracks."""
 
-    start: StartFacts
-    extrinsics: ExtrinsicsFacts
+    start: StartHeader
+    extrinsics: ExtrinsicsHeader
     calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
     delays_frames: dict[str, float]
     outline_bias_px: dict[str, list[float]]
@@ -50,7 +50,7 @@ class TracksFacts(TypedDict, total=False):
     registration: Registration
 
 
-class ModelFacts(TypedDict, total=False):
+class ModelHeader(TypedDict, total=False):
     """Header of a model."""
 
     method: str
@@ -62,16 +62,16 @@ class ModelFacts(TypedDict, total=False):
     warnings: list[dict[str, str]]
 
 
-def sync_facts(data: ReportData) -> SyncFacts:
+def sync_header(data: ReportData) -> SyncHeader:
     """Return the result of the synchronisation."""
-    return cast(SyncFacts, data.sync)
+    return cast(SyncHeader, data.sync)
 
 
-def tracks_facts(data: ReportData) -> TracksFacts:
+def tracks_header(data: ReportData) -> TracksHeader:
     """Return the header of the tracks."""
-    return cast(TracksFacts, data.tracks.meta)
+    return cast(TracksHeader, data.tracks.meta)
 
 
-def model_facts(data: ReportData) -> ModelFacts:
+def model_header(data: ReportData) -> ModelHeader:
     """Return the header of the model."""
-    return cast(ModelFacts, data.model.meta)
+    return cast(ModelHeader, data.model.meta)
