@@ -1,7 +1,9 @@
-"""Evaluate a jaw rig with numpy alone: poses, Jacobians, encoding, bounds, verdicts, inverse kinematics."""
+"""The runtime rig: poses, Jacobians, encoding, bounds, verdicts and inverse kinematics, with numpy alone.
 
-from jawusd.evaluator.files import load
-from jawusd.evaluator.rig import JawRig
+Imports only `base`, `geometry` and numpy, so that it can run inside other programs.
+"""
+
+from jawusd.evaluator.rig import JawRig, load
 from jawusd.evaluator.speeds import Speeds
 from jawusd.evaluator.verdicts import Reason, Verdicts
 

@@ -1,12 +1,12 @@
-"""``python -m jawusd.evaluator``: poses, encoding and verdicts of a model.npz where there is nothing but numpy.
+"""``python -m jawusd.evaluator``: poses, encoding and verdicts of a model.npz, with numpy alone.
 
     python -m jawusd.evaluator info MODEL
     python -m jawusd.evaluator pose MODEL --d 20 0 3
     python -m jawusd.evaluator encode MODEL poses.csv
     python -m jawusd.evaluator validate MODEL poses.csv
 
-Poses come as CSV with the columns frame, m00 ... m33 (row-major T_skull_mandible [mm]). Results go to stdout as CSV, or
-JSON with --json. Exit codes: 0, 1 an invalid pose was found, 2 usage, 3 and up an error (see jawusd.base.errors).
+Poses are CSV with the columns frame, m00 ... m33 (row-major T_skull_mandible [mm]). Results go to stdout as CSV, or
+JSON with --json. Exit codes: 0 success, 1 invalid poses, 2 usage, 3 and up errors (see jawusd.base.errors).
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, JawusdError
 from jawusd.base.tables import read_table
-from jawusd.evaluator.files import load
-from jawusd.evaluator.rig import JawRig
+from jawusd.evaluator.rig import JawRig, load
 
 _MAX_BYTES = 1 << 30
 _MATRIX_COLUMNS = [f"m{row}{column}" for row in range(4) for column in range(4)]
@@ -34,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code.
 
     Args:
-        arguments: Command line without the program's name; that of the process if None.
+        arguments: Command line without the program name; `sys.argv` if None.
     """
     options = _parser().parse_args(arguments)
     try:
@@ -43,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:
-        # the reader (head, less) has what it wanted; keep the interpreter from complaining at exit
+        # the reader (head, less) closed the pipe; keep the interpreter quiet at exit
         sys.stderr.close()
         return 0
 
@@ -54,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, run, text in (
-        ("info", _info, "what the model is, its ranges and limits"),
+        ("info", _info, "kind, ranges and limits of the model"),
         ("pose", _pose, "pose, twist, landmarks and margin of jaw parameters"),
         ("encode", _encode, "nearest jaw parameters and residual of each pose"),
         ("validate", _validate, "a verdict on each pose; exit code 1 if one is invalid"),
@@ -139,17 +138,17 @@ def _print_rows(header: list[str], rows: Sequence[Sequence[object]], *, as_json:
 
 
 def _plain(value: object) -> object:
-    """Return the value with NaN as null, which JSON has no other word for."""
+    """Return the value with non-finite numbers as null, since JSON has no NaN."""
     if isinstance(value, list):
         return [_plain(each) for each in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _read_poses(path: Path) -> tuple[list[int], Array]:
-    """Return frame numbers and T_skull_mandible (F, 4, 4) of a CSV table; nan and inf are taken as they stand.
+    """Return frame numbers and T_skull_mandible (F, 4, 4) of a CSV table; nan and inf are kept.
 
     Raises:
-        FormatError: not such a table, or a cell that is not a number.
+        FormatError: a column is missing, or a cell is not a number.
     """
     table = read_table(path, _MAX_BYTES)
     missing = [name for name in ("frame", *_MATRIX_COLUMNS) if name not in table.header]

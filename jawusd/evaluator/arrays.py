@@ -1,4 +1,4 @@
-"""Check the named arrays of a rig: presence, shapes and values."""
+"""The named arrays of a rig, and the checks of their presence, shapes and values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jawusd.geometry.se3 import rigidity_defect
 _RIGID_TOLERANCE = 1e-6
 
 _POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
-_LARGEST = 1e9  # [mm, rad]: far beyond any jaw, and squares and their sums still fit
+_LARGEST = 1e9  # [mm, rad] far beyond any jaw; sums of squares do not overflow
 _RISING = ("slice_d1", "path_limits", "glide_d2", "glide_d3", "curve1_knots", "curve2_knots", "curve3_knots")
 
 
@@ -27,11 +27,11 @@ class RigArrays:
 
     Attributes:
         arrays: Named arrays, read-only; `jawusd.evaluator.schema` lists them.
-        meta: The header that came with them.
+        meta: The header of the file.
     """
 
     def __init__(self, arrays: Mapping[str, ArrayLike], meta: Mapping[str, object]) -> None:
-        """Check and keep both.
+        """Check and store both.
 
         Raises:
             EvaluatorError: an unknown kind, or an array missing, of a wrong shape, not finite or out of range.
@@ -56,12 +56,12 @@ class RigArrays:
 
     @property
     def method(self) -> str:
-        """The method that fitted the model, empty if the rig does not say."""
+        """The method that fitted the model, empty if unknown."""
         return str(self.meta.get("method") or "")
 
     @property
     def inferred(self) -> tuple[str, ...]:
-        """What the rig holds that was not measured on the person, in words."""
+        """Descriptions of the parts that were inferred, not measured on this person."""
         found = self.meta.get("inferred")
         return tuple(str(each) for each in found) if isinstance(found, list | tuple) else ()
 
@@ -92,13 +92,13 @@ class RigArrays:
 
     @property
     def tolerance_mm(self) -> float:
-        """How far outside the bound a measured pose may lie and still be possible [mm]; authored poses may not."""
-        return float(self.arrays["tolerance_mm"]) + 0.0  # no -0.0, which the negated limit of older files may be
+        """How far outside the bound a measured pose may lie and still be valid [mm]; authored poses must lie inside."""
+        return float(self.arrays["tolerance_mm"]) + 0.0  # older files store the negated limit: avoid -0.0
 
     @property
     def model_hash(self) -> str:
         """SHA-256 of the arrays: names, shapes and little-endian float64 values, in order of name."""
-        # The tolerance counts under its first name and sign, so that rigs of version 1 keep their hash.
+        # The tolerance is hashed under its version 1 name and sign, so that old rigs keep their hash.
         named = {name: value for name, value in self.arrays.items() if name != "tolerance_mm"}
         named["margin_limit_mm"] = np.negative(self.arrays["tolerance_mm"])
         digest = hashlib.sha256()
@@ -114,10 +114,10 @@ class RigArrays:
 
 
 def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Array]:
-    """Return read-only float64 arrays of a rig of the given kind, and nothing else.
+    """Return the arrays of a rig of the given kind, checked, as read-only float64.
 
     Args:
-        arrays: Named arrays, see `jawusd.evaluator.schema`; others are left out.
+        arrays: Named arrays, see `jawusd.evaluator.schema`; others are ignored.
         kind: "anchored" or "additive".
 
     Raises:
@@ -146,7 +146,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
 
 
 def flat_arrays(arrays: Mapping[str, Array]) -> dict[str, list[float]]:
-    """Return arrays as `jawusd.evaluator.formula` takes them: flat, row by row."""
+    """Return the arrays flattened row by row, as `jawusd.evaluator.formula` expects them."""
     return {name: value.ravel().tolist() for name, value in arrays.items()}
 
 
@@ -184,7 +184,7 @@ def _check_values(arrays: dict[str, Array]) -> None:
         if name in arrays and (len(arrays[name]) < 2 or (np.diff(arrays[name]) <= 0).any()):
             raise EvaluatorError(f'"{name}" must hold at least two rising values.')
     if len(arrays["landmarks"]) < 3:
-        raise EvaluatorError(f'"landmarks" holds {len(arrays["landmarks"])} points; a pose shows in three at least.')
+        raise EvaluatorError(f'"landmarks" holds {len(arrays["landmarks"])} points; at least 3 are needed.')
     low, high = arrays["d_range"].T
     if not (low < high).all() or high[0] <= 0:
         raise EvaluatorError(f'"d_range" is {arrays["d_range"].tolist()} mm; rows must be (low, high), opening > 0.')

@@ -1,4 +1,4 @@
-"""What a rig says of motions: curves between keys, ranges of sliders, shares of ranges that other persons can take."""
+"""Authoring on a rig: curves between key frames, slider ranges, and ranges normalised for retargeting."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jawusd.evaluator.search import nearest_distance
 
 
 class RigAuthoring(RigArrays):
-    """A rig as far as motions of d and its bound go.
+    """The part of a rig that deals with motions of d and the bound.
 
     Attributes:
         bound: The slice bound.
@@ -40,16 +40,16 @@ class RigAuthoring(RigArrays):
         Args:
             frames: Times of the keys, rising, shape (K,).
             d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
-            at: Times wanted, any shape; outside the keys the nearest key holds.
+            at: Query times, any shape; outside the keys the nearest key is used.
             method: "linear", straight lines in d as in the paper, or "smooth", a C1 curve, monotone between keys.
-            inside: Where the smooth curve between two keys inside would leave the bound, follow the bound instead,
-                no more than continuously. See `keep_inside` for keys that are not inside.
+            inside: Where the smooth curve between two valid keys would leave the bound, follow the bound instead; the
+                curve is then only continuous. See `keep_inside` for keys outside the bound.
 
         Returns:
             Jaw parameters [mm], shape (*at.shape, 3).
 
         Raises:
-            ValueError: wrong shapes, keys that are not finite or frames that do not rise, or an unknown method.
+            ValueError: wrong shapes, keys that are not finite, frames that do not increase, or an unknown method.
         """
         frames, keys = as_keys(frames, d_keys)
         times, batch = as_rows(as_floats(at, "at")[..., None], (1,), "at")
@@ -59,33 +59,33 @@ class RigAuthoring(RigArrays):
     def keep_inside(self, times: ArrayLike, d: ArrayLike) -> Inside:
         """Return a motion brought inside the bound, at its samples and between them.
 
-        What is outside is brought in continuously, and no step becomes more than 5 % longer than it was: where the way
-        inside is longer than that, the motion takes the time from before and after.
+        Poses outside are moved inside continuously, and no step becomes more than 5 % longer than it was. Where the
+        path inside is longer than that, the motion borrows time from before and after.
 
         Args:
-            times: Of the samples, rising, shape (F,).
+            times: Increasing sample times, shape (F,).
             d: Jaw parameters [mm], linear in between, shape (F, 3).
 
         Returns:
-            The samples at the given times, and more where straight lines between them would leave the bound.
+            The samples at the given times, and additional ones where straight lines between them would leave the bound.
 
         Raises:
-            ValueError: wrong shapes, samples that are not finite or times that do not rise.
+            ValueError: wrong shapes, samples that are not finite, or times that do not increase.
             EvaluatorError: the bound of the rig is empty.
         """
         return kept_inside(self.bound, *as_keys(times, d))
 
     def ranges(self, d1: ArrayLike, d2: ArrayLike = 0.0, d3: ArrayLike = 0.0) -> Ranges:
-        """Return how far d2 and d3 can each go alone from (d1, d2, d3).
+        """Return the valid ranges of d2 and of d3, each varied alone from (d1, d2, d3).
 
         Args:
             d1: Opening [mm]; d1, d2, d3 broadcast to one shape (...).
-            d2: Laterotrusion [mm] at which d3 is moved.
-            d3: Protrusion [mm] at which d2 is moved.
+            d2: Laterotrusion [mm] while d3 varies.
+            d3: Protrusion [mm] while d2 varies.
 
         Returns:
-            The ends [mm]; NaN where the section has no point on that line. The bound closes some tenths of a mm before
-            the ends of ``d_range[0]``: there, the ends at the nearest opening on that line that is inside.
+            The limits [mm]; NaN where the section does not reach that line. The bound closes a few tenths of a mm
+            before the ends of ``d_range[0]``; in between, the limits at the nearest valid opening.
         """
         each = (as_floats(x, name) for x, name in ((d1, "d1"), (d2, "d2"), (d3, "d3")))
         d = np.stack(np.broadcast_arrays(*each), axis=-1)
@@ -96,22 +96,22 @@ class RigAuthoring(RigArrays):
         return Ranges(*(end.reshape(batch) for pair in ends for end in pair))
 
     def normalized(self, d: ArrayLike) -> Array:
-        """Return d as shares of this person's ranges, for carrying motion to another person.
+        """Return d as fractions of this person's ranges, for retargeting to another person.
 
-        The opening is divided by the full opening, d2 and d3 by the reach to their side along the habitual path at
-        that opening (at least 0.5 mm).
+        The opening is divided by the full opening, d2 and d3 by the range on their side of the habitual path at that
+        opening (at least 0.5 mm).
 
         Args:
             d: Jaw parameters [mm], shape (..., 3).
 
         Returns:
-            Shares, shape (..., 3): 1 is the full range.
+            Fractions, shape (..., 3): 1 is the full range.
         """
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(lambda d: normalized(self.bound, self.d_range, d), rows).reshape(*batch, 3)
 
     def denormalized(self, shares: ArrayLike) -> Array:
-        """Return the jaw parameters [mm], shape (..., 3), of shares (..., 3): the inverse of `normalized`."""
+        """Return the jaw parameters [mm], shape (..., 3), of fractions (..., 3): the inverse of `normalized`."""
         rows, batch = as_rows(shares, (3,), "shares")
         return in_chunks(lambda n: denormalized(self.bound, self.d_range, n), rows).reshape(*batch, 3)
 

@@ -1,4 +1,4 @@
-"""Batches of any shape as rows, and rows in pieces small enough for the processor's cache."""
+"""Reshape batches of any shape to rows, and process rows in chunks that fit the processor cache."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array, Indices
 
-Rows = TypeVar("Rows", Array, Indices)  # rows, or the numbers of rows
+Rows = TypeVar("Rows", Array, Indices)  # rows, or row indices
 
 CHUNK_ROWS = 2048
-LARGEST = 1e9  # 1,000 km: no jaw, and squares and cubes of it still fit a float
+LARGEST = 1e9  # [mm] far beyond any jaw; cubes do not overflow
 
 
 def as_floats(values: ArrayLike, name: str) -> Array:
@@ -36,7 +36,7 @@ def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
         ValueError: the trailing axes are not ``tail``, or complex numbers.
     """
     values = as_floats(values, name)
-    if values.shape == tail:  # one row, the call that must be quick
+    if values.shape == tail:  # fast path for one row
         return values[None], ()
     batch = values.shape[: values.ndim - len(tail)]
     if values.ndim < len(tail) or values.shape[len(batch) :] != tail:
@@ -46,7 +46,7 @@ def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
 
 
 def usable_rows(rows: Array) -> Array:
-    """Return the rows (n, ...); those with a value that is not finite, or above 1e9, become all NaN."""
+    """Return the rows (n, ...), all NaN where a value is not finite or is above 1e9."""
     usable = np.asarray((np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim))))  # False for NaN
     if usable.all():
         return rows
@@ -54,15 +54,15 @@ def usable_rows(rows: Array) -> Array:
 
 
 def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
-    """Return `rows_of` values, made `usable_rows`, and the batch shape."""
+    """Return the `usable_rows` of values (see `rows_of`) and the batch shape."""
     rows, batch = rows_of(values, tail, name)
     return usable_rows(rows), batch
 
 
 def in_chunks(function: Callable[[Rows], Array], rows: Rows) -> Array:
-    """Return ``function(rows)`` computed in pieces of `CHUNK_ROWS` rows.
+    """Return ``function(rows)`` computed in chunks of `CHUNK_ROWS` rows.
 
-    Temporary memory stays the same however many rows there are.
+    Temporary memory does not grow with the number of rows.
     """
     if len(rows) <= CHUNK_ROWS:
         return function(rows)
@@ -70,7 +70,7 @@ def in_chunks(function: Callable[[Rows], Array], rows: Rows) -> Array:
 
 
 def pairs_in_chunks(function: Callable[[Rows], tuple[Array, Array]], rows: Rows) -> tuple[Array, Array]:
-    """Return what `in_chunks` does, of a function that returns two arrays."""
+    """Return the same as `in_chunks` for a function that returns two arrays."""
     if len(rows) <= CHUNK_ROWS:
         return function(rows)
     parts = [function(rows[i : i + CHUNK_ROWS]) for i in range(0, len(rows), CHUNK_ROWS)]
@@ -81,7 +81,7 @@ def as_points(points: ArrayLike, name: str) -> Array:
     """Return one point (3,) or several (P, 3) as float64.
 
     Raises:
-        ValueError: another shape, no point, or values that are not finite.
+        ValueError: a wrong shape, no points, or values that are not finite.
     """
     points = as_floats(points, name)
     if points.ndim not in (1, 2) or points.shape[-1] != 3 or not points.size:
@@ -95,7 +95,7 @@ def as_keys(frames: ArrayLike, d_keys: ArrayLike) -> tuple[Array, Array]:
     """Return key times (K,) and keys (K, 3) as float64.
 
     Raises:
-        ValueError: other shapes, no key, values that are not finite, or times that do not rise.
+        ValueError: wrong shapes, no keys, values that are not finite, or times that do not increase.
     """
     frames, keys = as_floats(frames, "frames"), as_floats(d_keys, "d_keys")
     if frames.ndim != 1 or not frames.size or keys.shape != (len(frames), 3):
@@ -103,5 +103,5 @@ def as_keys(frames: ArrayLike, d_keys: ArrayLike) -> tuple[Array, Array]:
     if not (np.isfinite(frames).all() and np.isfinite(keys).all()):
         raise ValueError("frames and d_keys must be finite")
     if (np.diff(frames) <= 0).any():
-        raise ValueError("frames must rise")
+        raise ValueError("frames must increase")
     return frames, keys

@@ -13,13 +13,13 @@ is two outlines, in (d1, d2) and in (d1, d3), both of which must contain d (Yang
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from jawusd.base.arrays import Array
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.curve_formula import catmull_rom
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.formula import BoundFormula
@@ -28,19 +28,19 @@ _ARRAYS = ("slice_d1", "slice_directions", "slice_support", "slice_softness_mm",
 _NEWTON_ITERATIONS = 60
 _ROOT_TOLERANCE_MM = 1e-12
 _CANDIDATE_SLICES = 48
-_CANDIDATE_RADII = (0.4, 0.75, 0.9, 0.97, 1.0)  # denser towards the outline, where nearest points lie
+_CANDIDATE_RADII = (0.4, 0.75, 0.9, 0.97, 1.0)  # denser near the outline, where nearest points lie
 
 
 @dataclass(frozen=True, eq=False)
 class SliceHull:
-    """The bound of a rig.
+    """The slice hull of a rig.
 
     Attributes:
         supports: h_k(d1) [mm], constant outside the captured openings.
-        directions: Unit normals n_k in (d2, d3), shape (K, 2), pointing all around.
+        directions: Unit normals n_k in (d2, d3) around the full circle, shape (K, 2).
         softness_mm: Radius of the rounding where half-spaces meet.
         offset_mm: Distance by which the bound is wider than its supports.
-        slopes: Derivatives of the half-spaces by d, those of the sides by d1 left 0, shape (K + 2, 3).
+        slopes: Derivatives of the half-spaces by d, shape (K + 2, 3); those of the sides by d1 are left 0.
         formula: The same bound for one d, in floats.
         first_mm: First captured opening.
         last_mm: Last captured opening.
@@ -69,7 +69,7 @@ class SliceHull:
         """Build the bound from the named arrays of a rig."""
         knots = np.asarray(arrays["slice_d1"], dtype=float)
         values = np.asarray(arrays["slice_support"], dtype=float)
-        slopes = np.zeros_like(values)  # flat ends: the supports stay as they are beyond the captured openings
+        slopes = np.zeros_like(values)  # flat ends: the supports are constant beyond the captured openings
         slopes[1:-1] = catmull_rom(values[:-2], values[2:], (knots[2:] - knots[:-2])[:, None])
         return cls(
             supports=HermiteCurve(knots, values, slopes),
@@ -80,7 +80,7 @@ class SliceHull:
         )
 
     def signed_distance(self, d: Array) -> Array:
-        """Return how far outside d (n, 3) lies [mm], shape (n,); negative inside."""
+        """Return the signed distance (n,) of d (n, 3) to the bound [mm]; negative inside."""
         return self._joined(d, self.supports.value(d[:, 0]))[0]
 
     def signed_distance_gradient(self, d: Array) -> tuple[Array, Array]:
@@ -92,10 +92,10 @@ class SliceHull:
         return distance, gradient
 
     def signed_distance_curvature(self, d: Array) -> tuple[Array, Array, Array]:
-        """Return signed distance (n,), gradient (n, 3) and the rounding's part of the Hessian, shape (n, 3, 3) [1/mm].
+        """Return signed distance (n,), gradient (n, 3) and the Hessian's part from the rounding, (n, 3, 3) [1/mm].
 
-        The rest of the Hessian, the bending of the supports along d1, is left out: what is returned is never
-        indefinite, which keeps the steps of a solver pointing downhill.
+        The rest of the Hessian, from the curvature of the supports along d1, is omitted: the result is positive
+        semidefinite, so that solver steps point downhill.
         """
         reach, reach_1 = self.supports.value_and_slope(d[:, 0])
         distance, weights = self._joined(d, reach)
@@ -108,31 +108,30 @@ class SliceHull:
         return distance, gradient, curvature
 
     def chord(self, d: Array, axis: int) -> tuple[Array, Array]:
-        """Return the ends [mm] of the valid stretch through d (n, 3) along axis 1 or 2; NaN where there is none."""
+        """Return the ends [mm] of the valid interval through d (n, 3) along axis 1 or 2; NaN where it is empty."""
         return self._chord_end(d, axis, -1.0), self._chord_end(d, axis, 1.0)
 
     def nearest_opening(self, d: Array) -> Array:
-        """Return d (n, 3) [mm], with openings beyond the bound's ends moved to the nearest at which d is inside.
+        """Return d (n, 3) [mm] with openings beyond the ends of the bound moved to the nearest valid opening.
 
-        Only what is inside at the first or last opening is moved.
+        Rows that are not inside at the first or last opening are unchanged.
         """
         inner = d.copy()
         inner[:, 0] = np.clip(d[:, 0], self.first_mm, self.last_mm)
         closed = self.signed_distance(d) > 0
         moved = np.flatnonzero(closed & (inner[:, 0] != d[:, 0]) & (self.signed_distance(inner) < 0))
         found = d.copy()
-        low, high = np.zeros(len(moved)), np.ones(len(moved))
-        for _ in range(_NEWTON_ITERATIONS):
-            share = 0.5 * (low + high)
-            found[moved] = inner[moved] + share[:, None] * (d - inner)[moved]
-            outside = self.signed_distance(found[moved]) > 0
-            high, low = np.where(outside, share, high), np.where(outside, low, share)
-        found[moved] = inner[moved] + low[:, None] * (d - inner)[moved]
+
+        def outside(share: Array) -> Mask:
+            return self.signed_distance(inner[moved] + share[:, None] * (d - inner)[moved]) > 0
+
+        share = largest_share(outside, len(moved), _NEWTON_ITERATIONS)
+        found[moved] = inner[moved] + share[:, None] * (d - inner)[moved]
         return found
 
     def _chord_end(self, d: Array, axis: int, sign: float) -> Array:
-        # Newton from the corner of the sharp polygon, which contains the soft one: the signed distance is convex along
-        # the line, so the search runs inwards without overshooting, and turns back only if the line misses the section.
+        # Newton from the edge of the sharp polygon, which contains the soft one: the signed distance is convex along
+        # the line, so the search moves inwards without overshooting unless the line misses the section.
         along, across = self.directions[:, axis - 1], self.directions[:, 2 - axis]
         room = self.supports.value(d[:, 0]) + self.offset_mm - d[:, 3 - axis, None] * across
         facing = along * sign > 0
@@ -154,7 +153,7 @@ class SliceHull:
         return end
 
     def section_centres(self, count: int) -> tuple[Array, Array]:
-        """Return openings (n,) [mm] from end to end, at most ``count``, and the middle (n, 2) [mm] of each section."""
+        """Return up to ``count`` openings (n,) [mm] over the bound, and the middle (n, 2) [mm] of each section."""
         reach = self.offset_mm - self.softness_mm
         found = [
             (d1, self._sharp_outline(d1)) for d1 in np.linspace(self.first_mm - reach, self.last_mm + reach, count)
@@ -163,8 +162,8 @@ class SliceHull:
         return np.array([d1 for d1, _ in known]), np.array([middle for _, middle in known]).reshape(-1, 2)
 
     def candidates(self) -> Array:
-        """Return points (n, 3) [mm] spread over the valid volume, dense near its surface: starts for searches."""
-        reach = self.offset_mm - self.softness_mm  # at the very ends the rounding leaves no section
+        """Return starting points (n, 3) [mm] of searches, spread over the valid volume and denser near its surface."""
+        reach = self.offset_mm - self.softness_mm  # the rounding closes the section at the very ends
         low, high = self.first_mm - reach, self.last_mm + reach
         points = []
         for d1 in np.linspace(low, high, _CANDIDATE_SLICES):
@@ -209,12 +208,22 @@ class SliceHull:
         return peak + self.softness_mm * np.log(total) - self.offset_mm, v
 
 
-# A range shorter than this counts as this long, which keeps normalising invertible where a section closes.
+def largest_share(outside: Callable[[Array], Mask], count: int, iterations: int) -> Array:
+    """Return the largest shares (count,) of [0, 1] that are not outside, by bisection."""
+    low, high = np.zeros(count), np.ones(count)
+    for _ in range(iterations):
+        share = 0.5 * (low + high)
+        out = outside(share)
+        high, low = np.where(out, share, high), np.where(out, low, share)
+    return low
+
+
+# Lower limit of a range [mm]: keeps the normalisation invertible where a section closes.
 SMALLEST_REACH_MM = 0.5
 
 
 class Ranges(NamedTuple):
-    """How far d2 and d3 can each go alone [mm], each of shape (...); NaN where they cannot."""
+    """Valid ranges of d2 and d3 [mm], each varied alone, shape (...); NaN where empty."""
 
     d2_min: Array
     d2_max: Array
@@ -223,17 +232,17 @@ class Ranges(NamedTuple):
 
 
 def normalized(bound: SliceHull, d_range: Array, d: Array) -> Array:
-    """Return d (n, 3) [mm] as shares of the full opening and of the reach to its side at that opening."""
+    """Return d (n, 3) [mm] as fractions of the full opening and of the range on its side at that opening."""
     return d / _scale(bound, d_range, d[:, 0], d)
 
 
 def denormalized(bound: SliceHull, d_range: Array, shares: Array) -> Array:
-    """Return the d (n, 3) [mm] of shares (n, 3), the inverse of `normalized`."""
+    """Return the d (n, 3) [mm] of fractions (n, 3), the inverse of `normalized`."""
     return shares * _scale(bound, d_range, shares[:, 0] * d_range[0, 1], shares)
 
 
 def _scale(bound: SliceHull, d_range: Array, d1: Array, sides: Array) -> Array:
-    """Return what one unit means [mm], shape (n, 3), by opening d1 (n,) and by the signs of ``sides`` (n, 3)."""
+    """Return the length of one unit [mm], shape (n, 3), at openings d1 (n,) for the signs of ``sides`` (n, 3)."""
     knots = bound.supports.knots
     on_path = np.zeros((len(d1), 3))
     on_path[:, 0] = np.clip(d1, knots[0], knots[-1])
@@ -248,10 +257,10 @@ def _scale(bound: SliceHull, d_range: Array, d1: Array, sides: Array) -> Array:
 
 @dataclass(frozen=True)
 class PolygonBound:
-    """The two alpha shapes of a rig.
+    """The bound of the paper: two alpha shapes.
 
     Attributes:
-        opening_lateral: Edges of the outlines in (d1, d2) [mm], start and end, shape (e, 2, 2).
+        opening_lateral: Edges of the outlines in (d1, d2) [mm], from start to end, shape (e, 2, 2).
         opening_protrusion: Edges of the outlines in (d1, d3) [mm], shape (f, 2, 2).
     """
 
@@ -267,13 +276,13 @@ class PolygonBound:
         )
 
     def signed_distance(self, d: Array) -> Array:
-        """Return how far outside the worse of the two outlines d (n, 3) lies [mm], shape (n,); negative inside."""
+        """Return the larger signed distance (n,) of d (n, 3) to the two outlines [mm]; negative inside."""
         lateral = _distance_to_edges(d[:, [0, 1]], self.opening_lateral)
         return np.maximum(lateral, _distance_to_edges(d[:, [0, 2]], self.opening_protrusion))
 
 
 def _edges(vertices: Array, counts: Array) -> Array:
-    """Return the edges (e, 2, 2) of closed rings given one after the other."""
+    """Return the edges (e, 2, 2) of consecutive closed rings."""
     rings = np.split(vertices, np.cumsum(counts)[:-1].astype(int))
     return np.concatenate([np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings])
 

@@ -1,8 +1,7 @@
-"""Clearance: how far teeth, or condyles and skull, are from running deeper into each other than in the closed bite.
+"""Clearance: how far teeth, or condyles and skull, are from penetrating deeper than in the closed bite.
 
-Sampled over d when a rig is made, from the scans: at each of a grid of parameters, the depth of the closed bite less
-that of the pose. Between the values it is linear along each axis; beyond the grid, where the mouth is open, the nearest
-value holds.
+It is sampled from the scans on a grid over d when the rig is built: the penetration depth of the closed bite minus that
+of the pose. It is trilinear between the samples; outside the grid, where the mouth is open, the nearest value is used.
 """
 
 from __future__ import annotations
@@ -20,24 +19,24 @@ from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import pairs_in_chunks, rows_of
 from jawusd.evaluator.verdicts import Verdicts
 
-#: Values are stored as whole numbers of this length [mm].
+#: Stored values are multiples of this length [mm].
 UNIT_MM = 0.01
-#: How much deeper than in the closed bite teeth may run in a pose that is authored [mm].
+#: How much deeper than in the closed bite teeth may penetrate in an authored pose [mm].
 AUTHORED_MM = 0.15
-#: Errors of clearances are measured where there is less than this [mm].
+#: Clearances below this are included in the measured error [mm].
 NEAR_MM = 0.5
 
 
-#: What a clearance is of, and the first word of the names of its arrays.
+#: The surfaces of a clearance, and the prefix of its array names.
 Meeting = Literal["teeth", "condyles"]
 PREFIXES: dict[Meeting, str] = {"teeth": "contact", "condyles": "joint"}
 
 
 class Clearance(NamedTuple):
-    """What `JawRig.clearance` found.
+    """Result of `JawRig.clearance`.
 
     Attributes:
-        clearance_mm: Below 0 where surfaces run deeper into each other than in the closed bite, shape (...).
+        clearance_mm: Below 0 where surfaces penetrate deeper than in the closed bite, shape (...).
         gradient: Its derivative by d [mm/mm], shape (..., 3).
     """
 
@@ -50,12 +49,12 @@ class ContactField:
     """The clearance of a rig, sampled over d.
 
     Attributes:
-        first_mm: d of the first value, shape (3,).
-        step_mm: Between values along each axis, shape (3,).
+        first_mm: d of the first sample, shape (3,).
+        step_mm: Sample spacing along each axis, shape (3,).
         values: Clearances [mm], shape (n1, n2, n3).
-        closed_mm: How deep the scans run into each other in the closed bite; negative if they leave a gap.
-        error_mm: Largest error found at random valid parameters where the clearance is below `NEAR_MM`; 0 if none is.
-        limit_mm: The most that captured poses needed: of teeth, measured poses of less clearance collide.
+        closed_mm: Penetration depth of the scans in the closed bite; negative for a gap.
+        error_mm: Largest interpolation error at random valid parameters with a clearance below `NEAR_MM`, or 0.
+        limit_mm: Smallest clearance of the captured poses; measured poses below it count as colliding.
     """
 
     first_mm: Array
@@ -73,7 +72,7 @@ class ContactField:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array], of: Meeting) -> ContactField | None:
-        """Pick a field out of the named arrays of a rig; None if the rig has none."""
+        """Return the field in the named arrays of a rig, or None."""
         name = PREFIXES[of]
         if f"{name}_values" not in arrays:
             return None
@@ -91,7 +90,7 @@ class ContactField:
             "first_mm": self.first_mm,
             "step_mm": self.step_mm,
             "shape": np.array(self.values.shape, dtype=np.float64),
-            "values": np.round(self.values.ravel() / UNIT_MM) + 0.0,  # no -0: whole numbers have none
+            "values": np.round(self.values.ravel() / UNIT_MM) + 0.0,  # no -0.0
             "closed_mm": np.array(self.closed_mm),
             "error_mm": np.array(self.error_mm),
             "limit_mm": np.array(self.limit_mm),
@@ -127,11 +126,11 @@ class ContactField:
         return Clearance(value, gradient)
 
     def collides(self, d: Array, limit_mm: float) -> Mask:
-        """Tell at which d (n, 3) [mm] there is less clearance than ``limit_mm``; False for NaN."""
+        """Return where d (n, 3) [mm] has less clearance than ``limit_mm``; False for NaN."""
         return self.clearance(d).clearance_mm < limit_mm - self.error_mm
 
     def collides_at(self, d: Array, limit_mm: float) -> bool:
-        """Tell the same of one d (1, 3) [mm], in floats: the call that must be quick."""
+        """Return the same for one d (1, 3) [mm], in floats, which is faster."""
         return self._single(*d[0].tolist()) < limit_mm - self.error_mm
 
     def _single(self, d1: float, d2: float, d3: float) -> float:
@@ -163,32 +162,31 @@ _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1)
 
 
 class TouchingTeeth:
-    """What a rig says of its teeth and condyles.
+    """The clearances of a rig.
 
     Attributes:
-        contact: The clearance of the teeth over d; None if the scans do not show it.
-        joints: That of the condyles; None if there is no scanned bone of both jaws. It is what the bones of the scans
-            say: cartilage and disc are not among them, so no pose is refused for it.
+        contact: Clearance of the teeth over d; None if the scans do not include it.
+        joints: Clearance of the condyles; None unless the bones of both jaws were scanned. Cartilage and disc are not
+            in the scans, so this clearance never rejects a pose.
     """
 
     contact: ContactField | None
     joints: ContactField | None
 
     def clearance(self, d: ArrayLike, *, of: Meeting = "teeth") -> Clearance:
-        """Return how far teeth are from running deeper into each other than in the scans' closed bite.
+        """Return how far the teeth are from penetrating deeper than in the closed bite of the scans.
 
         Args:
             d: Jaw parameters [mm], shape (..., 3).
-            of: "teeth", or "condyles": how far these are from running into the skull, where they do in the closed bite
-                deeper than there.
+            of: "teeth", or "condyles" for the clearance between condyles and skull.
 
         Returns:
-            The clearance [mm], shape (...), and its derivative by d [mm/mm], shape (..., 3). It ends at some 1.5 mm,
-            and at the nearest sampled parameters far outside the bound. That of teeth is 0 in the closed bite.
+            The clearance [mm], shape (...), and its derivative by d [mm/mm], shape (..., 3). It saturates at about
+            1.5 mm and is constant far outside the bound. The clearance of the teeth is 0 in the closed bite.
 
         Raises:
-            EvaluatorError: The rig has no such clearances, see `contact` and `joints`.
-            ValueError: Neither teeth nor condyles.
+            EvaluatorError: The rig has no such clearance, see `contact` and `joints`.
+            ValueError: Another value of ``of``.
         """
         field = self._field(of)
         rows, batch = rows_of(d, (3,), "d")
@@ -197,22 +195,22 @@ class TouchingTeeth:
 
     def _field(self, of: Meeting) -> ContactField:
         if of not in PREFIXES:
-            raise ValueError(f'clearance is of "teeth" or "condyles", not of {of!r}')
+            raise ValueError(f'of must be "teeth" or "condyles", got {of!r}')
         field = self.contact if of == "teeth" else self.joints
         if field is not None:
             return field
         if of == "teeth":
             raise EvaluatorError(
-                "this rig does not know how the teeth meet.",
-                hint="Fit or bake it with scans of both rows of teeth in occlusion.",
+                "this rig has no clearance of the teeth.",
+                hint="Fit or bake it with scans of both dental arches in occlusion.",
             )
         raise EvaluatorError(
-            "this rig does not know how the condyles meet the skull.",
-            hint="Fit or bake it with meshes of skull and mandible that show the joints.",
+            "this rig has no clearance of the condyles.",
+            hint="Fit or bake it with meshes of skull and mandible that include the joints.",
         )
 
     def _without_collisions(self, verdicts: Verdicts, *, measured: bool) -> Verdicts:
-        """Return the verdicts with poses in which the teeth collide refused."""
+        """Return the verdicts with colliding poses marked invalid."""
         if self.contact is None:
             return verdicts
         limit_mm = self.contact.limit_mm if measured else -AUTHORED_MM
@@ -222,15 +220,15 @@ class TouchingTeeth:
 
 
 def check_contact(arrays: Mapping[str, Array], name: str) -> None:
-    """Check clearances among the named arrays of a rig, by the first word of their names.
+    """Check the clearances in the named arrays of a rig, by the prefix of their names.
 
     Raises:
-        EvaluatorError: Values out of range, or of numbers that do not match.
+        EvaluatorError: Values out of range, or counts that do not match.
     """
     shape, count = arrays[f"{name}_shape"], arrays[f"{name}_values"].size
     if (shape != np.round(shape)).any() or (shape < 2).any() or shape.prod() != count:
         raise EvaluatorError(
-            f'"{name}_shape" is {shape.tolist()}; it must give the {count} clearances three axes of 2 or more.'
+            f'"{name}_shape" is {shape.tolist()}; it must be three counts of 2 or more whose product is {count}.'
         )
     step, limit, error = (arrays[f"{name}_{each}_mm"] for each in ("step", "limit", "error"))
     if (step <= 0).any() or limit > 0 or error < 0:

@@ -1,4 +1,4 @@
-"""Cubic Hermite curves, stated once for every kind of number, see `jawusd.evaluator.formula`."""
+"""Cubic Hermite curves, written once for every number type, see `jawusd.evaluator.formula`."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ _CURVE_TABLES = ("start", "power0", "power1", "power2", "power3")
 
 
 def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) -> dict[str, Rows]:
-    """Return the tables of a C1 cubic Hermite curve that goes on straight outside its knots, see `curve`.
+    """Return the tables of a C1 cubic Hermite curve, continued straight outside its knots, see `curve`.
 
     Args:
         name: Prefix of the names of the tables.
-        knots: n rising parameter values.
+        knots: n increasing parameter values.
         values: Points of the curve at the knots, n rows.
         slopes: Derivatives at the knots, n rows.
 
     Returns:
-        The knots, and for each of the n + 1 intervals, the straight ends among them, its start and its powers 0..3.
+        The knots, and the start and the powers 0..3 of each of the n + 1 intervals, including the straight ends.
     """
     still = [0.0] * len(values[0])
     pieces = [[[knots[0]], values[0], slopes[0], still, still]]
@@ -63,7 +63,7 @@ def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) 
 
 
 def curve(name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]) -> list[N]:
-    """Return the point at x of the curve of `curve_tables`, a row."""
+    """Return the point at x, a row, of the curve of `curve_tables`."""
     s, powers = _interval(name, x, tables, ops)
     return [((c3 * s + c2) * s + c1) * s + c0 for c0, c1, c2, c3 in zip(*powers)]
 
@@ -83,6 +83,6 @@ def curve_derivatives(
 def _interval(
     name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]
 ) -> tuple[N, Sequence[Sequence[N]]]:
-    """Return how far x lies beyond the start of its interval, and the powers 0..3 of the curve there."""
+    """Return the offset of x from the start of its interval, and the powers 0..3 of the curve there."""
     found = ops.lookup(x, tables[f"{name}_knot"], [tables[f"{name}_{part}"] for part in _CURVE_TABLES])
     return x - found[0][0], found[1:]

@@ -18,13 +18,13 @@ from jawusd.evaluator.curve_formula import catmull_rom, cubic
 
 @dataclass(frozen=True)
 class HermiteCurve:
-    """A C1 cubic Hermite curve of one variable that goes on as a straight line outside its knots.
+    """A C1 cubic Hermite curve of one variable, continued as a straight line outside its knots.
 
     Attributes:
-        knots: Rising parameter values, shape (n,), n >= 2.
+        knots: Increasing parameter values, shape (n,), n >= 2.
         values: Points of the curve at the knots, shape (n, k).
         slopes: Derivatives at the knots, shape (n, k).
-        starts: Knot that each interval's powers count from, the straight ends first and last, shape (n + 1,).
+        starts: Origin of the powers of each interval, the straight ends first and last, shape (n + 1,).
         coefficients: Powers 0..3 of (x - start) per interval, shape (n + 1, 4, k).
     """
 
@@ -35,8 +35,8 @@ class HermiteCurve:
     coefficients: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        # Per interval the powers 0..3 of s = x - knot; intervals 0 and n are the straight ends, so that no
-        # evaluation has to treat them apart.
+        # powers 0..3 of s = x - knot per interval; intervals 0 and n are the straight ends, so that evaluation needs
+        # no special case
         y, m = self.values, self.slopes
         inner = np.stack(cubic(np.diff(self.knots)[:, None], y[:-1], y[1:], m[:-1], m[1:]), axis=1)
         straight = np.zeros((2, *inner.shape[1:]))
@@ -77,13 +77,16 @@ def flat_ended(knots: Array, values: Array) -> HermiteCurve:
 
 
 class GlideTable:
-    """The surface over d2 and d3.
+    """The tooth-glide surface measured on scans: how far the jaw must open to slide with the teeth together.
+
+    ``sum_r a_r(d2) b_r(d3)`` [mm], each factor a C1 cubic Hermite curve that is constant outside its knots. Stored
+    multiplied out, as one bicubic polynomial for every cell between knots.
 
     Attributes:
-        knots: Of d2 and of d3 [mm], each rising.
+        knots: Increasing knots of d2 and of d3 [mm].
         factors: Values of a_r at the knots of d2, shape (n2, r), and of b_r at those of d3, shape (n3, r).
-        starts: Where the polynomials of each interval count from, the outer ones first and last, (n2 + 1,), (n3 + 1,).
-        coefficients: Of the powers 0..3 of d2 and of d3 less their starts, by cell, (n2 + 1, n3 + 1, 4, 4).
+        starts: Origins of the polynomials of each interval, the outer ones first and last, (n2 + 1,), (n3 + 1,).
+        coefficients: Coefficients of the powers 0..3 of d2 and d3 minus their starts, by cell, (n2 + 1, n3 + 1, 4, 4).
     """
 
     def __init__(self, knots: tuple[Array, Array], factors: tuple[Array, Array]) -> None:
@@ -97,7 +100,7 @@ class GlideTable:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> GlideTable | None:
-        """Pick the surface out of the named arrays of a model; None if it has none.
+        """Build the surface from the named arrays of a rig; None if it has none.
 
         Raises:
             EvaluatorError: It is not 0 at the closed bite.

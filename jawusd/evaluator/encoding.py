@@ -29,7 +29,7 @@ Derivative = Callable[[Array], tuple[Array, Array, Array]]
 
 
 def landmark_vectors(landmarks: Array) -> Array:
-    """Return the four homogeneous vectors (4, 4), one a column, that stand for the landmarks (n, 3) [mm]."""
+    """Return the four homogeneous vectors (4, 4), one per column, that represent the landmarks (n, 3) [mm]."""
     centre = landmarks.mean(axis=0)
     scatter = (landmarks - centre).T @ (landmarks - centre) / len(landmarks)
     variance, axes = np.linalg.eigh(scatter)
@@ -40,10 +40,10 @@ def landmark_vectors(landmarks: Array) -> Array:
 
 
 def handle_vectors(points: Array, weights: ArrayLike | None) -> Array:
-    """Return points (H, 3) [mm] as homogeneous vectors (4, H) scaled so that squared lengths are weighted means.
+    """Return points (H, 3) [mm] as homogeneous vectors (4, H), scaled so that squared sums are weighted means.
 
     Raises:
-        ValueError: weights of another shape, negative, not finite or all zero.
+        ValueError: weights of a wrong shape, negative, not finite or all zero.
     """
     share = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
     if share.shape != (len(points),) or not np.isfinite(share).all() or (share < 0).any() or share.sum() == 0:
@@ -70,7 +70,7 @@ def point_velocities(R: Array, t: Array, S: Array, points: Array) -> Array:
 
 
 def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> Residual:
-    """Return, for `minimise`, how far motions leave the vectors (4, m) from their targets (n, 3, m)."""
+    """Return the residual function, for `minimise`, of the vectors (4, m) and their targets (n, 3, m)."""
     count = vectors.shape[1]
 
     def residual(x: Array, rows: Indices) -> tuple[Array, Array]:
@@ -90,19 +90,19 @@ def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> 
 
 
 class Encoding(NamedTuple):
-    """What `JawRig.encode` found: d [mm], shape (..., 3), and residual_mm, shape (...)."""
+    """Result of `JawRig.encode`: d [mm], shape (..., 3), and residual_mm, shape (...)."""
 
     d: Array
     residual_mm: Array
 
 
 class Encoder:
-    """Encode poses with one model, in numpy.
+    """Encoder of poses for one model, in numpy.
 
     Args:
         model: The jaw model.
-        frames: Of the rig.
-        vectors: The four vectors that stand for the landmarks, see `distances.landmark_vectors`.
+        frames: The frames of the rig.
+        vectors: The four vectors that represent the landmarks, see `landmark_vectors`.
     """
 
     def __init__(self, model: JawModelForm, frames: RigFrames, vectors: Array) -> None:
@@ -114,7 +114,7 @@ class Encoder:
         return d, self.residual_mm(d, T)
 
     def targets(self, T: Array) -> Array:
-        """Return where poses T_skull_mandible (n, 4, 4) carry the vectors, anatomical frame, shape (n, 3, 4)."""
+        """Return the images (n, 3, 4) of the vectors under poses T_skull_mandible (n, 4, 4), anatomical frame."""
         return carried(*self._frames.motions(T), self._vectors)
 
     def residual_mm(self, d: Array, T: Array) -> Array:
@@ -128,13 +128,13 @@ class Encoder:
         return self._model.chart_parameters(nearest_in_chart(self._model, R, t, self._vectors))
 
     def most_likely(self, T: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
-        """Return the most likely d (n, 3) of noisy poses: the least ``|W xi|^2`` with ``T = exp(xi) pose(d)``.
+        """Return the most likely d (n, 3) of noisy poses: minimise ``|W xi|^2`` with ``T = exp(xi) pose(d)``.
 
         Args:
             T: Poses T_skull_mandible, shape (n, 4, 4).
             whitening: W with ``W^T W`` the inverse covariance of xi, (omega, v), skull frame, shape (n, 6, 6).
-            start: First d [mm], shape (n, 3); inside the bound, if there is one. NaN gives NaN.
-            bound: Where d must stay.
+            start: Initial d [mm], shape (n, 3), inside the bound if given. NaN gives NaN.
+            bound: The bound that d must stay inside.
         """
         measured = make_transform(*self._frames.motions(T))
         whitening = whitening @ self._frames.adjoint
@@ -150,7 +150,7 @@ class Encoder:
 
 
 def nearest_in_chart(model: JawModelForm, R: Array, t: Array, vectors: Array) -> Array:
-    """Return the place (n, 3) in a model's chart whose motion is nearest to motions R (n, 3, 3), t (n, 3) [mm]."""
+    """Return the chart coordinates (n, 3) whose motions are nearest to motions R (n, 3, 3), t (n, 3) [mm]."""
     residual = distance_residual(model.chart_derivative, vectors, carried(R, t, vectors))
     return minimise(residual, model.chart_start(R, t))
 

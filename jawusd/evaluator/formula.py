@@ -1,12 +1,12 @@
-"""The jaw model's formulas, stated once for every kind of number.
+"""The jaw model's formulas, written once for every number type.
 
-Each function takes numbers that know ``+ - * /`` (floats, numpy arrays, torch tensors, values of an ONNX
-graph) and, where a formula needs more, an `Operations` object for that kind of number. The torch layer, the
-ONNX exporter and the single-file reader are built from `MODELS` and `BoundFormula`;
-`jawusd.evaluator.gauge` is the one other statement, with derivatives, for floats, compiled code and numpy.
+Each function takes numbers with ``+ - * /`` (floats, numpy arrays, torch tensors, values of an ONNX graph) and, where
+a formula needs more, an `Operations` object for that number type. The torch layer, the ONNX exporter and the
+single-file reader are built from `MODELS` and `BoundFormula`. `jawusd.evaluator.gauge` is the only other implementation
+of the gauge, with derivatives.
 
-This file imports nothing but the standard library, `jawusd.evaluator.operations` and `jawusd.geometry.rodrigues`: all
-three are copied into the reader, which runs in Python 3.9.
+This file imports only the standard library and modules that do the same: all of them are copied into the single-file
+reader, which runs in Python 3.9.
 
 The gauge maps the parameters d = (d1 opening, d2 laterotrusion, d3 protrusion) [mm] to the displacement u [mm] of the
 lower incisal point, anatomical frame (x left, y up, z anterior):
@@ -15,9 +15,8 @@ lower incisal point, anatomical frame (x left, y up, z anterior):
     y = -(d1 + drop(d2, d3) fade(d1))
     z = gz(d1) + rho(d2, d1) + d3
 
-gx, gz: the habitual opening path; rho: the gothic arch of a lateral excursion; drop: the tooth-glide surface that the
-jaw clears when it slides with the teeth together, fading out with opening; where scans show it, a table is added:
-``sum_r a_r(d2) b_r(d3)``.
+gx, gz: the habitual opening path; rho: the gothic arch of a lateral excursion; drop: how far the jaw must open to slide
+with the teeth together, fading out with opening. Where scans provide it, a table ``sum_r a_r(d2) b_r(d3)`` is added.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ from jawusd.evaluator.curve_formula import curve, curve_tables, flat_ended_slope
 from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, polynomial, rows, triple
 from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 
-# A margin this little below zero still counts as inside: parameters on the bound itself may round to either side of it.
+# Tolerance of the inside test: parameters on the bound may round to either side of it.
 ON_BOUND_MM = 1e-6
 FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
-LIMIT_SOFTNESS_MM = 4.0  # rounding of the kinks where the gothic arch stops changing with opening
-ARCH_BOW_MM = 10.0  # the quadratic arch features are d2^2 / 10 mm, to keep all coefficients of one order
-DROP_BEND = 0.15  # slope gained by the bent drop features per mm, saturating at 4 mm (below)
+LIMIT_SOFTNESS_MM = 4.0  # [mm] rounding of the kinks at both ends of the path limits
+ARCH_BOW_MM = 10.0  # the quadratic arch terms are d2^2 / 10 mm, so that all coefficients have the same order
+DROP_BEND = 0.15  # [1/mm] curvature of the bent drop terms, which saturates at 4 mm (next line)
 DROP_SATURATION_MM2 = 16.0
 
-Arrays = Mapping[str, Sequence[float]]  # a rig's named arrays, each flat, row by row
-Numbers = tuple[object, ...]  # single numbers in tuples: floats, or what a kind of number puts in their places
+Arrays = Mapping[str, Sequence[float]]  # the named arrays of a rig, flattened row by row
+Numbers = tuple[object, ...]  # nested tuples of floats, or of their counterparts of another number type
 
 
 class GaugeNumbers(NamedTuple):
@@ -48,15 +47,15 @@ class GaugeNumbers(NamedTuple):
 
     Attributes:
         path_x: Coefficients of gx: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm].
-        path_z: Coefficients of gz, alike.
-        path_scale_mm: Length that makes the polynomials' argument of order one.
-        low_mm: Smallest d1 at which the polynomials hold; beyond the limits they go on as straight lines.
-        high_mm: Largest such d1.
+        path_z: Coefficients of gz, likewise.
+        path_scale_mm: Length that scales the argument of the polynomials to order one.
+        low_mm: Smallest d1 of the polynomials; beyond the limits they continue as straight lines.
+        high_mm: Largest d1 of the polynomials.
         arch: Coefficients of rho, 7.
         drop: Coefficients of drop, 4.
         softness_mm: Radius of the softened absolute value and ramp.
         fade_mm: Opening over which the glide surface fades out.
-        glide: What `gauge.Elementary.glide` takes: the table of the glide surface; None without one.
+        glide: Table of the glide surface, as `gauge.Elementary.glide` expects it; None without one.
     """
 
     path_x: Sequence[float]
@@ -90,7 +89,7 @@ def soft_ramp(x: N, softness_mm: float, ops: Operations[N, Table]) -> N:
 
 
 def bent(x: N, ops: Operations[N, Table]) -> N:
-    """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm]: a drop that steepens and then runs straight."""
+    """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm]: a drop that steepens and then continues straight."""
     square = x * x
     return DROP_BEND * square / ops.sqrt(1.0 + square / DROP_SATURATION_MM2)
 
@@ -106,7 +105,7 @@ def path(gauge: GaugeNumbers, d1: N, ops: Operations[N, Table]) -> tuple[N, N]:
 
 
 def arch(gauge: GaugeNumbers, d1: N, d2: N, ops: Operations[N, Table]) -> N:
-    """Return rho [mm]: how far forward a lateral excursion d2 [mm] carries the incisal point at opening d1 [mm]."""
+    """Return rho [mm]: how far forward a lateral excursion d2 [mm] moves the incisal point at opening d1 [mm]."""
     rise = soft_ramp(d1 - gauge.low_mm, LIMIT_SOFTNESS_MM, ops)
     stop = soft_ramp(d1 - gauge.high_mm, LIMIT_SOFTNESS_MM, ops)
     t = (rise - stop + gauge.low_mm) / gauge.path_scale_mm
@@ -149,7 +148,7 @@ def displacement(gauge: GaugeNumbers, d: Triple[N], ops: Operations[N, Table], t
 
 
 def spline_input(gauge: GaugeNumbers, scales: Sequence[float], u: Triple[N], ops: Operations[N, Table]) -> Triple[N]:
-    """Return the argument of the spline: u [mm] sheared by the habitual path, over the scales [mm]."""
+    """Return the argument of the spline: u [mm] sheared by the habitual path, divided by the scales [mm]."""
     opening = -u[1]
     gx, gz = path(gauge, opening, ops)
     return opening / scales[0], (u[0] - gx) / scales[1], (u[2] - gz) / scales[2]
@@ -161,11 +160,11 @@ def spline(
     """Return ``sum_i W_i |q - c_i|^3 + q L``: a polyharmonic spline with a linear tail (Duchon 1977).
 
     Args:
-        q: Where, see `spline_input`.
-        centres: The centres c_i, one a row.
-        weights: The kernel weights W_i, one a row.
+        q: The argument, see `spline_input`.
+        centres: The centres c_i, one per row.
+        weights: The kernel weights W_i, one per row.
         linear: The linear terms, 3 inputs times 3 outputs.
-        ops: Operations on numbers.
+        ops: Operations of the number type.
     """
     kernels = []
     for x, y, z in zip(*ops.columns(centres)):
@@ -182,7 +181,7 @@ class RigidMotion(Generic[N]):
 
     Attributes:
         omega: Rotation vector [rad].
-        turn: Rows of the rotation matrix less the identity.
+        turn: Rows of the rotation matrix minus the identity.
         t: Translation [mm].
     """
 
@@ -198,7 +197,7 @@ class RigidMotion(Generic[N]):
 def anchored_motion(
     omega: Triple[N], u: Triple[N], anchor: Triple[N] | Triple[float], ops: Operations[N, Table]
 ) -> RigidMotion[N]:
-    """Return the motion that turns by omega [rad] and carries the anchor [mm] by u [mm]: ``t = u + p - R p``."""
+    """Return the motion that rotates by omega [rad] and displaces the anchor [mm] by u [mm]: ``t = u + p - R p``."""
     a, b, _ = ops.angle_coefficients(dot(omega, omega))
     turn = turning(omega, a, b)
     shifts = [u[i] - (row[0] * anchor[0] + row[1] * anchor[1] + row[2] * anchor[2]) for i, row in enumerate(turn)]
@@ -215,7 +214,7 @@ class JawFormula(Protocol):
     """The motion of one kind of model.
 
     Attributes:
-        tables: The rows of floats it needs, to be stored as the kind of number stores them.
+        tables: The rows of floats it needs, which each number type stores in its own form.
     """
 
     tables: dict[str, Rows]
@@ -235,7 +234,11 @@ class JawFormula(Protocol):
     ) -> RigidMotion[N]:
         """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm].
 
-        Of the formula, the tables as the kind of number stores them, and its numbers where they are not floats.
+        Args:
+            d: Jaw parameters [mm].
+            tables: The formula's tables in the form of the number type.
+            ops: Operations of the number type.
+            numbers: The formula's numbers, unless they are floats.
         """
 
 
@@ -335,7 +338,7 @@ class BoundFormula:
     def __init__(self, arrays: Arrays) -> None:
         knots, directions = arrays["slice_d1"], rows(arrays["slice_directions"], 2)
         supports = rows(arrays["slice_support"], len(directions))
-        slopes = flat_ended_slopes(knots, supports)  # beyond the ends the supports stay as they are
+        slopes = flat_ended_slopes(knots, supports)  # the supports are constant beyond the ends
         self.tables = {"directions": directions, **curve_tables("support", knots, supports, slopes)}
         softness_mm, offset_mm = arrays["slice_softness_mm"][0], arrays["slice_margin_mm"][0]
         self.numbers = BoundNumbers(knots[0], knots[-1], softness_mm, offset_mm)
@@ -359,9 +362,9 @@ class BoundFormula:
         return offset_mm - softness_mm * ops.log_sum_exp(terms)
 
     def middle(self, d1: float) -> tuple[float, float]:
-        """Return d2, d3 [mm] in the middle of the section at an opening d1 [mm]: the point with the most even supports.
+        """Return d2, d3 [mm] in the middle of the section at an opening d1 [mm], by least squares over the supports.
 
-        For directions spread evenly it is the section's Steiner point, which lies inside.
+        For evenly spaced directions it is the section's Steiner point, which lies inside.
         """
         reach = curve("support", d1, self.tables, FloatOperations())
         xx = xy = yy = hx = hy = 0.0

@@ -29,19 +29,19 @@ from jawusd.geometry.rodrigues import N, Triple
 
 INVERSE_TOLERANCE_MM = 1e-13
 INVERSE_ITERATIONS = 120
-PATIENCE = 8  # iterations after which Newton counts as stalled: without a bracket steps double, with one it is halved
+PATIENCE = 8  # iterations before Newton counts as stalled; then steps double until there is a bracket, which is halved
 INVERSE_STEP_MM = 20.0
-LEAST_INVERSE_SLOPE = 0.2  # a slope near or below zero leads away from the root
-MOST_DOUBLINGS = 64
+MIN_INVERSE_SLOPE = 0.2  # smaller slopes lead away from the root
+MAX_DOUBLINGS = 64
 
 
 class Elementary(NamedTuple, Generic[N]):
-    """The functions of a kind of number."""
+    """Elementary functions of a number type."""
 
     sqrt: Callable[[N], N]
     exp: Callable[[N], N]
     clip: Callable[[N, float, float], N]
-    glide: Callable[[object, N, N], Triple[N]]  # the table of a gauge, d2, d3 -> drop [mm], and its slopes by both
+    glide: Callable[[object, N, N], Triple[N]]  # (glide table, d2, d3) -> drop [mm] and its derivatives by d2 and d3
 
 
 def _clip_float(x: float, low: float, high: float) -> float:
@@ -118,7 +118,7 @@ def drop(gauge: GaugeNumbers, d2: N, d3: N, f: Elementary[N]) -> tuple[N, N, N]:
 
 
 def fade(gauge: GaugeNumbers, d1: N, f: Elementary[N]) -> tuple[N, N]:
-    """Return the share of the glide surface felt at opening d1 [mm], and its slope."""
+    """Return the weight of the glide surface at opening d1 [mm], and its slope."""
     root = f.sqrt(d1 * d1 + FADE_SOFTNESS_MM * FADE_SOFTNESS_MM)
     x = 0.5 * (d1 + root - FADE_SOFTNESS_MM) / gauge.fade_mm
     share = f.exp(-x * x)
@@ -128,9 +128,9 @@ def fade(gauge: GaugeNumbers, d1: N, f: Elementary[N]) -> tuple[N, N]:
 def displacement(
     gauge: GaugeNumbers, d1: N, d2: N, d3: N, f: Elementary[N]
 ) -> tuple[Triple[N], tuple[N, N, N, N, N, N]]:
-    """Return u [mm] of d [mm], and of its derivatives those that vary: x_1; y_1, y_2, y_3; z_1, z_2.
+    """Return u [mm] of d [mm], and its derivatives x_1; y_1, y_2, y_3; z_1, z_2.
 
-    The others are ``x_2 = z_3 = 1`` and ``x_3 = 0``.
+    The others are constant: ``x_2 = z_3 = 1`` and ``x_3 = 0``.
     """
     gx, gz, gx_1, gz_1 = path(gauge, d1, f)
     rho, rho_1, rho_2 = arch(gauge, d1, d2, f)
@@ -141,11 +141,11 @@ def displacement(
 
 
 def opening_equation(gauge: GaugeNumbers, u: Triple[N], d1: N, f: Elementary[N]) -> tuple[N, N, N, N]:
-    """Return what is left of the inverse gauge once d1 [mm] is given: an equation in one unknown.
+    """Return the inverse gauge reduced to one equation in d1 [mm].
 
     Returns:
-        d2, d3 [mm] that fit u's x and z at d1, the remainder ``d1 + drop fade + y`` [mm], zero at the solution, and
-        its slope by d1.
+        d2, d3 [mm] that match the x and z of u at d1, the remainder ``d1 + drop fade + y`` [mm], which is zero at the
+        solution, and its slope by d1.
     """
     gx, gz, gx_1, gz_1 = path(gauge, d1, f)
     d2 = u[0] - gx
@@ -162,7 +162,7 @@ def inverse(gauge: GaugeNumbers, u: Triple[float], f: Elementary[float]) -> Trip
     low, high, d1 = -math.inf, math.inf, -u[1]
     for iteration in range(INVERSE_ITERATIONS):
         d2, d3, remainder, slope = opening_equation(gauge, u, d1, f)
-        step = -remainder / (slope if slope > LEAST_INVERSE_SLOPE else 1.0)
+        step = -remainder / (slope if slope > MIN_INVERSE_SLOPE else 1.0)
         step = min(max(step, -INVERSE_STEP_MM), INVERSE_STEP_MM)
         if abs(step) <= INVERSE_TOLERANCE_MM * (1.0 + abs(d1)):
             return d1, d2, d3
@@ -172,7 +172,7 @@ def inverse(gauge: GaugeNumbers, u: Triple[float], f: Elementary[float]) -> Trip
             high = d1
         late = max(iteration - PATIENCE, 0)
         if low == -math.inf or high == math.inf:
-            d1 += min(max(step * 2.0 ** min(late, MOST_DOUBLINGS), -INVERSE_STEP_MM), INVERSE_STEP_MM)
+            d1 += min(max(step * 2.0 ** min(late, MAX_DOUBLINGS), -INVERSE_STEP_MM), INVERSE_STEP_MM)
         elif d1 + step <= low or d1 + step >= high or late % 2 == 1:
             d1 = 0.5 * (low + high)
         else:
@@ -183,33 +183,33 @@ def inverse(gauge: GaugeNumbers, u: Triple[float], f: Elementary[float]) -> Trip
 def spline_input(
     gauge: GaugeNumbers, scales: Sequence[float], u: Triple[N], f: Elementary[N]
 ) -> tuple[Triple[N], tuple[N, N]]:
-    """Return the argument q of the spline at u [mm], and the slopes of the path there, see `gradient_by_u`."""
+    """Return the spline's argument q at u [mm], and the slopes of the path there for `gradient_by_u`."""
     opening = -u[1]
     gx, gz, gx_1, gz_1 = path(gauge, opening, f)
     return (opening / scales[0], (u[0] - gx) / scales[1], (u[2] - gz) / scales[2]), (gx_1, gz_1)
 
 
 def gradient_by_u(by_q: Triple[N], scales: Sequence[float], slopes: tuple[N, N]) -> Triple[N]:
-    """Return a gradient by u from one by q, see `spline_input`."""
+    """Return the gradient by u of a function with gradient ``by_q``, see `spline_input`."""
     opening, side, front = by_q[0] / scales[0], by_q[1] / scales[1], by_q[2] / scales[2]
     return side, side * slopes[0] + front * slopes[1] - opening, front
 
 
 @dataclass(frozen=True)
 class Gauge:
-    """Map d to the incisal displacement u and back.
+    """The map between d and the incisal displacement u; ``u(0) = 0``.
 
     Attributes:
-        path_coefficients: Of gx and gz: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm], shape (2, 5).
+        path_coefficients: Coefficients of gx and gz: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm], shape (2, 5).
         path_scale_mm: Length that makes the polynomials' argument of order one.
-        path_limits: d1 interval [mm] in which the polynomials hold; outside they go on as straight lines (C1),
-            and ``rho`` sees d1 softly clamped to it.
+        path_limits: d1 interval [mm] of the polynomials; outside they continue as straight lines (C1), and ``rho`` uses
+            d1 softly clamped to the interval.
         glide_arch: Coefficients of rho, shape (7,).
         glide_drop: Coefficients of drop, shape (4,).
         glide_softness_mm: Radius ``e`` of the softened absolute value and ramp.
         glide_fade_mm: Opening over which the glide surface fades out.
         glide: Table added to drop; None without one.
-        numbers: All of these as floats.
+        numbers: All of the above as floats.
     """
 
     path_coefficients: Array
@@ -245,7 +245,7 @@ class Gauge:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> Gauge:
-        """Pick the gauge out of the named arrays of a model."""
+        """Build the gauge from the named arrays of a rig."""
         low, high = np.asarray(arrays["path_limits"], dtype=float)
         return cls(
             path_coefficients=np.asarray(arrays["path_coefficients"], dtype=float),
@@ -289,8 +289,8 @@ class Gauge:
         """Return the d (n, 3) [mm] whose incisal displacement is u (n, 3) [mm].
 
         For a given d1 the other two follow in closed form, so this is a root search in one variable: Newton with the
-        analytic slope, kept inside the tightest bracket seen so far. Rows that do not converge come back as NaN. One
-        row goes through `inverse`, the same search in floats.
+        analytic slope, inside the tightest bracket so far. Rows that do not converge become NaN. A single row uses
+        `inverse`, the same search in floats.
         """
         finite = np.isfinite(u).all(axis=1)
         if len(u) == 1 and finite.all():
@@ -303,7 +303,7 @@ class Gauge:
         for iteration in range(INVERSE_ITERATIONS):
             x = d1[active]
             d2, d3, remainder, slope = opening_equation(self.numbers, tuple(u[active].T), x, ARRAYS)
-            step = -remainder / np.where(slope > LEAST_INVERSE_SLOPE, slope, 1.0)
+            step = -remainder / np.where(slope > MIN_INVERSE_SLOPE, slope, 1.0)
             step = np.clip(step, -INVERSE_STEP_MM, INVERSE_STEP_MM)
             done = np.abs(step) <= INVERSE_TOLERANCE_MM * (1.0 + np.abs(x))
             d[active[done]] = np.stack([x, d2, d3], axis=-1)[done]
@@ -317,10 +317,10 @@ class Gauge:
 
 
 def _next_opening(x: Array, step: Array, low: Array, high: Array, iteration: int) -> Array:
-    """Return the next d1 to try: a Newton step, or the middle of the bracket if that leaves it or stalls."""
+    """Return the next d1: a Newton step, or the middle of the bracket if the step leaves it or Newton has stalled."""
     bounded = np.isfinite(low) & np.isfinite(high)
     late = max(iteration - PATIENCE, 0)
-    stride = np.clip(step * 2.0 ** min(late, MOST_DOUBLINGS), -INVERSE_STEP_MM, INVERSE_STEP_MM)
+    stride = np.clip(step * 2.0 ** min(late, MAX_DOUBLINGS), -INVERSE_STEP_MM, INVERSE_STEP_MM)
     newton = x + np.where(bounded, step, stride)
     halve = bounded & ((newton <= low) | (newton >= high) | (late % 2 == 1))
     middle = 0.5 * (np.where(bounded, low, 0.0) + np.where(bounded, high, 0.0))

@@ -1,6 +1,6 @@
-"""Animation between keys of d: straight lines as in the paper, or smooth curves that stay between their keys.
+"""Interpolation between key frames of d: straight lines as in the paper, or smooth curves without overshoot.
 
-A smooth curve is cubic between keys, in each parameter by itself, with tangents that keep it monotone (F. N. Fritsch
+A smooth curve is cubic between keys, separately in each parameter, with tangents that keep it monotone (F. N. Fritsch
 and R. E. Carlson, Monotone Piecewise Cubic Interpolation, SIAM J. Numer. Anal. 17, 1980), here those of F. N. Fritsch
 and J. Butland (SIAM J. Sci. Stat. Comput. 5, 1984): the weighted harmonic mean of the slopes on both sides, zero at
 extremes and holds. It starts and stops at rest.
@@ -15,9 +15,9 @@ from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.clamping import kept_inside
 from jawusd.evaluator.curves import HermiteCurve
 
-_SAMPLES = 129  # of a piece that is brought inside
-# Shares of a piece at which it is looked at to see whether it leaves the bound, dense at its ends: keys may lie on it.
-_CROWDED = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 1025))
+_SAMPLES = 129  # of a segment that is moved inside
+# Positions at which a segment is checked against the bound, dense at its ends, since keys may lie on the bound.
+_CHECK_SHARES = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 1025))
 _ROUNDING_MM = 1e-9
 
 
@@ -25,10 +25,10 @@ def interpolated(frames: Array, keys: Array, at: Array, method: str, bound: Slic
     """Return d (m, 3) [mm] at times ``at`` between keys (k, 3), "linear" or "smooth"; constant outside the keys.
 
     Args:
-        bound: Keeps smooth pieces between two keys that are inside: where one would leave the bound, it runs along it.
+        bound: Smooth segments between two valid keys that would leave this bound follow it instead.
 
     Raises:
-        ValueError: another method.
+        ValueError: an unknown method.
     """
     if method == "linear":
         return interpolate_linear(frames, keys, at)
@@ -45,7 +45,7 @@ def interpolate_linear(frames: Array, keys: Array, at: Array) -> Array:
 def interpolate_smooth(frames: Array, keys: Array, at: Array, bound: SliceHull | None) -> Array:
     """Return d (m, 3) [mm] at times ``at`` on a monotone C1 curve through the keys (k, 3); constant outside the keys.
 
-    With a bound, a piece that would leave it between keys inside follows it instead, and is continuous only.
+    A segment between valid keys that would leave the bound follows it instead, and is then only continuous.
     """
     if len(keys) == 1:
         return np.broadcast_to(keys, (len(at), 3)).copy()
@@ -55,16 +55,16 @@ def interpolate_smooth(frames: Array, keys: Array, at: Array, bound: SliceHull |
     if bound is None:
         return d
     inside = bound.signed_distance(keys) <= _ROUNDING_MM
-    for piece in np.flatnonzero(inside[:-1] & inside[1:]):
-        asked = (at >= frames[piece]) & (at <= frames[piece + 1])
-        if asked.any():
-            ends = frames[piece], frames[piece + 1]
-            looked_at = ends[0] + _CROWDED * (ends[1] - ends[0])
-            if (bound.signed_distance(curve.value(looked_at)) > _ROUNDING_MM).any():
+    for segment in np.flatnonzero(inside[:-1] & inside[1:]):
+        queried = (at >= frames[segment]) & (at <= frames[segment + 1])
+        if queried.any():
+            ends = frames[segment], frames[segment + 1]
+            checked = ends[0] + _CHECK_SHARES * (ends[1] - ends[0])
+            if (bound.signed_distance(curve.value(checked)) > _ROUNDING_MM).any():
                 times = np.linspace(*ends, _SAMPLES)
-                wanted = np.concatenate([keys[piece, None], curve.value(times[1:-1]), keys[piece + 1, None]])
+                wanted = np.concatenate([keys[segment, None], curve.value(times[1:-1]), keys[segment + 1, None]])
                 kept = kept_inside(bound, times, wanted, ends_stay=True)
-                d[asked] = interpolate_linear(kept.times, kept.d, at[asked])
+                d[queried] = interpolate_linear(kept.times, kept.d, at[queried])
     return d
 
 

@@ -1,6 +1,6 @@
-"""What a rig computes over rows: one interface, so that numpy and compiled code can stand in for each other.
+"""The kernels of a rig, which compute rows: an interface with a numpy and a compiled implementation.
 
-Rows are float64 arrays of any values; rows with a value that is not finite, or above 1e9, give NaN.
+Rows are float64 arrays; rows with a value that is not finite, or above 1e9, give NaN.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from jawusd.evaluator.solver import Residual, minimise
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
 from jawusd.geometry.se3 import rigidity_defect, transform_points
 
-_FEW_ROWS = 3  # searched one by one sooner than together
+_FEW_ROWS = 3  # up to this many rows, searching one by one is faster
 
 
 @dataclass(frozen=True)
 class RigParts:
-    """What kernels are made of.
+    """The inputs of kernels.
 
     Attributes:
         model: The jaw model.
-        bound: The valid volume.
-        frames: Of the rig.
+        bound: The bound.
+        frames: The frames of the rig.
         landmarks: Landmarks of the mandible [mm], mandible frame, shape (n, 3).
     """
 
@@ -42,7 +42,7 @@ class RigParts:
     landmarks: Array
 
     def vectors(self) -> Array:
-        """Return the homogeneous vectors (4, 4) that stand for the landmarks, anatomical frame [mm]."""
+        """Return the homogeneous vectors (4, 4) that represent the landmarks, anatomical frame [mm]."""
         return landmark_vectors(transform_points(self.frames.T_anatomical_mandible_rest, self.landmarks))
 
 
@@ -73,41 +73,41 @@ class Kernels(Protocol):
     def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm].
 
-        Those of matrices that are not rigid to `RIGID_TOLERANCE` are NaN.
+        Matrices that are not rigid to `RIGID_TOLERANCE` give NaN.
         """
 
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
-        """Return verdicts on poses T_skull_mandible (n, 4, 4); the limit of speed is not looked at."""
+        """Return verdicts on poses T_skull_mandible (n, 4, 4); the speed limit is ignored."""
 
     def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
-        """Return verdicts on d (n, 3) [mm], all with the residual 0; the limit of speed is not looked at."""
+        """Return verdicts on d (n, 3) [mm], all with the residual 0; the speed limit is ignored."""
 
     def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
-        """Search inside the bound for the points nearest to those wanted.
+        """Search inside the bound for the points nearest to given ones.
 
         Args:
-            wanted: d [mm], shape (n, 3).
-            start: Where to start, inside the bound, shape (n, 3).
+            wanted: Given d [mm], shape (n, 3).
+            start: Initial d [mm] inside the bound, shape (n, 3).
 
         Returns:
-            The bottoms (n, 3) [mm] of the valleys the starts lie in, and the squared distances (n,).
+            The local minima (n, 3) [mm] around the starts, and the squared distances (n,).
         """
 
     def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
-        """Search inside the bound for the motions that carry homogeneous vectors nearest to their targets.
+        """Search inside the bound for the motions that move homogeneous vectors nearest to their targets.
 
         Args:
             vectors: Points of the mandible at rest, anatomical frame [mm], scaled by their weights, shape (4, m).
-            targets: Where they should go, scaled alike, shape (n, 3, m).
-            start: d [mm] inside the bound, shape (n, 3).
+            targets: Their target positions, scaled likewise, shape (n, 3, m).
+            start: Initial d [mm] inside the bound, shape (n, 3).
 
         Returns:
-            The bottoms (n, 3) [mm] of the valleys the starts lie in, and the squared distances left (n,).
+            The local minima (n, 3) [mm] around the starts, and the remaining squared distances (n,).
         """
 
 
 class NumpyKernels:
-    """`Kernels` in numpy, by chunks of rows."""
+    """`Kernels` in numpy, in chunks of rows."""
 
     def __init__(self, parts: RigParts) -> None:
         self._model, self._bound, self._frames = parts.model, parts.bound, parts.frames
@@ -168,7 +168,7 @@ class NumpyKernels:
         return judge(finite, np.ones_like(finite), np.where(finite, 0.0, np.nan), self.margins(d), d, limits)
 
     def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
-        """Return the points (n, 3) [mm] inside nearest to those wanted, and the squared distances (n,)."""
+        """Return the valid points (n, 3) [mm] nearest to those wanted, and the squared distances (n,)."""
         if len(start) <= _FEW_ROWS:
             pairs = zip(wanted.tolist(), start.tolist())
             each = [nearest_in_valley(self._bound.formula, triple(to), triple(x)) for to, x in pairs]
@@ -182,7 +182,7 @@ class NumpyKernels:
         return self._bottom(residual, start)
 
     def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
-        """Return the d (n, 3) [mm] inside that carry vectors nearest to targets, and the squared distances (n,)."""
+        """Return the valid d (n, 3) [mm] that move vectors nearest to targets, and the squared distances (n,)."""
         if len(start) == 1:
             residual = distance_residual(self._model.decode_derivative, vectors, targets)
 

@@ -1,14 +1,14 @@
 """The two forms of the jaw model: parameters d [mm] to a rigid motion of the mandible, with exact derivatives.
 
 Everything here is in the anatomical frame (x left, y up, z anterior, mm, origin at the upper incisal point): a model
-gives the motion ``M(d)`` away from the closed bite, ``M(0) = I``. `jawusd.evaluator.rig` carries it to the skull frame.
+gives the motion ``M(d)`` away from the closed bite, ``M(0) = I``. `jawusd.evaluator.rig` maps it to the skull frame.
 Rows only: d has shape (n, 3); a row with a NaN gives NaN.
 
-Derivatives are *spatial*: ``S`` of shape (n, 6, 3) with ``M(d + e) = exp(S e) M(d)`` to first order, twists being
+Derivatives are *spatial*: ``S`` of shape (n, 6, 3) with ``M(d + e) = exp(S e) M(d)`` to first order; twists are
 (omega [rad], v [mm]).
 
-The search for the nearest pose runs in a chart of the model's own choice, coordinates x of shape (n, 3) [mm]: the
-incisal displacement where that spares the gauge, else d itself. The nearest pose does not depend on the chart.
+The search for the nearest pose runs in a chart chosen by the model, coordinates x of shape (n, 3) [mm]: the incisal
+displacement where that avoids the gauge, otherwise d itself. The nearest pose does not depend on the chart.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from jawusd.geometry.so3 import so3_left_jacobian, so3_left_jacobian_inverse
 
 
 class JawModelForm(Protocol):
-    """What a kind of model offers; decoders of a new kind implement this."""
+    """The interface of a jaw model; new kinds of decoders implement it."""
 
     kind: ClassVar[str]
 
@@ -47,11 +47,11 @@ class JawModelForm(Protocol):
 
     @property
     def single(self) -> SingleForm:
-        """The same model for one d, in floats."""
+        """The model for one d, in floats."""
         ...
 
     def arrays(self) -> dict[str, Array]:
-        """Return the kind's own arrays by their names in a rig."""
+        """Return the arrays of this kind by their names in a rig."""
         ...
 
     def motion(self, d: Array) -> Array:
@@ -75,7 +75,7 @@ class JawModelForm(Protocol):
         ...
 
     def chart_start(self, R: Array, t: Array) -> Array:
-        """Return where in the chart the search for motions (R, t) starts, shape (n, 3)."""
+        """Return starting points (n, 3) in the chart of searches for motions (R, t)."""
         ...
 
     def chart_motion(self, x: Array) -> tuple[Array, Array]:
@@ -103,11 +103,11 @@ class AnchoredModel:
         incisor: The incisal point p at rest [mm], shape (3,).
         scales: Lengths dividing the sheared displacement [mm], shape (3,).
         centres: Spline centres, sheared and scaled, shape (m, 3).
-        weights: Of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
+        weights: Weights of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
         centres_squared: |c_i|^2, shape (m,).
         moments: Kernel weights times 1, c_i and |c_i|^2, shape (m, 15); see `_spline`.
-        offset: Value of the bare spline at u = 0 [rad], taken off so that f(0) = 0, shape (3,).
-        single: The same model for one row, in floats.
+        offset: Value of the bare spline at u = 0 [rad], subtracted so that f(0) = 0, shape (3,).
+        single: The model for one row, in floats.
     """
 
     kind: ClassVar[str] = ANCHORED
@@ -123,8 +123,8 @@ class AnchoredModel:
     single: SingleAnchored = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        # Sum_i W_i r_i^3 and its gradient need only sums of r_i times W_i, W_i c_i and W_i |c_i|^2 (see _spline):
-        # one matrix product gives both.
+        # sum_i W_i r_i^3 and its gradient need only sums of r_i times W_i, W_i c_i and W_i |c_i|^2 (see _spline):
+        # one matrix product gives both
         squared = np.einsum("ij,ij->i", self.centres, self.centres)
         kernel = self.weights[: len(self.centres)]
         by_centre = (kernel[:, :, None] * self.centres[:, None, :]).reshape(len(kernel), 9)
@@ -149,7 +149,7 @@ class AnchoredModel:
         )
 
     def arrays(self) -> dict[str, Array]:
-        """Return the kind's own arrays by their names in a rig."""
+        """Return the arrays of this kind by their names in a rig."""
         own = {"spline_scales": self.scales, "spline_centres": self.centres, "spline_weights": self.weights}
         return {**self.gauge.arrays(), **own}
 
@@ -175,11 +175,11 @@ class AnchoredModel:
         return R, t, by_u @ du
 
     def chart_start(self, R: Array, t: Array) -> Array:
-        """Return the displacement u (n, 3) [mm] of the incisal point under the motions (R, t): the chart is u."""
+        """Return the incisal displacement u (n, 3) [mm] of the motions (R, t), which is the chart's coordinate."""
         return R @ self.incisor + t - self.incisor
 
     def chart_motion(self, x: Array) -> tuple[Array, Array]:
-        """Return rotation and translation of the motion that carries the incisal point by x (n, 3) [mm]."""
+        """Return rotation and translation of the motion that displaces the incisal point by x (n, 3) [mm]."""
         M = anchored_motions(self.rotation(x), x + self.incisor, self.incisor)
         return M[:, :3, :3], M[:, :3, 3]
 
@@ -191,7 +191,7 @@ class AnchoredModel:
         M = anchored_motions(omega, x + self.incisor, self.incisor)
         S = np.empty((len(x), 6, 3))
         S[:, :3] = so3_left_jacobian(omega) @ omega_x
-        # The incisal point itself moves by dx: w x (x + p) + v = dx.
+        # the incisal point itself moves by dx: w x (x + p) + v = dx
         S[:, 3:] = np.eye(3) + np.cross((x + self.incisor)[:, :, None], S[:, :3], axis=1)
         return M[:, :3, :3], M[:, :3, 3], S
 
@@ -253,8 +253,8 @@ class AdditiveModel:
         curves: The three curves of twists, about the origin of the anatomical frame.
         incisor: The incisal point at rest [mm], shape (3,).
         d_range: Box of valid d [mm], shape (3, 2).
-        single: The same model for one row, in floats.
-        starts: Where searches start, spread over that box.
+        single: The model for one row, in floats.
+        starts: Starting points of searches, spread over that box.
     """
 
     kind: ClassVar[str] = ADDITIVE
@@ -282,7 +282,7 @@ class AdditiveModel:
         )
 
     def arrays(self) -> dict[str, Array]:
-        """Return the kind's own arrays by their names in a rig."""
+        """Return the arrays of this kind by their names in a rig."""
         own: dict[str, Array] = {}
         for i, curve in enumerate(self.curves, start=1):
             parts = {"knots": curve.knots, "twists": curve.values, "slopes": curve.slopes}
@@ -314,7 +314,7 @@ class AdditiveModel:
         return np.stack([curve.slope(d[:, i]) for i, curve in enumerate(self.curves)], axis=2)
 
     def chart_start(self, R: Array, t: Array) -> Array:
-        """Return the nearest of the starts, shape (n, 3) [mm]: the chart is d, curves have no closed-form inverse."""
+        """Return the nearest of `starts`, shape (n, 3) [mm]; the chart is d, and curves have no closed-form inverse."""
         return self.starts.nearest(R @ self.incisor + t - self.incisor)
 
     def chart_motion(self, x: Array) -> tuple[Array, Array]:
@@ -332,7 +332,7 @@ class AdditiveModel:
 
 @dataclass(frozen=True)
 class StartGrid:
-    """Parameters spread over a box, for searches of models without a closed-form inverse.
+    """A grid of parameters, for searches in models without a closed-form inverse.
 
     Attributes:
         d: Jaw parameters [mm], shape (s, 3).
@@ -345,7 +345,7 @@ class StartGrid:
     @classmethod
     def of(cls, decode: Callable[[Array], tuple[Array, Array]], incisor: Array, d_range: Array) -> StartGrid:
         """Decode a grid over the box d_range (3, 2) [mm]."""
-        # opening is long and curved, the other two short: 13 x 9 x 9 starts lie within the basin of Gauss-Newton
+        # opening is long and curved, the others short: every point has a node of 13 x 9 x 9 in its Gauss-Newton basin
         axes = [np.linspace(low, high, n) for (low, high), n in zip(d_range, (13, 9, 9))]
         d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         R, t = decode(d)

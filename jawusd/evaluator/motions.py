@@ -25,7 +25,7 @@ from jawusd.geometry.so3 import batched_angle_coefficients
 
 
 def motions_from_twists(twists: Array) -> Array:
-    """Return the motions (n, 4, 4) of twists (omega [rad], v [mm]), shape (n, 6): what `geometry.se3_exp` does."""
+    """Return the motions (n, 4, 4) of twists (omega [rad], v [mm]), shape (n, 6): a faster `geometry.se3_exp`."""
     wx, wy, wz, vx, vy, vz = twists.T
     omega = wx, wy, wz
     a, b, c = batched_angle_coefficients(dot(omega, omega))
@@ -35,12 +35,12 @@ def motions_from_twists(twists: Array) -> Array:
 
 
 def anchored_motions(omega: Array, moved: Array, anchor: Array) -> Array:
-    """Return the motions (n, 4, 4) that rotate by omega (n, 3) [rad] and carry a point to where it moved.
+    """Return the motions (n, 4, 4) that rotate by omega (n, 3) [rad] and move an anchor point to given positions.
 
     Args:
         omega: Rotation vectors [rad], shape (n, 3).
-        moved: Where the point goes [mm], shape (n, 3).
-        anchor: The point [mm], shape (3,).
+        moved: Positions of the anchor after the motion [mm], shape (n, 3).
+        anchor: The anchor point [mm], shape (3,).
     """
     wx, wy, wz = omega.T
     a, b, _ = batched_angle_coefficients(dot((wx, wy, wz), (wx, wy, wz)))
@@ -50,7 +50,7 @@ def anchored_motions(omega: Array, moved: Array, anchor: Array) -> Array:
 
 
 def _with_rotation(omega: Triple[Array], a: Array, b: Array) -> Array:
-    """Return transforms (n, 4, 4) with the rotations of `turning`."""
+    """Return transforms (n, 4, 4) with the rotations of `turning`, without translation."""
     M = np.zeros((len(a), 4, 4))
     for i, row in enumerate(turning(omega, a, b)):
         M[:, i, 0], M[:, i, 1], M[:, i, 2] = row
@@ -73,14 +73,14 @@ class SingleForm(Protocol):
 
 
 class SingleAnchored:
-    """`AnchoredModel` for one finite d or u; the anchor is the incisal point.
+    """`models.AnchoredModel` for one finite d or u; the anchor is the incisal point.
 
     Args:
         gauge: Map between d and u.
         incisor: The incisal point at rest [mm], shape (3,).
         scales: Lengths dividing the sheared displacement [mm], shape (3,).
         centres: Spline centres, shape (m, 3).
-        weights: Of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
+        weights: Weights of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
         offset: Value of the bare spline at u = 0 [rad], shape (3,).
     """
 
@@ -137,10 +137,10 @@ class SingleAnchored:
         return M[None, :3, :3], M[None, :3, 3], S
 
     def _rotation(self, q: Vector) -> tuple[Vector, Array]:
-        """Return the rotation vector [rad] and the distances to the centres (m,), from the spline's argument."""
+        """Return the rotation vector [rad] and the distances (m,) to the centres at the spline's argument."""
         q0, q1, q2 = q
         squared = self._distances.dot(np.array((q0, q1, q2, q0 * q0 + q1 * q1 + q2 * q2, 1.0)))
-        np.abs(squared, squared)  # may round to just below zero at a centre
+        np.abs(squared, squared)  # rounding may give slightly negative values at a centre
         r = np.sqrt(squared)
         squared *= r
         kx, ky, kz = squared.dot(self._kernel).tolist()
@@ -154,7 +154,7 @@ class SingleAnchored:
 
 
 class SingleAdditive:
-    """`AdditiveModel` for one finite d; the anchor is the origin of the anatomical frame."""
+    """`models.AdditiveModel` for one finite d; the anchor is the origin of the anatomical frame."""
 
     anchor: Vector = (0.0, 0.0, 0.0)
 
@@ -204,7 +204,7 @@ def _motion(omega: Vector, u: Vector) -> Motion:
 
 
 class RigFrames:
-    """``T_skull_mandible = T_skull_anatomical M T_anatomical_mandible_rest``, see `jawusd.evaluator.models` for M.
+    """The frames of a rig: ``T_skull_mandible = T_skull_anatomical M T_anatomical_mandible_rest``, with the motion M.
 
     Attributes:
         T_anatomical_skull: Shape (4, 4).
@@ -215,7 +215,7 @@ class RigFrames:
     """
 
     def __init__(self, T_anatomical_skull: Array, T_rest: Array, anchor: Vector) -> None:
-        """Take the anchor [mm] of the motions that `pose` is given, anatomical frame."""
+        """Precompute the products; ``anchor`` [mm] is that of the motions in floats, anatomical frame."""
         self.T_anatomical_skull = T_anatomical_skull
         self.T_skull_anatomical = se3_inverse(T_anatomical_skull)
         self.T_anatomical_mandible_rest = T_anatomical_skull @ T_rest
@@ -224,13 +224,13 @@ class RigFrames:
         # L M Q as one matrix product over all motions: rows of 16 times the Kronecker product of L^T and Q
         self._to_pose = np.kron(self.T_skull_anatomical.T, self.T_anatomical_mandible_rest)
         self._to_motion = np.kron(T_anatomical_skull.T, self.T_mandible_anatomical_rest)
-        # the same for the twelve numbers of one motion, ``M - I = (R - I, u - (R - I) p)``, and a one for the rest
+        # likewise for the twelve numbers of one motion, ``M - I = (R - I, u - (R - I) p)``, and a 1 for the rest pose
         entries = self._to_pose.reshape(4, 4, 16)[:3]
         turn = entries[:, :3] - np.multiply.outer(anchor, entries[:, 3]).swapaxes(0, 1)
         self._single_to_pose = np.concatenate([turn.reshape(9, 16), entries[:, 3], T_rest.reshape(1, 16)])
 
     def pose(self, motion: Motion) -> Array:
-        """Return the pose T_skull_mandible (4, 4) of one motion of `jawusd.evaluator.motions`."""
+        """Return the pose T_skull_mandible (4, 4) of one motion in floats."""
         return np.array((*motion, 1.0)).dot(self._single_to_pose).reshape(4, 4)
 
     def poses(self, M: Array) -> Array:

@@ -1,10 +1,9 @@
-"""One search inside the bound in plain floats: for one point, and for the single-file reader.
+"""The search of `jawusd.evaluator.solver` for one row in plain floats: faster, and part of the single-file reader.
 
-The search is that of `jawusd.evaluator.solver`. Towards a point, as the bound's second derivatives are known, a step
-takes all of them, and only where that leads nowhere the part that is never indefinite.
+For the nearest point a step uses the full Hessian of the bound; if it fails, only the positive semidefinite part.
 
-This file imports nothing but the standard library, `curve_formula`, `formula` and `operations`: it is copied into the
-reader, which runs in Python 3.9. Symmetric matrices are six numbers: xx, xy, xz, yy, yz, zz.
+This file imports only the standard library, `curve_formula`, `formula` and `operations`: it is copied into the reader,
+which runs in Python 3.9. Symmetric matrices are six numbers: xx, xy, xz, yy, yz, zz.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ from jawusd.geometry.rodrigues import Triple, dot
 ITERATIONS = 80
 TOLERANCE_MM = 1e-6
 START_DAMPING = 1e-6
-LARGEST_DAMPING = 1e8
-SMALLEST_DAMPING = 1e-9
-INSIDE_MM = 1e-10  # depth at which a point pulled back onto the surface is left
-LONGEST_STEP_MM = 1.0  # within a bound, where a longer one may land in another valley
+MAX_DAMPING = 1e8
+MIN_DAMPING = 1e-9
+INSIDE_MM = 1e-10  # depth of a point after it is pulled back onto the surface
+MAX_STEP_MM = 1.0  # within a bound; a longer step may end in another valley
 PULL_BACKS = 12
-PULL = 1.01  # a little more than the distance, so that one pull mostly does; what is lost vanishes with the steps
-LEAST_STIFFNESS = 1e-12  # keeps steps finite where nothing depends on a parameter
-LEAST_SLOPE = 1e-6  # squared; keeps pulls finite where the bound is flat
-TOUCHING_MM = 1e-3  # depth up to which a start counts as lying on the bound
+PULL = 1.01  # overshoot, so that one pull is usually enough; the loss vanishes as steps shrink
+MIN_STIFFNESS = 1e-12  # keeps steps finite where the cost does not depend on a parameter
+MIN_SLOPE = 1e-6  # squared; keeps pulls finite where the bound is flat
+TOUCHING_MM = 1e-3  # up to this depth a start counts as lying on the bound
 
 Vector = Triple[float]
 Symmetric = tuple[float, float, float, float, float, float]
@@ -40,13 +39,13 @@ _FLOATS = FloatOperations()
 
 
 class Pull(NamedTuple):
-    """What draws a point: a squared residual and its quadratic model.
+    """A squared residual and its quadratic model.
 
     Attributes:
         cost: The squared residual.
         force: Half its derivative, downhill.
         stiffness: J^T J of the residual's derivatives J.
-        scale: A third of the trace of that, which damping is relative to.
+        scale: A third of the trace of the stiffness; damping is relative to it.
     """
 
     cost: float
@@ -61,8 +60,8 @@ class Place(NamedTuple):
     Attributes:
         distance: Signed distance [mm], negative inside.
         gradient: Its derivative.
-        rounding: The Hessian's part from the rounding, never indefinite.
-        bend: What the bending of the supports along d1 takes from the Hessian's first entry.
+        rounding: The Hessian's part from the rounding, positive semidefinite.
+        bend: The curvature of the supports along d1, to be subtracted from the Hessian's first entry.
     """
 
     distance: float
@@ -96,7 +95,7 @@ def place(bound: BoundFormula, d: Vector) -> Place:
 
 
 def nearest_in_valley(bound: BoundFormula, wanted: Vector, start: Vector) -> Vector:
-    """Return the point [mm] inside nearest to one wanted, in the valley that a start inside lies in."""
+    """Return the valid point [mm] nearest to ``wanted``, in the valley around a valid start."""
 
     def pull(x: Vector) -> Pull:
         away = (wanted[0] - x[0], wanted[1] - x[1], wanted[2] - x[2])
@@ -108,13 +107,13 @@ def nearest_in_valley(bound: BoundFormula, wanted: Vector, start: Vector) -> Vec
 def lowest_in_valley(
     bound: BoundFormula, pull: Callable[[Vector], Pull], start: Vector, *, exact: bool = False
 ) -> Vector:
-    """Return where the cost of a pull is least inside the bound, in the valley that a start inside [mm] lies in.
+    """Return the minimum of a pull's cost inside the bound, in the valley around a valid start [mm].
 
     Args:
         bound: The bound.
         pull: The cost and its model at a point.
-        start: Where to start; NaN comes back where it or the cost there is not finite.
-        exact: Whether the model is exact, so that steps gain by all second derivatives of the bound.
+        start: The start; if it or its cost is not finite, the result is NaN.
+        exact: Whether the model is exact, so that steps benefit from the full Hessian of the bound.
     """
     if not math.isfinite(sum(start)):
         return _UNKNOWN
@@ -123,15 +122,15 @@ def lowest_in_valley(
         return _UNKNOWN
     damping, multiplier, bent = START_DAMPING, 0.0, exact
     if at.distance > -TOUCHING_MM:
-        multiplier = max(dot(at.gradient, now.force) / max(dot(at.gradient, at.gradient), LEAST_SLOPE), 0.0)
+        multiplier = max(dot(at.gradient, now.force) / max(dot(at.gradient, at.gradient), MIN_SLOPE), 0.0)
     for _ in range(ITERATIONS):
         step, multiplier = _step(at, now, multiplier, damping, bent=bent)
-        if not max(map(abs, step)) > TOLERANCE_MM or damping >= LARGEST_DAMPING:
+        if not max(map(abs, step)) > TOLERANCE_MM or damping >= MAX_DAMPING:
             break
         trial, there = pulled_in(bound, _moved(x, 1.0, step))
         then = pull(trial)
         if there.distance <= 0 and then.cost <= now.cost:
-            x, at, now, bent, damping = trial, there, then, exact, max(0.1 * damping, SMALLEST_DAMPING)
+            x, at, now, bent, damping = trial, there, then, exact, max(0.1 * damping, MIN_DAMPING)
         elif bent:
             bent = False
         else:
@@ -140,39 +139,39 @@ def lowest_in_valley(
 
 
 def pulled_in(bound: BoundFormula, x: Vector, *, opening: float = 1.0) -> tuple[Vector, Place]:
-    """Return a point [mm] moved down the gradient until just inside, and the bound around it.
+    """Return a point [mm] moved along the gradient until just inside, and the bound around it.
 
     Args:
         bound: The bound.
         x: The point.
-        opening: Share of the gradient by d1 that is followed; with 0 the point keeps its opening.
+        opening: Factor of the gradient by d1; with 0 the point keeps its opening.
     """
     at = place(bound, x)
     for _ in range(PULL_BACKS):
         if at.distance <= 0:
             break
         slope = (opening * at.gradient[0], at.gradient[1], at.gradient[2])
-        x = _moved(x, -(PULL * at.distance + INSIDE_MM) / max(dot(slope, slope), LEAST_SLOPE), slope)
+        x = _moved(x, -(PULL * at.distance + INSIDE_MM) / max(dot(slope, slope), MIN_SLOPE), slope)
         at = place(bound, x)
     return x, at
 
 
 def _step(at: Place, now: Pull, multiplier: float, damping: float, *, bent: bool) -> tuple[Vector, float]:
     """Return the step of the quadratic model under the linearised bound, and the bound's multiplier."""
-    ease = damping * now.scale + LEAST_STIFFNESS
+    ease = damping * now.scale + MIN_STIFFNESS
     a, p, q, c, s, f = (k + multiplier * r for k, r in zip(now.stiffness, at.rounding))
     rows = _inverse((a + ease, p, q, c + ease, s, f + ease))
     free, inward = (triple([dot(row, v) for row in rows]) for v in (now.force, at.gradient))
     first = rows[0]
     bend = multiplier * at.bend
     left = 1.0 - bend * first[0]
-    if bent and left > 0:  # then A less the bend, in its first entry, is definite too (Sherman and Morrison 1950)
+    if bent and left > 0:  # A minus the bend in its first entry is still definite (Sherman and Morrison 1950)
         free = _moved(free, bend * free[0] / left, first)
         inward = _moved(inward, bend * inward[0] / left, first)
     over, yields = at.distance + dot(at.gradient, free), dot(at.gradient, inward)
     multiplier = over / yields if over > 0 and yields > 0 else 0.0
     step = _moved(free, -multiplier, inward)
-    shorter = min(1.0, LONGEST_STEP_MM / max(math.sqrt(dot(step, step)), 1e-300))
+    shorter = min(1.0, MAX_STEP_MM / max(math.sqrt(dot(step, step)), 1e-300))
     return (step[0] * shorter, step[1] * shorter, step[2] * shorter), multiplier
 
 
@@ -180,7 +179,7 @@ def _inverse(matrix: Symmetric) -> tuple[Vector, Vector, Vector]:
     """Return the rows of the inverse of a definite symmetric matrix, by cofactors."""
     a, p, q, c, s, f = matrix
     x, y, z = c * f - s * s, q * s - p * f, p * s - q * c
-    scale = 1.0 / ((a * x + p * y + q * z) or 1.0)  # a finite step even where A is singular; damping corrects it
+    scale = 1.0 / ((a * x + p * y + q * z) or 1.0)  # finite even for a singular matrix; damping corrects the step
     x, y, z = x * scale, y * scale, z * scale
     v, w = (p * q - a * s) * scale, (a * c - p * p) * scale
     return (x, y, z), (y, (a * f - q * q) * scale, v), (z, v, w)

@@ -1,8 +1,8 @@
-"""What the formulas need of a kind of number beyond arithmetic, and its form for Python's floats.
+"""The operations that formulas need beyond arithmetic, and their implementation for Python floats.
 
-A table is rows of floats, stored as the kind of number likes. A column of one is a sequence of numbers, or of one wide
-number that holds them all: a tensor, say. This file imports nothing but the standard library and
-`jawusd.geometry.rodrigues`: it is copied into the reader that runs inside other programs.
+A table is rows of floats, stored in a form that depends on the number type. A column of a table is a sequence of
+numbers, or of one wide number, such as a tensor. This file imports only the standard library and
+`jawusd.geometry.rodrigues`: it is copied into the single-file reader.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import Protocol, TypeVar
 from jawusd.geometry.rodrigues import N, Triple, angle_coefficients
 
 Rows = list[list[float]]
-Table = TypeVar("Table", contravariant=True)  # how a kind of number stores rows of floats
+Table = TypeVar("Table", contravariant=True)  # the form in which a number type stores rows of floats
 
 
 def polynomial(coefficients: Sequence[N | float], x: N) -> N:
-    """Return ``sum_k coefficients[k] x^k`` of two coefficients or more (Horner's scheme)."""
+    """Return ``sum_k coefficients[k] x^k`` for two or more coefficients (Horner's scheme)."""
     value = x * coefficients[-1] + coefficients[-2]
     for coefficient in reversed(coefficients[:-2]):
         value = value * x + coefficient
@@ -28,7 +28,7 @@ def polynomial(coefficients: Sequence[N | float], x: N) -> N:
 
 
 class Operations(Protocol[N, Table]):
-    """What the formulas need of a kind of number beyond arithmetic."""
+    """Operations of a number type beyond arithmetic."""
 
     def sqrt(self, x: N) -> N:
         """Return the square root."""
@@ -52,10 +52,10 @@ class Operations(Protocol[N, Table]):
         """Return the columns of a table."""
 
     def weighted_sum(self, factors: Sequence[N], weights: Table) -> Triple[N]:
-        """Return the sum of the rows of a table with three columns, each row times its factor."""
+        """Return the sum of the rows of a table with three columns, each multiplied by its factor."""
 
     def lookup(self, x: N, knots: Table, tables: Sequence[Table]) -> Sequence[Sequence[N]]:
-        """Return row i of each table, where i is the number of knots, a table with one column, at or below x."""
+        """Return row i of each table, where i is the number of knots (a table with one column) at or below x."""
 
     def split(self, row: Sequence[N], width: int) -> Sequence[N]:
         """Return a row as `width` separate numbers."""
@@ -65,11 +65,11 @@ S = TypeVar("S", bound="Symbol")
 
 
 class Symbol(ABC):
-    """A number that represents a value of a program: each operator adds an operation to that program."""
+    """A number that stands for a value in a program: each operator appends an operation to the program."""
 
     @abstractmethod
     def operation(self: S, name: str, *operands: S | float) -> S:
-        """Add "Add", "Subtract", "Multiply" or "Divide", applied to two operands."""
+        """Append "Add", "Subtract", "Multiply" or "Divide" of two operands."""
 
     def __add__(self: S, other: S | float) -> S:
         return self.operation("Add", self, other)
@@ -126,7 +126,7 @@ class FloatOperations:
 
     @staticmethod
     def weighted_sum(factors: Sequence[float], weights: Rows) -> Triple[float]:
-        """Return the sum of the rows of a table, each times its factor."""
+        """Return the sum of the rows of a table, each multiplied by its factor."""
         x = y = z = 0.0
         for factor, (a, b, c) in zip(factors, weights):
             x, y, z = x + factor * a, y + factor * b, z + factor * c
@@ -140,7 +140,7 @@ class FloatOperations:
 
     @staticmethod
     def split(row: Sequence[float], width: int) -> Sequence[float]:
-        """Return the row: it is separate numbers."""
+        """Return the row unchanged: it already is separate numbers."""
         return row
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Literal, cast
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array, Indices, Mask
+from jawusd.base.errors import EvaluatorError, FormatError
+from jawusd.base.npz import read_npz, upgraded_model
 from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import PolygonBound, SliceHull
@@ -23,10 +26,11 @@ from jawusd.evaluator.speeds import Speeds
 from jawusd.evaluator.verdicts import Limits, Verdicts, is_inside, too_fast
 from jawusd.geometry.se3 import transform_points
 
+FAMILY, VERSION = "jawusd-model", 2
 BoundName = Literal["slices", "polygons"]
 
-_scalar = cast("Callable[[float], Array]", np.float64)  # numpy types its scalars apart from its arrays
-_SINGLE_LIMIT_MM = 1e4  # beyond, functions of one d might raise where those of rows give infinities
+_scalar = cast("Callable[[float], Array]", np.float64)  # numpy's stubs do not treat scalars as arrays
+_SINGLE_LIMIT_MM = 1e4  # beyond this, float functions may raise where array functions give infinities
 
 
 class JawRig(TouchingTeeth, RigAuthoring):
@@ -35,16 +39,16 @@ class JawRig(TouchingTeeth, RigAuthoring):
     ``pose(d) = A^-1 M(d) A rest`` with A = T_anatomical_skull and rest = T_skull_mandible of the closed bite;
     ``twist(d) = log(pose(d) rest^-1)``, skull frame, (omega [rad], v [mm]).
 
-    Every function takes any batch shape in front of the axes it names, float32 or float64, and computes in float64. A
-    row with a NaN or infinity gives NaN. Rigs have no state: share them between threads, pickle them, fork.
+    Every function accepts any leading batch shape, float32 or float64, and computes in float64. A row with a NaN or
+    infinity gives NaN. Rigs are immutable: share them between threads, pickle them, fork.
 
     Attributes:
         model: The function from d to motions.
         bound: The slice bound.
         polygons: The paper's bound.
-        speeds: How fast the jaw moved in its take; None if the rig does not know.
-        limits: Thresholds of `validate`, for measured poses, stored in the rig.
-        kernels: What computes rows.
+        speeds: How fast the jaw moved in its take; None if unknown.
+        limits: The rig's thresholds of `validate`, for measured poses.
+        kernels: The implementation that computes rows.
     """
 
     def __init__(
@@ -57,9 +61,9 @@ class JawRig(TouchingTeeth, RigAuthoring):
         """Build the rig.
 
         Args:
-            arrays: Named arrays of a model of format jawusd-model/2; others are left out.
+            arrays: Named arrays of a model of format jawusd-model/2; others are ignored.
             meta: Its header; ``meta["kind"]`` is "anchored" or "additive".
-            kernels: What computes rows; `jawusd.fast` has a faster implementation.
+            kernels: The implementation that computes rows; `jawusd.fast` has a compiled one.
 
         Raises:
             EvaluatorError: an unknown kind, or an array missing, of a wrong shape, not finite or out of range.
@@ -106,14 +110,14 @@ class JawRig(TouchingTeeth, RigAuthoring):
     def spatial_jacobian(self, d: ArrayLike) -> Array:
         """Return the spatial velocity (omega [rad/mm], v [mm/mm]) per unit of each d, skull frame, (..., 6, 3).
 
-        The left twists that pose the mandible next to where d (..., 3) [mm] poses it (Barfoot 2017, section 7.1.5).
+        The left twists from the pose of d (..., 3) [mm] to that of d next to it (Barfoot 2017, section 7.1.5).
         """
         rows, batch = as_rows(d, (3,), "d")
         spatial = in_chunks(lambda d: self._frames.adjoint @ self.model.decode_derivative(d)[2], rows)
         return spatial.reshape(*batch, 6, 3)
 
     def point_jacobian(self, d: ArrayLike, p_mandible: ArrayLike) -> Array:
-        """Return the derivative by d of where points of the mandible are in the skull frame.
+        """Return the derivative by d of the positions of mandible points in the skull frame.
 
         Args:
             d: Jaw parameters [mm], shape (..., 3).
@@ -137,13 +141,13 @@ class JawRig(TouchingTeeth, RigAuthoring):
     ) -> Encoding:
         """Return the jaw parameters whose pose is nearest to each given one.
 
-        Nearest by ``residual_mm``, the root of the mean squared distance of the rig's landmarks between the two poses.
+        The distance is ``residual_mm``, the rms distance of the rig's landmarks between the two poses.
 
         Args:
-            T_skull_mandible: Poses, shape (..., 4, 4). Of a matrix that is not quite rigid, the images of the
-                landmarks are what is matched; one that is not rigid to 1e-3 is no pose and gives NaN.
+            T_skull_mandible: Poses, shape (..., 4, 4). Of a slightly non-rigid matrix the images of the landmarks are
+                matched; matrices that are not rigid to 1e-3 give NaN.
             inside: Search only inside the bound.
-            covariance: If given, return the most likely instead of the nearest parameters of noisy poses: covariance
+            covariance: If given, return the most likely instead of the nearest parameters of noisy poses. Covariance
                 of xi, (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``, shape (..., 6, 6) or
                 (6, 6).
 
@@ -200,9 +204,9 @@ class JawRig(TouchingTeeth, RigAuthoring):
         return self.kernels.margins(rows).reshape(batch)
 
     def is_inside(self, d: ArrayLike, *, bound: BoundName = "slices") -> Mask:
-        """Tell whether jaw parameters d (..., 3) [mm] lie inside the bound: a margin of 0 or more.
+        """Return whether jaw parameters d (..., 3) [mm] lie inside the bound: a margin of 0 or more.
 
-        The bound itself counts as inside, up to rounding of 1e-6 mm. The tolerance of measured poses has no part in it.
+        The bound itself counts as inside, up to rounding of 1e-6 mm. The tolerance of measured poses does not apply.
         """
         return is_inside(self.margin(d, bound=bound))
 
@@ -217,7 +221,7 @@ class JawRig(TouchingTeeth, RigAuthoring):
         return self.kernels.margin_gradients(rows).reshape(*batch, 3)
 
     def project(self, d: ArrayLike) -> Array:
-        """Return the nearest valid jaw parameters: d itself inside the bound, else the nearest point with margin >= 0.
+        """Return the nearest valid jaw parameters: d itself inside the bound, otherwise the nearest with margin >= 0.
 
         Args:
             d: Jaw parameters [mm], shape (..., 3).
@@ -241,22 +245,22 @@ class JawRig(TouchingTeeth, RigAuthoring):
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
-        """Judge measured poses: finite, rigid, on the model, in the bound or its tolerance, teeth apart, and in time.
+        """Judge measured poses: finite, rigid, on the model, inside the bound or tolerance, no collision, not too fast.
 
         Args:
             T_skull_mandible: Poses, shape (..., 4, 4).
-            residual_limit_mm: Largest landmark distance to the model; the rig's own if None.
-            tolerance_mm: How far outside the bound a measured pose may lie; the rig's own if None. Of 0, the poses are
-                judged as authored ones, whose teeth may not run as deep into each other as measured ones do.
+            residual_limit_mm: Largest landmark distance to the model; default: the rig's own limit.
+            tolerance_mm: How far outside the bound a measured pose may lie; default: the rig's own tolerance. With 0
+                the poses are judged as authored: teeth may then penetrate less deeply than in measured poses.
             bound: Which bound, see `margin`.
-            times_s: Times of the poses along the last batch axis, shape (F,); needed for a speed limit.
+            times_s: Times of the poses along the last batch axis, shape (F,); required with a speed limit.
             speed_limit_mm_s: Largest speed of a landmark between consecutive poses; None disables the check.
 
         Returns:
             Verdicts of the batch shape.
 
         Raises:
-            ValueError: wrong shapes, a tolerance below 0, or a speed limit without rising times.
+            ValueError: wrong shapes, a negative tolerance, or a speed limit without increasing times.
         """
         rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
         limits = self.limits.replaced(residual_limit_mm, tolerance_mm, speed_limit_mm_s)
@@ -275,12 +279,13 @@ class JawRig(TouchingTeeth, RigAuthoring):
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
-        """Judge jaw parameters d (..., 3) [mm] as `validate` does poses; the residual is 0.
+        """Judge jaw parameters d (..., 3) [mm] as `validate` judges poses; the residual is 0.
 
-        They count as authored, without a tolerance; None, for that of the rig, or another judges them as measured.
+        By default they count as authored, with tolerance 0. With another tolerance, or None for the rig's own, they are
+        judged as measured.
 
         Raises:
-            ValueError: wrong shapes, a tolerance below 0, or a speed limit without rising times.
+            ValueError: wrong shapes, a negative tolerance, or a speed limit without increasing times.
         """
         rows, batch = rows_of(d, (3,), "d")
         limits = self.limits.replaced(None, tolerance_mm, speed_limit_mm_s)
@@ -294,7 +299,7 @@ class JawRig(TouchingTeeth, RigAuthoring):
     def _with_speed(
         self, verdicts: Verdicts, poses: Array, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits
     ) -> Verdicts:
-        """Return the verdicts in batch shape; frames reached too fast are marked if there is a speed limit."""
+        """Return the verdicts in batch shape, with frames that exceed the speed limit marked."""
         if limits.speed_mm_s is None:
             return verdicts.finished(batch, limits.tolerance_mm)
         measured = np.where(verdicts.measured()[:, None, None], poses, np.nan)
@@ -314,13 +319,12 @@ class JawRig(TouchingTeeth, RigAuthoring):
         Args:
             p_mandible: One handle (3,) or several (H, 3) [mm], mandible frame.
             p_skull: Targets [mm], skull frame, shape (..., 3) for one handle, (..., H, 3) for several.
-            start: Where to start, d [mm], shape (..., 3); while dragging, the last result, so that the jaw moves on
-                without jumps. A start outside the bound is first brought inside. If None, the best of a scan of the
-                whole valid volume.
-            weights: Of the handles, shape (H,), >= 0 and not all zero; equal if None.
+            start: Initial d [mm], shape (..., 3). While dragging, pass the last result, so that the jaw moves without
+                jumps. A start outside the bound is first projected. Default: the best of a scan of the valid volume.
+            weights: Weights of the handles, shape (H,), >= 0 and not all zero; default: equal.
 
         Returns:
-            d, never outside the bound, and the root of the weighted mean squared distance between handles and targets.
+            d, always inside the bound, and the weighted rms distance between handles and targets.
 
         Raises:
             ValueError: wrong shapes or weights.
@@ -350,3 +354,19 @@ def _rebuilt(
     arrays: Mapping[str, ArrayLike], meta: Mapping[str, object], kernels: Callable[[RigParts], Kernels]
 ) -> JawRig:
     return JawRig(arrays, meta, kernels=kernels)
+
+
+def load(path: str | os.PathLike[str]) -> JawRig:
+    """Read a rig from a ``model.npz`` of format jawusd-model/2, as `jawusd fit` writes it.
+
+    Raises:
+        FormatError: another kind of file, a corrupt file, or arrays missing, of a wrong shape or not finite.
+        VersionError: written by a newer jawusd.
+        UnitsError: lengths, angles or twists in another convention.
+    """
+    arrays, meta = read_npz(path, FAMILY, VERSION)
+    arrays = upgraded_model(arrays, path)
+    try:
+        return JawRig(arrays, meta)
+    except EvaluatorError as error:
+        raise FormatError(error.message, path=path, hint="Fit the model again, or restore a good copy.") from error

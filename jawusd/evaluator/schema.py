@@ -1,6 +1,6 @@
 """The named arrays of a rig: shapes, model kinds, and the USD attribute that holds each.
 
-This file imports nothing but the standard library: it is copied into the reader that runs inside other programs.
+This file imports only the standard library: it is copied into the single-file reader.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ ANCHORED, ADDITIVE = KINDS = ("anchored", "additive")
 
 
 class ArraySpec(NamedTuple):
-    """Shape and place of one array.
+    """Shape and USD attribute of one array.
 
     Attributes:
-        attribute: USD attribute, which holds the values row by row; None for `d_range`, see `D_RANGE_ATTRIBUTES`.
-        shape: Lengths; a name stands for a length that must be the same wherever the name appears.
-        kind: The model kind that has the array, None for both.
-        integer: Whole numbers in USD; all arrays of a rig in memory are float64.
+        attribute: USD attribute, with the values row by row; None for `d_range`, see `D_RANGE_ATTRIBUTES`.
+        shape: Lengths; equal names mean equal lengths.
+        kind: The only model kind with this array; None for both.
+        integer: Integers in USD; in memory all arrays are float64.
     """
 
     attribute: str | None
@@ -72,7 +72,7 @@ ARRAYS: dict[str, ArraySpec] = {
 }
 
 
-#: Arrays of anchored models whose glide surface was measured on scans: all or none; see `jawusd.evaluator.curves`.
+#: Arrays of anchored models with a glide surface measured on scans, all or none; see `jawusd.evaluator.curves`.
 GLIDE_ARRAYS: dict[str, ArraySpec] = {
     "glide_d2": ArraySpec("jaw:model:glideD2", ("glide knots of d2",), ANCHORED),
     "glide_d2_factors": ArraySpec("jaw:model:glideD2Factors", ("glide knots of d2", "glide factors"), ANCHORED),
@@ -80,7 +80,7 @@ GLIDE_ARRAYS: dict[str, ArraySpec] = {
     "glide_d3_factors": ArraySpec("jaw:model:glideD3Factors", ("glide knots of d3", "glide factors"), ANCHORED),
 }
 
-#: Arrays of rigs whose scans show how the teeth meet: all of them or none; see `jawusd.evaluator.contact`.
+#: Clearance of the teeth, all or none; see `jawusd.evaluator.contact`.
 CONTACT_ARRAYS: dict[str, ArraySpec] = {
     "contact_first_mm": ArraySpec("jaw:contact:first", (3,)),
     "contact_step_mm": ArraySpec("jaw:contact:step", (3,)),
@@ -92,7 +92,7 @@ CONTACT_ARRAYS: dict[str, ArraySpec] = {
 }
 
 
-#: The same of condyles and skull, for rigs with scanned bones.
+#: Clearance of condyles and skull, for rigs with scanned bones, all or none.
 JOINT_ARRAYS: dict[str, ArraySpec] = {
     "joint_first_mm": ArraySpec("jaw:joints:first", (3,)),
     "joint_step_mm": ArraySpec("jaw:joints:step", (3,)),
@@ -103,14 +103,14 @@ JOINT_ARRAYS: dict[str, ArraySpec] = {
     "joint_limit_mm": ArraySpec("jaw:joints:limit"),
 }
 
-#: Arrays of rigs whose take has a frame rate: both or none; see `jawusd.evaluator.speeds`.
+#: Speeds of a take with a frame rate, both or none; see `jawusd.evaluator.speeds`.
 SPEED_ARRAYS: dict[str, ArraySpec] = {
     "velocity_covariance": ArraySpec("jaw:motion:velocityCovariance", (3, 3)),
     "acceleration_covariance": ArraySpec("jaw:motion:accelerationCovariance", (3, 3)),
 }
 
 
-#: Groups of arrays that a rig may lack, by the name of an array of each.
+#: Optional groups of arrays, by the name of one array of each.
 OPTIONAL = {
     "glide_d2": GLIDE_ARRAYS,
     "contact_values": CONTACT_ARRAYS,

@@ -16,27 +16,27 @@ from jawusd.evaluator.kernels import Kernels
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.solver import pulled_inside
 
-# (row numbers (k,), starts (k, 3)) -> bottoms (k, 3) and squared residuals (k,)
+# (row indices (k,), starts (k, 3)) -> minima (k, 3) and squared residuals (k,)
 Search = Callable[[Indices, Array], tuple[Array, Array]]
 
-_MOST_VALLEYS = 4
+_MAX_VALLEYS = 4
 _RIPPLE_STEPS = (-2.0, -1.0, 1.0, 2.0)
-_LONGEST_DRAG_MM = 3.0  # movement in d between two events of a drag; a longer one may change valleys
-_SCAN_ROWS = 64  # rows compared with all candidates at once: 64 x 6,000 distances are 3 MB
+_MAX_DRAG_MM = 3.0  # change of d between two events of a drag; a larger one may change valleys
+_SCAN_ROWS = 64  # rows compared with all candidates at once: 64 x 6,000 distances take 3 MB
 
 
 class IkResult(NamedTuple):
-    """What `JawRig.ik` found: d [mm], shape (..., 3), and the distance [mm] left, shape (...)."""
+    """Result of `JawRig.ik`: d [mm], shape (..., 3), and the remaining distance [mm], shape (...)."""
 
     d: Array
     distance_mm: Array
 
 
 class BoundedSearch:
-    """Searches inside the bound, started from points of a scan of the valid volume that is made once.
+    """Searches inside the bound, started from a cached scan of the valid volume.
 
-    Sections at one opening are convex, but the valid volume as a whole is not: along d1 a search may have several
-    valleys, so one is started in each of the deepest.
+    Sections at one opening are convex, but the valid volume is not: along d1 the cost may have several valleys, so a
+    search is started in each of the deepest.
     """
 
     def __init__(self, model: JawModelForm, bound: SliceHull, kernels: Kernels) -> None:
@@ -68,11 +68,11 @@ class BoundedSearch:
         return valid
 
     def solve_ik_multistart(self, vectors: Array, target: Array) -> Array:
-        """Return the valid d (n, 3) [mm] that bring the vectors (4, m) nearest to the targets (n, 3, m).
+        """Return the valid d (n, 3) [mm] that move the vectors (4, m) nearest to the targets (n, 3, m).
 
         Args:
             vectors: Homogeneous points of the mandible at rest, anatomical frame [mm], scaled by their weights.
-            target: Where they should go, scaled alike.
+            target: Their target positions, scaled likewise.
 
         Raises:
             EvaluatorError: the valid volume is empty.
@@ -80,13 +80,13 @@ class BoundedSearch:
         return self._multistart(vectors, target)[0]
 
     def solve_ik(self, vectors: Array, target: Array, start: Array) -> Array:
-        """Return what `solve_ik_multistart` does, but only the bottom of the valley that start (n, 3) [mm] lies in.
+        """Return the minimum of the valley around start (n, 3) [mm].
 
         Short steps keep the search in that valley, which makes dragging continuous. Where the result lies far from its
-        start, which is then no drag, the better of it and of `solve_ik_multistart` is returned.
+        start, this is not a drag, and `solve_ik_multistart` is used if it is better.
         """
         found, left = self._kernels.solve_ik(vectors, target, start)
-        far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _LONGEST_DRAG_MM)
+        far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _MAX_DRAG_MM)
         if far.size:
             best, least = self._multistart(vectors, target[far])
             better = least < left[far]
@@ -94,7 +94,7 @@ class BoundedSearch:
         return found
 
     def _multistart(self, vectors: Array, target: Array) -> tuple[Array, Array]:
-        """Return the bottoms (n, 3) [mm] of the deepest valleys, and the squared distances left (n,)."""
+        """Return the lowest minima (n, 3) [mm], and the remaining squared distances (n,)."""
         images = self._scan.images(vectors)
         wanted = target.reshape(len(target), images.shape[1])
         best, least = self._best(
@@ -112,7 +112,7 @@ class BoundedSearch:
 
     @cached_property
     def _ripples(self) -> Array:
-        """Steps (r, 3) [mm] to either side across ripples of the bound, which are as long as its knots lie apart."""
+        """Steps (r, 3) [mm] across ripples of the bound, whose wavelength is the spacing of its knots."""
         spacing_mm = np.diff(self._bound.supports.knots).mean()
         return np.array([[step * spacing_mm, 0.0, 0.0] for step in _RIPPLE_STEPS])
 
@@ -120,9 +120,9 @@ class BoundedSearch:
         """Return the best d (n, 3) [mm] over searches from every valley, and the squared residuals (n,).
 
         Args:
-            search: From starts to bottoms.
-            features: What is compared, of the scanned points, shape (p, k).
-            wanted: What it should be, shape (n, k).
+            search: Maps starts to minima.
+            features: Features of the scanned points, shape (p, k).
+            wanted: Their wanted values, shape (n, k).
         """
         best, least = np.full((len(wanted), 3), np.nan), np.full(len(wanted), np.inf)
         rows, starts = self._scan.valleys(features, wanted)
@@ -141,25 +141,25 @@ class _Scan:
     """
 
     def __init__(self, points: Array, R: Array, t: Array) -> None:
-        """Keep the points and their motions R (p, 3, 3), t (p, 3) [mm]."""
+        """Store the points and their motions R (p, 3, 3), t (p, 3) [mm]."""
         self.points, self._lengths = points, _squared_lengths(points)
         self._motions = np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 4)
         self._first = np.flatnonzero(np.diff(points[:, 0], prepend=-np.inf) > 0)
 
     def images(self, vectors: Array) -> Array:
-        """Return where the motions carry homogeneous vectors (4, m) [mm], flat: shape (p, 3 m)."""
+        """Return the images of homogeneous vectors (4, m) [mm] under the motions, flattened, shape (p, 3 m)."""
         return (self._motions @ vectors).reshape(len(self.points), -1)
 
     def valleys(self, features: Array, wanted: Array) -> tuple[Indices, Array]:
-        """Return starts: row numbers (m,), several for a row, and d (m, 3) [mm]; rows with NaN have none.
+        """Return starts: row indices (m,), several per row, and d (m, 3) [mm]; rows with NaN have none.
 
-        A valley is a slice whose best point is nearer to what is wanted than that of both its neighbours.
+        A valley is a slice whose best point is at least as good as those of both neighbouring slices.
 
         Args:
-            features: What is compared, of the points, shape (p, k).
-            wanted: What it should be, shape (n, k).
+            features: Features of the points, shape (p, k).
+            wanted: Their wanted values, shape (n, k).
         """
-        found = np.full((len(wanted), _MOST_VALLEYS), -1, dtype=np.intp)
+        found = np.full((len(wanted), _MAX_VALLEYS), -1, dtype=np.intp)
         squared = self._lengths if features is self.points else _squared_lengths(features)
         for i in range(0, len(wanted), _SCAN_ROWS):
             distance = squared - 2.0 * wanted[i : i + _SCAN_ROWS] @ features.T
@@ -174,8 +174,8 @@ class _Scan:
         walls = np.pad(least, ((0, 0), (1, 1)), constant_values=np.inf)
         valley = (least <= walls[:, :-2]) & (least <= walls[:, 2:])
         depth = np.where(valley, least, np.inf)
-        order = np.argsort(depth, axis=1)[:, :_MOST_VALLEYS]
-        found = np.full((len(distance), _MOST_VALLEYS), -1, dtype=np.intp)
+        order = np.argsort(depth, axis=1)[:, :_MAX_VALLEYS]
+        found = np.full((len(distance), _MAX_VALLEYS), -1, dtype=np.intp)
         ends = np.append(self._first[1:], distance.shape[1])
         for row, slices in enumerate(order):
             for place, each in enumerate(slices[np.isfinite(depth[row, slices])]):
@@ -192,7 +192,7 @@ def nearest_distance(points: Array, queries: Array) -> Array:
 
 
 def _nearest_rows(points: Array, queries: Array) -> Indices:
-    """Return for each query (n, k) the number of the nearest point (p, k); 0 for NaN."""
+    """Return the index of the nearest point (p, k) for each query (n, k); 0 for NaN."""
     squared = _squared_lengths(points)
     found = np.zeros(len(queries), dtype=np.intp)
     for i in range(0, len(queries), _SCAN_ROWS):

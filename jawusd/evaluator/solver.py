@@ -1,8 +1,8 @@
-"""Damped Gauss-Newton over many small problems at once, free or kept inside a bound.
+"""Damped Gauss-Newton over many small problems at once, unconstrained or inside a bound.
 
-Each row is a problem of its own in three unknowns [mm] (Levenberg 1944, Marquardt 1963; the damping of each row rises
-and falls on its own). Within a bound every iterate is feasible: the step solves the quadratic model under the
-linearised bound in closed form, is pulled back onto the surface, and counts only if the cost fell.
+Each row is a problem in three unknowns [mm] with its own damping (Levenberg 1944, Marquardt 1963). Within a bound every
+iterate is feasible: the step solves the quadratic model under the linearised bound in closed form, is pulled back onto
+the surface, and is accepted only if the cost does not rise.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator.nearest import (
     INSIDE_MM,
     ITERATIONS,
-    LARGEST_DAMPING,
-    LEAST_SLOPE,
-    LEAST_STIFFNESS,
-    LONGEST_STEP_MM,
+    MAX_DAMPING,
+    MAX_STEP_MM,
+    MIN_DAMPING,
+    MIN_SLOPE,
+    MIN_STIFFNESS,
     PULL,
     PULL_BACKS,
-    SMALLEST_DAMPING,
     START_DAMPING,
     TOLERANCE_MM,
     TOUCHING_MM,
 )
 
-# (x (k, 3), row numbers (k,)) -> residuals (k, m) and their derivatives by x (k, m, 3)
+# (x (k, 3), row indices (k,)) -> residuals (k, m) and their derivatives by x (k, m, 3)
 Residual = Callable[[Array, Indices], tuple[Array, Array]]
 
 _IDENTITY = np.eye(3)
 
 
 class Bound(Protocol):
-    """A smooth bound: negative inside."""
+    """A smooth bound, negative inside."""
 
     def signed_distance(self, d: Array) -> Array:
         """Return the signed distance (n,) [mm] at d (n, 3)."""
@@ -59,11 +59,11 @@ def minimise(
 
     Args:
         residual: Residuals and their derivatives at given points of given rows.
-        start: First points [mm], shape (n, 3); inside the bound, if there is one. Rows whose start or residual is NaN
-            come back NaN.
-        bound: Where the points must stay.
-        iterations: Most steps tried per row.
-        tolerance_mm: A row is settled when its next step is shorter.
+        start: Initial points [mm], shape (n, 3), inside the bound if given. Rows with a NaN start or residual become
+            NaN.
+        bound: The bound that points must stay inside.
+        iterations: Maximum number of steps per row.
+        tolerance_mm: A row has converged when its next step is shorter.
 
     Returns:
         The points [mm], shape (n, 3).
@@ -84,9 +84,9 @@ def minimise(
             step = -solve_symmetric(_damped(np.swapaxes(J, 1, 2) @ J, damping), _gradient(J, r))
         else:
             step, multiplier = _bounded_step(bound, x[rows], r, J, damping, multiplier)
-        moving = (np.abs(step) > tolerance_mm).any(axis=1) & (damping < LARGEST_DAMPING)
+        moving = (np.abs(step) > tolerance_mm).any(axis=1) & (damping < MAX_DAMPING)
         if bound is None:
-            x[rows] += np.where(moving[:, None], 0.0, step)  # the last step costs nothing and doubles the digits
+            x[rows] += np.where(moving[:, None], 0.0, step)  # the last step is free and doubles the digits
         rows = rows[moving]
         r, J, damping, multiplier, step = _picked(moving, r, J, damping, multiplier, step)
         if not rows.size:
@@ -98,7 +98,7 @@ def minimise(
         r_trial, J_trial = residual(trial, rows)
         cost_trial = np.einsum("nm,nm->n", r_trial, r_trial)
         better = (cost_trial <= cost[rows]) & allowed
-        damping = np.where(better, np.maximum(damping * 0.1, SMALLEST_DAMPING), damping * 10.0)
+        damping = np.where(better, np.maximum(damping * 0.1, MIN_DAMPING), damping * 10.0)
         if better.all():
             x[rows], cost[rows], r, J = trial, cost_trial, r_trial, J_trial
         else:
@@ -108,9 +108,9 @@ def minimise(
     return x
 
 
-def _picked(wanted: Mask, *arrays: Array) -> tuple[Array, ...]:
-    """Return the wanted rows of each array; the arrays themselves, not copies, if all are wanted."""
-    return arrays if wanted.all() else tuple(array[wanted] for array in arrays)
+def _picked(selected: Mask, *arrays: Array) -> tuple[Array, ...]:
+    """Return the selected rows of each array, without a copy if all are selected."""
+    return arrays if selected.all() else tuple(array[selected] for array in arrays)
 
 
 def solve_symmetric(A: Array, b: Array) -> Array:
@@ -128,7 +128,7 @@ def solve_symmetric(A: Array, b: Array) -> Array:
     c00, c01, c02 = c * f - s * s, q * s - p * f, p * s - q * c
     c11, c12, c22 = a * f - q * q, p * q - a * s, a * c - p * p
     determinant = a * c00 + p * c01 + q * c02
-    scale = 1.0 / (determinant + (determinant == 0))  # a finite step even of a singular row; damping mends it
+    scale = 1.0 / (determinant + (determinant == 0))  # finite even for a singular row; damping corrects the step
     solution = (c00 * x + c01 * y + c02 * z, c01 * x + c11 * y + c12 * z, c02 * x + c12 * y + c22 * z)
     return (np.array(solution) * scale).T.reshape(len(A), 3)
 
@@ -138,15 +138,15 @@ def _gradient(J: Array, r: Array) -> Array:
 
 
 def _damped(A: Array, damping: Array) -> Array:
-    # damping relative to the problem's own scale, so that it means the same for mm and for weighted residuals
-    amount = damping * (np.einsum("nii->n", A) / 3.0) + LEAST_STIFFNESS
+    # damping is relative to the scale of the problem, the same for mm and for weighted residuals
+    amount = damping * (np.einsum("nii->n", A) / 3.0) + MIN_STIFFNESS
     return A + amount[:, None, None] * _IDENTITY
 
 
 def _first_multiplier(bound: Bound, x: Array, r: Array, J: Array) -> Array:
-    """Return the bound's multiplier at the start: how hard the cost presses against it where x lies on it."""
+    """Return the bound's initial multiplier: the pressure of the cost where x lies on the bound, otherwise 0."""
     distance, normal = bound.signed_distance_gradient(x)
-    squared = np.maximum(np.einsum("ni,ni->n", normal, normal), LEAST_SLOPE)
+    squared = np.maximum(np.einsum("ni,ni->n", normal, normal), MIN_SLOPE)
     press = -np.einsum("ni,ni->n", normal, _gradient(J, r)) / squared
     return np.where(distance > -TOUCHING_MM, np.maximum(press, 0.0), 0.0)
 
@@ -161,11 +161,11 @@ def _bounded_step(bound: Bound, x: Array, r: Array, J: Array, damping: Array, mu
     multiplier = np.maximum(over, 0.0) / np.einsum("ni,ni->n", normal, inward)
     step -= multiplier[:, None] * inward
     length = np.sqrt(np.einsum("ni,ni->n", step, step))
-    return step * np.minimum(1.0, LONGEST_STEP_MM / np.maximum(length, 1e-300))[:, None], multiplier
+    return step * np.minimum(1.0, MAX_STEP_MM / np.maximum(length, 1e-300))[:, None], multiplier
 
 
 def pulled_inside(bound: Bound, x: Array) -> tuple[Array, Mask]:
-    """Move the points x (n, 3) [mm] down the gradient until just inside, in place; return them and which got there."""
+    """Move points x (n, 3) [mm] along the gradient until just inside, in place; return them and which succeeded."""
     inside = np.zeros(len(x), dtype=bool)
     rows: Indices = np.arange(len(x))
     for _ in range(PULL_BACKS):
@@ -176,6 +176,6 @@ def pulled_inside(bound: Bound, x: Array) -> tuple[Array, Mask]:
         distance, normal = _picked(out, distance, normal)
         if not rows.size:
             break
-        squared = np.maximum(np.einsum("ni,ni->n", normal, normal), LEAST_SLOPE)
+        squared = np.maximum(np.einsum("ni,ni->n", normal, normal), MIN_SLOPE)
         x[rows] -= ((PULL * distance + INSIDE_MM) / squared)[:, None] * normal
     return x, inside

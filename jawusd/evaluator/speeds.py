@@ -1,4 +1,4 @@
-"""How fast the jaw of a person moves: covariances of velocity and acceleration of d, as a take showed them."""
+"""How fast a jaw moves: covariances of the velocity and acceleration of d, estimated from a take."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
 
-_FEWEST_FRAMES = 30
-# Sums of the squared coefficients of first, second and fourth differences: the variance there of noise of variance 1.
+_MIN_FRAMES = 30  # fourth differences needed for an estimate
+# Sums of the squared coefficients of first, second and fourth differences: the variance of differenced unit noise.
 _NOISE_IN = {1: 2.0, 2: 6.0, 4: 70.0}
 _SIGMA_OF_MEDIAN = 1.4826  # standard deviation over the median absolute value, normal distribution
-_LEAST_SHARE = 0.05  # of what was seen; so much is motion even where all of it might be noise
-_LEAST_SPREAD = 1e-6  # relative; keeps covariances of takes that move along one line invertible
+_MIN_SIGNAL = 0.05  # lower limit of the share of the observed variance that is motion
+_MIN_SPREAD = 1e-6  # relative; keeps covariances of one-dimensional motion invertible
 
 
 @dataclass(frozen=True, eq=False)
 class Speeds:
-    """How fast a jaw moves, both about a mean of zero.
+    """Covariances of the motion of a jaw, about a mean of zero.
 
     Attributes:
         velocity: Covariance of the velocities of d [mm^2/s^2], shape (3, 3).
@@ -33,32 +33,31 @@ class Speeds:
 
     @classmethod
     def of_take(cls, d: ArrayLike, fps: float) -> Speeds:
-        """Learn the speeds of a take, less what noise from frame to frame adds to them.
+        """Estimate the speeds of a take, corrected for noise between frames.
 
-        Noise shows in fourth differences far more than motion does, and in most frames, where motion is jerky in few;
-        what it adds to first and second differences follows.
+        The noise level is estimated from the median of fourth differences, where noise dominates motion. Its
+        contribution to first and second differences is subtracted.
 
         Args:
-            d: Jaw parameters [mm] of consecutive frames, shape (F, 3), such as `solve` or `encode` give; NaN where a
-                frame is lost.
+            d: Jaw parameters [mm] of consecutive frames, shape (F, 3), from `solve` or `encode`; NaN if lost.
             fps: Frames per second.
 
         Raises:
-            ValueError: another shape, a rate that is not positive, or too few frames in a row.
+            ValueError: a wrong shape, a rate that is not positive, or too few consecutive frames.
         """
         rows = np.asarray(d, dtype=np.float64)
         if rows.ndim != 2 or rows.shape[1] != 3 or not fps > 0:
-            raise ValueError(f"a take has d of shape (F, 3) and a positive rate, got {rows.shape} and {fps}")
+            raise ValueError(f"d must have shape (F, 3) and the rate must be positive, got {rows.shape} and {fps}")
         seen = {order: _known(np.diff(rows, order, axis=0)) for order in _NOISE_IN}
-        if len(seen[4]) < _FEWEST_FRAMES:
-            raise ValueError(f"the take has {len(seen[4])} frames in a row, at least {_FEWEST_FRAMES} are needed")
+        if len(seen[4]) < _MIN_FRAMES:
+            raise ValueError(f"the take has {len(seen[4])} consecutive frames, at least {_MIN_FRAMES} are needed")
         spread = {order: changes.T @ changes / len(changes) for order, changes in seen.items()}
         noise = np.diag((_SIGMA_OF_MEDIAN * np.median(np.abs(seen[4]), axis=0)) ** 2) / _NOISE_IN[4]
-        return cls(*(fps ** (2 * order) * _less(spread[order], _NOISE_IN[order] * noise) for order in (1, 2)))
+        return cls(*(fps ** (2 * order) * _denoised(spread[order], _NOISE_IN[order] * noise) for order in (1, 2)))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> Speeds | None:
-        """Pick the speeds out of the named arrays of a rig; None if the rig has none."""
+        """Return the speeds in the named arrays of a rig, or None."""
         if "velocity_covariance" not in arrays:
             return None
         return cls(arrays["velocity_covariance"], arrays["acceleration_covariance"])
@@ -82,21 +81,21 @@ def _known(changes: Array) -> Array:
     return changes[np.isfinite(changes).all(axis=1)]
 
 
-def _less(seen: Array, noise: Array) -> Array:
-    """Return a covariance (3, 3) without that of noise, in no direction less than a share of what was seen."""
-    floor = _LEAST_SPREAD * np.trace(seen) / 3.0 + 1e-12
+def _denoised(seen: Array, noise: Array) -> Array:
+    """Return a covariance (3, 3) minus that of noise, limited from below in every direction."""
+    floor = _MIN_SPREAD * np.trace(seen) / 3.0 + 1e-12
     root = np.linalg.cholesky(seen + floor * np.eye(3))
     share = np.linalg.solve(root, np.linalg.solve(root, noise).T)
     sizes, directions = np.linalg.eigh(0.5 * (share + share.T))
-    left = root @ directions * np.sqrt(np.maximum(1.0 - sizes, _LEAST_SHARE))
+    left = root @ directions * np.sqrt(np.maximum(1.0 - sizes, _MIN_SIGNAL))
     return np.asarray(left @ left.T)
 
 
 def check_speeds(arrays: Mapping[str, Array]) -> None:
-    """Check the speeds among the named arrays of a rig.
+    """Check the speeds in the named arrays of a rig.
 
     Raises:
-        EvaluatorError: Covariances that are not symmetric and positive definite.
+        EvaluatorError: A covariance is not symmetric and positive definite.
     """
     for name in ("velocity_covariance", "acceleration_covariance"):
         value = arrays[name]

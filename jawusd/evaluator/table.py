@@ -1,4 +1,4 @@
-"""The sampled decoder, as readers that do not know the exact model see it: a grid of twists, interpolated linearly."""
+"""The sampled decoder for readers that do not implement the exact model: a grid of twists, interpolated linearly."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class SampledTable:
     Parameters outside the grid are clamped to it.
 
     Attributes:
-        grid_axes: Rising sample positions of d1, d2, d3 [mm], three arrays of length >= 2.
+        grid_axes: Increasing sample positions of d1, d2, d3 [mm], three arrays of length >= 2.
         T_rest: T_skull_mandible of the closed bite, shape (4, 4).
     """
 
@@ -28,12 +28,12 @@ class SampledTable:
         """Build the table.
 
         Args:
-            grid_axes: Sample positions of d1, d2, d3 [mm], rising.
+            grid_axes: Increasing sample positions of d1, d2, d3 [mm].
             twists: Twists (omega [rad], v [mm]), skull frame, shape (n1, n2, n3, 6).
             T_rest: T_skull_mandible of the closed bite, shape (4, 4).
 
         Raises:
-            ValueError: shapes that do not fit, or positions that do not rise.
+            ValueError: shapes that do not match, or positions that do not increase.
         """
         self.grid_axes = tuple(np.array(axis, dtype=np.float64) for axis in grid_axes)
         self.T_rest = np.array(T_rest, dtype=np.float64)
@@ -43,7 +43,7 @@ class SampledTable:
             raise ValueError(f"twists must have shape {(*counts, 6)} and T_rest (4, 4), got {twists.shape}")
         if len(counts) != 3 or any(len(axis) < 2 or (np.diff(axis) <= 0).any() for axis in self.grid_axes):
             raise ValueError("grid_axes must be three rising arrays of at least two positions")
-        # neighbours along d3 side by side: half as many places in memory to visit
+        # neighbours along d3 are stored side by side: half as many memory accesses
         self._pairs = np.concatenate([twists[:, :, :-1], twists[:, :, 1:]], axis=3)
         self._flat = self._pairs.reshape(-1, 12)
         self._positions = tuple(axis.tolist() for axis in self.grid_axes)
@@ -58,7 +58,7 @@ class SampledTable:
         d = np.asarray(d, dtype=np.float64)
         if d.shape == (3,):
             x, y, z = d.tolist()
-            if abs(x) + abs(y) + abs(z) < _SINGLE_LIMIT_MM:  # NaN and infinities go the long way
+            if abs(x) + abs(y) + abs(z) < _SINGLE_LIMIT_MM:  # False for NaN and infinities
                 return motion_matrix(motion_of_twist(*self._single_twist(x, y, z))).dot(self.T_rest)
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(self._poses, rows).reshape(*batch, 4, 4)
@@ -87,7 +87,7 @@ class SampledTable:
 
 
 def _located(knots: Array, x: Array) -> tuple[Indices, Array]:
-    """Return the cell (n,) of each position x (n,) and the share of the way through it, x clamped to the knots."""
+    """Return the cell (n,) of each position x (n,), clamped to the knots, and the fraction (n,) within the cell."""
     cell = np.clip(knots.searchsorted(x, side="right") - 1, 0, len(knots) - 2)
     start = knots[cell]
     return cell, np.clip((x - start) / (knots[cell + 1] - start), 0.0, 1.0)

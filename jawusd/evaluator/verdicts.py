@@ -1,4 +1,4 @@
-"""Verdicts: whether a pose is possible, and if not, why and by how many millimetres."""
+"""Verdicts: whether a pose is valid, and if not, why and by how many millimetres."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.formula import ON_BOUND_MM
 
-# A matrix written with 5 decimals or kept in half precision is rigid to about this; sheared or scaled ones are not.
+# Accepts matrices with 5 decimals or in half precision; rejects sheared or scaled ones.
 RIGID_TOLERANCE = 1e-3
 
 INSIDE, OUTSIDE = "inside", "outside"
 
 
 class Reason(IntFlag):
-    """Why a pose is invalid; several may hold at once."""
+    """Why a pose is invalid; flags may be combined."""
 
     VALID = 0
     NOT_FINITE = 1
@@ -34,7 +34,7 @@ class Reason(IntFlag):
 
     @property
     def words(self) -> str:
-        """The reasons in plain words, joined by commas."""
+        """The reasons in words, joined by commas."""
         return ", ".join(_WORDS[flag] for flag in Reason if flag in self and flag) or "valid"
 
 
@@ -49,16 +49,16 @@ _WORDS = {
 
 
 class Verdicts(NamedTuple):
-    """What `JawRig.validate` found, one entry per pose.
+    """Result of `JawRig.validate`, one entry per pose.
 
     Attributes:
-        valid: No reason against the pose, bool, shape (...): it is inside the bound, or a measured one within the
-            tolerance.
+        valid: Whether there is no reason against the pose, bool, shape (...). Measured poses are also valid within the
+            tolerance outside the bound.
         reason: `Reason` flags, uint8, shape (...); ``Reason(int(code))`` names them, `words` spells them out.
-        residual_mm: rms landmark distance to the nearest pose of the model, shape (...); NaN if not finite or rigid.
-        margin_mm: Signed distance of d to the bound, > 0 inside, shape (...); NaN if not finite or rigid.
-        d: Nearest jaw parameters [mm], shape (..., 3); NaN if not finite or rigid.
-        tolerance_mm: How far outside the bound a pose could lie and still be valid.
+        residual_mm: rms landmark distance to the nearest pose of the model, (...); NaN if not finite or not rigid.
+        margin_mm: Signed distance of d to the bound, > 0 inside, shape (...); NaN if not finite or not rigid.
+        d: Nearest jaw parameters [mm], shape (..., 3); NaN if not finite or not rigid.
+        tolerance_mm: How far outside the bound a pose may lie and still be valid.
     """
 
     valid: Mask
@@ -69,24 +69,24 @@ class Verdicts(NamedTuple):
     tolerance_mm: float = 0.0
 
     def measured(self) -> Mask:
-        """Tell which poses were compared with the model: those that are finite and rigid."""
+        """Return which poses were compared with the model: the finite and rigid ones."""
         return (self.reason & (Reason.NOT_FINITE | Reason.NOT_RIGID).value) == 0
 
     def with_margin(self, margin_mm: Array, limits: Limits) -> Verdicts:
-        """Return the verdicts with the margins (n,) to another bound in place of theirs."""
+        """Return the verdicts with their margins replaced by those (n,) to another bound."""
         reason = self.reason & ~np.uint8(Reason.OUTSIDE_BOUNDS.value)
         reason[self.measured() & _outside(margin_mm, limits)] |= Reason.OUTSIDE_BOUNDS.value
         return self._replace(valid=reason == 0, reason=reason, margin_mm=margin_mm)
 
     def with_collisions(self, collide: Mask) -> Verdicts:
-        """Return the verdicts with the poses marked in ``collide`` (n,) refused."""
+        """Return the verdicts with the poses in ``collide`` (n,) marked as colliding."""
         if not np.count_nonzero(collide):  # a tenth of the time of `any`
             return self
         reason = self.reason | np.where(collide, Reason.TEETH_COLLIDE.value, 0).astype(np.uint8)
         return self._replace(valid=reason == 0, reason=reason)
 
     def finished(self, batch: tuple[int, ...], tolerance_mm: float, fast: Mask | None = None) -> Verdicts:
-        """Return the verdicts in a batch shape, with their tolerance; frames in ``fast`` (same shape) are too fast."""
+        """Return the verdicts in a batch shape, with their tolerance and the frames in ``fast`` marked too fast."""
         if not batch and fast is None:
             valid, reason, residual_mm, margin_mm, d, _ = self
             return Verdicts(valid[0], reason[0], residual_mm[0], margin_mm[0], d[0], tolerance_mm)
@@ -97,25 +97,25 @@ class Verdicts(NamedTuple):
         return Verdicts(reason == 0, reason, residual_mm, margin_mm, self.d.reshape(*batch, 3), tolerance_mm)
 
     def inside(self) -> Mask:
-        """Tell which poses lie inside the bound, shape (...), whatever else is wrong with them."""
+        """Return which poses lie inside the bound, shape (...), regardless of other reasons."""
         return is_inside(self.margin_mm)
 
     def words(self) -> list[str]:
-        """Return the verdicts in plain words, one per pose in row-major order.
+        """Return the verdicts in words, one per pose in row-major order.
 
-        A valid pose is "inside", or "within tolerance 0.83 of 1.00 mm"; of the others the reasons are named.
+        A valid pose is "inside", or "within tolerance 0.83 of 1.00 mm"; for the others, the reasons.
         """
         pairs = zip(self.reason.ravel().tolist(), self.margin_mm.ravel().tolist())
         return [Reason(code).words if code else place(margin, self.tolerance_mm) for code, margin in pairs]
 
 
 def is_inside(margin_mm: ArrayLike) -> Mask:
-    """Tell which margins [mm] (...) are those of parameters inside the bound; NaN is not."""
+    """Return which margins [mm] (...) belong to parameters inside the bound; False for NaN."""
     return np.asarray(np.asarray(margin_mm) >= -ON_BOUND_MM)
 
 
 def place(margin_mm: float, tolerance_mm: float = 0.0) -> str:
-    """Return where parameters lie, in words: "inside", "within tolerance 0.83 of 1.00 mm" or "outside".
+    """Return the location of parameters in words: "inside", "within tolerance 0.83 of 1.00 mm" or "outside".
 
     Args:
         margin_mm: Their margin.
@@ -149,7 +149,7 @@ class Limits:
         return -self.tolerance_mm
 
     def replaced(self, residual_mm: float | None, tolerance_mm: float | None, speed_mm_s: float | None) -> Limits:
-        """Return these limits with those that are given in place of their own.
+        """Return the limits, with the given ones replaced.
 
         Raises:
             ValueError: a tolerance that is negative or NaN.
@@ -171,7 +171,7 @@ def judge(finite: Mask, rigid: Mask, residual_mm: Array, margin_mm: Array, d: Ar
     reason[~finite] |= Reason.NOT_FINITE.value
     reason[finite & ~rigid] |= Reason.NOT_RIGID.value
     measured = finite & rigid
-    # `not <=` so that a pose the model cannot measure (NaN) is refused
+    # `not <=` so that a NaN residual counts as off the model
     reason[measured & ~(residual_mm <= limits.residual_mm)] |= Reason.OFF_MODEL.value
     reason[measured & _outside(margin_mm, limits)] |= Reason.OUTSIDE_BOUNDS.value
     return Verdicts(reason == 0, reason, residual_mm, margin_mm, d)
@@ -182,11 +182,11 @@ def _outside(margin_mm: Array, limits: Limits) -> Mask:
 
 
 def too_fast(positions: Array, times_s: ArrayLike | None, limit_mm_s: float) -> Mask:
-    """Tell which frames were reached too fast.
+    """Return which frames were reached too fast.
 
     Args:
         positions: Landmark positions [mm], shape (..., F, L, 3); NaN where there is no pose.
-        times_s: Rising times, shape (F,).
+        times_s: Increasing times, shape (F,).
         limit_mm_s: Largest speed [mm/s].
 
     Returns:
@@ -194,12 +194,12 @@ def too_fast(positions: Array, times_s: ArrayLike | None, limit_mm_s: float) -> 
         are never too fast.
 
     Raises:
-        ValueError: no batch axis to go along, or times that do not fit it or do not rise.
+        ValueError: there is no frame axis, or the times do not match it or do not increase.
     """
     times = np.asarray([] if times_s is None else times_s, dtype=np.float64)
     if positions.ndim < 3 or times.shape != positions.shape[-3:-2] or not (np.diff(times) > 0).all():
         raise ValueError(
-            "a speed limit needs poses of shape (..., F, ...) and times_s of shape (F,) that rise, got "
+            "a speed limit needs poses of shape (..., F, ...) and increasing times_s of shape (F,), got "
             f"{positions.shape[:-2]} and {times.shape}"
         )
     flags = np.zeros(positions.shape[:-2], dtype=bool)

@@ -16,9 +16,9 @@ from jawusd.evaluator.batching import LARGEST
 from jawusd.evaluator.formula import ON_BOUND_MM
 from jawusd.evaluator.nearest import (
     ITERATIONS,
-    LARGEST_DAMPING,
-    LEAST_STIFFNESS,
-    SMALLEST_DAMPING,
+    MAX_DAMPING,
+    MIN_DAMPING,
+    MIN_STIFFNESS,
     START_DAMPING,
     TOLERANCE_MM,
 )
@@ -140,14 +140,14 @@ def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> 
         solve(n.damped, n.g, n.step)
         for i in range(3):
             n.trial[i] = x[i] - n.step[i]
-        if _settled(n.step) or damping >= LARGEST_DAMPING:
+        if _settled(n.step) or damping >= MAX_DAMPING:
             x[:] = n.trial  # the last step is free and doubles the digits
             return
         trial_cost = equations(model, problem, n.trial, w, n.A_trial, n.g_trial)
         if trial_cost <= cost:
             cost = trial_cost
             x[:], n.A[:], n.g[:] = n.trial, n.A_trial, n.g_trial
-            damping = max(damping * 0.1, SMALLEST_DAMPING)
+            damping = max(damping * 0.1, MIN_DAMPING)
         else:
             damping *= 10.0
 
@@ -159,7 +159,7 @@ def _settled(step: Array) -> bool:
 
 @device
 def _damp(A: Array, damping: float, out: Array) -> None:
-    amount = damping * ((A[0, 0] + A[1, 1] + A[2, 2]) / 3.0) + LEAST_STIFFNESS
+    amount = damping * ((A[0, 0] + A[1, 1] + A[2, 2]) / 3.0) + MIN_STIFFNESS
     out[:] = A
     for i in range(3):
         out[i, i] += amount

@@ -161,7 +161,7 @@ def summed_curves(model: Array, d1: float, d2: float, d3: float, twist: Array, b
 
 
 class Scratch(NamedTuple):
-    """The memory of one call."""
+    """Memory for one call."""
 
     centres: Array
     u_d: Array
@@ -174,7 +174,7 @@ class Scratch(NamedTuple):
 
 @device
 def scratch(model: Array) -> Scratch:
-    """Return the memory one call works in: never shared, so that threads do not meet."""
+    """Return the memory for one call; never shared between threads."""
     return Scratch(
         np.empty(4 * int(model[COUNT])),
         np.empty((3, 3)),
@@ -188,7 +188,7 @@ def scratch(model: Array) -> Scratch:
 
 @device
 def motion(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
-    """Write M(d) to w.M; of an anchored model also the rotation vector, of an additive one the twist."""
+    """Write M(d) to w.M, and the rotation vector (anchored) or the twist (additive) to w.twist."""
     if model[KIND] == ADDITIVE_KIND:
         summed_curves(model, d1, d2, d3, w.twist, w.twist_d)
         move(w.twist, w.M)
@@ -198,14 +198,14 @@ def motion(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
 
 @device
 def displaced(model: Array, u: Vector, w: Scratch) -> None:
-    """Write to w.M the motion of an anchored model that carries the incisal point by u, and its rotation vector."""
+    """Write the motion of an anchored model that displaces the incisal point by u, and its rotation vector."""
     w.twist[0], w.twist[1], w.twist[2] = spline(model, u, w.centres)
     _anchor(model, u, w)
 
 
 @device
 def _anchor(model: Array, u: Vector, w: Scratch) -> None:
-    """Write to w.M the motion that rotates by w.twist[:3] and carries the incisal point by u."""
+    """Write the motion that rotates by w.twist[:3] and displaces the incisal point by u to w.M."""
     rotate((w.twist[0], w.twist[1], w.twist[2]), w.M)
     p = (model[INCISOR], model[INCISOR + 1], model[INCISOR + 2])
     for i in range(3):
@@ -214,7 +214,7 @@ def _anchor(model: Array, u: Vector, w: Scratch) -> None:
 
 @device
 def motion_by_displacement(model: Array, u0: float, u1: float, u2: float, w: Scratch) -> None:
-    """Write the motion of an anchored model that carries the incisal point by u, and S by u, to w.M and w.S."""
+    """Write the motion of an anchored model that displaces the incisal point by u, and S by u, to w.M and w.S."""
     omega = spline_derivative(model, (u0, u1, u2), w.centres, w.omega_u)
     w.twist[0], w.twist[1], w.twist[2] = omega
     _anchor(model, (u0, u1, u2), w)
@@ -230,7 +230,7 @@ def motion_by_displacement(model: Array, u0: float, u1: float, u2: float, w: Scr
 
 @device
 def motion_derivative(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
-    """Write M(d) and its spatial derivative to w.M and w.S; of an additive model also its twist's to w.twist_d."""
+    """Write M(d) and its spatial derivative to w.M and w.S; for an additive model also d log M / dd to w.twist_d."""
     if model[KIND] == ADDITIVE_KIND:
         summed_curves(model, d1, d2, d3, w.twist, w.twist_d)
         move(w.twist, w.M)
@@ -246,9 +246,9 @@ def motion_derivative(model: Array, d1: float, d2: float, d3: float, w: Scratch)
 
 @device
 def _spatial(w: Scratch) -> None:
-    """Write to w.S the spatial derivative of exp(twist) whose twist changes by w.twist_d.
+    """Write the spatial derivative of exp(twist) for changes w.twist_d of the twist to w.S.
 
-    With t = v + b w x v + c w x (w x v) the translation, a change of the twist turns by W = J dw and shifts the
+    With the translation t = v + b w x v + c w x (w x v), a change of the twist rotates by W = J dw and shifts the
     origin by dt - W x t.
     """
     omega, v = (w.twist[0], w.twist[1], w.twist[2]), (w.twist[3], w.twist[4], w.twist[5])
@@ -294,7 +294,7 @@ def logarithm_derivative(model: Array, d1: float, d2: float, d3: float, w: Scrat
     y = cross(omega, x)
     for k in range(3):
         s = (w.S[0, k], w.S[1, k], w.S[2, k])
-        # the rotation vector changes by the inverse Jacobian of the turn; the translation by W x t + V
+        # the rotation vector changes by the inverse Jacobian of the rotation, the translation by W x t + V
         e = apply_series(omega, s, -0.5, factor)
         r = cross(s, t)
         v = apply_series(omega, (r[0] + w.S[3, k], r[1] + w.S[4, k], r[2] + w.S[5, k]), -0.5, factor)

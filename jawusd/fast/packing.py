@@ -1,7 +1,7 @@
-"""A rig's numbers laid out for the compiled code: one flat array for the model, one for the bound.
+"""The memory layout of a rig for compiled code: one flat array for the model, one for the bound.
 
-Passing an array to compiled code costs about as long as the arithmetic of one pose, so everything a function needs
-comes in one. The names below are places in those arrays; a slice of the model holds what its comment says.
+Passing an array to compiled code takes about as long as the arithmetic of one pose, so each function receives a single
+array. The constants below are offsets into these arrays, with the contents in their comments.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED, KINDS
 
 # the model, every kind
-KIND = 0  # place of the kind in `schema.KINDS`
-COUNT = 1  # spline centres of an anchored model, else 0
+KIND = 0  # index into `schema.KINDS`
+COUNT = 1  # number of spline centres; 0 for an additive model
 INCISOR = 2  # (3,) [mm]
 FROM_ANATOMICAL = 5  # (4, 4) row by row: L, Q of pose = L M Q
 CLOSED = 21  # (4, 4): Q
 TO_ANATOMICAL = 37  # (4, 4): L^-1
 FROM_CLOSED = 53  # (4, 4): Q^-1
 ADJOINT = 69  # (6, 6): twists from the anatomical to the skull frame
-VECTORS = 105  # (4, 4): what stands for the landmarks, see `evaluator.distances`
-REST = 121  # where the part of the kind begins
+VECTORS = 105  # (4, 4): vectors that represent the landmarks, see `evaluator.encoding`
+REST = 121  # start of the part that depends on the kind
 ANCHORED_KIND, ADDITIVE_KIND = KINDS.index(ANCHORED), KINDS.index(ADDITIVE)
 
 # anchored
@@ -39,14 +39,14 @@ DROP = REST + 35  # (4,)
 SOFTNESS = REST + 39  # [mm]
 FADE = REST + 40  # [mm]
 SPLINE = REST + 41  # centres column by column (3, m), then kernel weights (m, 3), then the table of the glide surface
-# the table: numbers n2, n3 of its knots, 0 without one; knots of d2 (n2,), starts (n2 + 1,), the same of d3,
+# the table: numbers of knots n2, n3, 0 without a table; knots of d2 (n2,), starts (n2 + 1,), likewise for d3,
 # coefficients (n2 + 1, n3 + 1, 4, 4)
 
 # additive
-CURVES = REST  # where each of the three curves begins
-STARTS = REST + 3  # number n of the starts of searches
-GRID = REST + 4  # d (n, 3) and incisal displacements (n, 3) of the starts [mm], then the curves
-# a curve, from where it begins: number of knots n, knots (n,), starts (n + 1,), coefficients (n + 1, 4, k)
+CURVES = REST  # offsets of the three curves
+STARTS = REST + 3  # number n of starting points of searches
+GRID = REST + 4  # d (n, 3) and incisal displacements (n, 3) of the starting points [mm], then the curves
+# a curve, from its offset: number of knots n, knots (n,), starts (n + 1,), coefficients (n + 1, 4, k)
 
 # the bound
 ROUNDING = 0  # [mm]
@@ -56,7 +56,7 @@ HULL = 3  # their normals column by column (2, k), then the curve of the support
 
 
 def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Array:
-    """Return the numbers of a model; see `distances.landmark_vectors` for the vectors (4, 4) [mm].
+    """Return a packed model; see `encoding.landmark_vectors` for the vectors (4, 4) [mm].
 
     Raises:
         TypeError: the kind of model has no compiled form.
@@ -79,7 +79,7 @@ def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Arra
 
 
 def packed_bound(bound: SliceHull) -> Array:
-    """Return the numbers of a bound."""
+    """Return a packed bound."""
     head = [np.array([bound.softness_mm, bound.offset_mm, len(bound.directions)]), bound.directions.T]
     return _joined([*head, _curve(bound.supports)])
 

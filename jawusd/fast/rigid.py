@@ -18,13 +18,13 @@ from jawusd.geometry.rodrigues import angle_coefficients, apply_series, dot, tur
 
 Vector = tuple[float, float, float]
 
-# inlined into the functions of `rows` and `searches`, which are the ones kept on disk
+# inlined into the functions of `kernels`, which are cached on disk
 device = numba.njit(nogil=True, error_model="numpy")
-# the same, with sums in whatever order is quickest
+# the same, with reassociation of sums
 summing = numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 
-# Plain functions of other modules that compiled code calls. Inlined, or else the functions in an `Elementary` would
-# be addresses in the machine code, which then cannot be kept on disk.
+# Plain functions of other modules that compiled code calls. Without inlining, the functions in an `Elementary` would be
+# addresses in the machine code, which could then not be cached on disk.
 for _function in (
     *(rodrigues.angle_series, rodrigues.angle_quotients, rodrigues.angle_coefficients, rodrigues.cross, rodrigues.dot),
     *(rodrigues.apply_series, rodrigues.turning, gauge.path, gauge.arch, gauge.drop),
@@ -33,7 +33,7 @@ for _function in (
 ):
     register_jitable(forceinline=True, nogil=True, error_model="numpy")(_function)
 
-_SERIES_SQUARED = 0.09  # below, derivatives of the coefficients come from their series; closed forms lose digits
+_SERIES_SQUARED = 0.09  # [rad^2] below, derivatives of the coefficients use series, since the closed forms lose digits
 
 
 @device
@@ -53,7 +53,7 @@ def _clip(x: float, low: float, high: float) -> float:
 
 @device
 def interval(knots: Array, count: int, x: float) -> int:
-    """Return how many of the first ``count`` knots are <= x."""
+    """Return the number of knots, of the first ``count``, that are <= x."""
     low, high = 0, count
     while low < high:
         middle = (low + high) // 2
@@ -66,7 +66,7 @@ def interval(knots: Array, count: int, x: float) -> int:
 
 @device
 def _glide(table: Array, d2: float, d3: float) -> Vector:
-    """Return what `glide.GlideTable.at_floats` does; `table` as `packing` lays it out, all zero without one."""
+    """Return `curves.GlideTable.at_floats` of a table packed by `packing`; zeros without one."""
     count2, count3 = int(table[0]), int(table[1])
     if count2 == 0:
         return 0.0, 0.0, 0.0

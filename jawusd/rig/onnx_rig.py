@@ -18,8 +18,8 @@ except ModuleNotFoundError as error:
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.batching import usable_rows
-from jawusd.evaluator.files import load
 from jawusd.evaluator.kernels import NumpyKernels, RigParts
+from jawusd.evaluator.rig import load
 from jawusd.rig.onnx_check import Run, load_sidecar, runner
 from jawusd.rig.read import load_rig
 

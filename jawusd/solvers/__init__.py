@@ -1,4 +1,7 @@
-"""Jaw rigs inside differentiable solvers: a torch module with poses, bounds and a prior on jaw poses."""
+"""Jaw rigs in differentiable solvers: a torch module with poses, bounds and priors on jaw poses.
+
+Imports only `base`, `geometry`, `evaluator` and torch.
+"""
 
 from jawusd.base.errors import MissingDependencyError
 

@@ -1,7 +1,7 @@
-"""The two kinds of models with derivatives, in the coordinates x (n, 3) [mm] in which nearest poses are searched.
+"""Both kinds of models with derivatives, in the coordinates x (n, 3) [mm] of the search for the nearest pose.
 
 As in `jawusd.evaluator.models`: for an anchored model x is the displacement u of the incisal point, for an additive one
-d itself; derivatives are spatial, S (n, 6, 3) with ``M(x + e) = exp(S e) M(x)``, twists being (omega [rad], v [mm]).
+d itself; derivatives are spatial, S (n, 6, 3) with ``M(x + e) = exp(S e) M(x)``; twists are (omega [rad], v [mm]).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from jawusd.evaluator.formula import AnchoredNumbers
 from jawusd.evaluator.gauge import (
     INVERSE_ITERATIONS,
     INVERSE_STEP_MM,
-    LEAST_INVERSE_SLOPE,
-    MOST_DOUBLINGS,
+    MAX_DOUBLINGS,
+    MIN_INVERSE_SLOPE,
     PATIENCE,
     Elementary,
     displacement,
@@ -32,13 +32,13 @@ from jawusd.evaluator.schema import ADDITIVE, ANCHORED
 from jawusd.solvers.motion import OPERATIONS, MotionModule
 from jawusd.solvers.solution import capturing, finished, inverse
 
-_STEPS_CAPTURED = 7  # of the inverse gauge; five do for parameters a jaw has
-_GAUGE_NUMBERS = 26
-_SERIES_SQUARED = 0.09  # rad^2; below, derivatives of the angle coefficients come from their series
+_STEPS_CAPTURED = 7  # of the inverse gauge in a captured graph; 5 suffice for anatomical parameters
+_GAUGE_NUMBERS = 26  # count of numbers in `GaugeNumbers`
+_SERIES_SQUARED = 0.09  # [rad^2] below, derivatives of the angle coefficients use series
 
 
 def _glide(table: object, d2: Tensor, d3: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the table [mm] of a glide surface, the module it belongs to, and its slopes at d2 (n,), d3 (n,) [mm]."""
+    """Return the glide table [mm] of a module at d2 (n,), d3 (n,) [mm], and its slopes; zeros for None."""
     if not isinstance(table, MotionModule):
         return torch.zeros_like(d2), torch.zeros_like(d2), torch.zeros_like(d2)
     a, a_2 = _curve(table, "glide2", d2[:, None])
@@ -47,7 +47,7 @@ def _glide(table: object, d2: Tensor, d3: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def _curve(module: MotionModule, name: str, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return point and slope (n, k) of a curve of a module at x (n, 1)."""
+    """Return the points and slopes (n, k) of a module's curve at x (n, 1)."""
     parts = [module.get_buffer(f"{name}_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
     (start,), (c0,), (c1,), (c2,), (c3,) = OPERATIONS.lookup(x, module.get_buffer(f"{name}_knot"), parts)
     s = x - start
@@ -58,10 +58,10 @@ TENSORS: Elementary[Tensor] = Elementary(torch.sqrt, torch.exp, OPERATIONS.clip,
 
 
 class Chart(Protocol):
-    """What the search for the nearest pose needs of a kind of model."""
+    """Interface of a model to the search for the nearest pose."""
 
     def start(self, u: Tensor) -> Tensor:
-        """Return where to start, x (n, 3), for displacements u (n, 3) [mm] of the incisal point."""
+        """Return starting points x (n, 3) for displacements u (n, 3) [mm] of the incisal point."""
 
     def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rotation (n, 3, 3), translation (n, 3) [mm] and spatial derivative S (n, 6, 3) at x."""
@@ -81,7 +81,7 @@ class AnchoredMotion(MotionModule):
         self._gliding = "glide_d2" in arrays
 
     def start(self, u: Tensor) -> Tensor:
-        """Return u: it is read off the pose."""
+        """Return u, the chart's coordinates."""
         return u
 
     def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -127,7 +127,7 @@ class AnchoredMotion(MotionModule):
         wanted = triple(u.unbind(dim=1))
         for iteration in range(_STEPS_CAPTURED if capturing() else INVERSE_ITERATIONS):
             _, _, remainder, slope = opening_equation(gauge, wanted, d1, TENSORS)
-            step = -remainder / torch.where(slope > LEAST_INVERSE_SLOPE, slope, torch.ones_like(slope))
+            step = -remainder / torch.where(slope > MIN_INVERSE_SLOPE, slope, torch.ones_like(slope))
             step = step.clamp(-INVERSE_STEP_MM, INVERSE_STEP_MM)
             moving = step.abs() > tolerance * (1.0 + d1.abs())
             if finished(moving):
@@ -153,7 +153,7 @@ class AdditiveMotion(MotionModule):
         self.register_buffer("displacements", torch.tensor(starts.displacements))
 
     def start(self, u: Tensor) -> Tensor:
-        """Return the start whose displacement is nearest to u (n, 3) [mm]."""
+        """Return the grid point with the displacement nearest to u (n, 3) [mm]."""
         grid = self.displacements
         return self.starts[(grid.square().sum(dim=1) - 2.0 * u @ grid.T).argmin(dim=1)]
 
@@ -177,10 +177,10 @@ def _columns(slopes: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def _next_opening(x: Tensor, step: Tensor, low: Tensor, high: Tensor, iteration: int) -> Tensor:
-    """Return the next d1 to try, as `jawusd.evaluator.gauge` does."""
+    """Return the next d1, as in `jawusd.evaluator.gauge`."""
     bounded = torch.isfinite(low) & torch.isfinite(high)
     late = max(iteration - PATIENCE, 0)
-    stride = (step * 2.0 ** min(late, MOST_DOUBLINGS)).clamp(-INVERSE_STEP_MM, INVERSE_STEP_MM)
+    stride = (step * 2.0 ** min(late, MAX_DOUBLINGS)).clamp(-INVERSE_STEP_MM, INVERSE_STEP_MM)
     newton = x + torch.where(bounded, step, stride)
     middle = torch.where(bounded, 0.5 * (low + high), newton)
     halve = (newton <= low) | (newton >= high) | (bounded if late % 2 == 1 else torch.zeros_like(bounded))
@@ -203,10 +203,10 @@ def _rotations(omega: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _twist_derivative(twist: Tensor, by_x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return R, t and the spatial derivative of exp(twist), twists (n, 6), that change by (n, 6, 3).
+    """Return R, t and the spatial derivative of exp(twist) for twists (n, 6) with derivatives (n, 6, 3).
 
-    With t = v + b w x v + c w x (w x v) the translation, a change of the twist turns by s = J dw and shifts the origin
-    by dt - s x t.
+    With the translation t = v + b w x v + c w x (w x v), a change of the twist rotates by s = J dw and shifts the
+    origin by dt - s x t.
     """
     omega, v = twist[:, :3, None], twist[:, 3:, None]
     R, J = _rotations(twist[:, :3])

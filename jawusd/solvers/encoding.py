@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from jawusd.evaluator.nearest import ITERATIONS, LARGEST_DAMPING, LEAST_STIFFNESS, SMALLEST_DAMPING, START_DAMPING
+from jawusd.evaluator.nearest import ITERATIONS, MAX_DAMPING, MIN_DAMPING, MIN_STIFFNESS, START_DAMPING
 from jawusd.solvers.charts import Chart
 from jawusd.solvers.solution import applied, capturing, finished, inverse
 
@@ -15,22 +15,22 @@ from jawusd.solvers.solution import applied, capturing, finished, inverse
 Residual = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 _STEPS_CAPTURED = 6
-_NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # off the model Gauss-Newton nears the bottom slowly
-_LEAST_CURVATURE = 1e-9  # relative; keeps encodings differentiable where a parameter hardly moves the landmarks
+_NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # off the model, Gauss-Newton converges slowly near the minimum
+_MIN_CURVATURE = 1e-9  # relative; keeps encodings differentiable where a parameter hardly moves the landmarks
 
 
 def nearest(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the parameters whose motion carries vectors nearest to their targets.
+    """Return the parameters whose motion moves vectors nearest to their targets.
 
     Args:
         chart: The model.
         vectors: Homogeneous vectors (4, m), anatomical frame [mm].
-        target: Where they should go [mm], shape (n, 3, m).
-        u: Displacements (n, 3) [mm] of the incisal point, from which the search starts.
+        target: Target positions [mm], shape (n, 3, m).
+        u: Displacements (n, 3) [mm] of the incisal point, where the search starts.
 
     Returns:
-        d (n, 3) [mm]; where its motion carries the vectors (n, 3 m) [mm]; and the derivative (n, 3, 3 m) of d by the
-        targets, by the implicit function theorem on ``grad |image(x) - target|^2 = 0``.
+        d (n, 3) [mm]; the images of the vectors (n, 3 m) [mm]; and the derivative (n, 3, 3 m) of d by the targets, from
+        the implicit function theorem on ``grad |image(x) - target|^2 = 0``.
     """
 
     def residual(x: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,7 +50,7 @@ def nearest(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[T
             break
         r_trial, J_trial = residual(x - step, target)
         g_trial = applied(J_trial.transpose(1, 2), r_trial)
-        # this near to the bottom the residual itself no longer tells which is lower
+        # this near to the minimum, rounding hides differences of the residual: compare gradients
         better = g_trial.square().sum(dim=1) <= g.square().sum(dim=1)
         x, r = torch.where(better[:, None], x - step, x), torch.where(better[:, None], r_trial, r)
         J, g = torch.where(better[:, None, None], J_trial, J), torch.where(better[:, None], g_trial, g)
@@ -64,7 +64,7 @@ def _tolerance_mm(x: Tensor) -> float:
 
 
 def _descended(residual: Residual, x: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the bottom x (n, 3) [mm], and the residual and its derivative there."""
+    """Return the minimum x (n, 3) [mm], and the residual and its derivative there."""
     tolerance_mm = _tolerance_mm(x)
     r, J = residual(x, target)
     cost = r.square().sum(dim=1)
@@ -73,15 +73,15 @@ def _descended(residual: Residual, x: Tensor, target: Tensor) -> tuple[Tensor, T
     for _ in range(_STEPS_CAPTURED if capturing() else ITERATIONS):
         slopes = J.transpose(1, 2)
         A = slopes @ J
-        amount = damping * A.diagonal(dim1=1, dim2=2).mean(dim=1) + LEAST_STIFFNESS
+        amount = damping * A.diagonal(dim1=1, dim2=2).mean(dim=1) + MIN_STIFFNESS
         step = applied(inverse(A + amount[:, None, None] * identity), applied(slopes, r))
         trial = x - step
         r_trial, J_trial = residual(trial, target)
         cost_trial = r_trial.square().sum(dim=1)
-        moving = (step.abs().amax(dim=1) > tolerance_mm) & (damping < LARGEST_DAMPING)
-        # the last step doubles the digits, and is taken though rounding may hide that it is better
+        moving = (step.abs().amax(dim=1) > tolerance_mm) & (damping < MAX_DAMPING)
+        # the last step doubles the digits: accept it even if rounding hides the improvement
         taken = (cost_trial <= cost) | ~moving
-        damping = torch.where(taken, (damping * 0.1).clamp(min=SMALLEST_DAMPING), damping * 10.0)
+        damping = torch.where(taken, (damping * 0.1).clamp(min=MIN_DAMPING), damping * 10.0)
         x, r = torch.where(taken[:, None], trial, x), torch.where(taken[:, None], r_trial, r)
         J, cost = torch.where(taken[:, None, None], J_trial, J), torch.where(taken, cost_trial, cost)
         if finished(moving):
@@ -98,5 +98,5 @@ def _curvature(residual: Residual, x: Tensor, target: Tensor) -> Tensor:
     g = applied(J.transpose(1, 2), r).reshape(-1, 2, 3, 3)
     H = (g[:, 0] - g[:, 1]) / (2.0 * h)
     H = 0.5 * (H + H.transpose(1, 2))
-    floor = _LEAST_CURVATURE * H.diagonal(dim1=1, dim2=2).abs().mean(dim=1)
+    floor = _MIN_CURVATURE * H.diagonal(dim1=1, dim2=2).abs().mean(dim=1)
     return H + floor[:, None, None] * torch.eye(3, dtype=x.dtype, device=x.device)

@@ -18,12 +18,12 @@ from jawusd.evaluator.formula import BoundFormula
 from jawusd.evaluator.nearest import (
     INSIDE_MM,
     ITERATIONS,
-    LARGEST_DAMPING,
-    LEAST_SLOPE,
-    LONGEST_STEP_MM,
+    MAX_DAMPING,
+    MAX_STEP_MM,
+    MIN_DAMPING,
+    MIN_SLOPE,
     PULL,
     PULL_BACKS,
-    SMALLEST_DAMPING,
     TOLERANCE_MM,
 )
 from jawusd.evaluator.operations import triple
@@ -32,7 +32,7 @@ from jawusd.solvers.solution import applied, capturing, finished, inverse
 
 _STEPS_CAPTURED, _PULLS_CAPTURED = 12, 2
 _START_DAMPING = 1e-3
-_POLISHING, _POLISH_MM = 2, 0.01  # Newton steps at the end, and how near the bottom they are to be trusted
+_POLISHING, _POLISH_MM = 2, 0.01  # number of final Newton steps, and their largest accepted length
 _VALLEYS = 4
 _ROWS = 512  # rows compared with all candidates at once
 
@@ -40,7 +40,7 @@ _ROWS = 512  # rows compared with all candidates at once
 class Expansion(NamedTuple):
     """The signed distance (n,) [mm] at points, its gradient (n, 3), and its Hessian (n, 3, 3) [1/mm] in two parts.
 
-    The rounding's part is never indefinite; the bending, of the supports along d1, may be.
+    The part from the rounding is positive semidefinite; the bending of the supports along d1 may be indefinite.
     """
 
     distance: Tensor
@@ -92,9 +92,9 @@ class Hull(Formula):
         return Expansion(distance, gradient, rounding, bending)
 
     def _sides(self, d: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the distance (n,) [mm], share (n, k) and slope (n, k, 3) of each half-space, and the supports' bend.
+        """Return the distance (n,) [mm], weight (n, k) and slope (n, k, 3) of the half-spaces, and d2 reach / d d1^2.
 
-        As in `jawusd.evaluator.bounds`: the sides first, with their second derivatives by d1, then both ends.
+        In the order of `jawusd.evaluator.bounds`: the sides, then both ends.
         """
         first, last, softness, offset = self.singles.unbind()
         (reach,), (reach_1,), (reach_11,) = curve_derivatives("support", d[:, :1], self.tables(), OPERATIONS)
@@ -106,10 +106,10 @@ class Hull(Formula):
         distance = softness * torch.logsumexp(v, dim=1) - offset
         return distance, torch.softmax(v, dim=1), slopes, reach_11
 
-    def most(self, d: Tensor) -> Tensor:
-        """Return a number (n,) [mm] that no margin in the section of d (n, 3) exceeds.
+    def upper_margin(self, d: Tensor) -> Tensor:
+        """Return an upper bound (n,) [mm] of the margins in the section of d (n, 3).
 
-        Whichever way a point lies from d, one half-plane faces it, and it is nearer to that one than d is.
+        In every direction from d, some half-plane faces it and gets nearer.
         """
         offset = self.singles[3]
         (reach,) = curve("support", d[:, :1], self.tables(), OPERATIONS)
@@ -118,7 +118,7 @@ class Hull(Formula):
     def nearest(self, d: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nearest points (n, 3) [mm] with margin >= 0, and their derivatives (n, 3, 3) by d (n, 3) [mm].
 
-        On the bound the derivative follows from the implicit function theorem on ``x - d + multiplier grad = 0,
+        On the bound, the derivative follows from the implicit function theorem on ``x - d + multiplier grad = 0,
         distance(x) = 0``.
         """
         identity = torch.eye(3, dtype=d.dtype, device=d.device).expand(d.shape[0], 3, 3)
@@ -145,7 +145,7 @@ class Hull(Formula):
         return x, torch.where(inside[:, None, None], identity, inverse(A) - across)
 
     def _starts(self, d: Tensor) -> Tensor:
-        """Return candidates (n, v, 3) [mm] in the valleys of the distance to d (n, 3), as `JawRig.project` does."""
+        """Return candidates (n, v, 3) [mm] in the valleys of the distance to d (n, 3), as in `JawRig.project`."""
         if not capturing() and len(d) > _ROWS:
             return torch.cat([self._starts(rows) for rows in d.split(_ROWS)])
         squared = self.scan.square().sum(dim=2).flatten()
@@ -158,10 +158,10 @@ class Hull(Formula):
         return self.scan[slices, place.gather(1, slices)]
 
     def _descended(self, wanted: Tensor, start: Tensor) -> Tensor:
-        """Return the nearest points (n, 3) [mm] inside, in the valleys of starts that are inside.
+        """Return the nearest valid points (n, 3) [mm] in the valleys around valid starts.
 
         As in `jawusd.evaluator.solver`, every iterate is inside: the step of the quadratic model under the linearised
-        bound is pulled back onto the surface, and counts only if it came nearer.
+        bound is pulled back onto the surface, and accepted only if the distance does not grow.
         """
         x, cost = start, (start - wanted).square().sum(dim=1)
         state = [wanted, x, cost, torch.full_like(cost, _START_DAMPING), torch.zeros_like(cost)]
@@ -181,7 +181,7 @@ class Hull(Formula):
     def _stepped(
         self, wanted: Tensor, x: Tensor, cost: Tensor, damping: Tensor, multiplier: Tensor
     ) -> tuple[list[Tensor], Tensor]:
-        """Return the state of searches one step on, and which of them (n,) were still moving."""
+        """Return the state of the searches after one step, and which of them (n,) were still moving."""
         tolerance_mm = TOLERANCE_MM if wanted.dtype == torch.float64 else 1e-4
         identity = torch.eye(3, dtype=x.dtype, device=x.device)
         at = self.expansion(x)
@@ -189,19 +189,19 @@ class Hull(Formula):
         to_bottom = inverse(A)
         step, inward = applied(to_bottom, wanted - x), applied(to_bottom, at.gradient)
         over = at.distance + (at.gradient * step).sum(dim=1)
-        multiplier = over.clamp(min=0.0) / (at.gradient * inward).sum(dim=1).clamp(min=LEAST_SLOPE)
+        multiplier = over.clamp(min=0.0) / (at.gradient * inward).sum(dim=1).clamp(min=MIN_SLOPE)
         step = step - multiplier[:, None] * inward
         length = step.square().sum(dim=1, keepdim=True).sqrt().clamp(min=1e-30)
-        moving = (length[:, 0] > tolerance_mm) & (damping < LARGEST_DAMPING)
-        trial = self._pulled_inside(x + step * (LONGEST_STEP_MM / length).clamp(max=1.0))
+        moving = (length[:, 0] > tolerance_mm) & (damping < MAX_DAMPING)
+        trial = self._pulled_inside(x + step * (MAX_STEP_MM / length).clamp(max=1.0))
         nearer = (trial - wanted).square().sum(dim=1)
         taken = (nearer <= cost) & (self.margin(trial) >= 0)
         x, cost = torch.where(taken[:, None], trial, x), torch.where(taken, nearer, cost)
-        damping = torch.where(taken, (damping * 0.1).clamp(min=SMALLEST_DAMPING), damping * 10.0)
+        damping = torch.where(taken, (damping * 0.1).clamp(min=MIN_DAMPING), damping * 10.0)
         return [wanted, x, cost, damping, multiplier], moving
 
     def _polished(self, wanted: Tensor, x: Tensor) -> Tensor:
-        """Return nearest points (n, 3) [mm] to rounding: Newton on the conditions of the nearest point of the bound."""
+        """Return the nearest points (n, 3) [mm], refined to rounding by Newton on the optimality conditions."""
         for _ in range(_POLISHING):
             A, multiplier, at = self._conditions(wanted, x)
             free = applied(inverse(A), wanted - x - multiplier[:, None] * at.gradient)
@@ -214,27 +214,27 @@ class Hull(Formula):
     def _conditions(self, wanted: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Expansion]:
         """Return the derivative (n, 3, 3) by x of ``x - wanted + multiplier gradient``, the multiplier and the hull."""
         at = self.expansion(x)
-        squared = at.gradient.square().sum(dim=1).clamp(min=LEAST_SLOPE)
+        squared = at.gradient.square().sum(dim=1).clamp(min=MIN_SLOPE)
         multiplier = ((wanted - x) * at.gradient).sum(dim=1) / squared
         identity = torch.eye(3, dtype=x.dtype, device=x.device)
         return identity + multiplier[:, None, None] * (at.rounding + at.bending), multiplier, at
 
     def _pulled_inside(self, x: Tensor) -> Tensor:
-        # deep enough that rounding cannot carry it out again, however the margin is summed
+        # deep enough that rounding of the margin cannot move the point out again
         depth_mm = INSIDE_MM if x.dtype == torch.float64 else 1e-5
         for _ in range(_PULLS_CAPTURED if capturing() else PULL_BACKS):
             distance, gradient = self.slope(x)
             out = distance + 0.5 * depth_mm
             if finished(out > 0):
                 break
-            squared = gradient.square().sum(dim=1).clamp(min=LEAST_SLOPE)
+            squared = gradient.square().sum(dim=1).clamp(min=MIN_SLOPE)
             pull = torch.where(out > 0, PULL * distance.clamp(min=0.0) + depth_mm, torch.zeros_like(out)) / squared
             x = x - pull[:, None] * gradient
         return x
 
 
 def _by_slices(points: Array) -> Array:
-    """Return points (p, 3), in order of d1, as slices (s, q, 3) of one d1 each; the last of a short one is repeated."""
+    """Return points (p, 3), sorted by d1, as slices (s, q, 3) of equal d1, padded with their last point."""
     slices = np.split(points, np.flatnonzero(np.diff(points[:, 0])) + 1)
     longest = max(map(len, slices))
     return np.stack([each[np.minimum(np.arange(longest), len(each) - 1)] for each in slices])

@@ -1,4 +1,4 @@
-"""All of the valid volume as the image of an unconstrained vector: smooth, onto, one to one."""
+"""A smooth bijection from unconstrained vectors onto the valid volume."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from jawusd.solvers.motion import OPERATIONS, Formula
 from jawusd.solvers.solution import capturing, finished
 
 _STEPS, _STEPS_CAPTURED = 60, 12
-_SOFTNESS_MM = 1.0  # rounding with which the middle of a section is found: keeps the line of middles straight
-_CHECKED = 400  # openings at which the line of middles must lie inside
+_SOFTNESS_MM = 1.0  # rounding used for the middle of a section: keeps the line of middles straight
+_CHECKED = 400  # openings at which the line of middles is checked
 _NEWTON_STEPS, _SMALLEST_SHARE, _STIFFNESS = 200, 1e-9, 1e-12
 _END_TOLERANCE_MM = 1e-13
 
 
 class Interior(Formula):
-    """A map from vectors z (n, 3) onto the inside of a hull.
+    """A map from vectors z (n, 3) onto the interior of a hull.
 
     ``d1`` is a sigmoid of z1 onto the valid openings. With m the margin and c(d1) a line inside the volume,
     ``(d2, d3) = c + (z2, z3) m(d1, d2, d3)``: sections are convex and m is concave in them, so along every ray from c
@@ -49,8 +49,8 @@ class Interior(Formula):
         root = torch.sqrt(1.0 + z[:, :1].square())
         on_line, slope = self._on_line(0.5 * (low + high) + 0.5 * (high - low) * z[:, :1] / root)
         side = torch.cat([torch.zeros_like(root), z[:, 1:]], dim=1)
-        # Newton from above: mu - m(c + z mu) is convex in mu, so that it comes down to the root without overshooting
-        mu = hull.most(on_line)[:, None]
+        # Newton from above: mu - m(c + z mu) is convex in mu, so it descends to the root without overshooting
+        mu = hull.upper_margin(on_line)[:, None]
         tolerance_mm = 500 * torch.finfo(z.dtype).eps
         for _ in range(_STEPS_CAPTURED if capturing() else _STEPS):
             at = hull.expansion(on_line + side * mu)
@@ -93,9 +93,9 @@ class Interior(Formula):
 
 
 def _middles(bound: SliceHull) -> Array:
-    """Return points (k, 2) [mm] in the sections at the knots: inside all, and the deepest of the first and the last.
+    """Return points (k, 2) [mm] inside the sections at the knots, the deepest ones at the first and last knot.
 
-    Beyond those two sections stay as they are but for the rounding of the ends, which closes around the deepest point.
+    Beyond these two, sections change only by the rounding of the ends, which closes around the deepest point.
     """
     reach = bound.supports.values
     found = np.zeros((len(reach), 2))
@@ -110,7 +110,7 @@ def _middles(bound: SliceHull) -> Array:
 
 
 def _deepest(normals: Array, reach: Array, softness_mm: float, y: Array) -> Array:
-    """Return where the soft maximum of ``normals @ y - reach`` is least, by damped Newton steps from y (2,) [mm]."""
+    """Return the minimiser of the soft maximum of ``normals @ y - reach``, by damped Newton from y (2,) [mm]."""
 
     def value(y: Array) -> tuple[float, Array]:
         v = (normals @ y - reach) / softness_mm

@@ -24,10 +24,10 @@ _CORNERS = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
 
 
 class Clearances(nn.Module):
-    """A field over d, all of it in buffers.
+    """A clearance field over d; all data are buffers.
 
     Args:
-        field: The field of a rig.
+        field: The clearance field of a rig.
     """
 
     first: Tensor
@@ -57,9 +57,9 @@ class Clearances(nn.Module):
 
 
 class TemporalPrior(nn.Module):
-    """The squared Mahalanobis lengths of velocity and acceleration of d, zero for a jaw at rest.
+    """A prior on motion: squared Mahalanobis lengths of velocity and acceleration of d, zero for a jaw at rest.
 
-    Both are taken as normal with mean zero; the inverses of their covariances are buffers, float64.
+    Both are modelled as normal with mean zero; the inverses of their covariances are buffers, float64.
 
     Args:
         speeds: How fast the jaw moves: `JawRig.speeds`, or `Speeds.of_take`.
@@ -74,13 +74,13 @@ class TemporalPrior(nn.Module):
             self.register_buffer(name, torch.linalg.inv(torch.tensor(covariance)))
 
     def forward(self, d: Tensor, fps: float) -> Tensor:
-        """Return the prior (...), of about 3 for motion like the take's, for d (..., F, 3) [mm] at a rate [1/s].
+        """Return the prior (...) of d (..., F, 3) [mm] at a rate [1/s]; about 3 for motion like that of the take.
 
-        Half the mean squared Mahalanobis length of the velocities, plus that of the accelerations.
+        Half the sum of the mean squared Mahalanobis lengths of velocities and accelerations.
 
         Raises:
             ValueError: fewer than three frames.
-            TypeError: another type of number than the prior's.
+            TypeError: a dtype other than the prior's.
         """
         if d.ndim < 2 or d.shape[-1] != 3 or d.shape[-2] < 3:
             raise ValueError(f"the shape of d must end in (F, 3) with three frames or more, got {tuple(d.shape)}")
@@ -98,14 +98,14 @@ class TemporalPrior(nn.Module):
 class JawLayer(nn.Module):
     """Evaluate a rig on torch tensors, with gradients, in float32 or float64, on any device.
 
-    ``layer(d)`` is `JawRig.pose`. Nothing is trained. All that is computed with lies in buffers: ``.to(...)`` moves it,
-    `state_dict` saves it, and `load_state_dict` takes the state of the same rig alone. Every function works under
+    ``layer(d)`` is `JawRig.pose`. There are no trainable parameters. All data are buffers: ``.to(...)`` moves them,
+    `state_dict` saves them, and `load_state_dict` accepts only the state of the same rig. Every function works under
     `torch.func`, `torch.compile(fullgraph=True)`, `torch.export` and its ONNX exporter, for any batch shape.
 
-    `encode`, `project` and `inside` carry first derivatives, not second ones.
+    `encode`, `project` and `inside` have first derivatives only.
 
-    ``layer.temporal(d, fps)`` is a prior on motion from frame to frame, see `TemporalPrior`; None if the rig does not
-    know how fast the jaw moves.
+    ``layer.temporal(d, fps)`` is a prior on motion between frames, see `TemporalPrior`; None if the rig has no
+    speeds.
 
     Args:
         rig: The rig.
@@ -145,7 +145,7 @@ class JawLayer(nn.Module):
         for name, value in buffers.items():
             self.register_buffer(name, torch.tensor(value))
         self.register_buffer("rig_hash", torch.tensor(list(bytes.fromhex(rig.model_hash)), dtype=torch.uint8))
-        self.register_load_state_dict_pre_hook(_refuse_other_rigs)
+        self.register_load_state_dict_pre_hook(_reject_other_rigs)
 
     def forward(self, d: Tensor) -> Tensor:
         """Return the poses T_skull_mandible, shape (..., 4, 4), for jaw parameters d (..., 3) [mm]."""
@@ -163,30 +163,30 @@ class JawLayer(nn.Module):
     def clearance(self, d: Tensor, of: Meeting = "teeth") -> Tensor:
         """Return the clearance (...) [mm] of teeth or condyles at d (..., 3) [mm], as `JawRig.clearance` does.
 
-        Below 0 where they run deeper into each other than in the closed bite; linear between sampled values, so its
-        derivative has steps.
+        Below 0 where they penetrate deeper than in the closed bite. Trilinear between samples, so the derivative is
+        discontinuous.
 
         Raises:
-            EvaluatorError: the rig has no such clearances.
+            EvaluatorError: the rig has no such clearance.
         """
         field = {"teeth": self.teeth, "condyles": self.condyles}[of]
         if field is None:
-            raise EvaluatorError(f"the rig of this JawLayer has no clearances of the {of}.")
+            raise EvaluatorError(f"the rig of this JawLayer has no clearance of the {of}.")
         return cast("Tensor", field(self._rows(d, (3,), "d"))).reshape(d.shape[:-1])
 
     def project(self, d: Tensor) -> Tensor:
-        """Return the nearest jaw parameters (..., 3) [mm] with margin >= 0, as `JawRig.project` does; d (..., 3) [mm].
+        """Return the nearest jaw parameters (..., 3) [mm] with margin >= 0 to d (..., 3) [mm], as `JawRig.project`.
 
-        Inside the bound the derivative is the identity; outside, that of the nearest point of the bound.
+        Inside the bound, the derivative is the identity; outside, that of the nearest point on the bound.
         """
         rows = self._rows(d, (3,), "d")
         x, by_d = solved(self.bound.nearest, rows)
         return attached(x, by_d, rows).reshape(d.shape)
 
     def inside(self, z: Tensor) -> Tensor:
-        """Return jaw parameters (..., 3) [mm] inside the bound for any vectors z (..., 3): smooth, onto, one to one.
+        """Return valid jaw parameters (..., 3) [mm] for any vectors z (..., 3): a smooth bijection.
 
-        z = 0 is a point in the middle of the valid openings; the bound is at infinity. See `Interior`.
+        z = 0 maps to the middle of the valid openings; the bound is at infinity. See `Interior`.
         """
         rows = self._rows(z, (3,), "z")
         d, by_z = solved(lambda z: self.interior.mapped(self.bound, z), rows)
@@ -197,17 +197,17 @@ class JawLayer(nn.Module):
         return self.interior.unconstrained(self.bound, self._rows(d, (3,), "d")).reshape(d.shape)
 
     def encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nearest jaw parameters and the landmark distance to them, as `JawRig.encode` does.
+        """Return the nearest jaw parameters and their landmark distance, as `JawRig.encode`.
 
-        The derivatives by the pose are those of the nearest point itself: the implicit function theorem on
-        ``grad_d |pose(d) - T|^2 = 0``, second derivatives of the model included.
+        The derivatives by the pose are exact, from the implicit function theorem on ``grad_d |pose(d) - T|^2 = 0``,
+        including second derivatives of the model.
 
         Args:
             T_skull_mandible: Poses, shape (..., 4, 4).
 
         Returns:
-            d [mm], shape (..., 3), and residual_mm, shape (...). The distance has a kink where it is zero; its
-            gradient there is taken as zero.
+            d [mm], shape (..., 3), and residual_mm, shape (...). The distance has a kink at zero, where
+            its gradient is set to zero.
         """
         d, squared = self._encode(T_skull_mandible)
         on_model = squared == 0
@@ -217,18 +217,18 @@ class JawLayer(nn.Module):
     def loss(self, T_skull_mandible: Tensor) -> Tensor:
         """Return a prior on jaw poses (..., 4, 4) [mm^2]: squared residual plus `penalty` of the nearest parameters.
 
-        It is zero for every pose of this person's jaw and grows with the distance to the model and to the bound: a
-        replacement for the usual pull towards the closed mouth. Shape (...), smooth everywhere.
+        It is zero for every pose of this person's jaw and grows with the distance to the model and to the bound. It
+        replaces the usual regularisation towards the closed mouth. Shape (...), smooth everywhere.
         """
         d, squared = self._encode(T_skull_mandible)
         return squared + self.penalty(d)
 
     def _encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nearest d [mm], shape (..., 3), and the squared residual [mm^2], smooth at zero too."""
+        """Return the nearest d [mm], shape (..., 3), and the squared residual [mm^2], which is smooth at zero."""
         T = self._rows(T_skull_mandible, (4, 4), "T_skull_mandible")
         d, image, by_target = solved(self._nearest, T)
         target = self._images(T)
-        # d is where the squared residual is least: to first order its change does not change the residual
+        # d minimises the squared residual, so to first order a change of d does not change it
         squared = (image - target).square().sum(dim=1)
         batch = T_skull_mandible.shape[:-2]
         return attached(d, by_target, target).reshape(*batch, 3), squared.reshape(batch)
@@ -253,15 +253,15 @@ class JawLayer(nn.Module):
         return values.reshape(-1, *tail)
 
 
-def _refuse_other_rigs(layer: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
-    """Refuse the state of another rig before any of it is loaded.
+def _reject_other_rigs(layer: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Reject the state of another rig before loading.
 
     Raises:
-        EvaluatorError: the state is of another rig, or does not say of which.
+        EvaluatorError: the state is of another rig or of an unknown one.
     """
     found, own = state.get(f"{prefix}rig_hash"), layer.get_buffer("rig_hash").tolist()
     if found is None or found.tolist() != own:
-        theirs = "does not say of which rig it is" if found is None else f"is of rig {bytes(found.tolist()).hex()[:12]}"
+        theirs = "is of an unknown rig" if found is None else f"is of rig {bytes(found.tolist()).hex()[:12]}"
         raise EvaluatorError(
             f"the state {theirs}; this JawLayer is of rig {bytes(own).hex()[:12]}.",
             hint="Build the layer from the rig the state was saved with.",

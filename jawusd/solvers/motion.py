@@ -17,11 +17,11 @@ from jawusd.evaluator.formula import MODELS, Numbers, RigidMotion, anchored_moti
 from jawusd.evaluator.operations import Rows, polynomial, triple
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, Triple, angle_quotients, angle_series
 
-_TINY = 1e-30  # keeps the slope of a root at zero finite
+_TINY = 1e-30  # keeps the derivative of sqrt at zero finite
 
 
 class TensorOperations:
-    """`jawusd.evaluator.operations.Operations` on tensors; all derivatives are finite, at zero too."""
+    """`jawusd.evaluator.operations.Operations` on tensors; all derivatives are finite, including at zero."""
 
     @staticmethod
     def exp(x: Tensor) -> Tensor:
@@ -42,7 +42,7 @@ class TensorOperations:
     def angle_coefficients(squared: Tensor) -> Triple[Tensor]:
         """Return a, b and c of `jawusd.geometry.rodrigues` at a squared angle [rad^2]."""
         small = squared < SMALL_SQUARED_ANGLE
-        # each branch gets an argument at which its derivatives are finite
+        # each branch gets an argument where its derivatives are finite
         far = torch.where(small, torch.ones_like(squared), squared)
         near = torch.where(small, squared, torch.zeros_like(squared))
         angle = torch.sqrt(far)
@@ -66,12 +66,12 @@ class TensorOperations:
 
     @staticmethod
     def weighted_sum(factors: Sequence[Tensor], weights: Tensor) -> Triple[Tensor]:
-        """Return the sum of the rows of a table (m, 3), each times its factor, one (n, m)."""
+        """Return the sum of the rows of a table (m, 3), each multiplied by its factor, factors (n, m)."""
         return triple((factors[0] @ weights).split(1, dim=1))
 
     @staticmethod
     def lookup(x: Tensor, knots: Tensor, tables: Sequence[Tensor]) -> list[tuple[Tensor]]:
-        """Return, of each table, the rows (n, k) whose index is the number of knots (m, 1) at or below x."""
+        """Return the rows (n, k) of each table at the index given by the number of knots (m, 1) at or below x."""
         interval = (x.detach() >= knots[:, 0]).sum(dim=1)
         return [(table[interval],) for table in tables]
 
@@ -85,11 +85,11 @@ OPERATIONS = TensorOperations()
 
 
 class Formula(nn.Module):
-    """A formula with its tables and its single numbers as buffers: nothing it computes with lies elsewhere.
+    """A formula with all its tables and numbers as buffers.
 
     Args:
         tables: Rows of floats by name.
-        numbers: Floats in tuples; None where there is nothing.
+        numbers: Nested tuples of floats or None.
     """
 
     singles: Tensor
@@ -107,7 +107,7 @@ class Formula(nn.Module):
         return {name: self.get_buffer(name) for name in self._names}
 
     def numbers(self) -> Numbers:
-        """Return the single numbers in their tuples, each a tensor of no axes."""
+        """Return the numbers in their nested tuples, each a scalar tensor."""
         return cast("Numbers", _nested(self._nesting, iter(self.singles.unbind())))
 
 
@@ -147,7 +147,7 @@ def _nested(like: object, leaves: Iterator[Tensor]) -> object:
     if not isinstance(like, tuple | list):
         return next(leaves)
     parts = [_nested(each, leaves) for each in like]
-    # a named tuple takes its fields one by one, which mypy does not know of `type(like)`
+    # a named tuple takes its fields as arguments, which mypy cannot infer from `type(like)`
     return type(like)(*parts) if hasattr(like, "_fields") else parts  # type: ignore[arg-type]
 
 
@@ -160,19 +160,19 @@ def jaw_pose_from_axis_angle(
     T_rest: Tensor,
     unit_mm: float = 1000.0,
 ) -> Tensor:
-    """Return the jaw poses of a face model whose jaw turns about a joint.
+    """Return the jaw poses of a parametric face model (FLAME, SMPL-X) as T_skull_mandible.
 
-    Such models move jaw vertices by ``v -> R (v - j) + j + t`` in the model's frame (Li et al. 2017, FLAME; Pavlakos et
-    al. 2019, SMPL-X); with the mouth closed, R = I and t = 0. In the skull frame, S = T_skull_model,
+    These models move jaw vertices by ``v -> R (v - j) + j + t`` in the model's frame (Li et al. 2017, FLAME; Pavlakos
+    et al. 2019, SMPL-X); with the mouth closed, R = I and t = 0. In the skull frame, S = T_skull_model,
     ``T_skull_mandible = S [R, j - R j + t] S^-1 T_rest``.
 
     Args:
         axis_angle: Rotation vectors of the jaw [rad], shape (..., 3).
-        translation: Translation t of the jaw [model units], shape (..., 3); None for models that only turn it.
-        joint: The jaw joint j of the face with the mouth closed [model units], shape (3,).
+        translation: Translation t of the jaw [model units], shape (..., 3); None for models that only rotate it.
+        joint: Jaw joint j of the face with the mouth closed [model units], shape (3,).
         T_skull_model: Rigid alignment of the model's frame with the skull (upper teeth scan) frame, in mm, (4, 4).
         T_rest: Pose of the closed bite, `JawRig.T_rest`, shape (4, 4).
-        unit_mm: Length of a model unit; both models count in metres.
+        unit_mm: Length of a model unit; both models use metres.
 
     Returns:
         T_skull_mandible [mm], shape (..., 4, 4).

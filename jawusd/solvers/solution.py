@@ -1,8 +1,8 @@
-"""Solutions of searches as differentiable functions: the search is opaque, its derivative is given.
+"""Iterative searches as differentiable functions: the search is opaque, its derivative is attached.
 
-A search takes rows (n, ...) and returns tensors whose first axis is n. It may stop early, depending on values, where
-torch runs step by step; while a graph is captured it makes a fixed number of steps. Derivatives come from the implicit
-function theorem, which is what `attached` is for; second derivatives of solutions are not carried.
+A search takes rows (n, ...) and returns tensors whose first axis is n. In eager mode it may stop early, depending on
+values; while a graph is captured it makes a fixed number of steps. Derivatives come from the implicit function theorem,
+see `attached`; there are no second derivatives.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Search = Callable[[Tensor], tuple[Tensor, ...]]
 
 
 class _Search(torch.autograd.Function):
-    """Run a search on plain tensors whatever transforms of `torch.func` surround it."""
+    """Run a search on plain tensors under any transforms of `torch.func`."""
 
     @staticmethod
     def forward(search: Search, rows: Tensor) -> tuple[Tensor, ...]:
@@ -41,7 +41,7 @@ class _Search(torch.autograd.Function):
 
 
 def solved(search: Search, rows: Tensor) -> tuple[Tensor, ...]:
-    """Return what a search finds for rows (n, ...), as constants."""
+    """Return the results of a search for rows (n, ...), as constants."""
     if capturing():
         return search(rows.detach())
     found: tuple[Tensor, ...] = _Search.apply(search, rows.detach())
@@ -49,24 +49,24 @@ def solved(search: Search, rows: Tensor) -> tuple[Tensor, ...]:
 
 
 def capturing() -> bool:
-    """Tell whether torch captures a graph, in which nothing may depend on values."""
+    """Return whether torch is capturing a graph, which must not depend on values."""
     return torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export()
 
 
 def finished(moving: Tensor) -> bool:
-    """Tell whether a search whose rows (n,) are moving or not may stop; never while a graph is captured."""
+    """Return whether a search may stop: no row of ``moving`` (n,) is set, and no graph is being captured."""
     return not capturing() and not bool(moving.any())
 
 
 def attached(value: Tensor, jacobian: Tensor, by: Tensor) -> Tensor:
-    """Return a value (n, k) with the derivative (n, k, m) by the argument (n, m) it was found for."""
+    """Return a value (n, k) with a given derivative (n, k, m) by its argument (n, m)."""
     return value + applied(jacobian, by - by.detach())
 
 
 def inverse(A: Tensor) -> Tensor:
     """Return the inverses of matrices (n, 3, 3) by cofactors, finite where they are singular.
 
-    `torch.linalg` raises for batches with singular matrices, and has no form in ONNX.
+    `torch.linalg` raises for batches with singular matrices and cannot be exported to ONNX.
     """
     x, y, z = A.unbind(dim=1)
     first = torch.linalg.cross(y, z)

@@ -77,7 +77,7 @@ def test_colliding_poses_are_refused():
         assert authored.reason.tolist() == [0, Reason.TEETH_COLLIDE]
 
 
-def test_condyles_are_told_of_and_refuse_nothing():
+def test_condyles_have_clearances_that_reject_no_pose():
     values = np.random.default_rng(2).uniform(-1.0, 1.5, SHAPE)
     field = ContactField(FIRST, STEP, np.round(values, 2), -0.4, 0.05, -0.3)
     rig = JawRig({**example_arrays(), **contact_arrays(), **field.arrays("condyles")}, example_meta())
@@ -88,7 +88,7 @@ def test_condyles_are_told_of_and_refuse_nothing():
     plain = touching_rig()
     np.testing.assert_array_equal(rig.validate(rig.pose(d)).reason, plain.validate(plain.pose(d)).reason)
     assert rig.model_hash != plain.model_hash
-    with pytest.raises(EvaluatorError, match="how the condyles meet"):
+    with pytest.raises(EvaluatorError, match="no clearance of the condyles"):
         plain.clearance(d, of="condyles")
     with pytest.raises(ValueError, match="tongue"):
         rig.clearance(d, of="tongue")
@@ -97,7 +97,7 @@ def test_condyles_are_told_of_and_refuse_nothing():
 def test_a_rig_without_scans_says_so():
     rig = JawRig(example_arrays(), example_meta())
     assert rig.contact is None
-    with pytest.raises(EvaluatorError, match="does not know how the teeth meet"):
+    with pytest.raises(EvaluatorError, match="has no clearance of the teeth"):
         rig.clearance([0.0, 0.0, 0.0])
 
 
