@@ -42,7 +42,7 @@ class RigArrays:
     def __repr__(self) -> str:
         low, high = self.d_range.T
         ranges = ", ".join(f"d{i} {a:.1f} to {b:.1f}" for i, (a, b) in enumerate(zip(low, high), start=1))
-        return f"<JawRig {self.actor or 'without a name'}, {self.kind}, {ranges} mm>"
+        return f"<JawRig {self.actor or 'unnamed'}, {self.kind}, {ranges} mm>"
 
     @property
     def kind(self) -> str:

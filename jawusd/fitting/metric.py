@@ -24,7 +24,7 @@ _EVERY = 32  # of the extreme points, one is looked at for a lower bound
 class MandibleMetric:
     """Measure pose differences by the displacement of a set of mandible points."""
 
-    # four homogeneous columns that represent the points, their mean last (see `evaluator.distances`), shape (4, 4)
+    # four homogeneous columns that represent the points, their mean last (see `evaluator.encoding`), shape (4, 4)
     vectors: Array
     extremes: Array  # vertices of the points' convex hull [mm], shape (H, 3)
 

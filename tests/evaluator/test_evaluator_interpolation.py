@@ -123,7 +123,7 @@ def test_shapes_and_single_keys():
     [
         ([0.0, 1.0], np.zeros((3, 3)), "shape"),
         ([], np.zeros((0, 3)), "shape"),
-        ([0.0, 0.0], np.zeros((2, 3)), "rise"),
+        ([0.0, 0.0], np.zeros((2, 3)), "increase"),
         ([0.0, np.nan], np.zeros((2, 3)), "finite"),
     ],
 )

@@ -58,10 +58,10 @@ def test_a_motion_along_one_line_has_speeds_that_can_be_inverted():
     [
         (np.zeros((40, 2)), 24.0, r"\(40, 2\)"),
         (np.zeros((40, 3)), 0.0, "positive"),
-        (np.zeros((33, 3)), 24.0, "in a row"),
+        (np.zeros((33, 3)), 24.0, "consecutive"),
     ],
 )
-def test_takes_that_say_nothing_are_refused(d, fps, message):
+def test_unusable_takes_are_rejected(d, fps, message):
     with pytest.raises(ValueError, match=message):
         Speeds.of_take(d, fps)
 
