@@ -114,7 +114,7 @@ def test_a_scan_that_fits_nowhere_is_named_before_mistakes_are_looked_for_on_oth
     assert searches.count == 20
 
 
-def test_of_mistakes_that_are_not_all_tried_only_one_only_clear_counts(monkeypatch):
+def test_of_mistakes_that_are_not_all_tried_only_a_clear_fit_counts(monkeypatch):
     monkeypatch.setattr(start_causes, "MOST_PICTURES", 20)
     assert "not tried" in _refused(_Searches({5: 0.2}), monkeypatch)
     with pytest.raises(TrackingError, match="found only with that undone"):
@@ -128,7 +128,7 @@ def test_sizes_are_tried_first_where_the_scans_are_of_no_usual_size(monkeypatch)
         _refused(_Searches({1: 0.2}), monkeypatch)
 
 
-def test_only_a_fit_only_clear_counts_where_one_is_asked_for(monkeypatch):
+def test_only_a_clear_fit_counts_where_one_is_required(monkeypatch):
     assert "does not help" in _refused(_Searches({1: 0.2}), monkeypatch, only_clear=True)
     with pytest.raises(TrackingError, match="the scans are mirrored"):
         _refused(_Searches({1: 0.4}), monkeypatch, only_clear=True)

@@ -11,7 +11,7 @@ from jawusd.formats.tracks import LOST, TRACKED, LostReason
 from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.sequence import passes
-from jawusd.tracking.sequence.passes import Passes, give_up_poorly_seen, nearest_well_seen
+from jawusd.tracking.sequence.passes import Passes, mark_poorly_seen_lost, nearest_well_seen
 
 FRAMES = 10
 OFF_MM = 2.5  # farther than the gates, so that a contour near by is taken for the teeth's
@@ -95,7 +95,7 @@ def seen(share, rough_px):
 )
 def test_an_arch_that_fits_far_less_and_far_more_roughly_than_usual_is_given_up(share, rough_px, given_up):
     known = {frame: seen(0.5, 0.6) for frame in range(10)} | {4: seen(share, rough_px)}
-    give_up_poorly_seen(known)
+    mark_poorly_seen_lost(known)
     lost = {frame: (record.status == LOST).tolist() for frame, record in known.items()}
     assert lost == {frame: [False, given_up and frame == 4] for frame in range(10)}
     if given_up:
@@ -105,7 +105,7 @@ def test_an_arch_that_fits_far_less_and_far_more_roughly_than_usual_is_given_up(
 
 def test_a_few_frames_do_not_tell_what_is_usual():
     known = {frame: seen(0.5, 0.6) for frame in range(4)} | {4: seen(0.12, 1.1)}
-    give_up_poorly_seen(known)
+    mark_poorly_seen_lost(known)
     assert (known[4].status == TRACKED).all()
 
 

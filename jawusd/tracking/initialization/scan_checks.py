@@ -63,7 +63,7 @@ def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | Non
     derived = anatomical_frame(*(scan.crown_vertices(6000) for scan in scans))
     found = measure_occlusion(scans, derived)
     errors = list(_impossible(found))
-    findings = errors[:1] or list(_doubtful(found))
+    findings = errors[:1] or list(_unusual(found))
     if not given:
         return derived, findings
     T = np.array(T_anatomical_scan, np.float64)
@@ -121,7 +121,7 @@ def _impossible(found: Occlusion) -> Iterator[Finding]:
         yield error("scans_inside", message, found.through, _THROUGH_SHARE)
 
 
-def _doubtful(found: Occlusion) -> Iterator[Finding]:
+def _unusual(found: Occlusion) -> Iterator[Finding]:
     """Yield warnings about a possible but unusual bite."""
 
     def warning(kind: str, message: str, value: float, limit: float, hint: str = _LOOK) -> Finding:

@@ -24,7 +24,7 @@ from jawusd.tracking.region.condyle_fusion import CondyleFusion
 from jawusd.tracking.region.tracker import RegionPose
 from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.nuisance import Hand, TakeEquations, corrected_pose
+from jawusd.tracking.sequence.nuisance import AnnotatorPrior, TakeEquations, corrected_pose
 from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings, mirror_findings
 from jawusd.tracking.sequence.time_checks import time_findings
@@ -129,7 +129,7 @@ def footage_doubts(tracks: Tracks) -> list[Finding]:
 
 #: How borders of colours lie beside the teeth's edges: up to half a pixel inside, as teeth darken towards them; where
 #: the gum line is found was learned on the way.
-BORDERS = Hand(edge_px=0.3, gum_px=0.08, gum_mm=0.02, arch_px=0.25, arch_mm=0.01, camera_px=0.08, frames=5.0)
+BORDERS = AnnotatorPrior(edge_px=0.3, gum_px=0.08, gum_mm=0.02, arch_px=0.25, arch_mm=0.01, camera_px=0.08, frames=5.0)
 FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)
 
 
@@ -174,7 +174,7 @@ def tracks_of(
     middle = np.median([record.solution.centres for record in records.values()], axis=(0, 1))
     extrinsics = Extrinsics.calibrated(take.cameras, middle)
     variance = outline_variance(records, config)
-    equations = TakeEquations(records, variance, extrinsics, hand=BORDERS)
+    equations = TakeEquations(records, variance, extrinsics, annotator=BORDERS)
     observe_bite(equations, records, rest, extrinsics, variance)
     nuisances = equations.solve(config, False)
     names = tuple(camera.name for camera in take.cameras)

@@ -27,21 +27,21 @@ from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import TakeEquations, pose_response
 
-# Teeth held together rest: slower than this against one another [mm/frame at the teeth], and no farther from the
-# closest frame [mm].
+# Teeth in contact are still: largest relative motion [mm/frame at the teeth], and largest distance from the most
+# closed frame [mm].
 _STILL_MM, _SAME_BITE_MM = 0.12, 0.2
-_LONGEST_REST = 24  # frames used on either side: later ones tell nothing new
+_LONGEST_REST = 24  # frames used on either side; more add no information
 
 
 @dataclass(frozen=True, eq=False)
 class RestFrames:
-    """Say where the teeth are together, and what to do about it.
+    """Frames with the teeth together, and how to use them.
 
     Attributes:
-        frames: numbers of the frames.
+        frames: frame numbers.
         named: whether the capture names one of them.
-        point, lower: amid the teeth, and amid the lower crowns, scan coordinates [mm], shape (3,).
-        apply: whether the lower scan is moved to where it belongs.
+        point, lower: centre of the teeth, and of the lower crowns, in scan coordinates [mm], shape (3,).
+        apply: whether to correct the position of the lower scan.
     """
 
     frames: tuple[int, ...]
@@ -54,12 +54,12 @@ class RestFrames:
 def rest_frames(
     records: Mapping[int, FrameRecord], named: int | None, up: Array, point: Array, probes: Array
 ) -> tuple[int, ...]:
-    """Return the frames in which the teeth rest together, around a named one or where the mouth is closed farthest.
+    """Return the frames in which the teeth rest together, around a named frame or the most closed one.
 
     Args:
-        named: frame the capture names; None searches.
-        up: from the lower to the upper teeth, unit vector in scan axes, shape (3,).
-        point, probes: amid the teeth, shape (3,), and spread over the lower ones, shape (N, 3), scan coordinates [mm].
+        named: frame named in the capture; None searches.
+        up: unit vector from the lower to the upper teeth in scan axes, shape (3,).
+        point, probes: centre of the teeth (3,), and points spread over the lower ones (N, 3), scan coordinates [mm].
     """
     relative = {frame: relative_pose(*records[frame].solution.poses) for frame in whole_frames(records)}
     if named is None:
@@ -86,37 +86,36 @@ def _still(relative: Mapping[int, Array], frame: int, other: int, probes: Array)
 
 
 def _moved_mm(one: Array, other: Array, probes: Array) -> float:
-    """Return how far two poses (4, 4) of the lower arch are apart, on average over points (N, 3) [mm]."""
+    """Return the mean distance of points (N, 3) between two poses (4, 4) of the lower arch [mm]."""
     gap = probes @ (one - other)[:3, :3].T + (one - other)[:3, 3]
     return float(np.linalg.norm(gap, axis=1).mean())
 
 
-# Spread of the closed bite about the scans' own: of a good registration together with how firmly people bite [mm], and
-# the same at the ends of an arch as a turn [rad].
+# Standard deviation of the closed bite about that of the scans, from registration and bite force [mm]; and radius that
+# converts it into a rotation [mm].
 _BITE_MM = 0.03
 _ARCH_MM = 25.0
-_DEGREES_OF_FREEDOM = 4.0  # of the Student distribution: one registration in some hundred is off by ten spreads
-# Share of the outline's error, apart from the habits of the hand, that is the same in all frames of a take [-]. Of 0 to
-# 0.7 it makes no difference to persons of `tests/benchmarks/population.py` (incisal point 0.054 to 0.050 mm), but above
-# 0.3 the noise of two closed frames of a coarse picture shifts the whole take.
+_DEGREES_OF_FREEDOM = 4.0  # of the Student distribution: about one registration in a hundred is off by ten sigmas
+#: Share of the outline error variance, besides annotator habits, that is constant over a take [-]: with more, the noise
+#: of few closed frames would shift the whole take.
 STEADY = 0.3
 _FEWEST_FRAMES = 2
-# Neighbouring frames have nearly the same outline error: each adds this much to the evidence of one, up to a limit [-].
+# Neighbouring frames have nearly the same outline error: independent measurements added per frame, and their limit [-].
 _NEW_PER_FRAME, _MOST_FRAMES = 0.25, 3.0
-_USUAL_FRAMES = 2000  # at least, evenly spread, that show the usual error of a long take: more add memory alone
+_USUAL_FRAMES = 2000  # about this many, evenly spread, are enough for the usual error of a long take
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedBite:
-    """Hold what the frames with the teeth together tell; twists are (omega [rad], v [mm]) about `point` in scan axes.
+    """Errors measured with the teeth together; twists are (omega [rad], v [mm]) about `point` in scan axes.
 
     Attributes:
         frames: the frames used.
-        point: amid the teeth, scan coordinates [mm], shape (3,).
-        registration: left twist that takes the lower scan to where it belongs, shape (6,), and its covariance (6, 6).
-        steady: right twists that the poses of both arches are off by, shape (2, 6).
-        spread, remaining: covariance of the steady errors of upper arch, lower arch, and lower against upper, before
-            and after, shape (3, 6, 6).
+        point: centre of the teeth, scan coordinates [mm], shape (3,).
+        registration: left twist that corrects the lower scan, shape (6,), and its covariance (6, 6).
+        steady: constant errors of the poses of both arches as right twists, shape (2, 6).
+        spread, remaining: covariance of the constant errors of upper arch, lower arch, and lower relative to upper,
+            before and after the correction, shape (3, 6, 6).
     """
 
     frames: tuple[int, ...]
@@ -128,7 +127,7 @@ class ClosedBite:
     remaining: Array
 
     def correct(self, poses: Array, registered: bool) -> Array:
-        """Return poses (F, 2, 4, 4) without their steady error; if registered, of a lower scan moved by `motion`."""
+        """Return poses (F, 2, 4, 4) without their constant error; if registered, of a lower scan moved by `motion`."""
         out = poses @ se3_inverse(self.steady_motions(False))
         if registered:
             out[:, 1] = out[:, 1] @ se3_inverse(self.motion())
@@ -161,12 +160,12 @@ class ClosedBite:
         }
 
     def reduce(self, covariance: Array, steady: Array, T_world_scan: Array, which: int) -> Array:
-        """Return what is left of covariances of left twists about the world origin, shape (F, 6, 6).
+        """Return the covariances of left twists about the world origin after the correction, shape (F, 6, 6).
 
         Args:
-            covariance, steady: before, in all and its part that is the same in all frames, shapes (F, 6, 6).
-            T_world_scan: poses whose axes the steady error keeps, shape (F, 4, 4).
-            which: 0 upper arch, 1 lower arch, 2 lower against upper (`T_world_scan` is identity then).
+            covariance, steady: total covariance before, and its part that is constant over the take, shapes (F, 6, 6).
+            T_world_scan: poses in whose axes the error is constant, shape (F, 4, 4).
+            which: 0 upper arch, 1 lower arch, 2 lower relative to upper (`T_world_scan` is identity then).
         """
         A = se3_adjoint(translation(-self.point) @ se3_inverse(T_world_scan))
         back = np.linalg.inv(A)
@@ -182,11 +181,11 @@ class ClosedBite:
 
 
 def steady_part(outline: Array, habits: Array) -> Array:
-    """Return the part of poses' covariances that is the same in all frames of a take, of any shape.
+    """Return the part of pose covariances that is constant over a take, of any shape.
 
     Args:
         outline: covariance by the outline errors of single frames.
-        habits: covariance by what the hand does in every frame, of the same shape.
+        habits: covariance by annotator habits, of the same shape.
     """
     return np.asarray(STEADY * outline + habits, np.float64)
 
@@ -194,13 +193,13 @@ def steady_part(outline: Array, habits: Array) -> Array:
 def closed_bite(
     frames: NDArray[np.int64], poses: Array, outline: Array, habits: Array, rest: RestFrames
 ) -> ClosedBite | None:
-    """Share out the deviation of the closed bite; None if too few of the rest frames are tracked.
+    """Attribute the deviation of the closed bite to its causes; None if too few of the rest frames are tracked.
 
     Args:
         frames: shape (F,).
         poses: T_world_upper, T_world_lower, shape (F, 2, 4, 4), NaN where lost.
         outline, habits: parts of the covariances of their left twists as in `steady_part`, shapes (F, 2, 6, 6).
-        rest: where the teeth are together.
+        rest: frames with the teeth together.
     """
     point = rest.point
     known = np.asarray(np.isfinite(poses).all((1, 2, 3)) & np.isfinite(outline).all((1, 2, 3)), bool)
@@ -236,51 +235,51 @@ def closed_bite(
     )
 
 
-# A registration off by more than this, and by more than its error explains, is worth a warning [mm, deg, sigmas].
+# Registration error that causes a warning, if it is also significant [mm, deg, sigmas].
 _OFF_MM, _OFF_DEG, _OFF_SIGMAS = 0.2, 0.5, 3.0
 
 
 def registration_findings(found: Registration) -> list[Finding]:
-    """Return a warning if the lower scan is not where the take shows the closed bite, a note if that was corrected."""
+    """Return a warning if the registration of the scans contradicts the closed bite, a note if it was corrected."""
     shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
     shifted = shift > max(_OFF_MM, _OFF_SIGMAS * math.hypot(*found["shift_sigma_mm"]))
     turned = turn > max(_OFF_DEG, _OFF_SIGMAS * math.hypot(*found["turn_sigma_deg"]))
     if not shifted and not turned:
         return []
     frames = f"{found['frames'][0]} to {found['frames'][-1]}"
-    where = f"in frames {frames}" + ("" if found["named"] else ", those closed farthest")
-    off = f"the lower scan is {shift:.2f} mm and {turn:.1f} degrees off the bite that the take shows {where}"
+    where = f"in frames {frames}" + ("" if found["named"] else ", the most closed ones")
+    off = f"the lower scan is {shift:.2f} mm and {turn:.1f} degrees off the bite of the take {where}"
     if found["applied"]:
         return [Finding("scan_registration", "note", f"{off}: corrected", value=shift, limit=_OFF_MM)]
-    severity: Severity = "warning" if found["named"] else "note"  # without a name the mouth may just not have closed
+    severity: Severity = "warning" if found["named"] else "note"  # a mouth may not have closed in an unnamed frame
     hint = 'Register the scans again, or set registration = "take" in [scans] if the teeth are together there.'
     return [Finding("scan_registration", severity, off, value=shift, limit=_OFF_MM, hint=hint)]
 
 
 def registration_unknown(rest: RestFrames) -> Finding:
-    """Return a note that the take does not tell how well the scans are registered."""
+    """Return a note that the take cannot verify the registration of the scans."""
     where = (
-        "the frame named as rest_frame is not tracked" if rest.named else "no frame shows the teeth at rest together"
+        "the frame named in rest_frame is not tracked" if rest.named else "no frame shows the teeth at rest together"
     )
-    hint = "Record a closed bite with both rows in sight, and name it as rest_frame in [motion]."
+    hint = "Record a closed bite with both arches in view, and name its frame as rest_frame in [motion]."
     return Finding("registration_unknown", "note", f"{where}: the bite of the scans was not checked", hint=hint)
 
 
-# What registrations are off by at most; beyond it the mouth was not closed [mm, deg].
+# Largest possible registration error; beyond it the mouth was not closed [mm, deg].
 _MOST_MM, _MOST_DEG = 3.0, 8.0
 
 
 def check_registration(found: Registration) -> None:
-    """Refuse to correct the lower scan by what cannot be an error of its registration.
+    """Reject a registration correction that is too large.
 
     Raises:
-        TrackingError: the lower scan is too far off the bite that the take shows.
+        TrackingError: the lower scan is too far off the bite of the take.
     """
     shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
     if found["applied"] and (shift > _MOST_MM or turn > _MOST_DEG):
         raise TrackingError(
-            f"the teeth are {shift:.1f} mm and {turn:.1f} degrees off the bite of the scans, a registration is off by "
-            f"{_MOST_MM:g} mm and {_MOST_DEG:g} degrees at most",
+            f"the teeth are {shift:.1f} mm and {turn:.1f} degrees off the bite of the scans; at most {_MOST_MM:g} mm "
+            f"and {_MOST_DEG:g} degrees can be a registration error",
             frame=found["frames"][0],
             hint="Name a frame with the teeth together as rest_frame in [motion], or register the scans again.",
         )
@@ -293,7 +292,7 @@ def observe_bite(
     extrinsics: Extrinsics,
     variance_px3: Array,
 ) -> None:
-    """Tell the equations of a take that the teeth are together: habits that part them there are unlikely.
+    """Add the observation to a take that the teeth are together: habits that separate them are unlikely.
 
     `variance_px3` is outline variance times correlation length per arch [px^3], shape (2,).
     """
@@ -317,7 +316,7 @@ def observe_bite(
 
 
 def _registration_spread(found: Array, others: Array) -> Array:
-    """Return the covariance of the registration that explains a deviation (6,) beside others (6, 6), shape (6, 6)."""
+    """Return the covariance of the registration given a deviation (6,) and other covariances (6, 6), shape (6, 6)."""
     bite = np.diag(np.r_[np.full(3, (_BITE_MM / _ARCH_MM) ** 2), np.full(3, _BITE_MM**2)])
     spread = bite
     for _ in range(50):
@@ -334,6 +333,6 @@ def _root(matrix: Array) -> Array:
 
 
 def _positive(matrix: Array) -> Array:
-    """Return the nearest positive matrix to a median of covariances, shape (6, 6)."""
+    """Return the nearest positive definite matrix to a median of covariances, shape (6, 6)."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 1e-9 * values.max())) @ vectors.T, np.float64)

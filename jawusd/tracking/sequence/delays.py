@@ -1,4 +1,4 @@
-"""Where the teeth were at the instants of cameras that run a part of a frame late or early."""
+"""Motion of the teeth within a frame, for cameras with a delay below a frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jawusd.tracking.contour.scan import ARCHES
 
 
 def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:
-    """Return the motion of both arches from the reference instant to each camera's own, shape (C, 2, 4, 4)."""
+    """Return the motion of both arches from the reference instant to that of each camera, shape (C, 2, 4, 4)."""
     out = np.tile(np.eye(4), (len(delays), 2, 1, 1))
     for arch in ARCHES:
         motion = _motion_twists(records, frame, arch)
@@ -28,8 +28,8 @@ def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array)
 def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
     """Return the twist per frame about the arch's centre and its change per frame, shapes (6,): a parabola in time.
 
-    Through both neighbours, at ends through two on one side (a jaw starts and stops within a frame or two), and across
-    a gap evenly; None without tracked frames close by.
+    Fitted through both neighbours, at ends through two on one side, since a jaw starts and stops within a frame or two.
+    Across a gap the motion is uniform. None without tracked frames nearby.
     """
 
     def step(frames: int) -> Array:
@@ -49,9 +49,9 @@ def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) ->
 
 
 def interpolation_errors(records: Mapping[int, FrameRecord], frame: int, arch: int, delays: Array) -> Array:
-    """Return how far the motion may be from the parabola of `delay_motions`, twists about the centre, shape (C, 6).
+    """Return the error of the parabola of `delay_motions`, as twists about the centre, shape (C, 6).
 
-    That is the next term of Newton's interpolation, by the third difference of four frames in a row.
+    It is the next term of Newton's interpolation, from the third difference of four consecutive frames.
     """
     first = next((f for f in (frame - 1, frame - 2, frame, frame - 3) if _all_tracked(records, f, arch)), None)
     if first is None:
@@ -82,14 +82,14 @@ def _is_tracked(records: Mapping[int, FrameRecord], frame: int, arch: int) -> bo
     return frame in records and bool(records[frame].status[arch] != LOST)
 
 
-#: Frames on either side that are looked at: a quarter of a second at 24 fps, jaws turn round in less than two of these.
+#: Frames searched on either side: a quarter of a second at 24 fps.
 BRIDGE_FRAMES = 6
 
 
 def bridge(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
-    """Interpolate an arch evenly between tracked frames: its pose (4, 4) and twist per frame about its centre (6,).
+    """Interpolate an arch linearly between tracked frames: its pose (4, 4) and twist per frame about its centre (6,).
 
-    None without tracked frames close by on both sides.
+    None without tracked frames nearby on both sides.
     """
     reach = range(1, BRIDGE_FRAMES + 1)
     before = next((frame - k for k in reach if _is_tracked(records, frame - k, arch)), None)

@@ -1,4 +1,4 @@
-"""Camera poses corrected from a whole take: their prior, and views as the corrected cameras see them."""
+"""Corrections of camera poses estimated from a whole take: their prior, and corrected views."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from jawusd.tracking.contour.views import View
 
 @dataclass(frozen=True, eq=False)
 class Extrinsics:
-    """Hold corrections of camera poses.
+    """Corrections of camera poses.
 
-    Camera c sees the world moved by exp(twists[c]) about the pivot: T_cam_world is followed by it on its right side.
-    A motion common to all cameras is a motion of the world, so the twists sum to zero.
+    Camera c sees the world moved by exp(twists[c]) about the pivot, which multiplies T_cam_world from the right. A
+    motion common to all cameras is a motion of the world, so the twists sum to zero.
     """
 
     T_cam_world: Array  # the calibrated poses, shape (C, 4, 4)
-    pivot: Array  # a point amid the teeth, where the masks constrain motion best, world coordinates [mm], shape (3,)
+    pivot: Array  # centre of the teeth, where the masks constrain motion best, in the world [mm], shape (3,)
     twists: Array  # the corrections [rad, mm], shape (C, 6)
     sigma: Array  # their standard deviations [rad, mm], shape (C, 6)
 
     @classmethod
     def calibrated(cls, cameras: Sequence[Camera], pivot: Array) -> Extrinsics:
-        """Return the cameras as calibrated, nothing corrected."""
+        """Return zero corrections of the calibrated cameras."""
         nothing = np.zeros((len(cameras), 6))
         return cls(np.stack([c.T_cam_world for c in cameras]), np.asarray(pivot, float), nothing, nothing)
 
     def motions(self) -> Array:
-        """Return how each camera sees the world moved, shape (C, 4, 4)."""
+        """Return the motion of the world seen by each camera, shape (C, 4, 4)."""
         return motion_about(self.pivot, self.twists)
 
     def then(self, twists: Array, sigma: Array) -> Extrinsics:
-        """Return the corrections with more on top of them, shapes (C, 6)."""
+        """Return the corrections composed with further ones, shapes (C, 6)."""
         both = se3_log(se3_exp(self.twists) @ se3_exp(twists))
         return replace(self, twists=both - both.mean(0), sigma=sigma)
 
@@ -57,7 +57,7 @@ class Extrinsics:
     def precision(self, turn_rad: float, move_mm: float) -> Array:
         """Return the prior precision of the twists of each camera, shape (C, 6, 6).
 
-        Cameras turn about themselves and move with the given standard deviations per axis.
+        Cameras rotate about their centres and move with the given standard deviations per axis.
         """
         A = se3_adjoint(translation(-self.pivot) @ se3_inverse(self.T_cam_world))
         variance = np.r_[np.full(3, turn_rad**2), np.full(3, move_mm**2)]
@@ -81,12 +81,12 @@ class Extrinsics:
 
 
 def lever(pivot: Array, centre: Array) -> Array:
-    """Return what turns a twist about a pivot into the same motion's twist about a centre, shape (6, 6)."""
+    """Return the matrix that converts a twist about a pivot to one about a centre, shape (6, 6)."""
     return se3_adjoint(translation(pivot - centre))
 
 
 def corrected_cameras(cameras: Sequence[Camera], meta: TracksMeta) -> list[Camera]:
-    """Return calibrated cameras with the corrections of pose and focal length that the meta data of tracks hold."""
+    """Return cameras with the corrections of pose and focal length from the meta data of tracks."""
     poses = meta["extrinsics"]["T_cam_world"] if "extrinsics" in meta else {}
     moved = [replace(c, T_cam_world=np.array(poses.get(c.name, c.T_cam_world))) for c in cameras]
     focal = meta.get("focal", {})
@@ -94,9 +94,9 @@ def corrected_cameras(cameras: Sequence[Camera], meta: TracksMeta) -> list[Camer
 
 
 def _with_focal(camera: Camera, factor: float) -> Camera:
-    """Return a camera whose focal length is so many times as long, its lens as calibrated pixel by pixel.
+    """Return a camera with its focal length multiplied by a factor, keeping the distortion of each pixel.
 
-    The lens bends x' = f x instead of x: k1 becomes f^2 k1, and p1 becomes f p1, in OpenCV's formula.
+    The distortion acts on x' = f x instead of x: k1 becomes f^2 k1, and p1 becomes f p1, in OpenCV's formula.
     """
     K = camera.K.copy()
     K[:2, :2] *= factor

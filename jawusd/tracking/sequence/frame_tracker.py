@@ -1,4 +1,4 @@
-"""One instant at a time: align, detect failure, escalate, and classify the outcome."""
+"""Tracking of single frames: align, detect failure, escalate, and classify the result."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.pose_search import shift_to_masks
 from jawusd.tracking.sequence.history import History
 
-_FEWEST_MASKS = 2  # one view leaves the depth to the outline's width, which a wrong mask shares
+_FEWEST_MASKS = 2  # with one view, depth depends on the size of the outline, which a wrong mask changes
 
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Hold a solution with the mask pixels it leaves uncovered; arrays per arch and view, shape (2, C)."""
+    """A solution with its uncovered mask pixels; arrays per arch and view, shape (2, C)."""
 
     solution: Solution
     uncovered: Array
@@ -42,17 +42,17 @@ class _Trial:
 
     @property
     def coverage(self) -> Array:
-        """Return E_SP over mask pixels, NaN without a mask."""
+        """E_SP over mask pixels, NaN without a mask."""
         return coverage_error(self.uncovered, self.mask_px)
 
     def objective(self, price: float) -> Array:
-        """Return what ranks poses, per arch and view: contour that fits less the price of uncovered mask [px]."""
+        """Return the objective per arch and view: matched contour less the penalty for uncovered mask [px]."""
         return score_px(self.solution) - price * np.where(self.use, self.uncovered, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class _Instant:
-    """Hold what all attempts at one instant share; see `FrameTracker.track`."""
+    """Inputs shared by all attempts at one instant; see `FrameTracker.track`."""
 
     starts: Sequence[Array]
     views: Sequence[View]
@@ -60,13 +60,13 @@ class _Instant:
 
 
 class FrameTracker:
-    """Track instant after instant from predictions, with ever costlier attempts where an alignment looks wrong."""
+    """Tracks instants from predictions, with increasingly expensive attempts if an alignment looks wrong."""
 
     def __init__(self, solver: ContourSolver, config: TrackingConfig, history: History) -> None:
         self._solver = solver
         self._config = config
         self.history = history
-        self.searched = False  # from many starts, at the last instant
+        self.searched = False  # whether the last instant was searched from many starts
 
     def track(
         self,
@@ -78,10 +78,10 @@ class FrameTracker:
         """Align one instant.
 
         Args:
-            starts: predictions, the likeliest first: T_world_upper, T_world_lower, each shape (2, 4, 4).
+            starts: predicted T_world_upper and T_world_lower, the most likely first, each shape (2, 4, 4).
             views: one per camera.
-            pose_history: further starts for the last resort, each shape (2, 4, 4); None disables the last resort.
-            reach_px: how far off the first start may be.
+            pose_history: further starts for the multi-start search, each shape (2, 4, 4); None disables that search.
+            reach_px: expected error of the first start.
         """
         gates = self._config.gates_from(reach_px)
         instant = _Instant(starts, views, pose_history or ())
@@ -97,17 +97,17 @@ class FrameTracker:
             if bad.any() and (attempt != self._search_many_starts or pose_history is not None):
                 trial = attempt(trial, bad, instant)
         kept = trial.use & ~self._spoiled(trial, 1)
-        if (kept != trial.use).any():  # a mask that had drawn the first attempt away from all others
+        if (kept != trial.use).any():  # a mask that biased the first attempt
             trial = self._try(trial.solution.poses, views, gates, kept)
         return self._record(first, trial)
 
     def align_once(self, start: Array, views: Sequence[View], reach_px: float) -> FrameRecord:
-        """Align one instant from one prediction, shape (2, 4, 4), without further attempts; see `track`."""
+        """Align an instant from one prediction, shape (2, 4, 4), without further attempts; see `track`."""
         trial = self._begin(start, views, self._config.gates_from(reach_px))
         return self._record(trial, trial)
 
     def _begin(self, start: Array, views: Sequence[View], gates: Sequence[float]) -> _Trial:
-        """Align once, and once more without masks that are spoiled."""
+        """Align once, and again without wrong masks."""
         use = present_masks(views)
         trial = self._try(start, views, gates, use)
         kept = use & ~self._spoiled(trial, 2)
@@ -135,11 +135,11 @@ class FrameTracker:
         return _Trial(solution, *uncovered_px(solver.scans, solution.poses, views, solver.map), use)
 
     def _suspect(self, trial: _Trial) -> Mask:
-        """Tell which arches look worse than in recent frames, shape (2,)."""
+        """Return which arches look worse than in recent frames, shape (2,)."""
         return self._failing(trial, self._config.suspect_score)
 
     def _alarming(self, trial: _Trial) -> Mask:
-        """Tell which arches look so bad that closing lips alone do not explain it, shape (2,)."""
+        """Return which arches look worse than closing lips can explain, shape (2,)."""
         return self._failing(trial, self._config.alarming_score)
 
     def _failing(self, trial: _Trial, share: float) -> Mask:
@@ -147,7 +147,7 @@ class FrameTracker:
         return np.asarray(bad & trial.use.any(1))
 
     def _uneven(self, trial: _Trial) -> Mask:
-        """Tell which arches are alarming or fit one view far worse than they usually fit, shape (2,)."""
+        """Return which arches are alarming, or fit one view far worse than usual, shape (2,)."""
         limit = self._config.uneven_residual * self.history.usual_residual()[:, None]
         return self._alarming(trial) | (trial.use & (view_residual_px(trial.solution) > limit)).any(1)
 
@@ -158,17 +158,17 @@ class FrameTracker:
         return ~(residual_px(trial.solution) < self._config.suspect_residual * self.history.usual_residual())
 
     def _badly_covered(self, trial: _Trial) -> Mask:
-        """Tell which masks stay uncovered more than in recent frames, shape (2, C)."""
+        """Return which masks are less covered than in recent frames, shape (2, C)."""
         return trial.use & (trial.coverage - self.history.usual_coverage() > self._config.suspect_coverage)
 
     def _spoiled(self, trial: _Trial, fewest: int) -> Mask:
-        """Tell which masks the scan neither covers nor fits while it does at least so many others, shape (2, C)."""
+        """Return wrong masks: the scan does not fit them, but at least `fewest` others of the arch, shape (2, C)."""
         dead = trial.use & (score_px(trial.solution) < self._config.dead_score * self.history.usual_score())
-        uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # alone it would lose the arch
+        uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # sufficient to lose the arch
         wrong = self._badly_covered(trial) | uncovered | dead
         for r in ARCHES:
             if (trial.use[r] & ~wrong[r]).sum() < fewest:
-                wrong[r] = False  # it is the pose that is wrong, not so many masks
+                wrong[r] = False  # more likely the pose is wrong than so many masks
         return wrong
 
     def _losses(self, trial: _Trial) -> tuple[Loss, Loss]:
@@ -203,7 +203,7 @@ class FrameTracker:
         return trial
 
     def _drop_conflicting_masks(self, trial: _Trial, suspect: Mask, instant: _Instant) -> _Trial:
-        """Leave a mask out if the others of its arch then agree far better among themselves."""
+        """Exclude a mask if the others of its arch then agree far better."""
         c = self._config
         for r in np.flatnonzero(suspect):
             for k in np.flatnonzero(trial.use[r]):
@@ -226,7 +226,7 @@ class FrameTracker:
         return trial
 
     def _search_many_starts(self, trial: _Trial, suspect: Mask, instant: _Instant) -> _Trial:
-        """Try many starts around the prediction and earlier poses, the most promising ones to the end."""
+        """Try many starts around the prediction and earlier poses, and refine the most promising ones."""
         c, views = self._config, instant.views
         self.searched = True
         for r in np.flatnonzero(suspect).tolist():
@@ -243,7 +243,7 @@ class FrameTracker:
         return trial
 
     def _onto_masks(self, pose: Array, r: int, views: Sequence[View], use: Mask) -> Array:
-        """Return the pose moved onto its masks if they lie farther off than the search reaches."""
+        """Return the pose moved onto its masks if they are out of reach of the search."""
         shift = shift_to_masks(self._solver.scans[r], pose, r, views, use)
         if np.linalg.norm(shift) <= self._config.search_rings[0][0]:
             return pose
@@ -262,7 +262,7 @@ class FrameTracker:
 
 
 def _around(pose: Array, centre: Array, rings: Sequence[tuple[float, float]]) -> Iterator[Array]:
-    """Yield a pose and, for each (mm, rad), the poses moved and turned both ways along each axis about a scan point."""
+    """Yield a pose, and for each (mm, rad) its translations along and rotations about each axis, in both directions."""
     yield pose
     c = transform_point(pose, centre)
     for mm, rad in rings:

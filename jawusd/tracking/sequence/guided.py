@@ -1,4 +1,4 @@
-"""Track through masks that are made on the way: each frame is segmented where colours show the teeth."""
+"""Tracking with masks that are made during tracking, around poses found by colour."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History
 
-#: Makes the views of a frame of the reference camera: called with the frame, T_world_upper and T_world_lower as
-#: expected, shape (2, 4, 4), and the round, 0 for poses that no masks were aligned with.
+#: Makes the views of a frame of the reference camera. Arguments: the frame, expected T_world_upper and T_world_lower,
+#: shape (2, 4, 4), and the round, which is 0 for poses not yet aligned with masks.
 See = Callable[[int, Array, int], Sequence[View]]
 
-_FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
+_FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round removes most of the remaining error
 
 
 class GuidedTracker:
-    """Track the teeth frame by frame; masks are made around poses that colours gave."""
+    """Tracks the teeth frame by frame, with masks made around poses found by colour."""
 
     def __init__(
         self,
@@ -49,8 +49,8 @@ class GuidedTracker:
 
         Args:
             upper, lower: teeth scans in one frame, in occlusion [mm].
-            see: makes the masks. Those made around a wrong pose tend to confirm it.
-            rounds: how often masks and poses alternate on a frame.
+            see: makes the masks; masks made around a wrong pose tend to confirm it.
+            rounds: number of alternations between masks and poses on a frame.
 
         Raises:
             TrackingError: a scan cannot be tracked.
@@ -63,19 +63,19 @@ class GuidedTracker:
 
     @property
     def scans(self) -> tuple[Scan, ...]:
-        """The scans, prepared."""
+        """The prepared scans."""
         return self._solver.scans
 
     def picked(self, bootstrap: Bootstrap | None, cameras: Mapping[str, Camera]) -> Array:
-        """Return T_world_upper and T_world_lower that agree with the picks, shape (2, 4, 4).
+        """Return T_world_upper and T_world_lower from the picks, shape (2, 4, 4).
 
         Raises:
             TrackingError: no picks, too few, or picks that contradict one another.
         """
         if bootstrap is None:
             raise TrackingError(
-                "without masks the tracking starts from picks, and the capture has none",
-                hint="Make them in the page of `jawusd view CAPTURE`, or add [bootstrap]: three or more vertices of "
+                "without masks, tracking starts from picks, and the capture has none",
+                hint="Make them on the page of `jawusd view CAPTURE`, or add [bootstrap]: three or more vertices of "
                 "each scan with their pixels in two cameras.",
             )
         picks = {"upper": bootstrap.upper, "lower": bootstrap.lower}
@@ -87,7 +87,7 @@ class GuidedTracker:
         """Align the first frame from picked poses.
 
         Raises:
-            TrackingError: the teeth do not fit what is seen.
+            TrackingError: the teeth do not fit the views.
         """
         for turn in range(_FIRST_ROUNDS):
             views = self._see(frame, poses, min(turn, self._rounds - 1))
@@ -101,16 +101,16 @@ class GuidedTracker:
         """Yield frames with their records; lost arches keep the poses of the guide.
 
         Args:
-            frames: in either direction, starting beside a known frame.
-            guide: T_world_upper and T_world_lower by frame as colours show them, shape (2, 4, 4).
-            past: the frames before, from the first one aligned to the one next to these.
+            frames: in either direction, starting next to a known frame.
+            guide: T_world_upper and T_world_lower by frame, as found by colour, shape (2, 4, 4).
+            past: the frames before, from the first aligned one to the neighbour of these.
         """
         history = History(self._config.history_frames, self._config.score_frames)
         for before in past:
             history.add_summary(before)
         tracker = FrameTracker(self._solver, self._config, history)
         for frame in frames:
-            self._solver.forget_drawings()  # work that is taken up here gives what work never stopped gives
+            self._solver.forget_drawings()  # resumed runs equal uninterrupted ones
             start = guide[frame]
             record = tracker.track([start], self._see(frame, start, 0), None)
             for turn in range(1, self._rounds):
@@ -122,7 +122,7 @@ class GuidedTracker:
             yield frame, record
 
     def judge(self, frame: int, poses: Array, status: NDArray[np.int8]) -> FrameRecord:
-        """Return the record of a frame whose poses, shape (2, 4, 4), and status, shape (2,), are known already."""
+        """Return the record of a frame with known poses (2, 4, 4) and status (2,)."""
         self._solver.forget_drawings()
         views = self._see(frame, poses, self._rounds - 1)
         use = present_masks(views)
@@ -132,5 +132,5 @@ class GuidedTracker:
 
 
 def _without_lost(record: FrameRecord, otherwise: Array) -> Array:
-    """Return the poses of a record, shape (2, 4, 4), with others in place of lost ones."""
+    """Return the poses of a record, shape (2, 4, 4), with substitutes for lost arches."""
     return np.where((record.status == LOST)[:, None, None], otherwise, record.solution.poses)

@@ -1,4 +1,4 @@
-"""What follows from earlier frames for the next one: predicted poses, and the usual quality of a good frame."""
+"""Predictions from earlier frames: poses of the next frame, and the usual quality of a good frame."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from jawusd.geometry import orthonormalise, se3_inverse, transform_points
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.scan import ARCHES
 
-_KEPT_POSES = 16  # earlier poses kept: enough to cover the exercises of a jaw at 2 mm
-_APART_MM = 2.0  # poses nearer than this have the same basin
-# Searches from many starts that may find nothing in a take, and frames of it that allow one more: at five seconds each
-# at most, all of them together take no longer than tracking. Of 40 valid persons of the population (seeds 8100, 9300)
-# none needed more, nor did 300 frames of one take and 80 of another while lips close over the teeth.
+_KEPT_POSES = 16  # earlier poses kept, enough to cover the range of a jaw
+_APART_MM = 2.0  # poses closer than this converge to the same minimum
+# Failed multi-start searches allowed in a take, and frames that allow one more: at up to five seconds each, all of them
+# together take no longer than tracking.
 _FRUITLESS, _FRAMES_PER_FRUITLESS = 8, 32
 _RECENT = 8  # frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
 
 
 class MotionPredictor:
-    """Extrapolate with constant velocity; keep earlier poses as starts for getting back after a loss."""
+    """Extrapolates poses with constant velocity, and keeps earlier poses as starts for recovery."""
 
     def __init__(self, poses: Array, points: Array) -> None:
-        """Start at rest; prediction errors will be measured at some points of both arches, shape (2, N, 3)."""
+        """Start at rest. Prediction errors are measured at `points` of both arches, shape (2, N, 3)."""
         self._points = points
         self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # two arches
         self._last = np.array(poses)
@@ -42,11 +41,11 @@ class MotionPredictor:
             if step is not None:
                 out[r] = step @ self._last[r]
         if self._lost_for[1] and not self._lost_for[0]:
-            out[1] = out[0] @ se3_inverse(self._last[0]) @ self._last[1]  # a lost jaw is carried along by the head
+            out[1] = out[0] @ se3_inverse(self._last[0]) @ self._last[1]  # a lost jaw moves with the head
         return orthonormalise(out)
 
     def starts(self) -> list[Array]:
-        """Return predictions for the next frame, the likeliest first: going on as before, at rest, and half way."""
+        """Return predictions for the next frame, the most likely first: constant velocity, at rest, and half way."""
         moving = self.predict()
         if self._step[0] is None and self._step[1] is None:
             return [moving]
@@ -54,13 +53,13 @@ class MotionPredictor:
         return [moving, self._last.copy(), half]
 
     def update(self, poses: Array, found: Mask, seen: Mask, guessed: bool = False) -> None:
-        """Add the next frame; arches not found keep their predictions, or go where they are guessed.
+        """Add the next frame; arches not found keep their predictions, or the given guesses.
 
         Args:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            found: arches whose poses can be trusted, shape (2,).
-            seen: arches that have any mask, shape (2,).
-            guessed: whether poses of arches not found are guesses better than predictions.
+            found: arches with reliable poses, shape (2,).
+            seen: arches with any mask, shape (2,).
+            guessed: whether poses of arches not found are better guesses than predictions.
         """
         expected = self.predict()
         for r in ARCHES:
@@ -68,7 +67,7 @@ class MotionPredictor:
                 if not self._lost_for[r]:
                     gap = transform_points(expected[r], self._points[r]) - transform_points(poses[r], self._points[r])
                     self._misses.append(float(np.linalg.norm(gap, axis=1).max()))
-                # After a loss the last pose is a guess, and a velocity from it would be another.
+                # After a loss the last pose is a guess, so it gives no velocity.
                 self._step[r] = None if self._lost_for[r] else poses[r] @ se3_inverse(self._last[r])
             else:
                 self._step[r] = None
@@ -87,7 +86,7 @@ class MotionPredictor:
         return max(self._misses, default=0.0)
 
     def remember(self, poses: Array, found: Mask) -> None:
-        """Keep poses of both arches, shape (2, 4, 4), as later starts if they are unlike those kept."""
+        """Keep poses of both arches, shape (2, 4, 4), as later starts if they differ from those kept."""
         if not found.all():
             return
         new = se3_inverse(poses[0]) @ poses[1]
@@ -96,29 +95,28 @@ class MotionPredictor:
         self._seen = [*self._seen[-_KEPT_POSES + 1 :], np.array(poses)]
 
     def search_is_due(self) -> bool:
-        """Tell whether a search from many starts is due: always at first, then ever less often while it fails.
+        """Return whether a multi-start search is due: always at first, then less and less often while it fails.
 
-        Frames without masks do not count: teeth that come back are searched at once.
+        Frames without masks do not count, so teeth that reappear are searched at once.
         """
         failures = int(self._failures.max())
         return failures & (failures - 1) == 0 or failures % 16 == 0
 
     def pose_history(self) -> list[Array]:
-        """Return earlier poses as starts for the next frame: the jaw relative to where the head is now."""
+        """Return earlier poses as starts for the next frame, relative to the current head."""
         head = self.predict()[0]
         return [np.stack([p[0], head @ se3_inverse(p[0]) @ p[1]]) for p in self._seen]
 
 
 class SearchAllowance:
-    """Say whether a take is worth another search from many starts.
+    """A budget of failed multi-start searches in a take.
 
-    One takes as long as tracking ten to fifty frames. Masks that show something else now and then would have it run in
-    vain on each such frame, forwards and backwards. Work is counted, not time, so the result does not depend on the
-    machine.
+    A search takes as long as tracking ten to fifty frames, and wrong masks would trigger failing searches on every such
+    frame, forwards and backwards. Work is counted instead of time, so results do not depend on the machine.
     """
 
     def __init__(self, frames: int) -> None:
-        """Allow for the searches of a take of so many frames."""
+        """Set the budget for a take of `frames` frames."""
         self.most = self._left = _FRUITLESS + frames // _FRAMES_PER_FRUITLESS
         self.fruitless = 0
         self._searched: set[int] = set()
@@ -126,24 +124,24 @@ class SearchAllowance:
 
     @property
     def left_out(self) -> set[int]:
-        """The frames on which a search was due and never ran."""
+        """Frames on which a search was due but never ran."""
         return self._refused - self._searched
 
     def allows(self, frame: int) -> bool:
-        """Tell whether to search on a frame where that is due."""
+        """Return whether a due search may run on a frame."""
         if self._left <= 0:
             self._refused.add(frame)
         return self._left > 0
 
     def note(self, frame: int, found: bool) -> None:
-        """Take a search on a frame into account: what finds teeth earns another one."""
+        """Record a search on a frame; a successful one adds to the budget."""
         self._searched.add(frame)
         self._left = min(self.most, self._left + 1) if found else self._left - 1
         self.fruitless += not found
 
 
 class _Partial(NamedTuple):
-    """Hold the quality of frames without one of the cameras; they count where there are no others."""
+    """Quality of frames without one of the cameras, used if there are no complete ones."""
 
     scores: deque[Array]
     residuals: deque[Array]
@@ -151,7 +149,7 @@ class _Partial(NamedTuple):
 
 
 class _Usual(NamedTuple):
-    """Hold what is usual; see the methods of `History`."""
+    """Medians; see the methods of `History`."""
 
     score: Array
     residual: Array
@@ -159,9 +157,9 @@ class _Usual(NamedTuple):
 
 
 class History:
-    """Remember the quality of recent good frames, to tell a bad one.
+    """The quality of recent good frames, as reference for the next one.
 
-    A camera may be missing in the whole take; then the frames without it tell what is usual.
+    If a camera is missing in the whole take, frames without it are the reference.
     """
 
     def __init__(self, length: int, score_length: int) -> None:
@@ -173,11 +171,11 @@ class History:
         self._usual: _Usual | None = None
 
     def add(self, record: FrameRecord) -> None:
-        """Add a frame; only arches tracked without trouble count, see the class."""
+        """Add a frame; only well-tracked arches count."""
         self.add_summary(FrameSummary.of(record))
 
     def add_summary(self, past: FrameSummary) -> None:
-        """Add what was kept of a frame."""
+        """Add the summary of a frame."""
         self._usual = None
         good = past.status == TRACKED
         self._scores.append(np.where(good[:, None], past.score_px, np.nan))
@@ -202,7 +200,7 @@ class History:
         return self._medians().coverage
 
     def _medians(self) -> _Usual:
-        """Return what is usual; found once between two frames, for a dozen questions about each."""
+        """Return the medians, cached until the next frame is added."""
         if self._usual is None:
             self._usual = _Usual(
                 _median(self._scores, _median(self._partial.scores, 0.0)),
@@ -213,10 +211,10 @@ class History:
 
 
 def _median(values: deque[Array], otherwise: float | Array) -> Array:
-    """Return the medians of what is known, by sorting: of so few values `np.nanmedian` takes ten times as long."""
+    """Return medians that ignore NaN; `np.nanmedian` is ten times slower for so few values."""
     if not values:
         return np.asarray(otherwise, np.float64)
-    stack = np.sort(np.array(values), axis=0)  # NaN behind all others
+    stack = np.sort(np.array(values), axis=0)  # NaN sorts last
     known = np.isfinite(stack).any(0)
     count = (~np.isnan(stack)).sum(0)
     low, high = (np.take_along_axis(stack, at[None], axis=0)[0] for at in (np.maximum(count - 1, 0) // 2, count // 2))

@@ -23,18 +23,18 @@ from jawusd.geometry import (
 )
 from jawusd.tracking.contour.equations import NormalEquations, Solution
 
-_NORMAL_DIRECTIONS = 3  # six motions of a rigid body less the three the model allows
+_NORMAL_DIRECTIONS = 3  # six degrees of freedom less the three of the model
 
 
 @dataclass(frozen=True, eq=False)
 class KinematicPrior:
-    """Pull relative poses towards the poses of a jaw model, and leave motion along the model free.
+    """A prior that pulls relative poses towards a jaw model, and leaves motion along the model free.
 
     The deviation of a pose from the model, the left twist xi with T_upper_lower = exp(xi) pose(d), costs
     xi^T P xi after the best change of d: P = 3 / s^2 (M - M J (J^T M J)^-1 J^T M) with the landmark metric M
     (xi^T M xi = mean squared displacement), the model's Jacobian J, and the rms distance s of captured poses from the
-    model, spread over three directions. The prior of Zoss et al. 2018 (an empirical rig), with the width taken from
-    the capture.
+    model, spread over three directions. This is the prior of Zoss et al. 2018 (an empirical rig), with its width
+    estimated from the capture.
     """
 
     jaw: JawRig  # the person's model
@@ -67,19 +67,20 @@ class KinematicPrior:
         return _NORMAL_DIRECTIONS / self.spread_mm**2 * normal
 
 
-_FEWEST = 15  # poses, below which a model says nothing of its own spread
-_ROUNDS = 3  # the model bends little over what poses are off
+_FEWEST = 15  # poses needed to estimate the spread about the model
+_ROUNDS = 3  # the model is nearly linear over pose errors
 
 
 def weigh_with_model(tracks: Tracks, jaw: JawRig) -> Tracks:
-    """Return tracks whose final relative poses are the likeliest by their covariance and by the model.
+    """Return tracks with final relative poses that are most likely under their covariance and the model.
 
-    The mean of two Gaussians, linearised again `_ROUNDS` times, with the prior of Zoss et al. 2018 as `KinematicPrior`
-    has it, its width being the rms distance of all raw poses from the model. The upper teeth stay; raw poses,
-    covariances and sigmas are as measured. `prior_spread_mm` in the meta data holds the width.
+    For tracks from colours, whose errors extend over whole teeth: the model improves molars and condyles, and keeps the
+    incisal point. The result is the mean of two Gaussians, relinearised `_ROUNDS` times, with `KinematicPrior` of the
+    rms distance of raw poses from the model. Upper teeth, raw poses, covariances and sigmas stay as measured. The meta
+    data store the width of the prior as `prior_spread_mm`.
 
     Args:
-        tracks: of colours, without a model.
+        tracks: from colours, without a model.
         jaw: the model fitted to them.
     """
     known = np.isfinite(tracks.raw_T_upper_lower).all((1, 2)) & np.isfinite(tracks.T_upper_lower).all((1, 2))
@@ -98,7 +99,7 @@ def weigh_with_model(tracks: Tracks, jaw: JawRig) -> Tracks:
 
 
 def _likeliest(measured: Array, covariance: Array, prior: KinematicPrior) -> Array:
-    """Return the likeliest T_upper_lower (4, 4) by a measured one, the covariance of its left twist, and the model."""
+    """Return the most likely T_upper_lower (4, 4) given a measurement, its left covariance, and the model."""
     information, pose = np.linalg.inv(covariance), measured
     for _ in range(_ROUNDS):
         deviation, precision = prior.deviation(pose)

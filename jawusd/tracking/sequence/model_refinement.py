@@ -1,4 +1,4 @@
-"""The second pass: frames that the masks alone leave uncertain, tracked again with the jaw model of the person."""
+"""The second pass: frames that are uncertain from masks alone, tracked again with the person's jaw model."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from jawusd.tracking.sequence.extrinsics import corrected_cameras
 from jawusd.tracking.sequence.kinematic_prior import KinematicPrior
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
-# Standard deviation of the worst landmark above which a frame is tracked again [mm]: about the error of any
-# three-parameter model; below it the masks are more accurate than the model.
+# Standard deviation of the worst landmark above which a frame is tracked again [mm]: about the error of a
+# three-parameter model, so that below it masks are more accurate.
 _HARD_MM = 0.3
-_FEWEST_GOOD = 15  # frames that must agree with the model before it may help others
+_FEWEST_GOOD = 15  # good frames needed to use the model as a prior
 
 
 def hard_frames(tracks: Tracks) -> Mask:
-    """Return the frames a model should help with: lost, recovered, without a camera, or uncertain; shape (F,)."""
+    """Return the frames to refine with the model: lost, recovered, without a camera, or uncertain; shape (F,)."""
     sigma = tracks.sigma_mm.max(1)
     return (tracks.status != TRACKED).any(1) | ~(sigma <= _HARD_MM)
 
@@ -58,14 +58,14 @@ def refine_tracks(
 ) -> Tracks:
     """Track the hard frames again with the fitted model as a prior on the relative pose.
 
-    Final poses, `prior_aided` and, of frames that were lost, uncertainties change; everything raw stays, so that no
-    model is ever fitted to or scored on poses that its prior influenced.
+    Changes final poses, `prior_aided`, and the uncertainties of lost frames. Raw poses stay, so that no model is fitted
+    to or scored on poses influenced by its prior.
 
     Args:
         tracks: the first pass.
         jaw: the model fitted to it.
         capture, cameras, offsets, upper, lower, config, threads: as for `track_capture`.
-        progress: called with hard frames done and hard frames in all.
+        progress: called with the number of hard frames done, and their total.
 
     Raises:
         CaptureError: a mask cannot be read.
@@ -90,9 +90,9 @@ def refine_tracks(
         second = _SecondPass(solver, config, prior, tracks)
         for done, k in enumerate(hard.tolist(), start=1):
             views = _corrected_views(masks.at(int(tracks.frames[k])), tracks, k, starts)
-            aided = second.align(k, starts[k], views)
-            if aided is not None:
-                found[k] = aided
+            refined = second.align(k, starts[k], views)
+            if refined is not None:
+                found[k] = refined
             if progress:
                 progress(done, len(hard))
     return _merged(tracks, jaw, found)
@@ -100,14 +100,14 @@ def refine_tracks(
 
 @dataclass(frozen=True, eq=False)
 class _Refined:
-    """Hold a frame's poses (2, 4, 4) with the joint covariance of their left world twists (12, 12)."""
+    """Poses of a frame (2, 4, 4) with the joint covariance of their left world twists (12, 12)."""
 
     poses: Array
     covariance: Array
 
 
 class _SecondPass:
-    """Align single frames with the prior and refuse what does not fit the masks."""
+    """Aligns single frames with the prior, and rejects poses that do not fit the masks."""
 
     def __init__(self, solver: ContourSolver, config: TrackingConfig, prior: KinematicPrior, tracks: Tracks) -> None:
         self._solver, self._config, self._prior, self._tracks = solver, config, prior, tracks
@@ -116,7 +116,7 @@ class _SecondPass:
         self._correlation_px = float(tracks.meta.get("correlation_px", config.correlation_px))
 
     def align(self, k: int, start: Array, views: Sequence[View]) -> _Refined | None:
-        """Return the poses of frame index k found with the prior, or None if they cannot be trusted."""
+        """Return the poses of frame index k aligned with the prior, or None if they are unreliable."""
         present = present_masks(views)
         lost = self._tracks.status[k] == LOST
         use = present & (self._tracks.masks_used[k] | lost[:, None])
@@ -143,7 +143,7 @@ class _SecondPass:
 
 
 def _spread_mm(jaw: JawRig, tracks: Tracks, good: Mask) -> float:
-    """Return the rms landmark distance of good raw poses from the model [mm]; tracking noise counts, so no less."""
+    """Return the rms landmark distance of good raw poses from the model [mm], tracking noise included."""
     residual_mm = jaw.encode(tracks.raw_T_upper_lower[good])[1]
     return float(np.sqrt(np.mean(residual_mm**2)))
 
@@ -155,10 +155,10 @@ def _variances(tracks: Tracks) -> Array:
 
 
 def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
-    """Return where to start every frame, T_world_upper and T_world_lower, shape (F, 2, 4, 4).
+    """Return start poses of every frame, T_world_upper and T_world_lower, shape (F, 2, 4, 4).
 
-    A lost arch follows from the other one and the model, interpolated between the neighbouring frames; where both are
-    lost, the head moves evenly from the last pose to the next.
+    A lost arch is placed by the other one and the model, interpolated between neighbouring frames. If both are lost,
+    the head is interpolated linearly.
     """
     frames = tracks.frames.astype(np.float64)
     d = jaw.interpolate(frames[measured], jaw.encode(tracks.raw_T_upper_lower[measured], inside=True)[0], frames)
@@ -180,7 +180,7 @@ def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
 
 
 def _corrected_views(views: Sequence[View], tracks: Tracks, k: int, poses: Array) -> list[View]:
-    """Return the views of frame index k with what the first pass found out about the take corrected."""
+    """Return the views of frame index k, corrected by the whole-take estimates of the first pass."""
     before, after = poses[max(k - 1, 0)], poses[min(k + 1, len(poses) - 1)]
     span = max(1, min(k + 1, len(poses) - 1) - max(k - 1, 0))
     velocity = se3_log(after @ se3_inverse(before)) / span  # per frame
@@ -201,18 +201,18 @@ def _relative_covariance(poses: Array, covariance: Array) -> Array:
 
 
 def _merged(tracks: Tracks, jaw: JawRig, found: Mapping[int, _Refined]) -> Tracks:
-    """Return the tracks with the aided frames in place, smoothed again; the relative pose by itself, as jaws move."""
+    """Return the tracks with the refined frames, smoothed again; the relative pose is smoothed separately."""
     upper, relative = tracks.raw_T_world_upper.copy(), tracks.raw_T_upper_lower.copy()
     covariance = {name: getattr(tracks, name).copy() for name in ("covariance_upper", "covariance_lower")}
     spread, smoothing = tracks.covariance_relative.copy(), tracks.covariance_relative.copy()
     sigma, status = tracks.sigma_mm.copy(), tracks.status.copy()
     lost = (tracks.status == LOST).any(1)
-    for k, aided in found.items():
-        upper[k], relative[k] = aided.poses[0], relative_pose(*aided.poses)
-        smoothing[k] = _relative_covariance(aided.poses, aided.covariance)
+    for k, refined in found.items():
+        upper[k], relative[k] = refined.poses[0], relative_pose(*refined.poses)
+        smoothing[k] = _relative_covariance(refined.poses, refined.covariance)
         if lost[k]:
-            covariance["covariance_upper"][k] = aided.covariance[:6, :6]
-            covariance["covariance_lower"][k] = aided.covariance[6:, 6:]
+            covariance["covariance_upper"][k] = refined.covariance[:6, :6]
+            covariance["covariance_lower"][k] = refined.covariance[6:, 6:]
             spread[k] = smoothing[k]
             sigma[k] = landmark_sigmas(relative[k], spread[k], jaw.landmarks)
             status[k] = np.where(status[k] == LOST, RECOVERED, status[k])

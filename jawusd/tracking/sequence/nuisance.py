@@ -1,4 +1,4 @@
-"""Disturbances estimated from a whole take: delays below a frame, masks drawn too wide, wrong camera poses."""
+"""Nuisance parameters of a whole take: delays below a frame, mask biases, errors of camera poses."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics, lever
 
 @dataclass(frozen=True, eq=False)
 class Nuisances:
-    """Hold the disturbances common to all frames of a take.
+    """Nuisance parameters common to all frames of a take.
 
     Attributes:
-        delays: camera c shows the instant of frame + delays[c], in frames, the first camera's is 0, shape (C,).
-        habits: how far the masks reach beyond the teeth, per arch and camera, shape (2, C, 3): at free edges and at the
-            gum line [px of the working size], and over the gum along the surface [mm]; see `OutlineSums`.
-        shift_px: what the latter two make of the gum line on average, and edges, shape (2, C, 2) (edge, gum).
+        delays: camera c shows the instant of frame + delays[c], in frames; 0 for the first camera, shape (C,).
+        habits: mask bias beyond the teeth, per arch and camera, shape (2, C, 3): at free edges and at the gum line [px
+            at working resolution], and along the gum surface [mm]; see `OutlineSums`.
+        shift_px: the resulting mean shift of edges and gum line, shape (2, C, 2).
         sigma_delays, sigma_habits, sigma_shift_px: their standard deviations.
         twists, sigma_twists: corrections of the camera poses as in `Extrinsics`, shape (C, 6).
-        contour_px: rms distance by which the twists shift contours beyond what poses of the teeth make up for.
-        covariance: of all unknowns as `TakeEquations` orders them, zero where not estimated, shape (U, U).
+        contour_px: rms contour shift by the twists that poses of the teeth cannot compensate.
+        covariance: of all unknowns in the order of `TakeEquations`, zero where not estimated, shape (U, U).
     """
 
     delays: Array
@@ -43,48 +43,47 @@ class Nuisances:
     covariance: Array
 
     def plus(self, more: Nuisances) -> Nuisances:
-        """Return the sum with delays and habits that were estimated on top of these."""
+        """Return the sum with delays and habits estimated on top of these."""
         shift = self.shift_px + more.shift_px
         return replace(more, delays=self.delays + more.delays, habits=self.habits + more.habits, shift_px=shift)
 
     def matters(self, config: TrackingConfig) -> bool:
-        """Tell whether anything exceeds its limit, delays and camera poses clearly so.
+        """Return whether anything exceeds its limit; delays and camera poses must be significant as well.
 
-        Habits have a prior of what hands do: without clear evidence their estimate is still the likeliest.
+        Habits have a prior, so even an insignificant estimate is the most likely value.
         """
         wide = np.abs(self.shift_px) > config.refine_bias_px
         return bool(self.late(config) or wide.any() or self.cameras_moved(config))
 
     def late(self, config: TrackingConfig) -> bool:
-        """Tell whether a delay exceeds its limit, and clearly so."""
+        """Return whether a delay exceeds its limit and is significant."""
         return bool((np.abs(self.delays) > np.maximum(config.refine_delay_frames, 4 * self.sigma_delays)).any())
 
     def settled(self, config: TrackingConfig) -> bool:
-        """Tell whether all are so small that estimating them once more changes too little."""
+        """Return whether all are too small for another iteration."""
         late = np.abs(self.delays).max() / config.refine_delay_frames
         wide = np.abs(self.shift_px).max() / config.refine_bias_px
         return max(late, wide, self.contour_px / config.refine_shift_px) < config.settled_share
 
     def cameras_moved(self, config: TrackingConfig) -> bool:
-        """Tell whether the camera poses are off by more than the limit, and clearly so."""
+        """Return whether the errors of camera poses exceed the limit and are significant."""
         clear = (np.abs(self.twists) > 4 * self.sigma_twists).any()
         return bool(clear and self.contour_px > config.refine_shift_px)
 
 
-# Prior standard deviation, which keeps the estimate finite where a take does not constrain it: cameras are synchronised
-# to whole frames.
+# Prior standard deviation of delays, since cameras are synchronised to whole frames.
 _PRIOR_DELAY_FRAMES = 0.5
 
 
 @dataclass(frozen=True)
-class Hand:
-    """Say what is known of how outlines reach over the teeth before a take is seen: prior standard deviations.
+class AnnotatorPrior:
+    """Prior standard deviations of mask biases.
 
     Attributes:
-        edge_px, gum_px, gum_mm: edges and gum line too wide, the gum line apart from edges, and along the surface.
-        arch_px, arch_mm, camera_px: by how much arches and cameras differ from these.
-        frames: whose errors are independent of one another [-]: the same lips and teeth are seen all over the take, so
-            that more frames tell little more.
+        edge_px, gum_px, gum_mm: of edges and gum line together, of the gum line relative to edges, and along the
+            surface.
+        arch_px, arch_mm, camera_px: of differences between arches and between cameras.
+        frames: effective number of independent frames in a take [-], since all frames show the same lips and teeth.
     """
 
     edge_px: float
@@ -96,21 +95,19 @@ class Hand:
     frames: float
 
 
-#: Of one person who draws masks.
-DRAWN = Hand(edge_px=0.5, gum_px=0.4, gum_mm=0.1, arch_px=0.15, arch_mm=0.05, camera_px=0.1, frames=1.5)
+#: For a person who draws masks.
+DRAWN = AnnotatorPrior(edge_px=0.5, gum_px=0.4, gum_mm=0.1, arch_px=0.15, arch_mm=0.05, camera_px=0.1, frames=1.5)
 
-#: The same, of scans that end at the gum without showing it. Outlines at a tooth's neck are then told from edges by the
-#: way they face, wrongly here and there, and so in every frame. Chosen on the 17 such persons of
-#: `tests/benchmarks/population.py --seed 7000`; on 6 others (9500-9529), with sides of teeth taken for gum line as they
-#: are now, NEES is 1.07, 0.92 and 1.22 (upper, lower, relative).
+#: The same for scans without gum. Outlines at the neck of a tooth are then classified by their direction, with some
+#: errors that recur in every frame.
 DRAWN_BESIDE_CROWNS = replace(DRAWN, frames=0.75)
 
 
 class _Layout:
-    """Say where the unknowns of a take stand: delays, habits, camera twists."""
+    """Indices of the unknowns of a take: delays, habits, camera twists."""
 
-    def __init__(self, cameras: int, hand: Hand = DRAWN) -> None:
-        self.cameras, self._hand = cameras, hand
+    def __init__(self, cameras: int, annotator: AnnotatorPrior = DRAWN) -> None:
+        self.cameras, self._annotator = cameras, annotator
         self.twists = cameras + 9 + 4 * cameras
         self.size = self.twists + 6 * cameras
         self._habits = np.zeros((2, cameras, 3, self.size))
@@ -123,34 +120,34 @@ class _Layout:
             out[2, [cameras + 2, of_arch + 2]] = 1.0
 
     def twist(self, camera: int) -> slice[int, int, None]:
-        """Return where a camera's twist stands."""
+        """Return the slice of a camera's twist."""
         return slice(self.twists + 6 * camera, self.twists + 6 * camera + 6)
 
     def habits(self, arch: int, camera: int) -> Array:
-        """Return how the habits of an arch in a camera follow from the unknowns, shape (3, size)."""
+        """Return the matrix from the unknowns to the habits of an arch in a camera, shape (3, size)."""
         return np.asarray(self._habits[arch, camera])
 
     def prior_sigma(self) -> Array:
         """Return the prior standard deviations of delays and habits, shape (twists,)."""
-        of = self._hand
+        of = self._annotator
         arch = [of.arch_px, of.arch_px, of.arch_mm]
-        hand = [of.edge_px, of.gum_px, of.gum_mm, *arch, *arch]
-        return np.r_[np.full(self.cameras, _PRIOR_DELAY_FRAMES), hand, np.full(4 * self.cameras, of.camera_px)]
+        habits = [of.edge_px, of.gum_px, of.gum_mm, *arch, *arch]
+        return np.r_[np.full(self.cameras, _PRIOR_DELAY_FRAMES), habits, np.full(4 * self.cameras, of.camera_px)]
 
     def redundancy(self, frames: int) -> Array:
-        """Return by how much a take of so many frames overrates what it tells about each unknown, shape (size,)."""
+        """Return the factor by which a number of frames overstates the information per unknown, shape (size,)."""
         out = np.ones(self.size)
-        out[self.cameras : self.twists] = max(1.0, frames / self._hand.frames)
+        out[self.cameras : self.twists] = max(1.0, frames / self._annotator.frames)
         return out
 
 
 class TakeEquations:
-    """Sum up the normal equations of what all frames share, the poses eliminated frame by frame.
+    """Normal equations of the nuisance parameters of a take, with the poses eliminated frame by frame.
 
     The residual of a sample is d = J (x + delay_c v + A y_c) + h . b_c with the pose correction x of its frame, the
-    arch's velocity v, the camera's twist y_c brought to the arch's centre by A, and the habits b_c of the masks, so all
-    frames share delays, habits and twists: a bordered block-diagonal system, solved by its Schur complement (as in
-    bundle adjustment, Triggs et al. 1999).
+    arch's velocity v, the camera's twist y_c transferred to the arch's centre by A, and the habits b_c of the masks.
+    Delays, habits and twists are shared by all frames, which gives a bordered block-diagonal system, solved by its
+    Schur complement (as in bundle adjustment, Triggs et al. 1999).
     """
 
     def __init__(
@@ -159,18 +156,18 @@ class TakeEquations:
         variance_px3: Array,
         extrinsics: Extrinsics,
         frames: Iterable[int] | None = None,
-        hand: Hand = DRAWN,
+        annotator: AnnotatorPrior = DRAWN,
     ) -> None:
-        """Sum up the given frames, by default all; lost arches and frames without both neighbours are left out.
+        """Sum over the given frames, by default all; lost arches and frames without both neighbours are skipped.
 
         Args:
             records: by frame.
             variance_px3: outline variance times correlation length per arch [px^3], shape (2,).
-            extrinsics: the camera poses the records were aligned with.
-            hand: what is known of the outlines beforehand.
+            extrinsics: the camera poses used for the alignment.
+            annotator: prior of the mask biases.
         """
         self._extrinsics = extrinsics
-        self._layout = _Layout(len(extrinsics.twists), hand)
+        self._layout = _Layout(len(extrinsics.twists), annotator)
         size, C = self._layout.size, self._layout.cameras
         self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
         self._gum = np.zeros((2, C, 2))  # sums of weights and slopes of the gum line
@@ -189,7 +186,7 @@ class TakeEquations:
                     self._gum[arch] += solution.outline.habit_weight[arch, :, 1, 1:]
 
     def observe(self, slope: Array, deviation: Array, precision: Array) -> None:
-        """Add what is known of the take besides its masks: deviation + slope @ unknowns is zero with that precision.
+        """Add an observation besides the masks: deviation + slope @ unknowns is zero with the given precision.
 
         Shapes (n, U), (n,) and (n, n).
         """
@@ -205,7 +202,7 @@ class TakeEquations:
         return np.diag(np.r_[self._layout.prior_sigma() ** 2, np.zeros(6 * self._layout.cameras)])
 
     def solve(self, config: TrackingConfig, cameras_move: bool) -> Nuisances:
-        """Return the nuisances of the frames; camera poses are estimated only if `cameras_move`."""
+        """Return the estimates; camera poses are estimated only if `cameras_move`."""
         layout = self._layout
         C, size, first_twist = layout.cameras, layout.size, layout.twists
         redundancy = layout.redundancy(self._frames)
@@ -218,7 +215,7 @@ class TakeEquations:
         covariance = np.zeros((size, size))
         covariance[np.ix_(keep, keep)] = np.linalg.inv(S[np.ix_(keep, keep)])
         x = covariance @ (self._r + redundancy.max() * self._seen_r)
-        # A motion common to all cameras is one of the world, which the masks cannot show.
+        # A motion common to all cameras is one of the world, which is unobservable.
         centred = np.eye(size)
         centred[first_twist:, first_twist:] -= np.kron(np.full((C, C), 1 / C), np.eye(6))
         x = centred @ x
@@ -251,7 +248,7 @@ def pose_response(records: Mapping[int, FrameRecord], frame: int, arch: int, ext
 
 
 def corrected_pose(records: Mapping[int, FrameRecord], frame: int, arch: int, nuisances: Nuisances) -> Array:
-    """Return the pose of an arch, shape (4, 4), as delays and habits move it to first order; twists are left out."""
+    """Return the pose of an arch, shape (4, 4), corrected to first order for delays and habits, but not for twists."""
     velocity = velocity_twist(records, frame, arch)
     solution = records[frame].solution
     outline, habits = solution.outline, nuisances.habits[arch]
@@ -263,7 +260,7 @@ def corrected_pose(records: Mapping[int, FrameRecord], frame: int, arch: int, nu
 
 
 def interpolation_covariance(records: Mapping[int, FrameRecord], frame: int, arch: int, delays: Array) -> Array:
-    """Return what motion between frames adds to the covariance of a pose's twist about its centre, shape (6, 6)."""
+    """Return the covariance of a pose's twist about its centre caused by interpolation errors, shape (6, 6)."""
     precision = records[frame].solution.outline.precision[arch]
     errors = interpolation_errors(records, frame, arch, delays)
     pull = np.einsum("cij,cj->ic", precision, errors)
@@ -274,9 +271,9 @@ def interpolation_covariance(records: Mapping[int, FrameRecord], frame: int, arc
 def _reduced(
     solution: Solution, velocity: Array, arch: int, pivot: Array, layout: _Layout
 ) -> tuple[Array, Array, Array]:
-    """Return one frame's part of the normal equations, the pose eliminated, and how the pose follows the unknowns.
+    """Return the normal equations of one frame with the pose eliminated, and the response of the pose to the unknowns.
 
-    The last is the twist about the arch's centre per unit of the unknowns, shape (6, U).
+    The response is the twist about the arch's centre per unit of the unknowns, shape (6, U).
     """
     outline, size = solution.outline, layout.size
     to_centre = lever(pivot, solution.centres[arch])
@@ -284,7 +281,7 @@ def _reduced(
     for c in range(layout.cameras):
         H, g = outline.precision[arch, c], outline.gradient[arch, c]
         habits = layout.habits(arch, c)
-        D = np.zeros((6, size))  # how the nuisances move the arch in this camera
+        D = np.zeros((6, size))  # motion of the arch in this camera per unknown
         D[:, c] = velocity
         D[:, layout.twist(c)] = to_centre
         slope = outline.habit_slope[arch, c].T @ habits

@@ -21,14 +21,14 @@ from jawusd.tracking.sequence.history import History, MotionPredictor, SearchAll
 
 Progress = Callable[[int, int], None]
 
-# Most frames around a restart whose poses and quality the tracker takes over: without a limit, a long take with many
-# gaps would cost the square of its length.
+# Maximum number of frames around a restart that initialise the tracker: without a limit, a long take with many gaps
+# would take quadratic time.
 _NEARBY_FRAMES = 4000
-_AGREED_MM = 0.05  # centres of arches tracked from both sides: half the error that counts as one
+_AGREED_MM = 0.05  # distance of arch centres up to which tracking in both directions agrees
 
 
 class Passes:
-    """Run the tracker over the frames of a take and keep one record per frame."""
+    """Runs the tracker over the frames of a take, and stores one record per frame."""
 
     def __init__(
         self,
@@ -47,11 +47,11 @@ class Passes:
         self.searches = SearchAllowance(stop - first)
 
     def track_from(self, frame: int, poses: Array) -> None:
-        """Track all frames, both ways from the one whose poses are given, then back to it and into the gaps.
+        """Track all frames in both directions from the given one, then back to it, and into the gaps.
 
         Args:
             frame: reference frame number.
-            poses: T_world_scan of both arches there, near enough to be aligned, shape (2, 4, 4).
+            poses: T_world_scan of both arches there, close enough to be aligned, shape (2, 4, 4).
 
         Raises:
             TrackingError: the teeth do not fit the masks of that frame.
@@ -64,12 +64,12 @@ class Passes:
         self.close_gaps()
 
     def begin(self, frame: int, poses: Array) -> None:
-        """Align the bootstrap frame from the pick poses."""
+        """Align the first frame."""
         self.records[frame] = first_record(self._solver, self._config, poses, self._masks.at(frame), frame, True)
         self._progress(1, self._stop - self._first)
 
     def run(self, frames: range) -> None:
-        """Track away from the frame next to the first one given."""
+        """Track a range of frames that starts next to a tracked one."""
         if not len(frames):
             return
         tracker, motion = self.beside(frames.start - frames.step)
@@ -79,9 +79,9 @@ class Passes:
             self._progress(len(self.records), self._stop - self._first)
 
     def track_back_to(self, start: int) -> None:
-        """Track to the first frame from one that shows the teeth well, and past it until both ways agree.
+        """Track to the first frame from a well-seen one, and past it until both directions agree.
 
-        The first frame was aligned without knowing how well teeth fit in this take, and those beside it followed it.
+        The first frame was aligned without knowing the usual fit of this take, and its neighbours followed it.
         """
         seen = nearest_well_seen(self.records, start)
         if seen is None or seen == start:
@@ -102,7 +102,7 @@ class Passes:
                 self.records[frame] = record
 
     def close_gaps(self) -> None:
-        """Track backwards into every gap from the frame after it, and keep frames that lose fewer arches."""
+        """Track backwards into every gap from the frame after it, and keep results with fewer lost arches."""
         for first, stop in _gaps(self.records):
             if stop not in self.records:
                 continue
@@ -117,7 +117,7 @@ class Passes:
     def beside(
         self, frame: int, records: Mapping[int, FrameRecord] | None = None
     ) -> tuple[FrameTracker, MotionPredictor]:
-        """Return a tracker and a predictor that start from the frames around a tracked one, or those given."""
+        """Return a tracker and a predictor initialised from the frames around a tracked one."""
         records = records or self.records
         history = History(self._config.history_frames, self._config.score_frames)
         known = sorted(records, key=lambda f: -abs(f - frame))[-_NEARBY_FRAMES:]
@@ -136,7 +136,7 @@ class Passes:
         views: Sequence[View],
         known: Array | None = None,
     ) -> FrameRecord:
-        """Track the next frame; where an arch is lost, poses known of it, shape (2, 4, 4), are tried as well."""
+        """Track the next frame; if an arch is lost, also try `known` poses, shape (2, 4, 4)."""
         reach = self._config.gate_per_miss * motion.miss_mm() * self._config.working_px_per_mm
         may_search = motion.search_is_due() and self.searches.allows(frame)
         record = tracker.track(motion.starts(), views, motion.pose_history() if may_search else None, reach)
@@ -151,7 +151,7 @@ class Passes:
 
 
 def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
-    """Yield runs of frames in which an arch is lost, as first frame and one past the last."""
+    """Return runs of frames in which an arch is lost, as first frame and one past the last."""
     lost = [frame for frame in sorted(records) if (records[frame].status == LOST).any()]
     runs: list[list[int]] = []
     for frame in lost:
@@ -162,19 +162,16 @@ def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
     return [(a, b) for a, b in runs]
 
 
-# Of the medians of the take, per arch. They only tell where tracking back to the first frame begins, and so what it
-# costs: what is kept there is decided frame by frame.
+# Least score and largest residual of a well-seen frame, relative to the medians of the take. They only determine where
+# tracking back to the first frame begins.
 _LEAST_SCORE, _MOST_RESIDUAL = 0.8, 1.2
-# Of the medians of the take, per arch: with a smaller share of the visible contour and a larger residual at once, the
-# edges of lips were taken for the teeth's. Chosen on 15 persons with lips in the way (9600-9614 and 9503-9521 of
-# `tests/benchmarks/population.py`, 360 arches in frames): it names the three that were 0.6 to 0.9 mm off at a promised
-# 0.15 (0.3 of the median share, 1.8 times the residual), and no other. Of nine persons besides, none of 216 was named,
-# at most 1.4 % (95 %), nor any of 833 frames of a long take (at most 1.43 times the residual).
+# Share of the visible contour and residual, relative to the medians of the take, beyond which both together mean that
+# lip edges were matched instead of teeth; and frames needed for the medians. False-alarm rate: at most 1.4 %.
 _POOR_SHARE, _POOR_RESIDUAL, _TELLING_FRAMES = 0.5, 1.6, 6
 
 
 def nearest_well_seen(records: Mapping[int, FrameRecord], start: int) -> int | None:
-    """Return the frame nearest to a given one in which as much of both arches fits, and as well, as usual in the take.
+    """Return the frame nearest to a given one in which both arches fit as well as usual in the take.
 
     None if there is none.
     """
@@ -190,8 +187,8 @@ def nearest_well_seen(records: Mapping[int, FrameRecord], start: int) -> int | N
     return min(seen.tolist(), key=lambda frame: (abs(frame - start), frame), default=None)
 
 
-def give_up_poorly_seen(records: MutableMapping[int, FrameRecord]) -> None:
-    """Mark arches lost in frames in which far less of them fits than usual in the take, and far more roughly."""
+def mark_poorly_seen_lost(records: MutableMapping[int, FrameRecord]) -> None:
+    """Mark arches as lost in frames where they match far less contour than usual, with far larger residuals."""
     frames = sorted(records)
     kept = np.array([records[frame].status != LOST for frame in frames])
     share, residual = (np.full((len(frames), 2), np.nan) for _ in range(2))

@@ -1,4 +1,4 @@
-"""The tracks of a take from the records of its frames."""
+"""Assemble the tracks of a take from the records of its frames."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, interpolation_covariance, pose_response
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
-#: What else is known of poses, told once all are measured: takes poses (F, 2, 4, 4), NaN where lost, the covariances of
-#: their left twists about the world origin (F, 2, 6, 6), and that of T_upper_lower about the skull origin (F, 6, 6);
-#: returns likelier ones.
+#: Refines all measured poses by further knowledge. Arguments and results: poses (F, 2, 4, 4), NaN where lost, the
+#: covariances of their left twists about the world origin (F, 2, 6, 6), and that of T_upper_lower about the skull
+#: origin (F, 6, 6).
 Fusion = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 
@@ -54,14 +54,13 @@ def assemble(
     notes: TracksMeta,
     fuse: Fusion | None = None,
 ) -> Tracks:
-    """Return the tracks of a take: raw poses as aligned, and fused if asked for; final poses smoothed over time.
+    """Return the tracks of a take: raw poses as aligned, optionally refined by `fuse`; final poses smoothed over time.
 
     The covariances are those of the raw poses: outline errors change slowly, so smoothing reduces them little.
-
-    `landmarks` are in mandible coordinates [mm], shape (5, 3); everything else goes to the meta data as well.
+    `landmarks` are in mandible coordinates [mm], shape (5, 3).
 
     Raises:
-        TrackingError: the registration of the scans is to be corrected, and the mouth was not closed.
+        TrackingError: the registration of the scans should be corrected, but the mouth was not closed.
     """
     frames = np.array(sorted(records), np.int64)
     raw, status, losses, centres, coverage, used, residual, matched = _columns(records, frames)
@@ -111,18 +110,18 @@ def assemble(
 
 
 def _columns(records: Mapping[int, FrameRecord], frames: NDArray[np.int64]) -> list[Array]:
-    """Return what the tracks say of frames, an array per figure: poses as aligned first, see `_figures`."""
+    """Return the values of `_figures` as one array each over all frames."""
     rows = (_figures(records[frame]) for frame in frames.tolist())
     first = next(rows)
     columns = [np.empty((len(frames), *value.shape)) for value in first]
-    for k, row in enumerate(chain([first], rows)):  # frame by frame: of long takes, a list would hold all records
+    for k, row in enumerate(chain([first], rows)):  # frame by frame, since a list would hold all records of a long take
         for column, value in zip(columns, row, strict=True):
             column[k] = value
     return columns
 
 
 def _figures(record: FrameRecord) -> tuple[Array | Mask | NDArray[np.int8], ...]:
-    """Return what the tracks say of a frame; the third are reason, value and limit of each loss."""
+    """Return the values of a frame that tracks store; the third are reason, value and limit of each loss."""
     solution, losses = record.solution, np.array(record.losses, np.float64)
     quality = (residual_px(solution), matched_px(solution))
     return (solution.poses, record.status, losses, solution.centres, record.coverage, record.used, *quality)
@@ -136,16 +135,15 @@ def _measured(
     correlation: float,
     rest: RestFrames,
 ) -> tuple[Array, Array, Array, ClosedBite | None]:
-    """Return the poses (F, 2, 4, 4), their covariances (F, 2, 6, 6), that of the relative pose (F, 6, 6), the bite.
+    """Return poses (F, 2, 4, 4), their covariances (F, 2, 6, 6), those of relative poses (F, 6, 6), and the bite.
 
-    `raw` are the poses as aligned, NaN where lost, `correlation` the length over which outline errors move together
-    [px].
+    `raw` are the poses as aligned, NaN where lost; `correlation` is the correlation length of outline errors [px].
     """
     frames = np.array(sorted(records), np.int64)
     outline, habits = _covariances(records, correlation, nuisances, extrinsics)
     bite = closed_bite(frames, raw, outline, habits, rest)
     covariance, steady = outline + habits, steady_part(outline, habits)
-    del outline, habits  # of long takes, as large as all tracks
+    del outline, habits  # as large as the tracks themselves
     relative = _relative_covariance(raw, covariance)
     if bite is None:
         return raw, covariance, relative, None
@@ -157,7 +155,7 @@ def _measured(
 
 
 def _bite_report(bite: ClosedBite | None, rest: RestFrames, findings: list[dict[str, str | float | int]]) -> TracksMeta:
-    """Return what the closed bite tells, for the meta data; the findings are added to those given."""
+    """Return the meta data about the closed bite; its findings are appended to those given."""
     if bite is None:
         return {"findings": [*findings, registration_unknown(rest).as_json()]}
     registration = bite.report(rest)
@@ -170,7 +168,7 @@ def _bite_report(bite: ClosedBite | None, rest: RestFrames, findings: list[dict[
 
 
 def _habits_report(nuisances: Nuisances, camera_names: tuple[str, ...]) -> TracksMeta:
-    """Return what the take tells about the hand that drew its masks, for the meta data."""
+    """Return the meta data about the habits of the annotator."""
 
     def by_camera(values: Array) -> dict[str, list[float]]:
         return dict(zip(camera_names, values.T.tolist(), strict=True))
@@ -197,7 +195,7 @@ def outline_variance(records: Mapping[int, FrameRecord], config: TrackingConfig)
 
 
 def take_correlation_px(records: Mapping[int, FrameRecord], config: TrackingConfig) -> float:
-    """Return the correlation length of the outline errors of a take, the median over its frames [px]."""
+    """Return the correlation length of outline errors, the median over the frames of a take [px]."""
     if config.known_correlation_px is not None:
         return config.known_correlation_px
     values = _of_tracked(records, lambda solution: correlation_px(solution, config))
@@ -206,16 +204,16 @@ def take_correlation_px(records: Mapping[int, FrameRecord], config: TrackingConf
 
 
 def _of_tracked(records: Mapping[int, FrameRecord], figure: Callable[[Solution], Array]) -> Array:
-    """Return a figure of every frame and arch, NaN where lost, shape (F, 2)."""
+    """Return a value of every frame and arch, NaN where lost, shape (F, 2)."""
     return np.stack([np.where(r.status != LOST, figure(r.solution), np.nan) for r in records.values()])
 
 
 def _covariances(
     records: Mapping[int, FrameRecord], correlation: float, nuisances: Nuisances, extrinsics: Extrinsics
 ) -> tuple[Array, Array]:
-    """Return the covariance of both arches' left twists, NaN where lost, two parts of shape (F, 2, 6, 6).
+    """Return the covariance of both arches' left twists, NaN where lost, in two parts of shape (F, 2, 6, 6).
 
-    The first by the outline errors of each frame alone, the second by the unknowns of the take.
+    The first is caused by outline errors of each frame, the second by the nuisance parameters of the take.
     """
     outline, habits = np.full((2, len(records), 2, 6, 6), np.nan)
     for k, frame in enumerate(sorted(records)):

@@ -25,26 +25,26 @@ from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance
 
 # Frames on either side over which process noise is estimated: a third of a second at 24 fps.
 _WINDOW = 4
-# Least acceleration variance, as a share of what noise independent from frame to frame would show: part of the outline
-# errors is the same in neighbouring frames and cancels in second differences.
+# Least acceleration variance, relative to that of independent noise: outline errors that neighbouring frames share
+# cancel in second differences.
 _FLOOR = 0.5
-_SHORTEST = 5  # frames; shorter runs do not show their process noise
+_SHORTEST = 5  # frames needed to estimate process noise
 
 
 def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, centre: Array) -> Array:
-    """Return the poses that balance the measured ones against even motion.
+    """Return smooth poses, by a fixed-interval smoother.
 
     Minimises sum x_k^T C_k^-1 x_k + sum a_k^T Q_k^-1 a_k over left twists x_k about a fixed point, with the second
     differences a_k of the poses: the smoother of a random walk in velocity (Rauch, Tung & Striebel 1965), with Q_k
-    taken from the raw second differences nearby less the share of noise, so that a sudden stop stays sudden.
+    estimated from nearby raw second differences less their noise, so that sudden stops stay sudden.
 
-    Lost frames stay NaN, runs of fewer than five frames stay as they are.
+    Lost frames stay NaN, and runs of fewer than five frames stay unchanged.
 
     Args:
         frames: frame numbers, shape (F,).
         poses: measured poses, NaN where lost, shape (F, 4, 4).
         covariance: of their left twists about the world origin, shape (F, 6, 6).
-        centre: the fixed point, amid the motion [mm], shape (3,).
+        centre: the fixed point, near the moving points [mm], shape (3,).
     """
     to = make_transform(np.eye(3), -np.asarray(centre))
     A, back = se3_adjoint(to), se3_inverse(to)
@@ -66,7 +66,7 @@ def _runs(frames: NDArray[np.int64], known: Mask) -> list[NDArray[np.int64]]:
 
 
 def _corrections(poses: Array, covariance: Array) -> Array:
-    """Return the twists that take one run of poses to the smooth ones, shape (N, 6)."""
+    """Return the twists from one run of poses to the smooth ones, shape (N, 6)."""
     count = len(poses)
     steps = se3_log(poses[1:] @ se3_inverse(poses[:-1]))
     bend = np.diff(steps, axis=0)  # of frames 1 .. N-2
@@ -74,7 +74,7 @@ def _corrections(poses: Array, covariance: Array) -> Array:
     noise = variance[:-2] + 4 * variance[1:-1] + variance[2:]
     process_noise = uniform_filter1d(bend**2 - noise, 2 * _WINDOW + 1, axis=0, mode="nearest")
     weight = 1.0 / np.maximum(process_noise, _FLOOR * noise)
-    # Band storage: diagonal d of the upper triangle in arch 17 - d; twists of three neighbours reach 17 entries.
+    # Band storage: diagonal d of the upper triangle in row 17 - d; twists of three neighbours reach 17 entries.
     bands = np.zeros((18, 6 * count))
     right = np.zeros(6 * count)
     information = np.linalg.inv(covariance)
@@ -92,13 +92,13 @@ def _corrections(poses: Array, covariance: Array) -> Array:
 
 
 def combine(tracks: Tracks, poses: Array, covariance: Array, landmarks: Array) -> Tracks:
-    """Return tracks with a second measurement of their poses taken in, each weighted by its covariance.
+    """Return tracks combined with a second measurement of their poses, each weighted by its covariance.
 
-    Where the two contradict each other, the covariance grows with the distance: by the Birge ratio (Birge 1932), as
-    covariances that are too small by the same factor explain it. Arches that are lost take the second measurement.
+    If the two contradict each other, the covariance is scaled by the Birge ratio (Birge 1932). Lost arches use the
+    second measurement.
 
     Args:
-        tracks: the first measurement; their raw poses are combined and smoothed anew.
+        tracks: the first measurement; their raw poses are combined and smoothed again.
         poses: T_world_upper and T_world_lower, NaN where they were not found, shape (F, 2, 4, 4).
         covariance: of their left world twists, shape (F, 2, 6, 6).
         landmarks: points whose uncertainty is reported, mandible coordinates [mm], shape (5, 3).
@@ -139,7 +139,7 @@ def combine(tracks: Tracks, poses: Array, covariance: Array, landmarks: Array) -
 
 
 def _weighted(one: Array, one_covariance: Array, other: Array, other_covariance: Array) -> tuple[Array, Array]:
-    """Return the means of poses (F, 4, 4) and their covariances (F, 6, 6); the other's where only that is known."""
+    """Return weighted means of poses (F, 4, 4) and their covariances (F, 6, 6); `other` where `one` is missing."""
     known, also = (
         np.isfinite(pose).all((1, 2)) & np.isfinite(covariance).all((1, 2))
         for pose, covariance in ((one, one_covariance), (other, other_covariance))

@@ -1,4 +1,4 @@
-"""A whole take: the first frame, passes over its frames, and a refinement of it all."""
+"""Tracking of a whole take: the first frame, passes over all frames, and whole-take corrections."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from jawusd.tracking.initialization.start import find_start, quoting
 from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.delays import BRIDGE_FRAMES, bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, Hand, Nuisances, TakeEquations
-from jawusd.tracking.sequence.passes import Passes, Progress, give_up_poorly_seen
+from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, AnnotatorPrior, Nuisances, TakeEquations
+from jawusd.tracking.sequence.passes import Passes, Progress, mark_poorly_seen_lost
 from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import (
     lens_findings,
@@ -37,10 +37,10 @@ from jawusd.tracking.sequence.take_checks import (
 )
 from jawusd.tracking.sequence.time_checks import frame_shifts, time_findings
 
-_SETTLED_REST = 6  # frames with the teeth together among those on which nuisances are settled
-# A moved camera would only hide these.
+_SETTLED_REST = 6  # closed-bite frames among those on which nuisance parameters are iterated
+# If these are found, camera poses are not corrected, since that would hide them.
 _SHOWN_AS_MOTION = ("focal_length", "scan_size", "lens_distortion", "scans_mirrored")
-_CHECKED_FRAMES = 8  # whose contours are searched widely for wrong lenses and sizes: half a second
+_CHECKED_FRAMES = 8  # tested for wrong lenses and sizes: takes half a second
 
 
 def track_capture(
@@ -58,16 +58,16 @@ def track_capture(
     """Track both arches through a capture.
 
     Args:
-        capture: gives masks, frame range and bootstrap picks; without picks the teeth are searched.
+        capture: provides masks, frame range and bootstrap picks; without picks, the teeth are searched.
         cameras: calibrated; world lengths in mm.
         offsets: reference frame minus own frame number, per camera name.
         upper, lower: teeth scans in one frame, in occlusion [mm].
         landmarks: points whose uncertainty is reported, mandible (= scan) coordinates [mm], shape (5, 3).
         threads: worker threads; the result does not depend on it.
-        progress: called with frames done and frames in all, once per frame.
+        progress: called once per frame with the number of frames done, and their total.
 
     Raises:
-        TrackingError: one camera only, masks or scans mixed up, or no frame on which the teeth can be aligned.
+        TrackingError: only one camera, exchanged masks or scans, or no frame on which the teeth can be aligned.
         CaptureError: a mask cannot be read.
     """
     config = config or FOR_TAKES
@@ -91,7 +91,7 @@ def track_capture(
             given = take.scans_and_lenses(start.T_anatomical_scan[0, :3])
             wrong = any(finding.kind in _SHOWN_AS_MOTION for finding in given)
             nuisances, extrinsics = take.refine(rest, may_move=not wrong)
-            give_up_poorly_seen(take.records)
+            mark_poorly_seen_lost(take.records)
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
             moved = motion_findings(names, extrinsics)
@@ -116,18 +116,18 @@ def track_capture(
 
 
 def _trimmed(records: PackedRecords) -> PackedRecords:
-    """Drop frames without any mask before the first and after the last frame that has one."""
+    """Return the records from the first to the last frame with a mask."""
     masked = [frame for frame, record in records.items() if np.isfinite(record.coverage).any()]
     return records.kept(frame for frame in records if min(masked) <= frame <= max(masked))
 
 
 class _Take(Passes):
-    """Track a take, estimate what is wrong with cameras and masks in all of it, and align its frames again."""
+    """Tracks a take, estimates its nuisance parameters, and aligns its frames again."""
 
     def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
-        """Estimate delays, habits and camera poses; where they matter, align all frames again with them corrected.
+        """Estimate delays, habits and camera poses; if they matter, align all frames again with them corrected.
 
-        Cameras whose lens or scans are of another size must not move (`may_move`).
+        Camera poses are corrected only if `may_move`, since wrong lenses or scan sizes look like moved cameras.
         """
         c = self._config
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
@@ -150,15 +150,15 @@ class _Take(Passes):
             self._realign(found, extrinsics)
             residual = self._equations(extrinsics, rest).solve(c, cameras_moved)
             found, rounds = found.plus(residual), rounds + 1
-            # Where a late camera sees the teeth follows from the motion, which the first round mends.
+            # The correction of a late camera depends on the motion, which the first round improves.
             late = residual.late(c) or (rounds == 1 and found.late(c))
             pending = late or (rounds < c.refine_rounds and residual.matters(c))
         return found, extrinsics
 
     def _late_cameras(self, equations: TakeEquations, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
-        """Correct delays near a frame before anything else; None without any.
+        """Correct delays of about a frame first; None without such delays.
 
-        So late a camera also looks moved, and its masks look wrong where the jaw is fast.
+        A camera with such a delay also looks moved, and its masks look wrong where the jaw is fast.
         """
         c = self._config
         found = equations.solve(c, False)
@@ -169,7 +169,7 @@ class _Take(Passes):
         return found
 
     def scans_and_lenses(self, left: Array) -> list[Finding]:
-        """Return what the take, before anything is corrected, shows about focal lengths, lenses and the scans.
+        """Return findings about focal lengths, lenses and scans from the uncorrected take.
 
         Args:
             left: unit vector in scan coordinates, shape (3,).
@@ -188,21 +188,21 @@ class _Take(Passes):
 
     def _equations(self, extrinsics: Extrinsics, rest: RestFrames) -> TakeEquations:
         variance = outline_variance(self.records, self._config)
-        equations = TakeEquations(self.records, variance, extrinsics, hand=self._hand())
+        equations = TakeEquations(self.records, variance, extrinsics, annotator=self._annotator())
         observe_bite(equations, self.records, rest, extrinsics, variance)
         return equations
 
-    def _hand(self) -> Hand:
+    def _annotator(self) -> AnnotatorPrior:
         return DRAWN if all(scan.shows_gum for scan in self._solver.scans) else DRAWN_BESIDE_CROWNS
 
     def _middle(self) -> Array:
-        """Return a point amid the teeth, world coordinates [mm], shape (3,)."""
+        """Return the centre of the teeth in the world [mm], shape (3,)."""
         return np.median([record.solution.centres for record in self.records.values()], axis=(0, 1))
 
     def _settle(
         self, found: Nuisances, extrinsics: Extrinsics, rest: RestFrames, cameras_moved: bool
     ) -> tuple[Nuisances, Extrinsics]:
-        """Align some frames repeatedly until the nuisances converge: matches follow them only step by step."""
+        """Align some frames repeatedly until the nuisance parameters converge, since matches adapt slowly."""
         c, records = self._config, self.records.kept(self.records)
         whole = whole_frames(records)
         if not whole:
@@ -220,7 +220,7 @@ class _Take(Passes):
                 views = _corrected_views(views, self.records, frame, found, extrinsics)
                 solution = self._solver.solve(start, views, c.gates_from(0.0), used)
                 records[frame] = replace(records[frame], solution=solution)
-            equations = TakeEquations(records, variance, extrinsics, sample, self._hand())
+            equations = TakeEquations(records, variance, extrinsics, sample, self._annotator())
             observe_bite(equations, records, sampled_rest, extrinsics, variance)
             more = equations.solve(c, cameras_moved)
             found = found.plus(more)
@@ -229,18 +229,18 @@ class _Take(Passes):
         return found, extrinsics
 
     def _realign(self, nuisances: Nuisances, extrinsics: Extrinsics) -> None:
-        """Align every frame again from its poses, with all nuisances of the take corrected."""
+        """Align every frame again from its poses, with all nuisance parameters corrected."""
         before = self.records.kept(self.records)
         tracker, _ = self.beside(self._first)
         for frame, views in self._masks.walk(self._first, self._stop):
             views = _corrected_views(views, before, frame, nuisances, extrinsics)
             record = tracker.track(_starts_again(before, frame), views, None)
             found = record.status == TRACKED
-            doubted = np.isin(before[frame].status, (RECOVERED, LOST))
-            status = np.where(found & doubted, RECOVERED, record.status).astype(np.int8)
+            unreliable = np.isin(before[frame].status, (RECOVERED, LOST))
+            status = np.where(found & unreliable, RECOVERED, record.status).astype(np.int8)
             self.records[frame] = replace(record, status=status)
             tracker.history.add(record)
-            before.pop(frame - BRIDGE_FRAMES, None)  # of a long take, not every frame is held twice
+            before.pop(frame - BRIDGE_FRAMES, None)  # no longer needed: saves memory in long takes
 
 
 def _corrected_views(
@@ -257,7 +257,7 @@ def _corrected_views(
 
 
 def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]:
-    """Return the starts for aligning a frame again: its poses, preceded by interpolated ones if an arch is lost."""
+    """Return starts for aligning a frame again: its poses, after interpolated ones if an arch is lost."""
     own = records[frame].solution.poses
     lost = np.flatnonzero(records[frame].status == LOST)
     even = own.copy()

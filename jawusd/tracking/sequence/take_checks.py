@@ -25,14 +25,14 @@ from jawusd.tracking.sequence.history import SearchAllowance
 
 @dataclass(frozen=True)
 class LensLimits:
-    """Say from what on a magnification is worth a warning.
+    """Limits of a magnification beyond which there is a warning.
 
     Attributes:
-        scale, common: of one camera against the others, and of all [-].
-        bend: change of it over 25 mm at the teeth [-].
-        bias_px: outline bias of a camera against the others [px].
-        clear: standard deviations of the first two.
-        knock: of the motion of a camera against the others [standard deviations].
+        scale, common: of one camera relative to the others, and of all cameras [-].
+        bend: change of magnification over 25 mm at the teeth [-].
+        bias_px: outline bias of a camera relative to the others [px].
+        clear: least significance of `scale` and `common` [standard deviations].
+        knock: motion of a camera relative to the others [standard deviations].
     """
 
     scale: float
@@ -43,37 +43,25 @@ class LensLimits:
     knock: float
 
 
-#: Of drawn masks. The second was a false alarm on 2 of 51 valid persons (0.028 and 0.030); at 0.035 it would miss scans
-#: 3 % too large. The third, of distortion with a wrong sign, finds 7 of 10 persons and 1 of 35 valid ones; at 0.006 4
-#: of 10 and the same 1. The sigmas of magnifications hold cameras that moved along their axis.
-#: The last was chosen on 13 valid persons, none of whom had more than 5.2, and on three with a camera knocked by half a
-#: degree and 2 mm (13.6 to 19, at least 1.9 times any other camera); masks drawn 6 px too wide had 10.6 in one camera
-#: and 9.6 in the next. False alarms: 1 of 116 others (9704, 12 times; 9600-9615, 9700-9799), at most 4 % (95 %).
-#: The fourth was chosen on 49 persons with three cameras or more (9310-9352, 9500-9615): at most 0.22 px as drawn; with
-#: one camera's masks widened by 6 px of its pictures, 44 had more (at 2.5, 37 had). False alarms: none
-#: of 94 others (9700-9799, 0.29 px at most), at most 3 % (95 %).
+#: For drawn masks. Sigmas of magnifications allow for cameras that moved along their axis.
 OF_MASKS = LensLimits(0.02, 0.015, 0.002, 1.2, 3.0, 8.0)
-#: Of colours, whose sigmas are wide. None of 8 takes of 7 mouths came near (0.019 at 1.0 sigma, 0.005 at 0.4), which
-#: bounds the rate of false alarms to 31 % (95 %). 4 of 4 of these with a focal length 5 % off (1.9 sigma at
-#: least), and 2 of 2 with scans 3 % too large (2.4), are found. Lens distortion is not: true lenses showed 0.04 at 3.
+#: For colours, whose sigmas are wide. Lens distortion cannot be detected with them.
 OF_COLOURS = LensLimits(0.03, 0.015, np.inf, np.inf, 1.6, np.inf)
-# Change that a lens of radial distortion k1 = -0.4 makes at the teeth from 130 mm away, without any calibration. Masks
-# made from the footage of three of five path-traced mouths with true lenses showed 0.019 to 0.068.
+# Magnification change of an uncalibrated lens with k1 = -0.4 at a distance of 130 mm [-]: larger changes are errors of
+# the masks of side teeth.
 _MOST_BEND = 0.015
-# Motion of a camera since its calibration, which the take corrects.
+# Motion of a camera since its calibration that causes a warning after its correction.
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
-_KNOCKED_MORE = 1.5  # than any other camera
-_TELLING_CAMERAS = 3  # of two that differ, either may be wrong
-# Share of its visible contour that a scan fits, over that of the other scan, and standard deviation of what is matched,
-# over that of the other: both together tell the scan of somebody else. Chosen on the one take with one that was tracked
-# at all (0.12 and 2.1; `population.py --faults`, person 9502) and nine valid persons, of whom the nearest had 0.55 and
-# 1.0. None of 21 other valid persons (9500-9529) was named, which bounds the rate of false alarms to 14 % (95 %).
+_KNOCKED_MORE = 1.5  # least ratio of its motion to that of any other camera
+_TELLING_CAMERAS = 3  # if two cameras differ, either may be wrong
+# Matched share of the visible contour, and residual, each relative to the other scan: both together reveal another
+# person's scan. And frames needed for that. False-alarm rate: at most 14 %.
 _FITS_LESS, _FITS_ROUGHER, _TELLING_FRAMES = 0.35, 1.5, 3
 _CLEARLY = 4.0  # standard deviations
 
 
 def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits = OF_MASKS) -> list[Finding]:
-    """Return what the magnification of the cameras shows about scans, focal lengths, lenses and masks.
+    """Return findings about scans, focal lengths, lenses and masks from the magnification of the cameras.
 
     Kinds: "scan_size" [%], "focal_length" [%], "camera_moved" [degrees], "lens_distortion" [%], "side_teeth" [%],
     "masks_wide" [px].
@@ -81,14 +69,14 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
     out = []
     knocked = _knocked(found, limits)
     common = found.common
-    sigma = float(np.sqrt(np.mean(found.sigma_scale**2) / len(found.scale)))  # cameras move independently
+    sigma = float(np.sqrt(np.mean(found.sigma_scale**2) / len(found.scale)))  # camera motions are independent
     if abs(common) > max(limits.common, limits.clear * sigma) and (np.sign(found.scale) == np.sign(common)).all():
         out.append(
             Finding(
                 "scan_size",
                 "warning",
-                f"every camera shows the teeth {_than(common)} than the scans: the scans' scale is wrong, or the "
-                f"calibration's lengths; at most {limits.common:.1%} is usual.",
+                f"every camera shows the teeth {_than(common)} than the scans: the scale of the scans or of the "
+                f"calibration is wrong; at most {limits.common:.1%} is usual.",
                 value=round(100 * common, 2),
                 limit=100 * limits.common,
                 hint="Check the scans' unit and scaling, and the square size of the calibration board.",
@@ -101,8 +89,8 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
                 Finding(
                     "focal_length",
                     "warning",
-                    f"it shows the teeth {_than(own)} than its calibration and the other cameras say; at most "
-                    f"{limits.scale:.0%} is usual. Its focal length is wrong, or its distance.",
+                    f"it shows the teeth {_than(own)} than expected from its calibration and the others; at most "
+                    f"{limits.scale:.0%} is usual. Its focal length or its distance is wrong.",
                     value=round(100 * own, 2),
                     limit=100 * limits.scale,
                     camera=name,
@@ -118,7 +106,7 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
 
 
 def _knocked(found: Magnification, limits: LensLimits) -> int | None:
-    """Return the camera that moved most clearly against the others, which seem to have moved as well; None if none."""
+    """Return the camera that moved most significantly relative to the others; None if there is none."""
     if len(found.motion_clear) < _TELLING_CAMERAS:
         return None
     *_, second, worst = np.argsort(found.motion_clear).tolist()
@@ -127,14 +115,15 @@ def _knocked(found: Magnification, limits: LensLimits) -> int | None:
 
 
 def _moved(name: str, turn_rad: float, move_mm: float, clear: float) -> Finding:
-    """Say that a camera stands elsewhere than its calibration says, too far off for its masks to be followed."""
+    """Return a warning about a camera that moved too far for a correction."""
     turn_deg = float(np.rad2deg(turn_rad))
     return _camera_moved(
         name,
         turn_deg,
-        f"against the other cameras it seems to have turned by {turn_deg:.2f} degrees and moved by {move_mm:.1f} mm "
-        f"since its calibration, {clear:.0f} times their uncertainty; up to {OF_MASKS.knock:g} times is usual.",
-        "It was knocked, or is calibrated wrongly: calibrate it again, or leave it out.",
+        f"relative to the other cameras it seems to have turned by {turn_deg:.2f} degrees and moved by "
+        f"{move_mm:.1f} mm since its calibration, {clear:.0f} times the uncertainty; "
+        f"up to {OF_MASKS.knock:g} times is usual.",
+        "It was knocked, or its calibration is wrong: calibrate it again, or exclude it.",
     )
 
 
@@ -143,22 +132,22 @@ def _camera_moved(name: str, turn_deg: float, message: str, hint: str) -> Findin
 
 
 def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
-    """Say that teeth away from the middle of a camera's pictures are shown larger or smaller."""
+    """Return a warning about a camera whose magnification changes away from the optical axis."""
     if abs(bend) > _MOST_BEND:
         return Finding(
             "side_teeth",
             "warning",
-            f"25 mm from the optical axis its masks show the teeth {_than(bend)} than in the middle; no lens bends "
-            f"more than {_MOST_BEND:.1%} there. The masks of the side teeth are wrong.",
+            f"25 mm from the optical axis its masks show the teeth {_than(bend)} than in the centre; no lens distorts "
+            f"by more than {_MOST_BEND:.1%} there. The masks of the side teeth are wrong.",
             value=round(100 * bend, 2),
             limit=100 * _MOST_BEND,
             camera=name,
-            hint="Look at the corners of the mouth: masks often end early in their shadow, or run on into it.",
+            hint="Check the masks at the corners of the mouth: they often end too early in the shadow, or include it.",
         )
     return Finding(
         "lens_distortion",
         "warning",
-        f"25 mm from the optical axis it shows the teeth {_than(bend)} than its calibration says; at most "
+        f"25 mm from the optical axis it shows the teeth {_than(bend)} than expected by its calibration; at most "
         f"{limits.bend:.1%} is usual. Its lens distortion is wrong.",
         value=round(100 * bend, 2),
         limit=100 * limits.bend,
@@ -172,7 +161,7 @@ def _than(share: float) -> str:
 
 
 def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[Finding]:
-    """Say that a camera's masks are drawn wider or narrower than the others' by far."""
+    """Return a warning if the masks of a camera are much wider or narrower than those of the others."""
     own = found.bias_px[c] - np.median(found.bias_px, axis=0)
     bias = float(own.mean())
     if len(found.bias_px) < _TELLING_CAMERAS:
@@ -186,18 +175,18 @@ def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[F
         Finding(
             "masks_wide",
             "warning",
-            f"its masks are drawn {abs(bias):.1f} px {'wider' if bias > 0 else 'narrower'} than those of the other "
-            f"cameras, at the size they are compared in; at most {limits.bias_px} px is usual.",
+            f"its masks are {abs(bias):.1f} px {'wider' if bias > 0 else 'narrower'} than those of the other cameras "
+            f"at working resolution; at most {limits.bias_px} px is usual.",
             value=round(bias, 2),
             limit=limits.bias_px,
             camera=name,
-            hint="Draw them again, or leave this camera out.",
+            hint="Draw them again, or exclude this camera.",
         )
     ]
 
 
 def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Finding]:
-    """Return a warning for each camera that stands clearly elsewhere than its calibration says.
+    """Return a warning for each camera that moved significantly since its calibration.
 
     Kind: "camera_moved" [degrees].
     """
@@ -207,15 +196,15 @@ def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Findin
         clear = (np.abs(twist) > _CLEARLY * sigma).any()
         if clear and (turn > _TURN_DEG or move > _MOVE_MM):
             message = (
-                f"as the take shows it, it sees the teeth turned by {turn:.2f} degrees and moved by {move:.1f} mm "
-                f"against its calibration (usual are {_TURN_DEG:g} degrees and {_MOVE_MM:g} mm); corrected."
+                f"it has turned by {turn:.2f} degrees and moved by {move:.1f} mm since its calibration "
+                f"(up to {_TURN_DEG:g} degrees and {_MOVE_MM:g} mm is usual); corrected."
             )
             out.append(_camera_moved(name, turn, message, "It was knocked: calibrate again to be sure."))
     return out
 
 
 def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
-    """Return a warning for a scan that fits hardly anything of the masks it was tracked through.
+    """Return a warning for a scan that barely fits its own masks.
 
     Kind: "scan_misfit" [% of the visible contour].
     """
@@ -232,9 +221,9 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
                 Finding(
                     "scan_misfit",
                     "warning",
-                    f"the {name} scan hardly fits its own masks: {share[r]:.0%} of its visible contour, within "
+                    f"the {name} scan barely fits its own masks: {share[r]:.0%} of its visible contour, within "
                     f"{rough[r]:.1f} px; the {ARCH_NAMES[other]} one fits {share[other]:.0%}, within "
-                    f"{rough[other]:.1f} px. Its poses are not to be trusted.",
+                    f"{rough[other]:.1f} px. Its poses are unreliable.",
                     value=round(100 * float(share[r]), 1),
                     limit=round(100 * _FITS_LESS * float(share[other]), 1),
                     hint=f"Check that the {name} scan is this person's, of this time, and that its masks show the "
@@ -245,7 +234,7 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
 
 
 def search_findings(searches: SearchAllowance, records: Mapping[int, FrameRecord]) -> list[Finding]:
-    """Return a warning if teeth were no longer searched on frames that stay lost, as too many searches were in vain.
+    """Return a warning if the search budget was exhausted, so that frames stay lost without a search.
 
     Kind: "searches_left_out" [frames].
     """
@@ -256,22 +245,22 @@ def search_findings(searches: SearchAllowance, records: Mapping[int, FrameRecord
         Finding(
             "searches_left_out",
             "warning",
-            f"the teeth were lost and searched from many starts {searches.fruitless} times in vain, as often as a take "
-            f"of this length allows ({searches.most} times more than with success); on {len(lost)} frames from this "
-            "one on they stay lost without another search.",
+            f"{searches.fruitless} searches for lost teeth failed, the limit for a take of this length (at most "
+            f"{searches.most} more failures than successes); on {len(lost)} frames from this one on, the teeth stay "
+            "lost without another search.",
             value=len(lost),
             limit=searches.most,
             frame=lost[0],
-            hint="Look at the masks of the lost frames: rows or cameras may be exchanged there.",
+            hint="Check the masks of the lost frames: arches or cameras may be exchanged there.",
         )
     ]
 
 
-_HALF = 0.5  # of a camera's masks: with fewer used, the camera contradicts the others more often than not
+_HALF = 0.5  # share of a camera's masks that must be used: below, it mostly contradicts the others
 
 
 def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -> list[Finding]:
-    """Return a warning for each camera whose masks were used in none of the frames, or in few of those that have some.
+    """Return a warning for each camera whose masks were never or rarely used.
 
     Kinds: "camera_not_used", with the number of frames that have masks; "camera_rarely_used", with the used share.
     """
@@ -309,16 +298,15 @@ def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -
     return out
 
 
-_FRAMES = 4  # that are aligned anew, twice: a second or two
-# Contour that fits the mirror images over that which fits the scans. As given, it was 0.18 to 0.49 in takes of four
-# mouths, and up to 0.98 in one whose arches are symmetric but for the triangles, where it does not matter.
+_FRAMES = 4  # aligned twice: takes a second or two
+# Ratio of the contour matched by the mirror images to that matched by the scans: at most 0.98 for correct scans.
 _LEAST_RATIO = 1.15
 
 
 def mirror_findings(
     scans: Sequence[Scan], left: Array, instants: Iterable[Instant], config: TrackingConfig
 ) -> list[Finding]:
-    """Return a warning if more of the contour fits with left and right of the scans exchanged. Kind: "scans_mirrored".
+    """Return a warning if more contour matches with left and right of the scans exchanged. Kind: "scans_mirrored".
 
     Args:
         scans: upper and lower.
@@ -332,7 +320,7 @@ def mirror_findings(
         Finding(
             "scans_mirrored",
             "warning",
-            f"mirrored, the scans fit {ratio:.2f} times as much of the outlines: their left and right are exchanged",
+            f"mirrored scans match {ratio:.2f} times as much of the outlines: left and right are exchanged",
             value=round(ratio, 2),
             limit=_LEAST_RATIO,
             hint="Export them again without mirroring; one axis may have been negated.",
@@ -341,7 +329,7 @@ def mirror_findings(
 
 
 def mirror_ratio(scans: Sequence[Scan], left: Array, instants: Iterable[Instant], config: TrackingConfig) -> float:
-    """Return how much contour fits with the scans mirrored, over that with the scans as given; NaN without any.
+    """Return the ratio of contour matched by the mirrored scans to that by the given ones; NaN without instants.
 
     Arguments as for `mirror_findings`.
     """

@@ -27,28 +27,25 @@ from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
 from jawusd.tracking.sequence.results import outline_variance
 
 SHIFTS = (-1, 0, 1)  # frames
-_LOOKED_AT = 18  # frames of a take: a tenth of a second each
-_FEWEST = 3  # frames that tell, on either side of a step: two masks in a row may be wrong
-# By how much a shift must fit better than others to tell, as a share of the visible contour, and how much of it counts.
+_CHECKED_FRAMES = 18  # of a take, at a tenth of a second each
+_FEWEST = 3  # conclusive frames needed on either side of a step, since two masks in a row may be wrong
+# Least margin by which a shift must fit better than others, as a share of the visible contour, and its clipping limit.
 _LEAST_LEAD, _MOST_LEAD = 0.1, 0.5
-# How well the masks of the right instant fit at least: otherwise it is not the instant that is wrong. Chosen on persons
-# 9300-9316 of `tests/benchmarks/population.py`: every camera of ten that dropped a frame was found, with fits of -0.02
-# and more; wrong focal lengths and masks drawn 6 px too wide had -0.2 and less. False alarms: none of 69 others
-# (9330-9399), at most 4 % (95 %).
+# Least fit of the masks of the correct instant [-]: below, something other than the instant is wrong. False-alarm rate:
+# at most 4 %.
 _LEAST_FIT = -0.1
-# Where all fit worse, as when the jaw was lost after a dropped frame: how much better than those of the other cameras
-# at their best. Chosen on the one of 17 takes with a dropped frame that was missed without it (9516, better by 0.6);
-# nothing changes in the other 16, in 13 takes with other faults, and in 30 valid ones (9500-9529).
+# Least margin over the best fit of the other cameras, if all fit worse, as when the jaw was lost after a dropped frame
+# [-].
 _BETTER_FIT = 0.15
 
 
 class Shift(NamedTuple):
-    """Name a camera that shows a later instant than it should by so many frames.
+    """A camera whose masks show a wrong instant.
 
     Attributes:
-        camera: its number.
-        frames: by how many; negative for an earlier instant.
-        frame: of the take, from which on; None if it does all over the take.
+        camera: its index.
+        frames: by how many frames it is late; negative if early.
+        frame: first frame with the shift; None for the whole take.
     """
 
     camera: int
@@ -58,37 +55,37 @@ class Shift(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FrameShifts:
-    """Hold how well each camera's masks of neighbouring frames fit the teeth as the others see them.
+    """Fit of each camera's masks of neighbouring frames to the poses seen by the other cameras.
 
     Attributes:
-        frames: that were looked at, shape (F,).
-        fit: contour that fits less the price of uncovered mask, per frame, camera and shift, as a share of what is
-            visible, shape (F, C, 3); NaN where the camera has no mask or the others see nothing.
+        frames: the frames checked, shape (F,).
+        fit: matched contour less the penalty for uncovered mask, relative to the visible contour, per frame, camera and
+            shift, shape (F, C, 3); NaN if the camera or all others have no mask.
     """
 
     frames: NDArray[np.int_]
     fit: Array
 
     def clearest(self) -> Shift | None:
-        """Return the camera that shows another instant most clearly, None if all show the right one.
+        """Return the most significant shift; None if all cameras show the correct instant.
 
-        One camera's shift draws the poses that others are compared with, so that these seem to shift as well.
+        The shift of one camera biases the poses that others are compared with, so these seem to shift as well.
         """
         found = [shift for c in range(self.fit.shape[1]) for shift in self._shifts_of(c)]
         return max(found, key=lambda entry: entry[0])[1] if found else None
 
     def is_timely(self, camera: int) -> bool:
-        """Tell whether a camera shows the right instant, clearly so."""
-        return _agree(self._told(camera)[1][:, SHIFTS.index(0)])
+        """Return whether a camera clearly shows the correct instant."""
+        return _agree(self._conclusive(camera)[1][:, SHIFTS.index(0)])
 
-    def _told(self, c: int) -> tuple[NDArray[np.int_], Array]:
-        """Return the rows of the frames that tell of a camera, and by how much each shift leads there, shape (n, 3)."""
+    def _conclusive(self, c: int) -> tuple[NDArray[np.int_], Array]:
+        """Return the conclusive rows of a camera, and the lead of each shift there, shape (n, 3)."""
         leads = _leads(self.fit[:, c])
         rows = np.flatnonzero(np.isfinite(leads).all(1))
         return rows, np.clip(leads[rows], -_MOST_LEAD, _MOST_LEAD)
 
     def _others_at_best(self, c: int, rows: NDArray[np.int_]) -> Array:
-        """Return how well the other cameras' masks fit at the shift that suits each, inf where none is seen, (n,)."""
+        """Return the fit of the other cameras' masks at the best shift of each, inf if none is seen, shape (n,)."""
         others = np.delete(self.fit[rows], c, axis=1).max(2)
         usual = np.full(len(rows), np.inf)
         seen = np.isfinite(others).any(1)
@@ -96,14 +93,14 @@ class FrameShifts:
         return usual
 
     def _shifts_of(self, c: int) -> Iterator[tuple[float, Shift]]:
-        """Yield what a camera's masks may show, each after its evidence."""
-        rows, told = self._told(c)
+        """Yield possible shifts of a camera, each with its evidence first."""
+        rows, leads = self._conclusive(c)
         above = self.fit[rows, c] - np.minimum(_LEAST_FIT, self._others_at_best(c, rows) + _BETTER_FIT)[:, None]
         for k, shift in enumerate(SHIFTS):
-            if shift != 0 and _agree(told[:, k], above[:, k]):
-                yield float(told[:, k].sum()), Shift(c, -shift, None)
+            if shift != 0 and _agree(leads[:, k], above[:, k]):
+                yield float(leads[:, k].sum()), Shift(c, -shift, None)
         for k in range(_FEWEST, len(rows) - _FEWEST + 1):
-            before, after = told[:k], told[k:]
+            before, after = leads[:k], leads[k:]
             a, b = int(np.median(before, axis=0).argmax()), int(np.median(after, axis=0).argmax())
             if a != b and _agree(before[:, a], above[:k, a]) and _agree(after[:, b], above[k:, b]):
                 evidence = float(before[:, a].sum() + after[:, b].sum())
@@ -111,22 +108,22 @@ class FrameShifts:
 
 
 def _leads(fit: Array) -> Array:
-    """Return by how much each shift (F, 3) fits better than the best other one, same shape."""
+    """Return the lead of each shift (F, 3) over the best other one, same shape."""
     return np.stack([fit[:, k] - np.delete(fit, k, axis=1).max(1) for k in range(fit.shape[1])], axis=1)
 
 
 def _agree(leads: Array, above: Array | None = None) -> bool:
-    """Tell whether a shift leads in enough frames, and in most, and fits better there than it must by so much."""
+    """Return whether a shift leads in enough frames, and in most, with a sufficient fit there."""
     leading = leads > _LEAST_LEAD
     clear = leading.sum() >= _FEWEST and np.median(leads) > _LEAST_LEAD
     return bool(clear and (above is None or np.median(above[leading]) > 0.0))
 
 
 def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: ContourSolver) -> FrameShifts:
-    """Compare the masks of some frames, those in which the jaw is fastest, with those before and after.
+    """Compare the masks of some frames with fast jaw motion with those of their neighbours.
 
-    Where all cameras show the right instant at both ends of the take, what lies between is not looked at: one step
-    there would have to be followed by its opposite.
+    If all cameras show the correct instant at both ends of the take, the frames between are skipped: a step there would
+    have to be followed by its opposite.
 
     Args:
         records: of all frames of the take.
@@ -147,7 +144,7 @@ def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: C
 
 
 def _fits(record: FrameRecord, around: Sequence[Sequence[View]], solver: ContourSolver) -> Array:
-    """Return the fit of all cameras' masks of every shift, at poses that the other cameras alone give, shape (C, 3)."""
+    """Return the fit of every camera's masks at every shift, to poses from the other cameras only, shape (C, 3)."""
     config, poses, views = solver.config, record.solution.poses, around[SHIFTS.index(0)]
     rendering = solver.rendering(views)
     out = np.full((len(views), len(SHIFTS)), np.nan)
@@ -163,7 +160,7 @@ def _fits(record: FrameRecord, around: Sequence[Sequence[View]], solver: Contour
 
 
 def _judged(poses: Array, view: View, masks: Sequence[NDArray[np.uint8]], shown: Mask, solver: ContourSolver) -> Array:
-    """Return how well each of several pairs of masks (2, h, w) of a view fits poses, shape (n,) [-]."""
+    """Return the fit of several pairs of masks (2, h, w) of a view to poses, shape (n,) [-]."""
     rendering, out = solver.rendering([view]), np.empty(len(masks))
     for k, pair in enumerate(masks):
         found = solver.solve(poses, [replace(view, masks=pair)], (), shown[:, None], rendering=rendering)
@@ -175,7 +172,7 @@ def _judged(poses: Array, view: View, masks: Sequence[NDArray[np.uint8]], shown:
 
 def _in_window(view: View, other: View) -> NDArray[np.uint8]:
     """Return the masks of another instant of the same camera in the window of a view, shape (2, h, w)."""
-    # Windows differ by whole pixels: cutting off x columns takes x times row 2 of the matrix from row 0.
+    # Windows differ by whole pixels: cropping x columns subtracts x times row 2 of the matrix from row 0.
     axis = view.matrix[2]
     moved = np.rint((other.matrix[:2] - view.matrix[:2]) @ axis / (axis @ axis)).astype(int)
     out = np.zeros_like(view.masks)
@@ -189,13 +186,13 @@ def _in_window(view: View, other: View) -> NDArray[np.uint8]:
 
 
 def _fast_frames(records: Mapping[int, FrameRecord]) -> list[int]:
-    """Return frames all over the take, of every part the one in which the lower arch moves most between neighbours."""
+    """Return frames spread over the take: of every part, the one with the fastest motion of the lower arch."""
     centres = {frame: records[frame].solution.centres[1] for frame in sorted(records)}
     inner = [frame for frame in centres if frame - 1 in centres and frame + 1 in centres]
     if not inner:
         return []
     moved = [float(np.linalg.norm(centres[frame + 1] - centres[frame - 1])) for frame in inner]
-    parts = np.array_split(np.arange(len(inner)), min(_LOOKED_AT, len(inner)))
+    parts = np.array_split(np.arange(len(inner)), min(_CHECKED_FRAMES, len(inner)))
     return [inner[max(part, key=lambda i: moved[i])] for part in parts]
 
 
@@ -205,7 +202,7 @@ _LEAST_FRAMES = 2  # on either side of it
 
 @dataclass(frozen=True)
 class DelayStep:
-    """The clearest step of one camera's delay: its size and standard deviation [frames], and the first frame after."""
+    """The most significant step of a camera's delay: size and standard deviation [frames], and first frame after it."""
 
     step: float
     sigma: float
@@ -215,10 +212,10 @@ class DelayStep:
 def delay_steps(
     records: Mapping[int, FrameRecord], variance_px3: Array, extrinsics: Extrinsics, frames: list[int]
 ) -> list[DelayStep]:
-    """Return the clearest step of every camera's delay over some frames; nothing if these are too few.
+    """Return the most significant step of every camera's delay; empty with too few frames.
 
-    One camera's delay from a frame on is added to the unknowns of the take (see `TakeEquations`), for every camera and
-    every place in turn; all others are eliminated.
+    For every camera and frame in turn, a delay from that frame on is added to the unknowns of the take (see
+    `TakeEquations`), and all others are eliminated.
 
     Args:
         records, variance_px3, extrinsics: as for `TakeEquations`.
@@ -228,7 +225,7 @@ def delay_steps(
         return []
     cameras = len(extrinsics.twists)
     S, right = TakeEquations(records, variance_px3, extrinsics, []).normal_equations()
-    # Of the delays, per frame, then summed up in place from each frame on: of long takes, tens of megabytes.
+    # The parts of the delays per frame, then summed in place from each frame on: tens of megabytes for long takes.
     after_S = np.empty((len(frames), len(right), cameras))
     after_r = np.empty((len(frames), cameras))
     for k, frame in enumerate(frames):
@@ -238,7 +235,7 @@ def delay_steps(
     for table in (after_S, after_r):
         np.cumsum(table[::-1], axis=0, out=table[::-1])
     prior = np.linalg.pinv(TakeEquations(records, variance_px3, extrinsics, []).prior_covariance())
-    fixed = len(right) - 6 * cameras  # camera motions are taken as known
+    fixed = len(right) - 6 * cameras  # camera motions are assumed to be known
     keep = np.arange(1, fixed)
     A = np.linalg.inv((S + prior)[np.ix_(keep, keep)])
     out = []
@@ -256,9 +253,8 @@ def delay_steps(
 
 
 _CLEARLY = 4.0  # standard deviations
-_LATE_FRAMES = 0.7  # cameras that run freely are up to half a frame apart
-# Step of a delay in mid take of footage without masks [frames]. The one valid take of a drawn person that was looked at
-# (30 frames) showed 0.02; a rate of false alarms is not known. Steps are missed where the jaw is fast.
+_LATE_FRAMES = 0.7  # free-running cameras differ by up to half a frame
+# Step of a delay within a take without masks that causes a warning [frames]. Steps are missed where the jaw is fast.
 _STEP_FRAMES = 0.5
 
 
@@ -270,13 +266,13 @@ def time_findings(
     config: TrackingConfig,
     shifts: FrameShifts | None = None,
 ) -> list[Finding]:
-    """Return cameras that are a frame late or early, from the start or from some frame on.
+    """Return warnings about cameras that are a frame late or early, from the start or from some frame on.
 
     Args:
         names: of the cameras.
         records: of all frames.
         nuisances, extrinsics, config: of the take.
-        shifts: which instants masks show; without masks, steps are looked for among delays of parts of a frame.
+        shifts: instants shown by the masks; without masks, steps are found from delays below a frame.
 
     Kinds: "camera_late" [frames], "frame_dropped" [frames].
     """
@@ -298,13 +294,13 @@ def _is_late(nuisances: Nuisances, camera: int) -> bool:
 
 
 def _late(names: Sequence[str], frames: Mapping[int, float]) -> list[Finding]:
-    """Say that cameras are late by so many frames."""
+    """Return warnings about cameras that are late by some frames."""
     return [
         Finding(
             "camera_late",
             "warning",
-            f"its pictures are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its offset "
-            f"says; below {_LATE_FRAMES} frames is usual.",
+            f"its pictures are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its offset; "
+            f"below {_LATE_FRAMES} frames is usual.",
             value=round(late, 2),
             limit=_LATE_FRAMES,
             camera=names[camera],
@@ -317,9 +313,9 @@ def _late(names: Sequence[str], frames: Mapping[int, float]) -> list[Finding]:
 def _step_of_delay(
     names: Sequence[str], records: Mapping[int, FrameRecord], extrinsics: Extrinsics, config: TrackingConfig
 ) -> list[Finding]:
-    """Say that the delay of a camera changes in mid take."""
+    """Return a warning if the delay of a camera changes within the take."""
     steps = delay_steps(records, outline_variance(records, config), extrinsics, whole_frames(records))
-    # Poses follow the camera in part, so that the others seem to step the other way: the clearest step is its own.
+    # Poses partly follow the camera, so the others seem to step the other way; the most significant step is its own.
     clearest = max(range(len(steps)), key=lambda c: abs(steps[c].step) / steps[c].sigma, default=None)
     if clearest is None:
         return []
@@ -333,7 +329,7 @@ def _dropped(name: str, step: float, frame: int) -> Finding:
     return Finding(
         "frame_dropped",
         "warning",
-        f"its delay changes by {step:+.1f} frames near here: a frame was dropped or doubled; below "
+        f"its delay changes by {step:+.1f} frames near here: a frame was dropped or repeated; below "
         f"{_STEP_FRAMES} frames is usual.",
         value=round(step, 2),
         limit=_STEP_FRAMES,
