@@ -46,7 +46,7 @@ def main() -> None:
     table = options.out / "clip.csv"
     frames, T_true = write_clip_table(table)
 
-    motion = read_motion(table, TrajectoryOptions(columns=COLUMNS, length_unit="m", rest_frame=REST_FRAME))
+    motion, _ = read_motion(table, TrajectoryOptions(columns=COLUMNS, length_unit="m", rest_frame=REST_FRAME))
     subject = subject_of_capture(load_capture(CAPTURE))
     model = fit_subject(subject, motion)
     bake_subject(subject, model, options.out)

@@ -171,10 +171,10 @@ def split_rows(
         FormatError: quotes that do not match.
     """
     named = _NAMED_SEPARATOR.match(text)
-    separator = named[1] if named else _separator(text, comment)
-    reader = csv.reader(io.StringIO(text[named.end() :] if named else text), delimiter=separator, strict=True)
     above = 1 if named else 0
     try:
+        separator = named[1] if named else _separator(text, comment)
+        reader = csv.reader(io.StringIO(text[named.end() :] if named else text), delimiter=separator, strict=True)
         rows = [(reader.line_num + above, row) for row in reader if blank_rows and len(row) > 1 or _is_filled(row)]
     except csv.Error as error:
         raise FormatError(f"is not a CSV table ({error}).", path=path) from error

@@ -129,15 +129,23 @@ def names_without(text):
 
 PARSED = [block for block in of("python") if block.parsed]
 IN_PROGRAMS = [block for block in PARSED if "jawusd_reader" in block.text]
+IN_BLENDER = [block for block in PARSED if "import bpy" in block.text and block not in IN_PROGRAMS]
 
 
-@pytest.mark.parametrize("block", [block for block in PARSED if block not in IN_PROGRAMS], ids=str)
+@pytest.mark.parametrize("block", [block for block in PARSED if block not in (*IN_PROGRAMS, *IN_BLENDER)], ids=str)
 def test_blocks_for_clusters_run_commands_that_there_are(block):
     lists = [node.elts for node in ast.walk(ast.parse(block.text)) if isinstance(node, ast.List)]
     words = [[getattr(element, "value", "PLACE") for element in elements] for elements in lists]
     commands = [" ".join(map(str, line)) for line in words if line[:1] == ["jawusd"]]
     assert commands and [fault for fault in map(unknown, commands) if fault] == []
     assert unknown(commands[0].replace("build-many", "build-all"))
+
+
+@pytest.mark.parametrize("block", IN_BLENDER, ids=str)
+def test_blocks_for_blender_call_operators_of_the_add_on(block):
+    called = re.findall(r"bpy\.ops\.(jaw(?:usd)?\.\w+)\(", block.text)
+    sources = "".join(path.read_text() for path in (ROOT / "jawusd" / "plugins" / "blender").glob("*.py"))
+    assert called and [name for name in called if f'bl_idname = "{name}"' not in sources] == []
 
 
 @pytest.mark.parametrize("block", IN_PROGRAMS, ids=str)

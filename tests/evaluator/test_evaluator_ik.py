@@ -62,7 +62,7 @@ def test_a_far_throw_finds_the_better_side_of_a_ripple(kind, monkeypatch):
     found, distance_mm = rig.ik(points, targets, start=start)
     assert (rig.margin(found) >= -1e-12).all()
     assert (distance_mm <= brute_mm + 1e-9).all()
-    monkeypatch.setattr(search, "_LONGEST_DRAG_MM", np.inf)
+    monkeypatch.setattr(search, "_MAX_DRAG_MM", np.inf)
     _, distance_mm = rig.ik(points, targets, start=start)
     assert (distance_mm > brute_mm + 0.01).any()
 

@@ -74,7 +74,8 @@ def test_a_placeholder_is_not_shown_as_a_mandible(built):
     report_build(built, None, quiet)
     assert "placeholder is no anatomy" not in (built / "report.html").read_text()
     scans = {name: mesh for name, mesh in example_meshes().items() if name != "mandible"}
-    baked(built, load_model(built / "model.npz"), scans)
+    files = baked(built, load_model(built / "model.npz"), scans)
+    BuildState(built).finish("bake", "", files, 1.0, {})
     report_build(built, None, quiet)
     assert "the rig&#39;s placeholder is no anatomy" in (built / "report.html").read_text()
 

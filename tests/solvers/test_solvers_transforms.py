@@ -139,7 +139,7 @@ def test_state_of_the_same_rig_loads_and_of_another_is_refused():
     for name, value in other.state_dict().items():
         torch.testing.assert_close(value, before[name])
     nameless = {name: value for name, value in layer.state_dict().items() if name != "rig_hash"}
-    with pytest.raises(EvaluatorError, match="does not say"):
+    with pytest.raises(EvaluatorError, match="is of an unknown rig"):
         JawLayer(rig).load_state_dict(nameless, strict=False)
     parent = torch.nn.Sequential(JawLayer(rig))
     parent.load_state_dict(torch.nn.Sequential(layer).state_dict())

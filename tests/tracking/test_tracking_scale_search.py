@@ -42,7 +42,7 @@ def test_masks_of_something_else_tell_no_size(capture, monkeypatch):
     turned = [replace(m, vertices=m.vertices * [0.6, 1.0, 1.3]) for m in MESHES]
     with pytest.raises(TrackingError, match=r"do not fit the masks of frames \d+, \d+ at any size from 0\.5 to 2"):
         seen_size(capture, CAMERAS, OFFSETS, turned)
-    with pytest.raises(TrackingError, match="has masks of both rows"):
+    with pytest.raises(TrackingError, match="has masks of both arches"):
         seen_size(make_capture(capture.folder, COUNT, frames=(400, 402)), CAMERAS, OFFSETS, MESHES)
 
 

@@ -128,7 +128,7 @@ def test_masks_of_something_else_are_refused_with_what_was_tried(tmp_path, short
         picture = np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
         place = (260 + 29 * (k % 5), 150 + 31 * (k % 4) + 60 * ("lower" in str(path)))
         cv2.imwrite(str(path), cv2.circle(picture, place, 45, 255, -1))
-    words = r"failed on all 1 frames tried. Frame \d+: .* No mistake explains it. Give \[bootstrap\] picks"
+    words = r"failed on all 1 frames tried. Frame \d+: .* No mistake explains it. Add \[bootstrap\] picks"
     with pytest.raises(TrackingError, match=words):
         _start(_capture(folder, bootstrap=None))
 
@@ -138,7 +138,7 @@ def test_where_teeth_are_not_found_it_is_said_what_is_doubtful_about_the_scans(p
         raise TrackingError("the teeth are not found", frame=7, hint="Give picks.")
 
     monkeypatch.setattr(take_start, "search_start", fail)
-    with pytest.raises(TrackingError, match=r"Give picks\. warning: the crowns of the scans run 1\.\d mm into"):
+    with pytest.raises(TrackingError, match=r"Give picks\. warning: the crowns of the scans overlap by 1\.\d mm"):
         _start(_capture(pictures, bootstrap=None))
     lower = Mesh(MESHES[1].vertices - [0.0, 2.5, 0.0], MESHES[1].faces, MESHES[1].colors)
     with pytest.raises(TrackingError, match=r"Give picks\.$"):
@@ -150,7 +150,7 @@ def test_where_picked_teeth_do_not_fit_it_is_said_what_is_doubtful_about_the_sca
         raise TrackingError("the teeth do not fit", frame=7, hint="Check the picks.")
 
     monkeypatch.setattr(Passes, "begin", fail)
-    with pytest.raises(TrackingError, match=r"Check the picks\. warning: the crowns of the scans run 1\.\d mm into"):
+    with pytest.raises(TrackingError, match=r"Check the picks\. warning: the crowns of the scans overlap by 1\.\d mm"):
         track_capture(_capture(pictures), CAMERAS, OFFSETS, *MESHES, LANDMARKS)
 
 
