@@ -256,10 +256,15 @@ def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
 
 
 class _IgnoreInterrupt(WorkerPlugin):
-    """Leave Ctrl-C, which a terminal sends to all processes, to the one that started them."""
+    """Leave signals that a terminal or a service sends to all processes to the one that started them.
+
+    A worker that such a signal ended would be replaced, and the new one would go on with the build.
+    """
 
     def setup(self, worker: Worker) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), signal.SIG_IGN)
 
 
 @contextlib.contextmanager

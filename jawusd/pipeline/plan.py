@@ -34,9 +34,10 @@ def plan_build(capture: Capture | str | os.PathLike[str], out: Path, options: Bu
         CaptureError, FormatError: the capture cannot be read.
         OutputError: the build may not write to this folder.
     """
+    opened = open_capture(capture, allow_outside=options.allow_outside)
     check_folder(out, resume=options.resume, fresh=options.fresh)
-    run = DryWorkspace(out, lambda: open_capture(capture, allow_outside=options.allow_outside))
-    recorded, opened = dict(run.state.stages), run.capture
+    run = DryWorkspace(out, opened, lambda: opened)
+    recorded = dict(run.state.stages)
     with contextlib.suppress(StageMissing):
         if not options.fresh:
             build.run_stages(run, options, None)

@@ -61,10 +61,16 @@ class Workspace:
         reused: names of the stages that did not have to run.
     """
 
-    def __init__(self, folder: Path, read_capture: Callable[[], Capture], progress: Progress = no_progress) -> None:
-        """Open a folder without locking it; `read_capture` reads the capture, again after each stage."""
+    def __init__(
+        self,
+        folder: Path,
+        capture: Capture,
+        read_capture: Callable[[], Capture],
+        progress: Progress = no_progress,
+    ) -> None:
+        """Open a folder without locking it; `read_capture` reads the capture again after each stage."""
         self._read_capture = read_capture
-        self._opened = self.capture = read_capture()
+        self._opened = self.capture = capture
         self._watch = InputWatch()
         self.folder, self.progress = folder, progress
         self.state = BuildState(folder)
@@ -140,16 +146,17 @@ def opened(
     """Open the folder of a build and hold its lock.
 
     Args:
-        read_capture: reads the capture, again after each stage.
+        read_capture: reads the capture, before the folder is made and again after each stage.
         resume: continue an earlier build in the folder.
         fresh: delete an earlier build in the folder first.
 
     Raises:
         OutputError: see `check_folder` and `state.locked`.
     """
+    capture = read_capture()
     check_folder(folder, resume=resume, fresh=fresh)
     with locked(folder):
-        workspace = Workspace(folder, read_capture, progress)
+        workspace = Workspace(folder, capture, read_capture, progress)
         if fresh:
             workspace.state.clear()
         yield workspace

@@ -54,7 +54,7 @@ IN_THE_FILE = [
     ("a way to align that is none", "[boards]", '[sync]\nmethod = "clap"\n[boards]', "method", '"clap"', '"flash"', ""),
     ("a camera that is none", "[boards]", '[sync]\nreference = "mid"\n[boards]', "reference", '"mid"', "left", "Write"),
     ("an offset too few", "[boards]", "[sync]\noffsets = { left = 0 }\n[boards]", "offsets", "right", "needed", "= 0"),
-    ("a pick before the take", "[boards]", "[bootstrap]\nframe = -1\n[boards]", "frame", "-1", "0 or more", "Write it"),
+    ("a pick before the take", "[boards]", "[bootstrap]\nframe = -1\n[boards]", "frame", "-1", "0 or more", "For ex"),
     ("a pick of no camera", "[boards]", PICK % "mid", "[[bootstrap.upper]] camera", '"mid"', "left, ", "Write"),
     ("a newer file", "capture/1", "capture/9", "format", "capture/9", "up to", "Update jawusd"),
     ("centimetres", "fps", 'units = "cm"\nfps', "units", '"cm"', 'allowed is "mm"', "Scale to mm"),
@@ -66,7 +66,7 @@ IN_THE_FILE = [
     ("one scan for both rows", '"l.ply"', '"u.ply"', "[scans] lower_teeth", '"u.ply"', "own file", "upper_teeth"),
     ("backslashes", '= "left.mp4"', '= "clips\\left.mp4"', "line 9", "clips\\left.mp4", "TOML", '"video/left.mp4"'),
     ("backslashes as text", '= "left.mp4"', "= 'clips\\left.mp4'", "video", "clips\\left", "separates", "video/left"),
-    ("a backslash and t", '= "left.mp4"', '= "clips\\take.mp4"', "video", "clips\take.mp4", "separates", "video/left"),
+    ("a backslash and t", '= "left.mp4"', '= "clips\\take.mp4"', "video", r"clips\take.mp4", "separates", "video/left"),
     ("a drive", '= "left.mp4"', '= "C:/anna/left.mp4"', "video", "C:/anna", "Windows", "from the folder of"),
     ("curly quotes", '"u.ply"', "\u201cu.ply\u201d", "line 5", "\u201cu.ply\u201d", "TOML", "straight quotes"),
     ("an accent", 'name = "x"', 'name = "J\u00f6rg"', "name", '"J\u00f6rg"', "A-Z a-z 0-9 _ - . blanks", '"anna"'),
@@ -74,7 +74,6 @@ IN_THE_FILE = [
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
 # How the file is stored: words; encoding; what is allowed; what to do.
 STORED = [
-    ("UTF-16", "utf-16", "is UTF-16 text, allowed is UTF-8", "Save it as UTF-8"),
     ("an accent of Windows", "cp1252", "line 2 holds the byte 0xf6", "Save it as UTF-8"),
 ]
 # Files that are there and hold something else: words; name; bytes; found; what to do.
@@ -83,7 +82,7 @@ CONTENTS = [
     ("an empty clip", "left.mp4", b"", "the file is empty", "Copy it again"),
     ("a scan that git has not fetched", "l.ply", LFS, "Git LFS", "git lfs pull"),
     ("a clip that git has not fetched", "left.mp4", LFS, "Git LFS", "pull"),
-    ("text under the name of a scan", "u.ply", b"dear diary", "cannot be read", "Export it again"),
+    ("text under the name of a scan", "u.ply", b"dear diary", "is no PLY file", "Export it again"),
 ]
 # The same of what is typed: words; file; found; allowed; what to do.
 TYPED = [

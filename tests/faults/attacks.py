@@ -225,6 +225,18 @@ ATTACKS = {
 }
 
 
+def largest_mb(pid: int) -> float:
+    """Return the largest peak memory of a process and its children [MB]; `wait4` would count that of this process."""
+    found = [0.0]
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+        found += [int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM")]
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except (OSError, ValueError):  # it has ended
+        return max(found)
+    return max([*found, *(largest_mb(int(child)) for child in children)])
+
+
 def run(attack: Attack, folder: Path) -> tuple[bool, str]:
     """Return whether an attack was held off, and the rest of its line."""
     from forked import in_copy
@@ -243,17 +255,15 @@ def run(attack: Attack, folder: Path) -> tuple[bool, str]:
         )
         if attack.act is not None:
             attack.act(process.pid)
-        pid = 0
-        while not pid and time.monotonic() - begun < MOST_S:
+        peak_mb = 0.0
+        while (code := process.poll()) is None and time.monotonic() - begun < MOST_S:
+            peak_mb = max(peak_mb, largest_mb(process.pid))
             time.sleep(0.02)
-            pid, status, usage = os.wait4(process.pid, os.WNOHANG)
-        if not pid:
+        if code is None:
             process.kill()
-            pid, status, usage = os.wait4(process.pid, 0)
-        process.returncode = code = os.waitstatus_to_exitcode(status)
+            code = process.wait()
         said.seek(0)
         text = said.read().decode(errors="replace")
-    peak_mb = usage.ru_maxrss / 1024  # of the largest process that was waited for
     held = code == attack.code and attack.says in text and peak_mb <= attack.most_mb
     held = held and "Traceback" not in text and "\x1b" not in text
     last = (text.strip().splitlines() or [""])[-1].replace(str(folder), "...")

@@ -143,5 +143,5 @@ def test_hidden_teeth_cannot_be_picked(anatomy: PersonAnatomy) -> None:
     cameras = build_cameras((1280, 720))
     wall = np.array([[-90, -90, 150], [90, -90, 150], [-90, 90, 150], [90, 90, 150.0]])
     everything = [*_occluders(anatomy, np.eye(4)), Mesh(wall, np.array([[0, 1, 2], [1, 3, 2]], np.int32))]
-    with pytest.raises(ValueError, match="seen by two cameras"):
+    with pytest.raises(ValueError, match="visible in two cameras"):
         choose_picks(anatomy.upper, T_WORLD_SCAN, cameras, everything, 4, 1.0, np.random.default_rng(0))

@@ -240,7 +240,7 @@ def test_tracked_poses_are_drawn_and_the_plot_is_a_timeline(chromium, example_bu
     tab.picture("capture_tracked")
     tab.press("first")
     until(lambda: footage.frame == footage.worst[0])
-    tab.said("number 1 of the")
+    tab.said("number 1 of")
     tab.web.get_by_label("dark page").click()
     tab.press("3-D")
     tab.settle()

@@ -124,7 +124,7 @@ def test_measures_are_explained_where_the_pointer_rests():
     reading = reading_html(read_out(RIG, [5.0, 0, 0]), (5.0, 0, 0), np.array([[0.0, 40.0], [-2, 2], [-1, 1]]))
     rows = {row.find("td").text: row.get("title") for row in ElementTree.fromstring(reading).iter("tr")}
     assert "pose" in rows["nearest captured"] and "forward" in rows["incisal point moved"] and all(rows.values())
-    assert "forward" not in rows and 'title="How far' in verdict_html(read_out(RIG, [5.0, 0, 0]))
+    assert "forward" not in rows and 'title="Distance' in verdict_html(read_out(RIG, [5.0, 0, 0]))
 
 
 def test_no_value_is_minus_zero():
