@@ -142,7 +142,7 @@ def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
     lists["regularised by the model"] = tracks.frames[tracks.prior_aided]
     for why, frames in meta.get("excluded_frames", {}).items():
         lists[f"excluded from the fit: {why}"] = np.asarray(frames, dtype=np.int64)
-        lists["excluded from the fit as outliers"] = np.asarray(meta.get("trimmed_frames", []), dtype=np.int64)
+    lists["excluded from the fit as outliers"] = np.asarray(meta.get("trimmed_frames", []), dtype=np.int64)
     return [(reason, len(frames), _spans(frames)) for reason, frames in lists.items()]
 
 

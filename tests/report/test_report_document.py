@@ -74,6 +74,13 @@ def test_reasons_of_losses_are_listed_with_their_frames(words_alone):
     assert "lost, lower arch: low score" in document(data)
 
 
+def test_outliers_are_listed_where_no_frame_was_excluded():
+    data = report_data()
+    meta = {**data.model.meta, "trimmed_frames": [22, 23, 30], "excluded_frames": {}}
+    listed = _frame_lists(replace(data, model=replace(data.model, meta=meta)))
+    assert ("excluded from the fit as outliers", 3, "22\u201323, 30") in listed
+
+
 def test_nothing_comes_from_elsewhere(page):
     assert outside(page) == []
     policy = next(a["content"] for tag, a in Page(page).tags if a.get("http-equiv") == "Content-Security-Policy")
