@@ -302,6 +302,11 @@ def test_a_bad_file_is_a_message_and_the_page_lives_on(tab, tmp_path):
     bad.write_text('{"fps": 24, "keys": [{"frame": 0}]}')
     chooser.set_input_files(bad)
     tab.said("bad.json: keys, entry 1: d")
+    worse = tmp_path / "worse.json"
+    worse.write_bytes(b"\xff\xfe\x00rubbish")
+    chooser.set_input_files(worse)
+    tab.web.wait_for_timeout(3000)
+    assert "none after the last." in tab.web.inner_text("body")
     huge = tmp_path / "huge.csv"
     huge.write_bytes(b"0" * (MOST_BYTES + 1))
     chooser.set_input_files(huge)
