@@ -1,4 +1,8 @@
-"""Fit jaw models to captured poses: the model, its bounds, its errors and the movements it lacks."""
+"""Jaw models fitted to captured poses: decoder, bounds, error tables, and checks of the data.
+
+Knows no pictures and no tracking state: poses come as `formats.tracks.Tracks` or as arrays. Must not import another
+stage (capture, tracking, paper, rig, ...); `pipeline` and `paper` import it.
+"""
 
 from jawusd.fitting.fit import FittingConfig, fit_model
 

@@ -1,4 +1,12 @@
-"""Curves in se(3) whose parameter is millimetres at the lower incisal point."""
+"""Models that sum three curves in se(3), each parametrised by millimetres at the lower incisal point.
+
+The additive model is log M = Phi1(d1) + Phi2(d2) + Phi3(d3), fitted jointly to the captured poses. The twist is taken
+about the incisal point p, (omega, s = omega x p + v), and one component of s of each curve is its parameter t itself
+(-s_y of Phi1, s_x of Phi2, s_z of Phi3), which makes the sum unique. All other components are smoothing splines, solved
+for together by least squares while the poses are projected onto the sum.
+
+The linear baseline, PCA of the twists under the mandible metric, is the same sum with straight curves.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +25,25 @@ from jawusd.fitting.metric import velocity_of
 from jawusd.fitting.spline import choose_smoothing, ridge_solve, within
 from jawusd.geometry import se3_exp, se3_left_jacobian, se3_log
 
-#: A curve of some parameter t (n,): twists (n, 6) and their derivatives by t (n, 6); the twist is zero at t = 0.
+#: Map of a parameter t (n,) to twists (n, 6) and their derivatives by t (n, 6); the twist is zero at t = 0.
 Curve = Callable[[Array], tuple[Array, Array]]
 
 KNOTS = 97
 #: Directions of the incisal displacement that opening, laterotrusion and protrusion measure.
 MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
-# Share of the mandible's rms speed below which the incisal point counts as standing still or turning back
+# Share of the mandible's rms speed below which the incisal point counts as standing still or reversing.
 _SLOWEST = 0.2
-_SHORTEST_MM = 0.01  # a curve shorter than this is a network that collapsed
+_SHORTEST_MM = 0.01  # a shorter curve comes from a collapsed network
+
+_PIECES = (8, 6, 6)  # polynomial pieces of the three curves
+_ROUNDS = 8
+_SMOOTHING = 10.0 ** np.arange(-4.0, 5.0)
+_TAIL_RIDGE = 1e-4  # keeps coefficients finite in intervals without frames
+_HIDDEN_RIDGE = 1e9  # keeps coefficients at zero for parameters that the data do not show
+_TRIM_FLOOR_MM = 0.8  # residuals up to this are model error, not tracking failures
+_CV_BLOCK, _CV_FOLDS, _CV_CAP_MM = 25, 5, 1.0
+_LARGEST_CONDITION = 1e3
 
 
 def in_millimetres(
@@ -34,7 +51,7 @@ def in_millimetres(
 ) -> tuple[HermiteCurve, Mask]:
     """Reparametrise a curve by d, the displacement of the incisal point along the curve's own axis [mm].
 
-    Where the incisal point stands still or turns back, d goes on growing with a fifth of the mandible's rms path, so
+    Where the incisal point stands still or reverses, d continues to grow with a fifth of the mandible's rms path, so
     that every point of the curve has a parameter.
 
     Args:
@@ -44,7 +61,7 @@ def in_millimetres(
         axis: 0 opening, 1 laterotrusion, 2 protrusion.
 
     Returns:
-        The curve over d, through zero at d = 0, and at which of its knots the incisal point advances steadily.
+        The curve over d, zero at d = 0, and the knots at which the incisal point advances steadily (mask).
 
     Raises:
         FittingError: the curve does not move at all.
@@ -63,9 +80,9 @@ def in_millimetres(
     d = sense * (d - d[zero])
     if np.ptp(d) < _SHORTEST_MM:
         raise FittingError(
-            f"what was learned of the {PARAMETERS[axis]} moves nothing: {np.ptp(d):.2g} mm along its whole range, at "
+            f"the learned {PARAMETERS[axis]} curve moves the incisal point by {np.ptp(d):.2g} mm over its range, at "
             f"least {_SHORTEST_MM:g} mm are needed.",
-            hint="The networks of this start collapsed. Try another seed or more starts, or the model 'anchored'.",
+            hint="The networks collapsed in training. Try another seed, more starts, or the model 'anchored'.",
         )
     order = np.argsort(d)
     slopes = sense * rate / pace[:, None]
@@ -83,7 +100,7 @@ def translation(axis: int) -> Array:
 
 
 def _incisal_advance(twist: Array, rate: Array, incisor: Array, direction: Array) -> tuple[Array, Array]:
-    """Return how far the incisal point has moved along a direction (n,) [mm], and its speed by the parameter."""
+    """Return the displacement (n,) of the incisal point along a direction [mm], and its derivative by t."""
     M = se3_exp(twist)
     point = M[:, :3, :3] @ incisor + M[:, :3, 3]
     spatial = np.einsum("nij,nj->ni", se3_left_jacobian(twist), rate)
@@ -91,17 +108,8 @@ def _incisal_advance(twist: Array, rate: Array, incisor: Array, direction: Array
     return (point - incisor) @ direction, velocity @ direction
 
 
-_PIECES = (8, 6, 6)  # polynomial pieces of the three curves
-_ROUNDS = 8
-_SMOOTHING = 10.0 ** np.arange(-4.0, 5.0)
-_TAIL_RIDGE = 1e-4  # keeps the coefficients finite where there are no frames
-_HIDDEN_RIDGE = 1e9  # and at zero in directions the data do not show
-_TRIM_FLOOR_MM = 0.8  # a sum of curves misses whole exercises by more than tracking noise
-_CV_BLOCK, _CV_FOLDS, _CV_CAP_MM = 25, 5, 1.0
-
-
 class _Basis:
-    """B-spline columns of one parameter, zero at zero, continued straight, and their bending energy."""
+    """B-spline regression columns of one parameter, zero at zero, extrapolated linearly, with their bending energy."""
 
     def __init__(self, values: Array, pieces: int) -> None:
         low, high = min(float(values.min()), -1.0), max(float(values.max()), 1.0)
@@ -109,7 +117,7 @@ class _Basis:
         knots = np.concatenate([[low] * 3, np.linspace(low, high, pieces + 1), [high] * 3])
         self._splines = BSpline(knots, np.eye(pieces + 3), 3)
         sites = np.linspace(low, high, 20 * pieces)
-        bend = self._splines(sites, nu=2) * (high - low) ** 1.5  # so that the energy does not depend on the range
+        bend = self._splines(sites, nu=2) * (high - low) ** 1.5  # makes the energy independent of the range
         self.energy = bend.T @ bend * (sites[1] - sites[0])
 
     def columns(self, t: Array) -> Array:
@@ -142,19 +150,19 @@ def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
 
 
 def _own(curve: HermiteCurve, d: Array, incisor: Array, axis: int) -> Array:
-    """Return the component of a curve that is its parameter t, at d (n,)."""
+    """Return the parameter t of a curve, one of its own twist components, at d (n,)."""
     twist = curve.value(d)
     return (np.cross(twist[:, :3], incisor) + twist[:, 3:]) @ MEASURED[axis]
 
 
 def _regress(data: TrainingData, t: Array, kept: Mask, shown: Mask) -> tuple[AdditiveModel, float]:
-    """Fit the curves while the parameters of the frames stay at t (N, 3)."""
+    """Fit the curves with the parameters of the frames fixed at t (N, 3)."""
     twists = se3_log(data.motion[kept])
     t, weights = t[kept], data.weights[kept]
     bases = [_Basis(t[:, i], _PIECES[i]) for i in range(3)]
     columns = [basis.columns(t[:, i]) for i, basis in enumerate(bases)]
     root = data.metric.twist_root()
-    # In mm: rotations by their effect on the mandible, translations as they are.
+    # Residuals in mm: rotations by the displacement of the mandible, translations unchanged.
     L = np.linalg.cholesky(data.metric.about(data.incisor))
     turning = twists[:, :3] @ L
     gliding = (np.cross(twists[:, :3], data.incisor) + twists[:, 3:]) @ MEASURED.T - t
@@ -181,7 +189,7 @@ def _regress(data: TrainingData, t: Array, kept: Mask, shown: Mask) -> tuple[Add
 def _assembled(
     columns: list[Array], bases: list[_Basis], shown: Mask, which: tuple[int, ...]
 ) -> tuple[Array, Array, Array]:
-    """Return the columns of some parameters side by side, their bending energy and the fixed part of the penalty."""
+    """Return the stacked columns of some parameters, their bending energy, and the constant part of the penalty."""
     sizes = [columns[i].shape[1] for i in which]
     energy = np.zeros((sum(sizes), sum(sizes)))
     tail = np.zeros_like(energy)
@@ -202,7 +210,7 @@ def _solve(matrix: Array, values: Array, weights: Array, penalty: Array, columns
 
 
 def _curve(basis: _Basis, turn: Array, glide: Array, incisor: Array, axis: int) -> Curve:
-    """Return the function t -> twist, rate of one curve from the coefficients of omega and s."""
+    """Return one curve, t -> (twist, derivative), from the coefficients of omega and s."""
 
     def curve(t: Array) -> tuple[Array, Array]:
         def twist(columns: Array, own: Array) -> Array:
@@ -215,23 +223,20 @@ def _curve(basis: _Basis, turn: Array, glide: Array, incisor: Array, axis: int) 
     return curve
 
 
-_LARGEST_CONDITION = 1e3
-
-
 def fit_pca(data: TrainingData, shown: Mask) -> FittedForm:
     """Fit a linear subspace of se(3) through the closed bite to all frames.
 
-    The subspace holds the first principal components (as many as there are shown parameters) of log M; not centred, so
-    that d = 0 is the closed bite. Its basis is chosen by the incisal velocity: d2 and d3 move the incisal point purely
-    sideways and forward at first order, d1 along the mean opening direction of the take.
+    The subspace is spanned by the first principal components of log M, one per shown parameter, not centred, so that
+    d = 0 is the closed bite. Its basis follows from the incisal velocity: to first order, d2 and d3 move the incisal
+    point purely sideways and forward, and d1 along the mean opening direction of the take.
 
-    The note `singular_values_mm` holds those of the weighted twists, rms over the mandible.
+    The note `singular_values_mm` lists the singular values of the weighted twists, rms over the mandible.
 
     Args:
-        shown: which parameters the data show, shape (3,); the others become translations without rotation.
+        shown: parameters that the data show, shape (3,); the others become translations without rotation.
 
     Raises:
-        FittingError: the components do not move the incisal point in as many independent directions.
+        FittingError: the components do not move the incisal point in independent directions.
     """
     L = data.metric.twist_root()
     twists = se3_log(data.motion)

@@ -1,13 +1,18 @@
-"""The paths of the condyles, which extrapolate a fit beyond the captured poses.
+"""The default model: rotation as a smooth function of the position of the lower incisal point.
 
-A condyle slides on its eminence with the disc between, so its height is a function of its forward slide at any opening;
-and its sideways movement of the difference of the two slides (Bennett) and the opening. These three equations, learned
-from the captured poses, fix the rotation for every position of the incisal point. They are coarser than the spline of
-`anchored` where there are poses, but wide open with the jaw to one side, which few takes contain, both condyles are on
-slopes that other exercises have measured.
+On the three-dimensional set of reachable poses the displacement u of the incisal point is itself a coordinate system,
+so omega = f(u), t = u + p - R(omega) p with f(0) = 0 describes any smooth three-parameter jaw. f is a smoothing
+polyharmonic spline; it is refitted while the captured poses are projected onto it, so that noise in u does not bias f.
+Where no poses were captured, predictions from the condylar paths guide the spline with a low weight.
 
-The point of the condyle that deviates least from one path, its kinematic centre (Yatabe et al. 1995, J Dent Res
-74:2006), is found near the landmark, which therefore need not be exact.
+Condylar paths: a condyle slides on its eminence, so its height is a function of its forward slide at any opening;
+its sideways movement is a function of the difference of the two slides (Bennett) and the opening. These three
+equations, learned from the captured poses, determine the rotation at every position of the incisal point. They are
+coarser than the spline where there are poses, but they extrapolate to combinations that few takes contain, such as wide
+open with the jaw to one side, because other exercises have measured the same slopes.
+
+The kinematic centre, the point of the condyle that deviates least from one path (Yatabe et al. 1995, J Dent Res
+74:2006), is estimated near the landmark, which therefore need not be exact.
 """
 
 from __future__ import annotations
@@ -26,20 +31,33 @@ from jawusd.fitting.gauge_fit import fit_gauge, fit_path
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve, within
 from jawusd.geometry import make_transform, so3_exp, so3_log
 
-_SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # make the polynomials' arguments of order one
+_SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # normalise the polynomials' arguments
 _DEGREE = 4
 _RIDGE = 1e-3
-_RANGE_PERCENTILES = (0.5, 99.5)  # of the slides: beyond, the eminence is extrapolated linearly
-_LANDMARK_SIGMA_MM = 10.0  # how far the kinematic centre may be from the landmark
-_PATH_SIGMA_MM = 0.3  # how closely it keeps to its path
-_FRAMES_ALIKE = 25  # frames (a second of video) with the information of one independent frame
+_RANGE_PERCENTILES = (0.5, 99.5)  # of the slides; outside, the eminence is extrapolated linearly
+_LANDMARK_SIGMA_MM = 10.0  # of the kinematic centre about the landmark
+_PATH_SIGMA_MM = 0.3  # of the kinematic centre about its path
+_FRAMES_ALIKE = 25  # consecutive frames (a second of video) that carry the information of one
 _NEWTON_STEPS, _LARGEST_STEP_RAD, _SETTLED_MM = 15, 0.1, 1e-6
-_FARTHER_MM = 4.0  # by which slides may exceed the captured ones
+_FARTHER_MM = 4.0  # extrapolation allowed beyond the captured slides
+
+CENTRES = 80
+_ROUNDS = 4
+_SCALES_MM = np.array([10.0, 7.0, 5.0])  # length scales of f along opening, sideways and forward
+_HIDDEN_SCALE_MM = 1e9  # makes f independent of a parameter that the data do not show
+_SMOOTHING = 10.0 ** np.arange(-6.0, 4.0)
+_CV_BLOCK, _CV_FOLDS = 25, 5  # block of frames held out together (about a second of video), number of folds
+_CV_CAP_MM = 1.0
+_TAIL_RIDGE = 1e-6  # keeps the slope finite along a direction without motion
+_FRAMES_PER_CENTRE = 4
+_TRIM_FLOOR_MM = 0.5
+_GUIDED_GRID = (9, 7, 7)  # points along opening, sideways and forward with predictions from the condylar paths
+_GUIDED_SHARE = 0.08  # total weight of these points relative to the frames, for paths without misfit
 
 
 @dataclass(frozen=True)
 class CondylarGuidance:
-    """Hold the paths of the left and right condyle, anatomical frame."""
+    """Learned paths of the left and right condyle, anatomical frame."""
 
     incisor: Array  # lower incisal point at rest [mm], shape (3,)
     centres: Array  # kinematic centres at rest [mm], shape (2, 3)
@@ -64,13 +82,13 @@ class CondylarGuidance:
         return replace(guidance, misfit_mm=float(misfit))
 
     def rotation(self, u: Array, start: Array) -> tuple[Array, Mask]:
-        """Return the rotations that satisfy the equations at incisal displacements u (N, 3) [mm].
+        """Return the rotations that satisfy the condylar equations at incisal displacements u (N, 3) [mm].
 
         Args:
             start: rotation vectors to start from [rad], shape (N, 3).
 
         Returns:
-            Rotation vectors (N, 3) [rad], and which of them converged with slides like the captured ones, shape (N,).
+            Rotation vectors (N, 3) [rad], and which of them converged with slides near the captured ones, shape (N,).
         """
         R = so3_exp(start)
         for _ in range(_NEWTON_STEPS):
@@ -84,7 +102,7 @@ class CondylarGuidance:
         return so3_log(R), found
 
     def _residual(self, R: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return the equations' residuals (N, 3) [mm], their derivatives by a spatial rotation (N, 3, 3), the slides.
+        """Return residuals (N, 3) [mm], their derivatives by a spatial rotation (N, 3, 3), and the slides (N, 2).
 
         The poses are rotations R (N, 3, 3) at incisal displacements u (N, 3) [mm].
         """
@@ -113,7 +131,7 @@ class CondylarGuidance:
 def _kinematic_centre(motion: Array, weights: Array, condyle: Array) -> Array:
     """Return the point near a condyle landmark whose height follows its slide most closely [mm], shape (3,).
 
-    Only its height and depth are searched: all points of the condylar axis behave alike.
+    Only its height and depth are searched, since all points of the condylar axis move alike.
     """
     root = np.sqrt(weights / _FRAMES_ALIKE)
 
@@ -148,20 +166,6 @@ def _ridge_fit(columns: Array, values: Array, weights: Array) -> Array:
     return np.linalg.solve(weighted.T @ columns + penalty, weighted.T @ values)
 
 
-CENTRES = 80
-_ROUNDS = 4
-_SCALES_MM = np.array([10.0, 7.0, 5.0])  # lengths over which f changes along opening, sideways and forward
-_HIDDEN_SCALE_MM = 1e9  # f does not depend on a direction the data do not show
-_SMOOTHING = 10.0 ** np.arange(-6.0, 4.0)
-_CV_BLOCK, _CV_FOLDS = 25, 5  # frames (about a second of video) that are left out together
-_CV_CAP_MM = 1.0
-_TAIL_RIDGE = 1e-6  # keeps the slope finite along a direction without motion
-_FRAMES_PER_CENTRE = 4
-_TRIM_FLOOR_MM = 0.5
-_GUIDED_GRID = (9, 7, 7)  # points along opening, sideways and forward with predictions from the condyles' paths
-_GUIDED_SHARE = 0.08  # weight of all of them together, relative to the frames, if the paths fitted perfectly
-
-
 def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm:
     """Fit the anchored model.
 
@@ -192,7 +196,7 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
 
 @dataclass(frozen=True)
 class _Chart:
-    """Map incisal displacements u (N, 3) [mm] to the arguments q (N, 3) of the spline: sheared by the path, scaled."""
+    """Map from incisal displacements u (N, 3) [mm] to spline arguments q (N, 3): sheared by the path and scaled."""
 
     path: Gauge
     scales: Array
@@ -208,9 +212,9 @@ class _Chart:
 
 
 def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bool) -> tuple[AnchoredModel, float]:
-    """Fit f to the best rotations of the frames while their incisal points stay at u.
+    """Fit f to the best rotations of the frames with their incisal points fixed at u.
 
-    The smoothing is chosen again in every round, since trimmed outliers no longer require a stiffer f.
+    The smoothing is chosen anew by every call, since trimming outliers permits a less stiff f.
     """
     rotation = data.metric.best_rotation(data.motion, data.incisor, u + data.incisor)[kept]
     omega, q, weights = so3_log(rotation), chart.of(u[kept]), data.weights[kept]
@@ -236,9 +240,9 @@ def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bo
 
 
 def _guided_rows(data: TrainingData, motion: Array, weights: Array, chart: _Chart) -> tuple[Array, Array, Array]:
-    """Return rotation vectors (G, 3), spline arguments (G, 3) and weights (G,) predicted from the condyles' paths.
+    """Return rotation vectors (G, 3), spline arguments (G, 3) and weights (G,) predicted from the condylar paths.
 
-    They fill the box around the captured poses and have a few percent of their total weight, so that they matter only
+    They fill the box around the captured poses and carry a few percent of their total weight, so that they matter only
     where there are no poses.
     """
     guidance = CondylarGuidance.of_motion(motion, weights, data.incisor, data.landmarks[-2:])

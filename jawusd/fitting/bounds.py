@@ -7,8 +7,8 @@ alpha of 0.12 is in units of its network's components, whose ranges it does not 
 Slice hull: for every opening a convex section of (laterotrusion, protrusion), in mm. A tight alpha shape in three
 dimensions is hollow: captured border movements leave the inside of the envelope empty. Sections of the envelope at one
 opening are close to convex, so the support function of the captured poses near that opening, smoothed over the opening,
-encloses it with few numbers. It lies close around the captured poses, so that every pose a slider reaches is
-anatomical; how much farther a measured pose may lie is estimated from frames left out.
+encloses it with few numbers. It is tight around the captured poses, so that every pose a slider reaches is anatomical;
+the tolerance for measured poses is estimated by cross-validation.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from jawusd.evaluator.bounds import SliceHull
 #: Names and columns of d of the planes of the alpha shapes.
 PLANES = {"polygon_d1d2": [0, 1], "polygon_d1d3": [0, 2]}
 
-_SMALLEST_RANGE_MM = 0.5  # ranges below this are noise, not motion; dividing by them would blow the noise up
-_SLIVER = 1e-12  # twice the smallest area of a triangle, in normalised units
-_THIN = 0.02  # width given to shapes of points on a line, normalised units
+_SMALLEST_RANGE_MM = 0.5  # smaller ranges are noise, which normalisation would amplify
+_SLIVER = 1e-12  # twice the smallest triangle area, normalised units
+_THIN = 0.02  # width of the shape of collinear points, normalised units
 
 DIRECTIONS = 16
 KNOTS = 48
 SOFTNESS_MM = 0.1
 
-_PROTRUSION_STRETCH = 1.6  # directions are spread evenly after stretching protrusion, the shorter axis, by this
-_WINDOW_MM = 3.5  # frames within this opening of a section shape it,
-_FEWEST_IN_WINDOW = 12  # or this many nearest ones where there are fewer
-_TAPER = 0.35  # reach lost, relative to the section's middle, by a frame at the edge of the window
+_PROTRUSION_STRETCH = 1.6  # protrusion, the shorter axis, is stretched before directions are spaced evenly
+_WINDOW_MM = 3.5  # a section uses the frames within this opening
+_FEWEST_IN_WINDOW = 12  # nearest frames used where the window holds fewer
+_TAPER = 0.35  # share by which a frame at the edge of the window is pulled towards the section's middle
 _KERNEL_KNOTS = 1.0  # sd of the smoothing over the opening, in knots
-_FOLDS, _BLOCK = 5, 50  # left-out blocks of about one exercise each [frames]
-# The soft maximum of all half-spaces at once is SOFTNESS_MM * log(DIRECTIONS + 2) = 0.29 mm above the largest one: with
-# less margin, a section without extent (a direction the data do not show) would contain nothing.
+_FOLDS, _BLOCK = 5, 50  # folds of blocks of about one exercise each [frames]
+# The soft maximum over all half-spaces is up to SOFTNESS_MM * log(DIRECTIONS + 2) = 0.29 mm above the largest one. With
+# a smaller margin, a section without extent (a parameter the data do not show) would be empty.
 _MARGIN_MM = 0.38
-_CONTACT_TOLERANCE_MM = 0.05  # how far below the captured openings the hull reaches
-_FRAMES_PER_SLIP = 400  # one frame in this many may lie beyond closed teeth, by noise
+_CONTACT_TOLERANCE_MM = 0.05  # extension of the hull below the captured openings
+_FRAMES_PER_SLIP = 400  # one frame in this many may lie beyond closed teeth by noise
 _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
 
@@ -91,14 +91,14 @@ def _circumradius(corners: Array) -> Array:
 
 
 def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, Array], float]:
-    """Build the slice hull of captured parameters (N, 3) [mm] in the order of time.
+    """Build the slice hull of captured parameters (N, 3) [mm] in temporal order.
 
     Args:
-        closed_mm: where the hull ends at closed teeth, d1; None: where nearly all captured poses do.
+        closed_mm: d1 at which the hull ends at closed teeth; default: the least captured d1, apart from noise.
 
     Returns:
-        The `slice_*` arrays of a model; and how far outside of it measured poses may lie [mm]: the 95 % quantile over
-        frames left out, as other exercises go a little farther than those captured.
+        The `slice_*` arrays of a model; and the tolerance for measured poses [mm]: the 95 % quantile over held-out
+        frames, since other exercises reach slightly farther than those captured.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
     excess = [
@@ -109,7 +109,7 @@ def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, 
 
 
 def valid_box(arrays: Mapping[str, Array]) -> Array:
-    """Return the axis-parallel box of d [mm], shape (3, 2), that contains the slice hull of the `slice_*` arrays."""
+    """Return the axis-aligned bounding box in d [mm], shape (3, 2), of the slice hull of the `slice_*` arrays."""
     reach, directions, d1 = arrays["slice_support"].max(0), arrays["slice_directions"], arrays["slice_d1"]
     ends = [sign * reach[np.argmax(sign * directions[:, axis])] for axis in (0, 1) for sign in (-1, 1)]
     box = np.array([[d1[0], d1[-1]], ends[:2], ends[2:]])
@@ -139,7 +139,7 @@ def _section(distance: Array, reach: Array) -> Array:
     """Return the support values (K,) of one section [mm].
 
     Args:
-        distance: of the frames in opening, in windows, shape (N,).
+        distance: of the frames in opening, in units of the window, shape (N,).
         reach: of the frames along each direction [mm], shape (N, K).
     """
     order = np.argsort(distance, kind="stable")

@@ -1,7 +1,7 @@
-"""The anatomical gate: compare landmarks and poses with human ranges and recognise common mistakes.
+"""Checks of the training data: human ranges, common mistakes, and movements that are missing.
 
-Ranges: opening 49 +-9 mm, laterotrusion 10-12 +-3 mm, protrusion 8-9 +-2.5 mm, rotation 39 +-6 deg, condylar path
-20 +-4 mm (Zawawi 2003; Hirsch 2006; Muto & Kanazawa 1996); limits lie three standard deviations out or more.
+Human ranges: opening 49 +-9 mm, laterotrusion 10-12 +-3 mm, protrusion 8-9 +-2.5 mm, rotation 39 +-6 deg, condylar path
+20 +-4 mm (Zawawi 2003; Hirsch 2006; Muto & Kanazawa 1996). Limits lie at least three standard deviations out.
 """
 
 from __future__ import annotations
@@ -20,26 +20,39 @@ _LATERAL_MAX_MM = 20.0
 _PROTRUSION_MAX_MM = 16.0
 _RETRUSION_MAX_MM = 6.0  # backwards beyond the habitual path, teeth nearly together
 _NEAR_CLOSED_MM = 5.0  # openings up to which protrusion and retrusion are measured
-_RISE_MAX_MM = 4.0  # the lower incisor cannot rise above the bite by more
+_RISE_MAX_MM = 4.0  # of the lower incisor above the closed bite
 _ROTATION_MAX_DEG = 57.0
 _CONDYLE_MAX_MM = 32.0
 _CONDYLES_APART_MM = (70.0, 140.0)
 _QUANTILE = 99.5
-_SAME_FRAME = 0.01  # of rotation matrices: a frame that was found from the landmarks themselves
+_SAME_FRAME = 0.01  # tolerance of rotation matrices: the frame was derived from the landmarks themselves
 
 _UNITS = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 1e-3}  # mm in one unit
+
+# Ranges below which a take should be repeated; nearly all adults exceed them (Hirsch 2006, Zawawi 2003).
+_SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
+_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # share of the largest opening that counts as wide open; frames required there
+_HALF_OPEN = (0.25, 0.65)  # shares of the largest opening
+_HALF_OPEN_SHARE = 0.35  # of the full range that should be reached half open
+# Directions of (laterotrusion, protrusion); half open, enough of them should be reached to this share of the range.
+_SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
+#: A point of the bound farther than this from all captured poses lies in a gap, per parameter [mm].
+FAR_MM = np.array([3.0, 2.0, 2.0])
+_MOST_GAPS = 0.15  # share of the bound in gaps above which more should be recorded
+# Ranges (1st to 99th percentile) below which a parameter counts as not exercised [mm].
+_SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
 
 
 @dataclass(frozen=True)
 class AnatomyWarning:
-    """Report one finding that no human jaw shows: a short code, and a message with the normal range."""
+    """A finding outside human anatomy: a short code, and a message with the normal range."""
 
     code: str
     message: str
 
 
 def check_anatomy(data: TrainingData, anatomy: SubjectAnatomy) -> list[AnatomyWarning]:
-    """Compare landmarks and motions with human ranges; a recognised mistake is reported alone."""
+    """Compare landmarks and motions with human ranges; if a common mistake explains them, report it alone."""
     mistake = _frame_mistake(data) or _unit_mistake(data, anatomy) or _swap_mistake(data)
     return [mistake] if mistake else _out_of_range(data)
 
@@ -60,20 +73,20 @@ def _frame_mistake(data: TrainingData) -> AnatomyWarning | None:
     if condyle_left[0] < condyle_right[0] or molar_left[0] < molar_right[0]:
         return AnatomyWarning(
             "left_right_flip",
-            "Left and right landmarks are exchanged: in the anatomical frame x must point to the subject's left.",
+            "Left and right landmarks are swapped: in the anatomical frame x must point to the subject's left.",
         )
     if min(condyle_left[1], condyle_right[1]) < incisor[1]:
         if np.allclose(landmark_frame(data.landmarks)[:3, :3], np.eye(3), atol=_SAME_FRAME):
             return AnatomyWarning(
                 "left_right_flip",
-                "Left and right landmarks are exchanged: the frame was found from them, and has the condyles below.",
+                "Left and right landmarks are swapped: the frame derived from them puts the condyles below.",
             )
         return AnatomyWarning("upside_down", "The condyles lie below the incisal point: y must point up.")
     return None
 
 
 def _unit_mistake(data: TrainingData, anatomy: SubjectAnatomy) -> AnatomyWarning | None:
-    """Recognise translations in a wrong unit, which move the condyles out of their joints."""
+    """Detect translations in a wrong unit, which dislocate the condyles."""
     travel = _condyle_travel(data, anatomy, 1.0)
     if travel <= _CONDYLE_MAX_MM:
         return None
@@ -88,7 +101,7 @@ def _unit_mistake(data: TrainingData, anatomy: SubjectAnatomy) -> AnatomyWarning
 
 
 def _condyle_travel(data: TrainingData, anatomy: SubjectAnatomy, factor: float) -> float:
-    """Return how far the middle between the condyles moves [mm] with the poses' translations scaled."""
+    """Return how far the midpoint of the condyles moves [mm] if the translations are scaled by a factor."""
     T = anatomy.poses(data.motion)
     T[:, :3, 3] *= factor
     moved = displacement(anatomy.motion(T), data.landmarks[3:].mean(0))
@@ -103,7 +116,7 @@ def _swap_mistake(data: TrainingData) -> AnatomyWarning | None:
         return AnatomyWarning(
             "swapped_jaws",
             f"The lower incisal point rises {rise:.1f} mm above the bite (at most {_RISE_MAX_MM:g} mm is possible) but "
-            "not in the inverse poses: upper and lower teeth are probably exchanged (T_lower_upper for T_upper_lower).",
+            "not in the inverse poses: upper and lower teeth are probably swapped (T_lower_upper for T_upper_lower).",
         )
     return None
 
@@ -137,32 +150,13 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
     ]
 
 
-# Ranges below which a take should be repeated: smaller than those of nearly all adults (Hirsch 2006, Zawawi 2003)
-_SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
-_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # share of the largest opening that counts as wide open
-_HALF_OPEN = (0.25, 0.65)
-_HALF_OPEN_SHARE = 0.35  # of the range with closed teeth that should be reached half open
-# Directions of (laterotrusion, protrusion) that frames should reach half open, to this share of the closed range
-_SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
-
-#: A place of the bound farther than this from all captured poses lies in a gap [mm].
-FAR_MM = np.array([3.0, 2.0, 2.0])
-# Share of the bound in gaps that is worth recording. Of 14 synthetic persons' takes of 1,200 frames that wander through
-# the whole envelope at most 0.5 % lie in gaps, without half open frames at least 20 %; of takes of 833 frames of
-# exercises, none of which gets this advice, 0.4 to 10.8 %.
-_MOST_GAPS = 0.15
-
-# Ranges (1 to 99 %) below which a parameter is noise or habit, not an exercise [mm]
-_SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
-
-
 def shown_parameters(data: TrainingData) -> tuple[Mask, list[str]]:
-    """Return which of opening, laterotrusion and protrusion the poses exercise, (3,), and a sentence for each other."""
+    """Return which parameters (3,) the poses exercise, and a sentence for each one that they do not."""
     u = data.displacement()
     gx, gz, _, _ = fit_path(u, data.weights).path(-u[:, 1])
     side, front = u[:, 0] - gx, u[:, 2] - gz
     if _range(side) >= _SMALLEST_RANGE_MM[1]:
-        # A lateral excursion moves the jaw forward too; only motion beyond that shows protrusion.
+        # A lateral excursion also moves the jaw forward; only motion beyond that is protrusion.
         arch = np.stack([np.abs(side), side, side**2], axis=-1)
         front = front - arch @ np.linalg.lstsq(arch, front, rcond=None)[0]
     spread = np.array([_range(values) for values in (-u[:, 1], side, front)])
@@ -181,11 +175,11 @@ def _range(values: Array) -> float:
 
 
 def missing_movements(d: Array, shown: Mask) -> list[str]:
-    """Return a sentence for each movement that a take lacks, with what to record.
+    """Return a sentence for each missing movement, with advice on what to record.
 
     Args:
         d: parameters of the captured poses [mm], shape (N, 3).
-        shown: which parameters the data show, shape (3,); the others have their own sentences.
+        shown: parameters that the data show, shape (3,); `shown_parameters` reports the others.
     """
     widest = float(d[:, 0].max())
     found = []
@@ -204,11 +198,11 @@ def missing_movements(d: Array, shown: Mask) -> list[str]:
 
 
 def bound_not_reached(gaps: tuple[Array, Array], shares: tuple[float, float]) -> list[str]:
-    """Return a sentence for each plane in which much of the bound lies far from every captured pose.
+    """Return a sentence for each plane in which too much of the bound is far from every captured pose.
 
     Args:
-        gaps: places (d1, d2) and (d1, d3) in gaps [mm], each (G, 2).
-        shares: of all places of the bound in that plane.
+        gaps: points (d1, d2) and (d1, d3) in gaps [mm], each (G, 2).
+        shares: of all points of the bound in that plane.
     """
     found = []
     for name, far, places, share in zip(PARAMETERS[1:], FAR_MM[1:], gaps, shares, strict=True):
@@ -222,7 +216,7 @@ def bound_not_reached(gaps: tuple[Array, Array], shares: tuple[float, float]) ->
 
 
 def _missing_half_open(d: Array) -> list[str]:
-    """Return sentences for what is missing between a quarter and two thirds of the opening."""
+    """Return sentences for movements missing between a quarter and two thirds of the opening."""
     low, high = (share * d[:, 0].max() for share in _HALF_OPEN)
     half = d[(d[:, 0] > low) & (d[:, 0] < high), 1:]
     where = f"between {low:.0f} and {high:.0f} mm of opening"

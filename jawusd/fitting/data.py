@@ -15,22 +15,31 @@ from jawusd.fitting.metric import MandibleMetric
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, so3_log, transform_points
 
-#: Tracks, or frame numbers (F,) and poses T_skull_mandible (F, 4, 4) with NaN where there is none.
+#: Tracks, or frame numbers (F,) and poses T_skull_mandible (F, 4, 4) with NaN where the pose is unknown.
 Source = Tracks | tuple[ArrayLike, ArrayLike]
 
 #: Names of d1, d2 and d3.
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
 #: How far real jaws deviate from a three-parameter model: smaller tracking errors hardly matter [mm].
 MODEL_SIGMA_MM = 0.3
-_LARGEST_SIGMA_MM = 2.0  # frames less certain than this over the mandible (rms) are left out
+_LARGEST_SIGMA_MM = 2.0  # frames less certain than this over the mandible (rms) are discarded
 _RIGID = 1e-3
 _FEWEST_POSES = 15
 _SMALLEST_MOTION_MM = 1.0  # rms over the mandible from the first pose, 95 % quantile
 
+_FEWEST = 60  # poses required for screening
+_TRIALS, _SAMPLE = 300, 15  # number and size of the random samples; there are ten unknowns per component
+_CONSENSUS = 0.75  # share of the poses that must agree
+_REFITS = 3
+# Outlier threshold, relative to the majority's spread and absolute [mm, rms over the mandible]. A jaw deviates from the
+# quadratic by one or two millimetres at its borders; the smooth models trim smaller failures themselves.
+_TIMES, _FLOOR_MM = 8.0, 6.0
+REASON = "far from the other poses' smooth motion"
+
 
 @dataclass(frozen=True)
 class SubjectAnatomy:
-    """Hold the landmarks and measured points of a person's jaw and the frames of its poses."""
+    """Landmarks and measured points of a person's jaw, and the coordinate frames of its poses."""
 
     T_anatomical_skull: Array  # skull (scan) frame to anatomical frame, shape (4, 4)
     landmarks: Array  # `geometry.LANDMARKS` in mandible coordinates [mm], shape (5, 3)
@@ -45,10 +54,10 @@ class SubjectAnatomy:
         mandible_vertices: ArrayLike | None,
         T_rest: ArrayLike | None,
     ) -> SubjectAnatomy:
-        """Check the arrays; the defaults are the landmarks as points and the identity as closed bite.
+        """Check the arrays; by default the points are the landmarks and the closed bite is the identity.
 
         Raises:
-            ValueError: a wrong shape, or values that are not finite.
+            ValueError: an array has a wrong shape or is not finite.
         """
         landmarks = _array(landmarks, (len(LANDMARKS), 3), "landmarks")
         vertices = landmarks if mandible_vertices is None else mandible_vertices
@@ -74,14 +83,14 @@ class SubjectAnatomy:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Hold the poses a model is fitted to."""
+    """Poses a model is fitted to."""
 
     frames: NDArray[np.int64]
     motion: Array  # motions away from the closed bite, anatomical frame, shape (N, 4, 4)
     weights: Array  # between 0 and 1, shape (N,)
     incisor: Array  # lower incisal point in the closed bite, anatomical frame [mm], shape (3,)
-    landmarks: Array  # all landmarks likewise, shape (5, 3)
-    metric: MandibleMetric  # the mandible metric, anatomical frame
+    landmarks: Array  # all landmarks in the closed bite, anatomical frame [mm], shape (5, 3)
+    metric: MandibleMetric  # anatomical frame
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -91,19 +100,19 @@ class TrainingData:
         return displacement(self.motion, self.incisor)
 
     def select(self, rows: Mask) -> TrainingData:
-        """Return the given frames only."""
+        """Return the selected frames only."""
         return replace(self, frames=self.frames[rows], motion=self.motion[rows], weights=self.weights[rows])
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Hold the captured poses (F, 4, 4) with their frame numbers (F,), and the training data selected from them."""
+    """Captured poses (F, 4, 4) with their frame numbers (F,), and the training data selected from them."""
 
     frames: NDArray[np.int64]
     T_skull_mandible: Array
     data: TrainingData
-    used: Mask  # which captured frames the data hold, shape (F,)
-    excluded: dict[str, list[int]]  # frame numbers left out, by reason
+    used: Mask  # captured frames contained in the data, shape (F,)
+    excluded: dict[str, list[int]]  # excluded frame numbers, by reason
 
 
 def displacement(motion: Array, point: Array) -> Array:
@@ -112,12 +121,12 @@ def displacement(motion: Array, point: Array) -> Array:
 
 
 def select(source: Source, anatomy: SubjectAnatomy) -> Selection:
-    """Select the frames of a source that can train a model; see `select_tracks` and `select_poses` for errors."""
+    """Select the frames of a source that can train a model; raises as `select_tracks` and `select_poses` do."""
     return select_tracks(source, anatomy) if isinstance(source, Tracks) else select_poses(*source, anatomy)
 
 
 def select_tracks(tracks: Tracks, anatomy: SubjectAnatomy) -> Selection:
-    """Select the frames of a take that can train a model: measured without a prior, and certain enough.
+    """Select the frames of a take that can train a model: measured without a prior, with a small covariance.
 
     Raises:
         FittingError: too few frames or no motion.
@@ -138,7 +147,7 @@ def select_tracks(tracks: Tracks, anatomy: SubjectAnatomy) -> Selection:
 
 
 def select_poses(frames: ArrayLike, T_skull_mandible: ArrayLike, anatomy: SubjectAnatomy) -> Selection:
-    """Select the frames (F,) of a list of poses (F, 4, 4) that can train a model; poses with NaN count as lost.
+    """Select the poses (F, 4, 4) of frames (F,) that can train a model; poses with NaN count as lost.
 
     Raises:
         ValueError: wrong shapes.
@@ -192,7 +201,7 @@ def _exclude(used: Mask, mask: Mask, reason: str, frames: NDArray[np.int64], exc
 
 
 def _repeats(rows: NDArray[np.int64] | Array, used: Mask) -> Mask:
-    """Return which used rows equal an earlier used one, shape (F,)."""
+    """Return which used rows repeat an earlier used row, shape (F,)."""
     index = np.flatnonzero(used)
     repeats = np.zeros(len(rows), dtype=bool)
     if index.size:
@@ -204,7 +213,7 @@ def _repeats(rows: NDArray[np.int64] | Array, used: Mask) -> Mask:
 def _check(frames: NDArray[np.int64], T: Array) -> None:
     if len(frames) < _FEWEST_POSES:
         raise FittingError(
-            f"{len(frames)} usable poses, at least {_FEWEST_POSES} are needed.",
+            f"{len(frames)} poses are usable, at least {_FEWEST_POSES} are needed.",
             hint="Capture opening, lateral and protrusive movements, about 30 s in all.",
         )
     defect = rigidity_defect(T)
@@ -220,7 +229,7 @@ def _check_motion(data: TrainingData) -> None:
     moved = float(np.percentile(data.metric.rms(data.motion, data.motion[:1]), 95))
     if moved < _SMALLEST_MOTION_MM:
         raise FittingError(
-            f"the poses are all alike: the mandible moves by {moved:.2g} mm, at least {_SMALLEST_MOTION_MM:g} mm are "
+            f"the poses hardly differ: the mandible moves by {moved:.2g} mm, at least {_SMALLEST_MOTION_MM:g} mm are "
             "needed.",
             hint="If the jaw did move, check that the translations are in mm.",
         )
@@ -245,25 +254,20 @@ def _mandible_sigma(T: Array, covariance: Array, anatomy: SubjectAnatomy) -> Arr
 
 @dataclass(frozen=True, eq=False)
 class FittedForm:
-    """Hold a fitted decoder."""
+    """A fitted decoder: the result of every fitting method."""
 
     model: JawModelForm
-    kept: Mask  # training frames that were not trimmed, shape (N,)
-    notes: dict[str, object]  # JSON-able facts about the fit, for the header
-
-
-_FEWEST = 60  # poses needed to identify outliers
-_TRIALS, _SAMPLE = 300, 15  # random samples; each somewhat above the ten unknowns per component
-_CONSENSUS = 0.75  # share of the poses that must agree
-_REFITS = 3
-# A jaw deviates from the quadratic by a millimetre or two at its borders; smaller failures are trimmed by the smooth
-# models themselves [mm, rms over the mandible].
-_TIMES, _FLOOR_MM = 8.0, 6.0
-REASON = "far from the other poses' smooth motion"
+    kept: Mask  # training frames that were not trimmed as outliers, shape (N,)
+    notes: dict[str, object]  # JSON-serialisable facts about the fit, for the header
 
 
 def screened(selection: Selection) -> Selection:
-    """Return the selection without its gross outliers."""
+    """Return the selection without gross outliers: isolated tracking failures of centimetres.
+
+    A spline would interpolate such poses. A quadratic map from the incisal displacement to the rotation cannot: fitted
+    by random sample consensus (Fischler & Bolles 1981), it follows the majority, and the residuals of the outliers
+    equal their errors.
+    """
     outliers = gross_outliers(selection.data)
     if not outliers.any():
         return selection
@@ -274,7 +278,7 @@ def screened(selection: Selection) -> Selection:
 
 
 def gross_outliers(data: TrainingData) -> Mask:
-    """Return which poses lie centimetres off the quadratic map of the majority, shape (N,); none of fewer than 60."""
+    """Return which poses lie centimetres off the majority's quadratic map, shape (N,); all False below 60 poses."""
     count = len(data)
     if count < _FEWEST:
         return np.zeros(count, dtype=bool)
@@ -297,13 +301,13 @@ def gross_outliers(data: TrainingData) -> Mask:
 
 
 def _quadratic(u: Array) -> Array:
-    """Return the ten monomials up to degree two of displacements (N, 3), scaled to their usual size, shape (N, 10)."""
+    """Return the ten monomials up to degree two of normalised displacements (N, 3), shape (N, 10)."""
     x = (u - np.median(u, axis=0)) / np.maximum(np.percentile(np.abs(u), 75, axis=0), 1.0)
     pairs = [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
     return np.column_stack([np.ones(len(x)), x, *pairs])
 
 
 def _residual(columns: Array, values: Array, rows: Indices | Mask) -> Array:
-    """Return the residuals (N,) of a fit to some rows."""
+    """Return the residuals (N,) of a least-squares fit to a subset of the rows."""
     solution = np.linalg.lstsq(columns[rows], values[rows], rcond=1e-8)[0]
     return np.linalg.norm(values - columns @ solution, axis=1)

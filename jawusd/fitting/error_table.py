@@ -1,4 +1,4 @@
-"""Error tables: how far a model is from captured poses, in mm on the mandible and at the landmarks, seen and unseen."""
+"""Error tables: distances of a model from captured poses on the mandible and at the landmarks, trained and held out."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from jawusd.fitting.data import FittedForm, TrainingData
 from jawusd.geometry import LANDMARKS, transform_point
 
 Refit = Callable[[TrainingData], FittedForm]
-#: Mean, median, p95, max [mm] and number of frames of each column.
+#: Mean, median, p95, max [mm] and number of frames, by landmark or "mandible".
 ErrorTable = dict[str, dict[str, float]]
 
-_INSIDE_TWO_SD = 0.97  # of left-out frames: poses of other exercises lie farther out, 95 % of them are meant
-_SLOWEST_GROWTH = 0.01  # mm per mm: errors grow with distance even if no left-out frame lay far from the captured ones
+_INSIDE_TWO_SD = 0.97  # of held-out frames; more than 95 %, as other exercises lie farther from the training poses
+_SLOWEST_GROWTH = 0.01  # mm per mm: errors grow with distance even if all held-out frames lie near the training poses
 
 
 def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
-    """Return the errors of every frame, given the motions (N, 4, 4) of a model for them.
+    """Return the errors of every frame for the motions (N, 4, 4) of a model.
 
     Returns:
-        "mandible" (largest vertex distance) and each landmark to distances [mm], shape (N,).
+        Distances [mm], shape (N,), by landmark, and of the farthest vertex under "mandible".
     """
     errors = {"mandible": data.metric.largest(model, data.motion)}
     for name, point in zip(LANDMARKS, data.landmarks, strict=True):
@@ -35,7 +35,7 @@ def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
 
 
 def summarise(errors: dict[str, Array]) -> ErrorTable:
-    """Return the error table of the errors of every frame [mm], by column; columns without frames are left out."""
+    """Return the error table of the errors of every frame [mm], by column; empty columns are omitted."""
     return {
         name: {
             "mean": float(values.mean()),
@@ -50,7 +50,7 @@ def summarise(errors: dict[str, Array]) -> ErrorTable:
 
 
 def seen_errors(data: TrainingData, form: FittedForm) -> dict[str, ErrorTable]:
-    """Return the error tables "train", over the frames that were kept, and "trimmed", if there are any others."""
+    """Return the error tables "train", over the kept frames, and "trimmed", over the others if there are any."""
     tables = {"train": summarise(_errors(data.select(form.kept), form))}
     if not form.kept.all():
         tables["trimmed"] = summarise(_errors(data.select(~form.kept), form))
@@ -60,16 +60,16 @@ def seen_errors(data: TrainingData, form: FittedForm) -> dict[str, ErrorTable]:
 def unseen_errors(
     data: TrainingData, kept: Mask, folds: int, refit: Refit, notify: Callable[[int], None]
 ) -> tuple[ErrorTable, dict[str, dict[str, float]], Array]:
-    """Leave out contiguous parts of a take in turn, refit, and measure the error on them.
+    """Cross-validate: hold out contiguous parts of a take in turn, refit, and measure the error on them.
 
     Args:
-        kept: frames that count, shape (N,): those the fit to all did not trim.
-        notify: called with the number of each part.
+        kept: frames that are scored, shape (N,): those that the fit to all frames did not trim.
+        notify: called with the index of each part.
 
     Returns:
-        The error table; how the errors grow with the distance of a pose's parameters from the captured ones: for every
-        landmark and the mandible, sd = base_mm + per_mm * captured_distance, such that 97 % of the left-out errors are
-        below two sd; and the rms landmark error of every left-out frame [mm], shape (n,).
+        The error table; the growth of the errors with the distance of a pose's parameters from the training poses: for
+        each landmark and the mandible, sd = base_mm + per_mm * captured_distance, such that 97 % of the held-out errors
+        are below two sd; and the rms landmark error of every held-out frame [mm], shape (n,).
     """
     fold = np.arange(len(data)) * folds // len(data)
     errors, distances = [], []
@@ -93,17 +93,17 @@ def _errors(data: TrainingData, form: FittedForm) -> dict[str, Array]:
 
 
 def _distance(model: JawModelForm, seen: TrainingData, unseen: TrainingData) -> Array:
-    """Return the distance of each unseen frame's parameters to the nearest seen ones [mm], shape (N,)."""
+    """Return the distance of each held-out frame's parameters to the nearest training frame's [mm], shape (N,)."""
     captured, wanted = (part.metric.nearest(model, part.motion)[0] for part in (seen, unseen))
     return cKDTree(captured[np.isfinite(captured).all(1)]).query(np.nan_to_num(wanted))[0]
 
 
 def _growth(distance: Array, errors: Array) -> dict[str, float]:
-    """Fit half the 97 % quantile of errors as a straight, rising function of distance (Koenker & Bassett 1978)."""
+    """Fit half the 97 % quantile of errors as an increasing linear function of distance (Koenker & Bassett 1978)."""
     count = len(errors)
     above, below = np.full(count, _INSIDE_TWO_SD), np.full(count, 1 - _INSIDE_TWO_SD)
     cost = np.concatenate([[0.0, 0.0], above, below])
-    # Sparse: dense, the two unit matrices of a take of 20,000 frames would take 6 GB.
+    # Sparse, as the two dense identity matrices of a take of 20,000 frames would need 6 GB.
     one = eye_array(count, format="csc")
     equal = hstack([np.column_stack([np.ones(count), distance]), one, -one], format="csc")
     limits = [(0, None), (_SLOWEST_GROWTH, None)] + [(0, None)] * (2 * count)

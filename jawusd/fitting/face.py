@@ -1,4 +1,4 @@
-"""What the jaw weights of a face capture mean for one person, learned from the jaw captured at the same time."""
+"""Mapping from the ARKit jaw weights of a face capture to one person's jaw, learned from a simultaneous jaw take."""
 
 from __future__ import annotations
 
@@ -12,46 +12,42 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.arkit import ArkitMapping, FaceCapture, moved_terms, shares_of
 from jawusd.geometry import transform_points
 
-_REST_SHARE = 0.1  # of the frames: those nearest to the closed bite show the neutral weights
-_DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # tried for each weight
+_REST_SHARE = 0.1  # of the frames, nearest to the closed bite, that give the neutral weights
+_DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # candidates for each weight
 _ROUNDS = 2
-_COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offsets tried: all over, then so many to either side of the best
-_BLOCKS = 5  # of time, each predicted from the others
+_COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # coarse and fine step of the offset search, fine steps per side
+_BLOCKS = 5  # contiguous blocks for cross-validation
 _LEAST_SECONDS = 10.0
-# How much of the person's own range a take must show to each side. Of the 12 persons of tests/benchmarks/arkit.py,
-# exercises to every side show 0.75 and more, speech, chewing or opening alone at most 0.24 of some side.
-_LEAST_REACH = 0.4
-# Correlation of JawOpen with the opening. Of the same persons, takes that belong together have 0.87 and more (speech;
-# exercises 0.90); takes of different exercises reach 0.58 at the best of all offsets.
-_LEAST_FOLLOWING = 0.7
+_LEAST_REACH = 0.4  # share of the person's range that a take must reach in each direction
+_LEAST_FOLLOWING = 0.7  # correlation of JawOpen with the opening; takes of different exercises stay below
 _DIRECTIONS = ("opening", "movement to the left", "movement to the right", "movement forward")
 
 
 @dataclass(frozen=True)
 class ArkitFit:
-    """Hold a mapping and how well it did on parts of the take that it was not learned from."""
+    """A mapping and its cross-validation error."""
 
     mapping: ArkitMapping
     error_mm: float  # mean error of the incisal point on held-out parts
-    shares_error_mm: float  # the same of fixed shares of the person's ranges
-    offset_s: float  # clock of the jaw less that of the face, both from their first frames
-    frames: int  # of the jaw that the mapping was learned from
+    shares_error_mm: float  # the same for fixed shares of the person's ranges
+    offset_s: float  # clock of the jaw minus clock of the face, both counted from their first frames
+    frames: int  # jaw frames that the mapping was learned from
 
 
 def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s: float | None = None) -> ArkitFit:
     """Learn a mapping from a face capture and the jaw of the same performance.
 
-    Neutral weights are the medians near the closed bite; gains and cross-talk come from least squares, dead zones from
-    a search that lowers their sum of squares.
+    Neutral weights are medians near the closed bite, gains and cross-talk a least-squares fit, and dead zones the
+    result of a coordinate search on its residual.
 
     Args:
-        times_s: times of d [s], any start, shape (N,).
+        times_s: times of d [s] from an arbitrary start, shape (N,).
         d: jaw parameters [mm], NaN where unknown, shape (N, 3).
-        offset_s: added to the face's times, counted from its first row, gives those of d. None to find it where weights
-            follow opening and side best.
+        offset_s: added to the face's times, counted from its first row, to obtain the times of d; default: estimated
+            by correlating the weights with opening and laterotrusion.
 
     Raises:
-        FittingError: too little in common, no movement to some side, or no better than fixed shares.
+        FittingError: the takes overlap too little, some direction is not exercised, or fixed shares do as well.
     """
     known = np.isfinite(d).all(axis=1)
     times_s, d = times_s[known], d[known]
@@ -72,9 +68,9 @@ def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s
     shares_error = _incisal_error(rig, rig.denormalized(shares_of(weights)), d)
     if error >= shares_error:
         raise FittingError(
-            f"a mapping learned from this take errs by {error:.2f} mm on parts it has not seen, fixed shares of the "
-            f"ranges by {shares_error:.2f} mm: it would not help.",
-            hint="Check that both takes are of the same performance; without a mapping, `animate --arkit` uses shares.",
+            f"the mapping learned from this take errs by {error:.2f} mm on held-out parts, fixed shares of the "
+            f"ranges by {shares_error:.2f} mm: it would not be an improvement.",
+            hint="Check that both takes show the same performance; without a mapping, `animate --arkit` uses shares.",
         )
     return ArkitFit(mapping, error, shares_error, offset_s, len(d))
 
@@ -107,14 +103,14 @@ def _learned(rig: JawRig, weights: Array, d: Array) -> ArkitMapping:
 
 
 def _weights_at(face_s: Array, weights: Array, times_s: Array) -> Array:
-    """Return the weights at times (N,) between rows of the capture, NaN beside it and without a face, shape (N, 4)."""
+    """Interpolate the weights at times (N,), shape (N, 4); NaN outside the capture and where no face was found."""
     return np.stack([np.interp(times_s, face_s, column, np.nan, np.nan) for column in weights.T], axis=1)
 
 
 def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
-    """Return the offset [s] at which weights follow opening and side best, over all with half of a take in common.
+    """Return the offset [s] with the best correlation to opening and side, among those that overlap by half a take.
 
-    The opening alone repeats where somebody opens in a rhythm.
+    The opening alone is ambiguous if the person opens rhythmically.
     """
     shorter = min(face_s[-1], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
     if shorter < _LEAST_SECONDS:
@@ -131,15 +127,15 @@ def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> flo
     best = int(np.argmax(following.sum(axis=1)))
     if following[best, 0] < _LEAST_FOLLOWING:
         raise FittingError(
-            f"JawOpen does not follow the opening of the jaw at any offset of the clocks (correlation "
-            f"{following[best, 0]:.2f} at best, {_LEAST_FOLLOWING:g} is needed).",
-            hint="Give the face capture and the jaw of the same performance, or their offset with --offset.",
+            f"JawOpen does not follow the opening of the jaw at any clock offset (correlation "
+            f"{following[best, 0]:.2f} at best, {_LEAST_FOLLOWING:g} required).",
+            hint="Use a face capture and a jaw take of the same performance, or set their offset with --offset.",
         )
     return float(tried[best])
 
 
 def _refined_offset(offset_s: float, face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
-    """Return the offset [s] near a first one at which all weights together explain d best."""
+    """Return the offset [s] near an initial one at which all weights together explain d best."""
     tried = offset_s + _FINE_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1)
     left = []
     for offset in tried:
@@ -151,7 +147,7 @@ def _refined_offset(offset_s: float, face_s: Array, weights: Array, times_s: Arr
     best = int(np.argmin(left))
     if not 0 < best < len(tried) - 1:
         return float(tried[best])
-    before, low, after = left[best - 1 : best + 2]  # the bottom of the parabola through three values
+    before, low, after = left[best - 1 : best + 2]  # vertex of the parabola through three values
     bend = before - 2 * low + after
     return float(tried[best] + (0.5 * _FINE_S * (before - after) / bend if bend > 0 else 0.0))
 
@@ -164,20 +160,20 @@ def _correlation(a: Array, b: Array) -> float:
 
 
 def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
-    """Refuse a take that is short or does not move to every side."""
+    """Reject a take that is too short or does not exercise every direction."""
     step = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     if len(d) * step < _LEAST_SECONDS:
         raise FittingError(
-            f"face and jaw have {len(d) * step:.1f} s in common, at least {_LEAST_SECONDS:g} s are needed.",
-            hint="Check rates and offset: --fps, --jaw-fps, --offset.",
+            f"face and jaw overlap by {len(d) * step:.1f} s, at least {_LEAST_SECONDS:g} s are needed.",
+            hint="Check frame rates and offset: --fps, --jaw-fps, --offset.",
         )
     low, high = rig.d_range.T
     reach = [d[:, 0].max() / high[0], d[:, 1].max() / high[1], d[:, 1].min() / low[1], d[:, 2].max() / high[2]]
     worst = int(np.argmin(reach))
     if reach[worst] < _LEAST_REACH:
         raise FittingError(
-            f"the take shows {max(reach[worst], 0.0):.0%} of the range of {_DIRECTIONS[worst]}, "
-            f"{_LEAST_REACH:.0%} is needed to tell what the weights mean.",
+            f"the take covers {max(reach[worst], 0.0):.0%} of the range of {_DIRECTIONS[worst]}, "
+            f"{_LEAST_REACH:.0%} is needed to learn the mapping.",
             hint="Record wide opening, both sides and forward, teeth together and apart, for half a minute.",
         )
     still = np.ptp(weights, axis=0) == 0

@@ -36,34 +36,42 @@ from jawusd.formats.model import JawModel
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-#: Called with the steps done and the steps in all.
+#: Called with the number of steps done and the total.
 Progress = Callable[[int, int], None]
 Method = Literal["anchored", "additive", "paper", "pca"]
-#: Fit the decoder of one method to data that show some parameters (3,).
+#: Fitter of one method; the mask (3,) tells which parameters the data show.
 FormFitter = Callable[[TrainingData, Mask, "FittingConfig"], FittedForm]
 
-_MOST_CAPTURED = 2000  # captured parameters that a model keeps
-# A measured pose is off the model beyond the residuals of nearly all trained and nearly all left-out poses: 99.5 % of
-# the poses of the take itself have to pass this limit and the bound together.
+_MOST_CAPTURED = 2000  # captured parameters kept in a model
+# Percentiles of the training and of the hold-out residuals. The larger one is the limit beyond which a measured pose
+# counts as off the model; 99.5 % of the take's own poses pass this limit and the bound together.
 _TRAINED_QUANTILE, _UNSEEN_QUANTILE = 99.8, 99.5
 _SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # noise-free poses must not make every measured pose "off the model"
 _FEW_POSES = 100
 
+#: Fitters by method; `jawusd.paper.model.FORMS` adds the paper's own, which needs torch.
+FORMS: Mapping[str, FormFitter] = {
+    "anchored": lambda data, shown, config: fit_anchored(data, shown, config.trim_mad),
+    "additive": lambda data, shown, config: fit_additive(data, shown, config.trim_mad),
+    "pca": lambda data, shown, config: fit_pca(data, shown),
+}
+_FASTEST_MM_S2 = 3e4  # three times gravity; beyond this, poses jump
+
 
 @dataclass(frozen=True)
 class FittingConfig:
-    """Choose the model and how it is checked."""
+    """Choice of model, and settings of its validation."""
 
     method: Method = "anchored"
     literal: bool = False  # with method "paper", keep the paper's fixed grouping of components
-    # contiguous parts of the take that are left out in turn to measure the error on unseen poses; 0 to skip
+    # contiguous parts of the take held out in turn to measure the error on unseen poses; 0 to skip
     holdout_folds: int = 5
-    # frames farther from the model than the median by this many normalised median absolute deviations count as tracking
-    # failures and are left out
+    # frames whose residual exceeds the median by this many normalised median absolute deviations count as tracking
+    # failures and are discarded
     trim_mad: float = 4.5
-    alpha: float = 0.23  # largest circumradius of the triangles of the paper's alpha shapes, range-normalised units
-    starts: int = 4  # random starts of the networks of method "paper"; the best is kept
-    seed: int = 0  # of the first start
+    alpha: float = 0.23  # largest triangle circumradius of the paper's alpha shapes, range-normalised units
+    starts: int = 4  # random initialisations of the networks of method "paper"; the best is kept
+    seed: int = 0  # of the first initialisation
 
     def __post_init__(self) -> None:
         if self.method not in get_args(Method):
@@ -77,9 +85,10 @@ class FittingConfig:
 
 
 def one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Run a function with one thread of OpenBLAS, MKL or BLIS, whatever the process has otherwise.
+    """Limit BLAS (OpenBLAS, MKL or BLIS) to one thread while a function runs.
 
-    The matrices of a fit are so small that more threads save nothing. Apple's Accelerate has no such setting.
+    The matrices of a fit are too small to gain from threads, and threaded sums differ in their last digits, which moves
+    a fit by micrometres. Apple's Accelerate has no such setting.
     """
 
     @wraps(function)
@@ -88,14 +97,6 @@ def one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Arguments
             return function(*args, **kwargs)
 
     return limited
-
-
-#: The methods fitted here; `jawusd.paper.model.FORMS` adds the paper's own, which needs torch.
-FORMS: Mapping[str, FormFitter] = {
-    "anchored": lambda data, shown, config: fit_anchored(data, shown, config.trim_mad),
-    "additive": lambda data, shown, config: fit_additive(data, shown, config.trim_mad),
-    "pca": lambda data, shown, config: fit_pca(data, shown),
-}
 
 
 @one_blas_thread
@@ -114,17 +115,17 @@ def fit_model(
     """Fit a person's jaw model.
 
     Args:
-        source: of tracks the raw poses are used.
+        source: tracks, whose raw poses are used, or frame numbers and poses.
         T_anatomical_skull: skull (scan) frame to anatomical frame, shape (4, 4).
         landmarks: `geometry.LANDMARKS` in mandible coordinates [mm], shape (5, 3).
-        mandible_vertices: points whose motion is measured, mandible coordinates [mm], shape (V, 3); None: the
+        mandible_vertices: points whose motion is measured, mandible coordinates [mm], shape (V, 3); default: the
             landmarks.
-        T_rest: T_skull_mandible of the closed bite, shape (4, 4); None when the scans lie in occlusion.
+        T_rest: T_skull_mandible of the closed bite, shape (4, 4); default: the scans are in occlusion.
         forms: the fitter of each method.
 
     Returns:
-        The model. `d` and `residual_mm` are those of the raw poses; `meta` holds the error tables [mm], the frames
-        left out and trimmed, warnings, and what the poses do not show.
+        The model. `d` and `residual_mm` belong to the raw poses; `meta` holds the error tables [mm], the excluded
+        and trimmed frames, warnings, and the parameters that the poses do not show.
 
     Raises:
         FittingError: too few poses, no motion, poses that are not rigid, or parameters outside what a rig allows.
@@ -150,7 +151,7 @@ def fit_model(
     errors, uncertainty, unseen_mm = _errors(data, shown, form, config, forms, lambda fold: notify(fold + 1, steps))
     d, _ = data.metric.nearest(form.model, data.motion[form.kept])
     if not np.isfinite(d).all():
-        raise FittingError("the parameters of some training poses cannot be found.", hint="Check the poses' units.")
+        raise FittingError("some training poses cannot be encoded.", hint="Check the units of the poses.")
     captured_d = d[:: -(-len(d) // _MOST_CAPTURED)]
     warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(captured_d, shown)]
     hull, tolerance_mm = fit_slice_hull(d)
@@ -187,11 +188,11 @@ def _errors(
     forms: Mapping[str, FormFitter],
     notify: Callable[[int], None],
 ) -> tuple[dict[str, ErrorTable], dict[str, dict[str, float]], Array]:
-    """Return the error tables of a fit by name, and the rest of `unseen_errors`, empty without hold-out."""
+    """Return the error tables of a fit by name, and the other results of `unseen_errors`, empty without hold-out."""
     tables = seen_errors(data, form)
     if not config.holdout_folds:
         return tables, {}, np.zeros(0)
-    # In the folds the networks of "paper" have one start: that of the best network of the full fit.
+    # In the folds, method "paper" trains one network only, with the seed of the best network of the full fit.
     seed = form.notes.get("seed")
     again = replace(config, starts=1, seed=seed if isinstance(seed, int) else config.seed)
     tables["holdout"], uncertainty, rms_mm = unseen_errors(
@@ -208,7 +209,7 @@ def _model(
     warnings: list[AnatomyWarning],
     unseen_mm: Array,
 ) -> JawModel:
-    """Encode every captured pose with the evaluator and set the limits of the verdicts from the trained ones."""
+    """Encode every captured pose with the evaluator and set the residual limit from the training poses."""
     meta |= {
         "kind": form.model.kind,
         "fit": form.notes,
@@ -220,7 +221,7 @@ def _model(
         rig = JawRig({**arrays, "residual_limit_mm": np.array(1.0)}, meta)
     except EvaluatorError as error:
         advice = " ".join(warning.message for warning in warnings)
-        raise FittingError(f"the poses give no usable model: {error}", hint=advice or None) from error
+        raise FittingError(f"no usable model fits the poses: {error}", hint=advice or None) from error
     d, residual_mm = rig.encode(selection.T_skull_mandible)
     trained = np.zeros(len(d), dtype=bool)
     trained[np.flatnonzero(selection.used)[form.kept]] = True
@@ -233,14 +234,11 @@ def _model(
     return JawModel(arrays, selection.frames, d, residual_mm, trained, meta)
 
 
-_FASTEST_MM_S2 = 3e4  # three times gravity: poses that jump, no motion
-
-
 def with_speeds(model: JawModel, fps: float) -> JawModel:
-    """Return a model with the speeds of its take at a rate [1/s].
+    """Return a model with the speeds of the take it was fitted to, recorded at a frame rate [1/s].
 
-    Frames that took no part in the fit are left out. The model stays as it was if too few frames follow each other, or
-    if no jaw moves like this.
+    Only trained frames count. The model is returned unchanged if too few of them are consecutive, or if the
+    accelerations are implausible.
     """
     d = np.where(model.trained[:, None], model.d, np.nan)
     gaps = np.flatnonzero(np.diff(model.frames) != 1) + 1

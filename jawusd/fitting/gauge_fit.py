@@ -2,7 +2,7 @@
 
 d1 follows the habitual opening path, where the incisal point is most often at each opening. A plain lateral slide at
 closed teeth carries the incisal point forward (gothic arch) and down (tooth guidance). All three are learned from the
-captured poses and put into the gauge, outside the regression of the poses.
+captured poses and stored in the gauge, outside the regression of the poses.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.gauge import Gauge
 
-SOFTNESS_MM = 2.0  # rounding of the arch across d2 = 0, for smooth motion of the slider there
+SOFTNESS_MM = 2.0  # rounding of the arch across d2 = 0, which keeps slider motion smooth there
 FADE_MM = 14.0  # opening at which tooth guidance has faded to 1/e
 
 _PATH_DEGREE, _PATH_ITERATIONS, _PATH_RIDGE = 5, 40, 1e-5
-_SMALLEST_SPREAD_MM = 0.3  # residuals below this are never treated as outliers of the path
-#: Openings (1 to 99 %) below which there is no path: the motion is then a glide of closed teeth [mm].
+_SMALLEST_SPREAD_MM = 0.3  # least scale of the path's residuals
+#: Range of openings (1st to 99th percentile) below which no path is fitted: the teeth glide while closed [mm].
 SMALLEST_OPENING_MM = 5.0
 
 _ROUNDS = 3
@@ -27,23 +27,23 @@ _ITERATIONS = 60
 _RESIDUAL_FLOOR_MM = 0.08  # keeps the reweighting of the quantile regressions finite
 _ARCH_QUANTILE, _ARCH_RIDGE, _ARCH_MIN_SIDE_MM = 0.5, 1e-3, 1.0
 _DROP_QUANTILE, _DROP_RIDGE, _DROP_MAX_OPENING_MM = 0.1, 3e-2, 1.2 * FADE_MM
-_UNKNOWN = 1e6  # extra stiffness of terms that the data do not show
+_UNKNOWN = 1e6  # extra stiffness of terms without data
 _FEWEST_FRAMES = 20
 
 #: Smallest principal minor of the gauge's Jacobian that counts as invertible; it is 1 for an undistorted gauge.
 SMALLEST_MINOR = 0.25
 _STIFFNESSES = 4.0 ** np.arange(8)
-_WIDER_MM = 3.0  # by which the checked box is wider than the captured poses: the largest margin of a bound
+_WIDER_MM = 3.0  # margin of the checked box around the captured poses: the largest margin of a bound
 _GRID = 33
 
 
 @dataclass(frozen=True)
 class GaugeFit:
-    """Hold a gauge, its check and its regularisation."""
+    """A fitted gauge with its invertibility check and regularisation."""
 
     gauge: Gauge
-    smallest_minor: float  # least principal minor of the Jacobian over the box (see `smallest_minor`)
-    # factor on the ridge penalties, 1 unless the gauge folded at first; None: no glide surface at all
+    smallest_minor: float  # least principal minor of the Jacobian over the box, see `smallest_minor()`
+    # factor on the ridge penalties, above 1 if a softer gauge folded; None if there is no glide surface
     stiffness: float | None
 
 
@@ -84,14 +84,14 @@ def _robust_fit(basis: Array, values: Array, weights: Array) -> Array:
 
 
 def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
-    """Fit arch and glide surface to incisal displacements u (N, 3) [mm], with rising stiffness until invertible.
+    """Fit arch and glide surface to incisal displacements u (N, 3) [mm], stiffening them until invertible.
 
     Args:
         path: the gauge of the habitual path alone.
         shown: which of opening, laterotrusion, protrusion the data show, shape (3,).
 
     Returns:
-        The gauge; if no stiffness makes it invertible, that of the path alone, which always is.
+        The gauge; if no stiffness makes it invertible, the gauge of the path alone, which always is.
     """
     for stiffness in _STIFFNESSES:
         gauge = _fit(u, weights, path, shown, stiffness)
@@ -132,11 +132,11 @@ def _fit(u: Array, weights: Array, gauge: Gauge, shown: Mask, stiffness: float) 
 
 
 def _with_arch(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: float) -> Gauge:
-    """Fit the forward displacement of the incisal point in lateral excursions: the median of the frames."""
+    """Fit the forward displacement of the incisal point in lateral excursions, as the median of the frames."""
     if not shown[1]:
         return gauge
     d1, d2, _ = np.nan_to_num(gauge.inverse(u)).T
-    # The terms are linear in their coefficients, so the evaluator itself gives the columns.
+    # The terms are linear in their coefficients, so unit coefficients in the evaluator yield the columns.
     columns = np.stack([replace(gauge, glide_arch=row).arch(d1, d2)[0] for row in np.eye(7)], axis=-1)
     ahead = u[:, 2] - gauge.path(d1)[1]
     side = np.abs(d2) > _ARCH_MIN_SIDE_MM
@@ -146,7 +146,7 @@ def _with_arch(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: f
 
 
 def _with_drop(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: float) -> Gauge:
-    """Fit the downward displacement of the incisal point by gliding teeth: the lower edge of the frames."""
+    """Fit the downward displacement of the incisal point by gliding teeth, as a low quantile of the frames."""
     _, d2, d3 = np.nan_to_num(gauge.inverse(u)).T
     columns = np.stack([replace(gauge, glide_drop=row).drop(d2, d3)[0] for row in np.eye(4)], axis=-1)
     low = -u[:, 1] < _DROP_MAX_OPENING_MM

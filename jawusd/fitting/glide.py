@@ -1,8 +1,8 @@
-"""Let d1 = 0 be tooth contact: the glide surface of a gauge measured on the scans, and the bounds in its parameters.
+"""Make d1 = 0 tooth contact: the glide surface of a gauge measured on the scans, and the bounds in its parameters.
 
-The gauge that is fitted to captured poses knows the glide surface only as a smooth bowl. Teeth make it rough: of the
-openings at which the scans touch, all over d2 and d3, a surface is made that no opening lies above, as far as its
-slopes are limited, for a gauge must not fold. The poses of the model stay what they are; only their parameters change.
+The gauge fitted to captured poses approximates the glide surface by a smooth bowl. The true surface is rough: this
+module measures the opening at which the scans touch over a grid of d2 and d3, and builds an upper envelope of it with
+limited slopes, so that the gauge does not fold. The poses of the model do not change, only their parameters.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from jawusd.formats.model import JawModel
 from jawusd.geometry.se3 import make_transform
 from jawusd.meshes.contact import Teeth
 
-_STEP_MM = 0.5  # between knots: cusps and fossae are a few times as wide
-_BEYOND_MM = 1.5  # outside the captured parameters, still measured
-_HIGHEST_MM, _LOWEST_MM = 5.0, -2.5  # drops searched; no contact there is none at all
-_HALVINGS = 4  # of the search step: to 0.03 mm
+_STEP_MM = 0.5  # knot spacing; cusps and fossae are a few times as wide
+_BEYOND_MM = 1.5  # margin around the captured parameters that is measured too
+_HIGHEST_MM, _LOWEST_MM = 5.0, -2.5  # range of drops searched for contact
+_HALVINGS = 4  # bisections of the search step, to 0.03 mm
 _SMOOTHING = 0.7  # standard deviation, in knots
-_RAISES = 3  # times that what smoothing took away is given back
-_REST_MM = 2.0  # within which the surface is brought to 0 at the closed bite, the deepest point of its fossae
-# Slopes along d2 and d3 from the steepest to the flattest tried; steeper ones would hover less above deep fossae.
+_RAISES = 3  # iterations that restore the height lost in smoothing
+_REST_MM = 2.0  # radius within which the surface is blended to 0 at the closed bite, the bottom of the fossae
+# Slope limits along d2 and d3 in the order tried; steeper surfaces follow deep fossae more closely.
 _SLOPES = ((1.5, 1.0), (1.0, 0.7), (0.6, 0.4))
 _RANK_ERROR_MM = 0.03
-_GAUGE_ROOM_MM = 3.0
+_GAUGE_ROOM_MM = 3.0  # margin of the box in which the gauge must be invertible
 
 
 def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
-    """Return an anchored model whose d1 counts from where the teeth touch, with bounds that end there.
+    """Return an anchored model whose d1 is measured from tooth contact, with bounds that end there.
 
     Returns:
-        The model as it was if its form has no gauge or if every surface would fold the gauge.
+        The unchanged model if it has no gauge or if every surface would fold the gauge.
     """
     form = JawRig(model.arrays, model.meta).model
     if not isinstance(form, AnchoredModel):
@@ -64,7 +64,7 @@ def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
 
 
 def _regauged(model: JawModel, old: Gauge, gauge: Gauge, d: Array) -> JawModel:
-    """Return the model with another gauge, its parameters d (F, 3) and bounds that end at closed teeth."""
+    """Return the model with a new gauge, its parameters d (F, 3), and bounds that end at closed teeth."""
     trained = d[model.trained]
     hull, tolerance_mm = fit_slice_hull(trained, closed_mm=0.0)
     config = model.meta["config"]
@@ -84,7 +84,7 @@ def _regauged(model: JawModel, old: Gauge, gauge: Gauge, d: Array) -> JawModel:
 
 
 def _carried(old: Gauge, new: Gauge, d: Array) -> Array:
-    """Return the parameters (n, 3) [mm] in a new gauge of the same poses; NaN for NaN."""
+    """Convert parameters d (n, 3) [mm] of the old gauge to the new gauge; NaN stays NaN."""
     out = np.full(d.shape, np.nan)
     known = np.isfinite(d).all(axis=1)
     out[known] = new.inverse(old.displacement(d[known]))
@@ -92,13 +92,13 @@ def _carried(old: Gauge, new: Gauge, d: Array) -> Array:
 
 
 def _axis(values: Array) -> Array:
-    """Return knots [mm] around captured values, 0 among them."""
+    """Return knots [mm] that cover the captured values and contain 0."""
     low, high = min(values.min(), 0.0) - _BEYOND_MM, max(values.max(), 0.0) + _BEYOND_MM
     return _STEP_MM * np.arange(np.floor(low / _STEP_MM), np.ceil(high / _STEP_MM) + 1)
 
 
 def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captured: Array) -> Array:
-    """Return how far the incisal point must drop for the teeth to pass [mm], shape (n2, n3)."""
+    """Return the drop of the incisal point at which the teeth just touch [mm], shape (n2, n3)."""
     side, front = (x.ravel() for x in np.meshgrid(d2, d3, indexing="ij"))
     wanted = _near(np.stack([side, front], axis=1), captured[:, 1:])
     ahead = front + form.gauge.arch(np.zeros_like(side), side)[0]
@@ -125,7 +125,7 @@ def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captu
 
 
 def _near(points: Array, captured: Array) -> Mask:
-    """Tell which points (n, 2) lie within `_BEYOND_MM` of a captured one (m, 2), or of the rest, by cells."""
+    """Return which points (n, 2) lie about `_BEYOND_MM` or less from a captured one (m, 2) or from 0, by grid cells."""
     reach = int(np.ceil(_BEYOND_MM / _STEP_MM)) + 1
     cells = {(int(a), int(b)) for a, b in np.round(np.vstack([captured, [[0.0, 0.0]]]) / _STEP_MM)}
     around = [(a, b) for a in range(-reach, reach + 1) for b in range(-reach, reach + 1)]
@@ -134,7 +134,7 @@ def _near(points: Array, captured: Array) -> Mask:
 
 
 def _hull(d2: Array, d3: Array, down: Array, slopes: tuple[float, float]) -> Array:
-    """Return a smooth surface (n2, n3) [mm] on or above the contact, of limited slopes; 0 at the closed bite."""
+    """Return a smooth surface (n2, n3) [mm] on or above the contact, with limited slopes; 0 at the closed bite."""
     limited = _dilated(down, slopes)
     surface = gaussian_filter(limited, _SMOOTHING, mode="nearest")
     for _ in range(_RAISES):
@@ -146,7 +146,7 @@ def _hull(d2: Array, d3: Array, down: Array, slopes: tuple[float, float]) -> Arr
 
 
 def _dilated(surface: Array, slopes: tuple[float, float]) -> Array:
-    """Return the least surface on or above one (n2, n3) [mm] whose slopes [mm/mm] along both axes are limited."""
+    """Return the lowest surface above a given one (n2, n3) [mm] whose slopes [mm/mm] along both axes are limited."""
     out = surface
     for axis, slope in enumerate(slopes):
         n = surface.shape[axis]
@@ -156,7 +156,7 @@ def _dilated(surface: Array, slopes: tuple[float, float]) -> Array:
 
 
 def _factored(d2: Array, d3: Array, surface: Array) -> GlideTable:
-    """Return a surface (n2, n3) as the fewest products of curves that give it, exactly 0 at the closed bite."""
+    """Factor a surface (n2, n3) into a low-rank sum of products of curves, exactly 0 at the closed bite."""
     left, sizes, right = np.linalg.svd(surface, full_matrices=False)
     rank = 1
     while np.abs(surface - (left[:, :rank] * sizes[:rank]) @ right[:rank]).max() > _RANK_ERROR_MM:

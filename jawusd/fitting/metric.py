@@ -16,15 +16,15 @@ from jawusd.evaluator.encoding import carried, landmark_vectors, nearest_in_char
 from jawusd.evaluator.models import JawModelForm
 from jawusd.geometry import hat, make_transform
 
-_TOGETHER = 32  # poses whose displacements are computed at once
-_EVERY = 32  # of the extreme points, one is looked at for a lower bound
+_TOGETHER = 32  # poses per block, so that displacements stay in the CPU cache
+_EVERY = 32  # stride through the hull vertices for a lower bound
 
 
 @dataclass(frozen=True)
 class MandibleMetric:
-    """Measure pose differences by the displacement of a set of mandible points."""
+    """Pose differences measured by the displacement of a set of mandible points."""
 
-    # four homogeneous columns that represent the points, their mean last (see `evaluator.encoding`), shape (4, 4)
+    # four homogeneous columns equivalent to the points, the mean last (see `evaluator.encoding`), shape (4, 4)
     vectors: Array
     extremes: Array  # vertices of the points' convex hull [mm], shape (H, 3)
 
@@ -47,7 +47,7 @@ class MandibleMetric:
         return _farthest(M - target, self.extremes)
 
     def largest_at_least(self, M: Array, target: Array) -> Array:
-        """Return what `largest` is not below [mm], shape (N,), in a fraction of its time."""
+        """Return a fast lower bound of `largest` [mm], shape (N,)."""
         return _farthest(M - target, self.extremes[::_EVERY])
 
     def nearest(self, model: JawModelForm, target: Array) -> tuple[Array, Array]:
@@ -56,11 +56,11 @@ class MandibleMetric:
         return model.chart_parameters(x), make_transform(*model.chart_motion(x))
 
     def best_rotation(self, target: Array, incisor: Array, at: Array) -> Array:
-        """Return the rotations (N, 3, 3) that fit motions (N, 4, 4) best with the incisal point fixed (Kabsch 1976).
+        """Return the rotations (N, 3, 3) that best fit motions (N, 4, 4) with the incisal point fixed (Kabsch 1976).
 
         Args:
             incisor: incisal point at rest [mm], shape (3,).
-            at: its fixed places [mm], shape (N, 3).
+            at: its fixed positions [mm], shape (N, 3).
         """
         R, t = _parts(target)
         mean, root = self.vectors[:3, 3], self.vectors[:3, :3]
@@ -87,7 +87,7 @@ class MandibleMetric:
 def _farthest(difference: Array, points: Array) -> Array:
     """Return the largest displacement of points (H, 3) by differences of motions (N, 4, 4) [mm], shape (N,)."""
     found = np.empty(len(difference))
-    for first in range(0, len(found), _TOGETHER):  # as many as caches hold
+    for first in range(0, len(found), _TOGETHER):
         D = difference[first : first + _TOGETHER]
         x, y, z = np.moveaxis(D[:, :3, :3] @ points.T + D[:, :3, 3:], 1, 0)
         found[first : first + _TOGETHER] = np.sqrt((x * x + y * y + z * z).max(-1))

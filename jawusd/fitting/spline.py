@@ -15,18 +15,18 @@ from jawusd.base.arrays import Array, Indices, Mask
 
 _RANK = 1e-9  # singular values below this share of the largest count as zero
 _TIE_DIGITS = 9
-_SAME_CENTRE = 1e-6  # normalised distance below which two points are one centre
+_SAME_CENTRE = 1e-6  # normalised distance below which two points count as one centre
 
 
 def farthest_points(points: Array, count: int) -> Array:
-    """Return `count` of the points (N, D), each the farthest from those before it (Gonzalez 1985).
+    """Return `count` of the points (N, D) by farthest-point sampling (Gonzalez 1985).
 
-    The first is the one nearest the origin; fewer are returned when the points repeat.
+    The first is nearest to the origin; fewer are returned if points repeat.
     """
     chosen = [int(np.argmin((points**2).sum(1)))]
     distance = ((points - points[chosen[0]]) ** 2).sum(1)
     while len(chosen) < min(count, len(points)):
-        # Rounded, so that ties, as on a grid, are broken alike in every coordinate frame.
+        # Rounding breaks ties, as on a grid, the same way in every coordinate frame.
         farthest = int(np.argmax(np.round(distance, _TIE_DIGITS)))
         if distance[farthest] < _SAME_CENTRE**2:
             break
@@ -37,7 +37,7 @@ def farthest_points(points: Array, count: int) -> Array:
 
 @dataclass(frozen=True)
 class SplineBasis:
-    """Turn normalised points into regression columns whose bending energy is a quadratic form."""
+    """Regression basis on normalised points whose bending energy is a quadratic form."""
 
     centres: Array  # shape (m, 3)
     null_space: Array  # maps free coefficients to kernel weights that meet the side conditions, shape (m, k)
@@ -86,17 +86,17 @@ def within(residual_mm: Array, trim_mad: float, floor_mm: float) -> Mask:
 def choose_smoothing(
     columns: Array, values: Array, weights: Array, energy: Array, tail: Array, grid: Array, folds: Indices, cap: float
 ) -> float:
-    """Return the smoothing factor with the smallest capped error on left-out folds.
+    """Return the smoothing factor with the smallest capped error on held-out folds.
 
     Args:
         columns: regression columns, shape (N, k).
-        values: to predict, in units in which their Euclidean norm is the error [mm], shape (N, C).
+        values: targets, in units in which their Euclidean norm is the error [mm], shape (N, C).
         energy: bending energy, shape (k, k).
-        tail: fixed part of the penalty, shape (k, k).
+        tail: constant part of the penalty, shape (k, k).
         grid: smoothing factors to try, ascending.
-        folds: fold number of each frame, shape (N,): contiguous blocks, since neighbours in time are nearly equal;
-            rows with a negative one are never left out.
-        cap: largest error that counts [mm], so that outliers do not determine the smoothness.
+        folds: fold number of each frame, shape (N,): contiguous blocks, since neighbouring frames are nearly equal;
+            rows with a negative number are never held out.
+        cap: cap on the error of a row [mm], so that outliers do not determine the smoothness.
     """
     weighted = columns * weights[:, None]
     total, right = weighted.T @ columns, weighted.T @ values

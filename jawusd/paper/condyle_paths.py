@@ -1,4 +1,4 @@
-"""Paper Fig. 5: the paths of the condyles when the jaw opens, in the principal component and in the models."""
+"""Paper Fig. 5: the paths of the condyles as the jaw opens, by the first principal component and by the models."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ EXPERIMENT = "condyle path"
 PRINCIPAL = "principal component 1"
 
 _STEPS = 121
-_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the path with the condyle's outline: four, as in the paper
+_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the path at which the condyle's outline is drawn
 _AROUND_MM = 24.0  # half size of the outlines
 _NEAR_CLOSED_MM = 5.0
-_HABITUAL_MM = 1.5  # captured poses with |d2| and |d3| below this belong to plain opening
-_BESIDE_MM = 0.75  # captured condyles this near in z bound the height of a condyle under the eminence
+_HABITUAL_MM = 1.5  # captured poses with smaller |d2| and |d3| count as plain opening
+_BESIDE_MM = 0.75  # captured condyles this near in z limit the height of a condyle under the eminence
 _FEWEST_BESIDE = 3
 
 
@@ -50,7 +50,7 @@ def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], capture
         captured: parameters of the captured poses in the default model [mm], shape (N, 3).
     """
     found = []
-    # The other parameters stay zero, so that d2 and d3 reach only what was captured with the teeth nearly together.
+    # The other parameters stay zero, so d2 and d3 sweep only the range captured with the teeth nearly closed.
     near = captured[captured[:, 0] < _NEAR_CLOSED_MM]
     for name, model in models.items():
         for axis in range(3):
@@ -64,10 +64,10 @@ def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], capture
 
 
 def principal_opening(data: TrainingData) -> Array:
-    """Return the motions log M = w p1 for w between the captured extremes, shape (K, 4, 4), ordered to open.
+    """Return the motions log M = w p1 for w between the captured extremes, shape (K, 4, 4), from closed to open.
 
-    p1 is the first principal component of the captured twists under the mandible metric, not centred, so that the
-    sweep passes the closed bite as the models' do (the paper's w1 p1).
+    p1 is the first principal component of the captured twists under the mandible metric. It is not centred, so that the
+    sweep passes through the closed bite like those of the models (w1 p1 in the paper).
     """
     root = data.metric.twist_root()
     points = se3_log(data.motion) @ root * np.sqrt(data.weights)[:, None]
@@ -105,7 +105,7 @@ def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
         return np.empty((0, 2, 2))
     height = cut[:, :, 0] - centre[0]
     above = height > 0
-    # One of three corners is alone on its side of the plane: the cut connects its two edges.
+    # One of the three corners lies alone on its side of the plane; the cut connects its two edges.
     alone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
     rows = np.arange(len(cut))
     ends = []
@@ -125,8 +125,8 @@ def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[
         d: parameters of the captured poses in the default model [mm], shape (N, 3).
 
     Returns:
-        For each path the distances of its points from the nearest captured condyle of plain opening, and their heights
-        above the highest captured condyle beside them, if any, which the eminence makes impossible.
+        For each path, the distances of its points from the nearest captured condyle of plain opening, and their heights
+        above the highest nearby captured condyle, which are anatomically impossible if positive.
     """
     habitual = captured[:, np.all(np.abs(d[:, 1:]) < _HABITUAL_MM, axis=1)]
     found = []
@@ -140,7 +140,7 @@ def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[
 
 
 def _above(path: Array, captured: Array) -> Array:
-    """Return heights of path points (K, 3) above the highest captured ones (N, 3) at the same z [mm], 0 if below."""
+    """Return the heights of path points (K, 3) above the highest captured ones (N, 3) at equal z [mm], at least 0."""
     beside = np.abs(path[:, None, 2] - captured[None, :, 2]) < _BESIDE_MM
     highest = np.where(beside, captured[None, :, 1], -np.inf).max(1)
     known = beside.sum(1) >= _FEWEST_BESIDE

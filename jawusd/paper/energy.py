@@ -1,4 +1,4 @@
-"""The energy of the paper: eqs. 6 to 9, counted pixels of a scan against the masks of one instant."""
+"""The energy of the paper, eqs. 6 to 9: pixels in which a projected scan and its masks disagree, counted on the CPU."""
 
 from __future__ import annotations
 
@@ -20,15 +20,21 @@ from jawusd.meshes.meshio import winding
 from jawusd.meshes.raster import Bits, Singles, count_and_not, draw_silhouette, pack_bits, project
 from jawusd.tracking.contour.views import View
 
-_MARGIN_PX = 48  # of the screen buffer around the scan at the start: 7 mm, farther than any search goes
-_FARTHEST_PX = 1024  # that the buffer reaches beyond the masks, wherever the search starts
+_MARGIN_PX = 48  # margin of the screen buffer around the initial scan: 7 mm, more than any search moves it
+_FARTHEST_PX = 1024  # largest extent of the buffer beyond the masks
+
+_MATRICES = types.Array(types.float32, 3, "C", readonly=True)
+_SCREENS = types.Array(types.uint64, 3, "C", readonly=True)
+_VERTICES = types.Array(types.float32, 2, "C", readonly=True)
+_FACES = types.Array(types.int32, 2, "C", readonly=True)
+_COUNTS = types.Array(types.int64, 2, "C")
 
 
 class PixelCounter(Protocol):
-    """Draw a scan and count pixels: `RasterCounter` or `paper.gl.GlCounter`."""
+    """Renderer of a scan that counts pixels: `RasterCounter` or `paper.gl.GlCounter`."""
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
-        """Set the pictures of one instant: matrices (C, 3, 4), masks and free (C, h, w)."""
+        """Set the masks of one instant: matrices (C, 3, 4), masks and free (C, h, w)."""
 
     def counts(self, poses: Array) -> NDArray[np.int64]:
         """Return E_SP and E_BND of poses (N, 4, 4) in every view, shape (N, C, 2)."""
@@ -36,17 +42,17 @@ class PixelCounter(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PaperScan:
-    """Hold the regions of a teeth scan that the paper draws (fig. 8)."""
+    """Regions of a teeth scan as drawn in the paper (fig. 8)."""
 
     vertices: Array  # scan coordinates [mm], shape (V, 3)
     plain_faces: NDArray[np.int32]  # red: teeth that only have to cover their masks, shape (F, 3)
     boundary_faces: NDArray[np.int32]  # green: the boundary of interest, shape (B, 3)
-    cull: bool  # whether faces turned away may be left out
+    cull: bool  # whether back faces may be culled
     centre: Array  # centroid of the teeth [mm], shape (3,)
 
 
 def paper_scan(mesh: Mesh, name: str) -> PaperScan:
-    """Take the red and green regions out of a painted teeth scan; a face belongs where two of its corners do.
+    """Extract the red and green regions of a painted teeth scan; two corners decide the region of a face.
 
     Args:
         mesh: the scan with vertex colours.
@@ -67,14 +73,14 @@ def paper_scan(mesh: Mesh, name: str) -> PaperScan:
         vertices=np.asarray(mesh.vertices, np.float64),
         plain_faces=np.ascontiguousarray(mesh.faces[teeth & ~boundary], np.int32),
         boundary_faces=np.ascontiguousarray(mesh.faces[boundary], np.int32),
-        # The side of a solid that faces away is hidden by the side that does not, if all faces agree which is which.
+        # Back faces of a solid are hidden by front faces, provided that all faces are wound consistently.
         cull=winding(mesh).outward and _is_consistent(mesh),
         centre=mesh.vertices[np.unique(mesh.faces[teeth])].mean(0),
     )
 
 
 def _is_consistent(mesh: Mesh) -> bool:
-    """Tell whether no two faces run along an edge in the same direction."""
+    """Return whether all faces are wound consistently: no two faces share an edge in the same direction."""
     unique, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[mesh.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
@@ -83,18 +89,18 @@ def _is_consistent(mesh: Mesh) -> bool:
 
 
 class PaperEnergy:
-    """Give the energy of poses of one arch.
+    """Energy of the pose of one arch.
 
-    Every view is drawn into a screen buffer of its own around the teeth, at the working size and undistorted. A pixel
-    is red or green as soon as a triangle of that colour covers its centre, whatever lies in front of it: with faces
-    turned away left out that differs by some ten pixels from what a depth buffer gives.
+    Every view is rendered into its own screen buffer around the teeth, undistorted and at the working resolution. There
+    is no depth buffer: a pixel is red or green if any triangle of that colour covers its centre. With back-face
+    culling, the count differs by about ten pixels from that of a depth buffer.
     """
 
     def __init__(self, counter: PixelCounter, scan: PaperScan, boundary_weight: float) -> None:
-        """Weigh the counts.
+        """Combine a counter with the weight of the boundary term.
 
         Args:
-            counter: knows the scan.
+            counter: renderer of the scan.
             scan: the scan.
             boundary_weight: lambda of eq. 7.
         """
@@ -105,10 +111,10 @@ class PaperEnergy:
         """Set the masks of one instant.
 
         Args:
-            views: those that have a mask of this row.
+            views: views with a mask of this arch.
             row: 0 upper, 1 lower.
-            start: pose around which will be searched, T_world_scan, shape (4, 4).
-            other_row_hides: do not count boundary pixels that lie in the mask of the other row.
+            start: initial pose of the search, T_world_scan, shape (4, 4).
+            other_row_hides: do not count boundary pixels inside the mask of the other arch.
         """
         boxes = np.stack([self._box(view, start) for view in views])
         width, height = (boxes[:, 2:] - boxes[:, :2]).max(0)
@@ -125,7 +131,7 @@ class PaperEnergy:
         self._counter.show(matrices, masks, free)
 
     def _box(self, view: View, start: Array) -> NDArray[np.int64]:
-        """Return x0, y0, x1, y1 [px] around a view's masks and the scan where it starts; x0, y0 are at most 0."""
+        """Return x0, y0, x1, y1 [px] around a view's masks and the initial scan; x0 and y0 are at most 0."""
         vertices = self._scan.vertices[np.unique(self._scan.boundary_faces)]
         h = transform_points(start, vertices) @ view.matrix[:, :3].T + view.matrix[:, 3]
         seen = h[:, :2] / h[:, 2:]
@@ -143,13 +149,6 @@ class PaperEnergy:
     def uncovered_px(self, pose: Array) -> NDArray[np.int64]:
         """Return E_SP (eq. 8) of a pose (4, 4) per view, shape (C,)."""
         return self._counter.counts(pose[None])[0, :, 0]
-
-
-_MATRICES = types.Array(types.float32, 3, "C", readonly=True)
-_SCREENS = types.Array(types.uint64, 3, "C", readonly=True)
-_VERTICES = types.Array(types.float32, 2, "C", readonly=True)
-_FACES = types.Array(types.int32, 2, "C", readonly=True)
-_COUNTS = types.Array(types.int64, 2, "C")
 
 
 @numba.njit(
@@ -171,7 +170,7 @@ def _count(
     width: int,
     counts: NDArray[np.int64],
 ) -> None:
-    """Fill counts (T, 2) for drawings first .. first + T of the list pose by pose, view by view."""
+    """Fill counts (T, 2) for renderings first .. first + T, enumerated pose by pose and view by view."""
     points = np.empty((vertices.shape[0], 3), np.float32)
     bits = np.empty((masks.shape[1], masks.shape[2]), np.uint64)
     for t in range(counts.shape[0]):
@@ -185,7 +184,7 @@ def _count(
 
 
 class RasterCounter:
-    """Count disagreeing pixels with the bit-row rasteriser; use as a context manager, or close it."""
+    """CPU pixel counter based on the bit-row rasteriser; use as a context manager, or close it."""
 
     def __init__(
         self,
@@ -202,7 +201,7 @@ class RasterCounter:
             vertices: scan coordinates [mm], shape (V, 3).
             plain_faces: teeth without the boundary of interest (red in the paper's fig. 8), shape (F, 3).
             boundary_faces: the boundary of interest (green), shape (B, 3).
-            cull: leave out faces turned away; halves the time where all faces are counter-clockwise from outside.
+            cull: cull back faces, which halves the time; all faces must be counter-clockwise seen from outside.
             threads: worker threads; the counts do not depend on it.
         """
         used, index = np.unique(np.concatenate([plain_faces, boundary_faces]), return_inverse=True)
@@ -213,12 +212,12 @@ class RasterCounter:
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
-        """Set the pictures of one instant.
+        """Set the masks of one instant.
 
         Args:
             matrices: world [mm] to homogeneous px, per view, shape (C, 3, 4).
             masks: the segmented teeth, shape (C, h, w).
-            free: where boundary pixels are not counted: the masks themselves, and whatever else may hide the boundary;
+            free: where boundary pixels are not counted: the masks, and anything else that may hide the boundary;
                 shape (C, h, w).
 
         Raises:
@@ -233,7 +232,7 @@ class RasterCounter:
     def counts(self, poses: Array) -> NDArray[np.int64]:
         """Return the disagreeing pixels of T_world_scan (N, 4, 4), shape (N, C, 2).
 
-        They are mask pixels that the scan does not cover (E_SP, eq. 8) and boundary pixels outside `free` (E_BND, 9).
+        Counted are mask pixels not covered by the scan (E_SP, eq. 8) and boundary pixels outside `free` (E_BND, eq. 9).
         """
         matrices = np.einsum("cij,njk->ncik", self._matrices, poses).reshape(-1, 3, 4).astype(np.float32)
         counts = np.empty((len(matrices), 2), np.int64)
@@ -249,7 +248,7 @@ class RasterCounter:
         return counts.reshape(len(poses), -1, 2)
 
     def close(self) -> None:
-        """End the threads."""
+        """Shut down the worker threads."""
         if self._pool:
             self._pool.shutdown()
 

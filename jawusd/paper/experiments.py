@@ -1,4 +1,4 @@
-"""The experiments of Yang et al. (2019) on any take: paper Figs. 5, 12 and 13, and which poses the take lacks."""
+"""The experiments of Yang et al. (2019) on any take: paper Figs. 5, 12 and 13, and the coverage of the envelope."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from jawusd.paper.synthesis import Bounds, captured_reference, distance_to_neare
 if TYPE_CHECKING:
     from jawusd.paper.nlpca import Nlpca  # imports torch
 
-#: Models of the experiments by label.
+#: Configurations of the compared models, by label.
 MODELS: dict[str, FittingConfig] = {
     "paper, literal": FittingConfig(method="paper", literal=True),
     "paper": FittingConfig(method="paper"),
@@ -33,12 +33,12 @@ MODELS: dict[str, FittingConfig] = {
     "pca": FittingConfig(method="pca"),
 }
 DEFAULT, LINEAR = "anchored", "pca"
-#: Models that take seconds, for `quick`.
+#: Models that fit within seconds, for `quick`.
 QUICK = ("additive", DEFAULT, LINEAR)
 RECONSTRUCTION, SYNTHESIS = "reconstruction", "synthesis"
 
 _LARGEST = "largest vertex distance"
-_OPENING_QUANTILE = 0.995  # where the sweep of Fig. 5 ends, so that a single frame does not decide
+_OPENING_QUANTILE = 0.995  # end of the sweep of Fig. 5, robust against single frames
 _SKULL_AROUND_MM = 30.0
 _GRID_MM = 0.5
 _SLICES = 60
@@ -65,16 +65,16 @@ def run_experiments(
     quick: bool = False,
     progress: Progress | None = None,
 ) -> Experiments:
-    """Do the paper's experiments on a take.
+    """Run the paper's experiments on a take.
 
     Args:
-        source: of tracks the raw poses are used, except prior-aided ones.
+        source: tracks, whose raw poses without a prior are used, or frame numbers and poses.
         bones: meshes "mandible" and "skull" for outlines, scan frame [mm]; either may be missing.
         config: starts and seed of the networks, trimming, alpha, folds; the method is ignored.
-        quick: leave out the networks and the paper's model, and draw random poses of the default model alone.
+        quick: skip the networks and the paper's model, and draw random poses of the default model only.
 
     Returns:
-        The results. Models that cannot be fitted to the take are left out and named in `notes`.
+        The results. Models that cannot be fitted to the take are omitted and listed in `notes`.
 
     Raises:
         FittingError: too few poses or no motion.
@@ -127,7 +127,7 @@ def _fit_all(
         start = time.perf_counter()
         try:
             chosen = replace(config, method=MODELS[name].method, literal=MODELS[name].literal)
-            if chosen.method == "paper":  # its two variants share their networks
+            if chosen.method == "paper":  # both variants share their networks
                 form: FittedForm = fit_paper(data, shown, chosen.literal, chosen.starts, chosen.seed, nets)
             else:
                 form = FORMS[chosen.method](data, shown, chosen)
@@ -140,19 +140,19 @@ def _fit_all(
         d, motion = data.metric.nearest(form.model, data.motion)
         usable = np.all(np.isfinite(d), axis=1)
         if not usable[form.kept].all():
-            notes.append(f"{name}: the parameters of {int((~usable[form.kept]).sum())} poses cannot be found.")
+            notes.append(f"{name}: {int((~usable[form.kept]).sum())} poses cannot be encoded.")
             if name == DEFAULT:
-                raise FittingError(notes[-1], hint="Check the poses' units.")
+                raise FittingError(notes[-1], hint="Check the units of the poses.")
             continue
         forms[name], parameters[name], nearest[name] = form, d, motion
-        notes.append(f"{name}: fitted in {seconds:.1f} s; {int((~form.kept).sum())} frames left out as outliers.")
+        notes.append(f"{name}: fitted in {seconds:.1f} s; {int((~form.kept).sum())} frames discarded as outliers.")
     return _Fitted(forms, parameters, nearest, tuple(notes))
 
 
 def _networks(
     data: TrainingData, config: FittingConfig, paper: FittedForm | None, notify: Callable[[int], None]
 ) -> list[Nlpca]:
-    """Return networks of 1..5 components; the last is that of the paper's model, if there is one."""
+    """Return networks of 1 to 5 components; the last is taken from the paper's model if it was fitted."""
     from jawusd.paper.nlpca import train_nlpca  # imports torch
 
     points = se3_log(data.motion) @ data.metric.twist_root()
@@ -168,7 +168,7 @@ def _networks(
 
 
 def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> list[Distances]:
-    """Paper Fig. 12: every captured pose against its reconstruction by each model, trimmed frames included."""
+    """Paper Fig. 12: error of the reconstruction of every captured pose by each model, including trimmed frames."""
     root = data.metric.twist_root()
     points = se3_log(data.motion) @ root
     rebuilt = {
@@ -180,7 +180,7 @@ def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> l
     rebuilt |= fitted.nearest
     found = []
     for name, motion in rebuilt.items():
-        known = np.all(np.isfinite(motion), axis=(1, 2))  # a gross outlier may have no nearest pose on a model
+        known = np.all(np.isfinite(motion), axis=(1, 2))  # gross outliers may not converge
         errors = data.metric.largest(motion[known], data.motion[known])
         found.append(Distances(RECONSTRUCTION, name, _LARGEST, errors))
     return found
@@ -189,7 +189,7 @@ def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> l
 def _synthesis(
     data: TrainingData, fitted: _Fitted, bounds: dict[str, Bounds], config: FittingConfig
 ) -> list[Distances]:
-    """Paper Fig. 13: random poses of each model against the nearest captured pose."""
+    """Paper Fig. 13: distance of random poses of each model to the nearest captured pose."""
     folds = max(config.holdout_folds, 2)
     reference = captured_reference(data.metric, data.motion, folds)
     found = [Distances(SYNTHESIS, "captured hold-out poses", f"{folds} contiguous parts", reference)]
@@ -214,7 +214,7 @@ def _coverage(d: Array, bounds: Bounds, sentences: tuple[str, ...]) -> Coverage:
 
 
 def _gaps(d: Array, bounds: Bounds, axis: int) -> tuple[Array, float]:
-    """Return points (d1, d_axis) of the slice hull, the other parameter zero, far from every pose, and their share."""
+    """Return the points (d1, d_axis) of the slice hull that are far from every pose, and their share."""
     first, second = (np.arange(low, high, _GRID_MM) for low, high in bounds.slices_box[[0, axis]])
     grid = np.zeros((len(first) * len(second), 3))
     grid[:, 0], grid[:, axis] = (part.ravel() for part in np.meshgrid(first, second))

@@ -1,4 +1,4 @@
-"""The figures of the paper's experiments and the coverage plot."""
+"""Figures of the paper's experiments, and the coverage plot."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from jawusd.report.style import (
 
 FIGURES = ("fig5_condyle_path", "fig12_reconstruction", "fig13_synthesis", "coverage")
 
-_HEADS = (PALE, SKY, BLUE, BLACK)  # colours of the condyle from closed to wide open
+_HEADS = (PALE, SKY, BLUE, BLACK)  # colours of the condyle outlines from closed to wide open
 _BINS = 40
-_SCALE_QUANTILE = 0.8  # of the models' 95 % quantiles: the end of the axis of all histograms
-_BONES_MM, _CLOSE_MM = 12.0, 1.5  # shown around the paths
-_ADVICE_LETTERS = 140  # in a line above the coverage plot
-_FEW_MM = 1.0  # the smallest range of a histogram
-_MANY = 2500  # points; more of them are rasterised to limit the file size
+_SCALE_QUANTILE = 0.8  # of the models' 95 % quantiles: upper end of the histograms' shared axis
+_BONES_MM, _CLOSE_MM = 12.0, 1.5  # margins around the paths
+_ADVICE_LETTERS = 140  # per line above the coverage plot
+_FEW_MM = 1.0  # smallest range of a histogram
+_MANY = 2500  # number of points above which they are rasterised to limit the file size
 _MOVES = ("opening d1", "laterotrusion d2", "protrusion d3")
 
 
@@ -55,7 +55,7 @@ def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
 
 
 def inline_figures(found: Experiments) -> dict[str, Markup]:
-    """Return the plots of the experiments as SVG, by the names of their places on the report's page."""
+    """Return the plots of the experiments as SVG, by their slots in the report page."""
     figures = {
         "coverage": (coverage_figure(found.coverage, found.actor), "Captured poses, the bounds and the gaps."),
         "reconstruction": (reconstruction_figure(found), "Histograms of the reconstruction error of each model."),
@@ -69,7 +69,7 @@ def inline_figures(found: Experiments) -> dict[str, Markup]:
 def condyle_figure(found: Experiments) -> Figure:
     """Draw paper Fig. 5: the left condyle in the sagittal plane while the jaw opens, one column per model.
 
-    Above with the bones, below the path alone, enlarged.
+    The upper row shows the bones, the lower row the path enlarged.
     """
     paths = found.condyle_paths
     if not paths:
@@ -181,7 +181,7 @@ def _histograms(
     columns = min(columns, len(samples))
     rows = -(-len(samples) // columns)
     figure, axes = new_figure(11.0, 1.9 * rows + 0.6, rows, columns, sharex=True, sharey=True)
-    # One scale for all that is not dominated by the long tail of one model; values beyond it are counted.
+    # A shared scale that the long tail of one model does not dominate; values beyond it are counted.
     end = max(_FEW_MM, float(np.quantile([np.percentile(one.values_mm, 95) for one in samples], _SCALE_QUANTILE)))
     bins = np.linspace(0.0, end, _BINS + 1).tolist()
     for axis, one, label in zip(axes, samples, labels, strict=False):
@@ -209,7 +209,7 @@ def _histograms(
 
 
 def _nothing_to_draw(why: str) -> Figure:
-    """Return a figure that says why there is nothing in it."""
+    """Return an empty figure with an explanation."""
     figure, (axis,) = new_figure(11.0, 1.0, 1, 1)
     axis.set_axis_off()
     axis.text(0.5, 0.5, why, ha="center", va="center")
@@ -233,7 +233,7 @@ def coverage_figure(coverage: Coverage, actor: str) -> Figure:
         axis.plot(coverage.slices_d1, edges[:, 0], color=BLACK, lw=1.2, label="slice hull, on the habitual path")
         axis.plot(coverage.slices_d1, edges[:, 1], color=BLACK, lw=1.2)
         gaps = coverage.gaps[index]
-        axis.plot(gaps[:, 0], gaps[:, 1], "x", ms=3, color=VERMILION, label="inside the bound, nothing captured near")
+        axis.plot(gaps[:, 0], gaps[:, 1], "x", ms=3, color=VERMILION, label="inside the bound, no captured pose nearby")
         axis.set_xlabel("opening d1 [mm]")
         axis.set_ylabel(names[index])
     handles, labels = axes[0].get_legend_handles_labels()

@@ -1,7 +1,7 @@
-"""The GPU twin of `pixel_counts`: many poses times views in one layered drawing, counted where it was drawn.
+"""GPU pixel counter: renders many poses and views into one layered texture and counts there.
 
-Needs OpenGL 4.3 through EGL, so no display; a software driver (llvmpipe) does. Its edges are the driver's: pixels
-whose centre lies within a rounding error of a triangle's side may fall to the other side of it than on the CPU.
+Needs OpenGL 4.3 through EGL, but no display; a software driver (llvmpipe) is sufficient. Counts may differ slightly
+from the CPU's, where a pixel centre lies within rounding error of a triangle's edge.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ except ModuleNotFoundError as error:
 
 
 _LAYER_EXTENSION = "GL_ARB_shader_viewport_layer_array"
-_MOST_PIXELS = 1 << 26  # of one layered picture: 64 MB
-_TILE_PX = 64  # side of the square that one work group of 16 x 16 counts
-_ROUND_PX = 64  # picture sides are rounded up to this, so that frames of changing size share their textures
+_MOST_PIXELS = 1 << 26  # of one layered texture: 64 MB
+_TILE_PX = 64  # side of the tile that one work group of 16 x 16 counts
+_ROUND_PX = 64  # texture sizes are rounded up to a multiple of this, so that frames can share textures
 
 _VERTEX = f"""#version 430
 #extension {_LAYER_EXTENSION} : require
@@ -80,13 +80,13 @@ void main() {{
 
 
 def open_context() -> moderngl.Context:
-    """Open an OpenGL 4.3 context without a window; it belongs to the calling thread. Release it when done.
+    """Open an OpenGL 4.3 context without a window. It is bound to the calling thread; release it when done.
 
     Raises:
-        MissingDependencyError: there is no EGL, no driver for it, or the driver lacks what is needed.
+        MissingDependencyError: EGL, a driver, or an extension of the driver is missing.
     """
     try:
-        # moderngl annotates each setting as if it were all of them.
+        # moderngl annotates every keyword with the type of the whole settings dictionary.
         context = moderngl.create_standalone_context(backend="egl", require=430)  # type: ignore[arg-type]  # a name
     except Exception as error:  # moderngl raises bare exceptions with the loader's text
         raise MissingDependencyError(
@@ -105,7 +105,7 @@ def open_context() -> moderngl.Context:
 
 
 def describe_graphics() -> str:
-    """Return the name and version of OpenGL here, or why it cannot be used."""
+    """Return the OpenGL version and renderer, or why OpenGL cannot be used."""
     try:
         context = open_context()
     except JawusdError as error:
@@ -125,7 +125,7 @@ Resource = TypeVar("Resource", bound=_Releasable)
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """Hold a layered picture to draw into."""
+    """A layered render target."""
 
     texture: moderngl.TextureArray
     frame: moderngl.Framebuffer
@@ -136,9 +136,9 @@ class _Target:
 
 
 class GlCounter:
-    """Count disagreeing pixels on the GPU; use as a context manager, or close it.
+    """Pixel counter on the GPU; use as a context manager, or close it.
 
-    Counters may share a context. All calls belong to the thread that opened it.
+    Counters may share a context. All calls must come from the thread that opened it.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class GlCounter:
         *,
         cull: bool = False,
     ) -> None:
-        """Copy the scan to the device of an `open_context`; other arguments as for `pixel_counts.RasterCounter`."""
+        """Upload the scan to a context of `open_context`; other arguments as for `RasterCounter`."""
         self._gl = context
         self._flags = moderngl.CULL_FACE if cull else moderngl.NOTHING
         self._stack = contextlib.ExitStack()
@@ -158,7 +158,7 @@ class GlCounter:
         self._compute = self._own(context.compute_shader(_COUNT))
         self._compute["drawn"], self._compute["masks"] = 0, 1
         buffer = self._own(context.buffer(np.ascontiguousarray(vertices, np.float32)))
-        # All teeth first, the boundary over them: later triangles overwrite, so no depth is needed.
+        # The boundary is drawn after the other teeth and overwrites them, so no depth buffer is needed.
         self._passes = []
         for shade, faces in ((0.5, plain_faces), (1.0, boundary_faces)):
             if len(faces):
@@ -174,30 +174,30 @@ class GlCounter:
         return resource
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
-        """Set the pictures of one instant; arguments as for `pixel_counts.RasterCounter.show`.
+        """Set the masks of one instant; arguments as for `RasterCounter.show`.
 
         Raises:
-            ValueError: the shapes do not agree, or the pictures are too large for the device.
+            ValueError: the shapes do not agree, or the masks are too large for the device.
         """
         checked_screens(matrices, masks, free)
         views, height, width = masks.shape
         size = (-(-width // _ROUND_PX) * _ROUND_PX, -(-height // _ROUND_PX) * _ROUND_PX)
         if size[0] * size[1] * views > _MOST_PIXELS or views > self._most_layers:
-            raise ValueError(f"{views} pictures of {width} x {height} px are more than one drawing may hold")
+            raise ValueError(f"{views} masks of {width} x {height} px exceed the size of one texture")
         if self._masks is None or self._masks.size != (*size, views):
             self._drop_textures()
             self._masks = self._gl.texture_array((*size, views), 1, dtype="u1")
             self._masks.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        # Padding counts neither as mask nor as a place where a boundary pixel is wrong.
+        # Padding is neither mask nor forbidden for boundary pixels.
         flags = np.full((views, size[1], size[0]), 2, np.uint8)
         flags[:, :height, :width] = masks + np.uint8(2) * free
         self._masks.write(flags, alignment=1)
-        # To clip coordinates; image row 0 is row 0 of the target: x_ndc = (2 u + 1) / w - 1, and no depth.
+        # Pixel to clip coordinates, x_ndc = (2 u + 1) / w - 1, without depth; image row 0 is row 0 of the target.
         to_clip = np.array([[2 / size[0], 0, 1 / size[0] - 1], [0, 2 / size[1], 1 / size[1] - 1], [0, 0, 0], [0, 0, 1]])
         self._to_clip = to_clip @ np.asarray(matrices, np.float64)
 
     def counts(self, poses: Array) -> NDArray[np.int64]:
-        """Return the counts of poses, as `pixel_counts.RasterCounter.counts` does, shape (N, C, 2)."""
+        """Return the counts of poses as `RasterCounter.counts` does, shape (N, C, 2)."""
         width, height, views = self._shown().size
         most = max(1, min(self._most_layers, _MOST_PIXELS // (width * height)) // views)
         parts = [self._count_part(poses[k : k + most]) for k in range(0, len(poses), most)]
@@ -205,12 +205,12 @@ class GlCounter:
 
     def _shown(self) -> moderngl.TextureArray:
         if self._masks is None:
-            raise ValueError("counting needs pictures: call `show` first")
+            raise ValueError("no masks are set: call `show` first")
         return self._masks
 
     def _count_part(self, poses: Array) -> NDArray[np.int64]:
         width, height, views = self._shown().size
-        clip = np.einsum("cij,njk->ncki", self._to_clip, poses)  # transposed: GL reads columns first
+        clip = np.einsum("cij,njk->ncki", self._to_clip, poses)  # transposed, as GL is column-major
         layers = len(poses) * views
         matrices = self._gl.buffer(np.ascontiguousarray(clip, np.float32))
         counts = self._gl.buffer(np.zeros(2 * layers, np.uint32))
@@ -228,7 +228,7 @@ class GlCounter:
 
     def _draw(self, target: _Target, matrices: moderngl.Buffer, layers: int) -> None:
         self._gl.enable_only(self._flags)
-        self._gl.front_face = "cw"  # window rows count downwards here, as in the picture
+        self._gl.front_face = "cw"  # rows are flipped, as image row 0 is row 0 of the target
         target.frame.use()
         target.frame.clear()
         matrices.bind_to_storage_buffer(0)
@@ -238,7 +238,7 @@ class GlCounter:
         target.texture.use(0)
 
     def _target(self, layers: int) -> _Target:
-        """Return a target of at least this many layers; clearing costs time, so small ones exist beside large ones."""
+        """Return a target of at least this many layers; several sizes are cached, since clearing takes time."""
         width, height, views = self._shown().size
         room = min(1 << (layers - 1).bit_length(), self._most_layers)
         if room not in self._targets:
@@ -256,7 +256,7 @@ class GlCounter:
             self._masks = None
 
     def close(self) -> None:
-        """Free what lies on the device; the context stays."""
+        """Free the device memory; the context stays open."""
         self._drop_textures()
         self._stack.close()
 

@@ -5,9 +5,9 @@ two groups of components (D23, D45) are each reduced to one dimension by a netwo
 
     Phi(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)                                                       (paper eq. 5)
 
-Taken literally the sum counts Phi_gen(0) three times; here it counts once. The components' meaning is not the same in
-every training, so they are grouped by how they move the incisal point unless the paper's fixed groups are asked for.
-Twists enter in mandible-metric coordinates, which makes the result independent of units and origin.
+Taken literally, the sum counts Phi_gen(0) three times; here it counts once. The meaning of a component varies between
+trainings, so components are grouped by how they move the incisal point unless the paper's fixed groups are requested.
+Twists are given in mandible-metric coordinates, which makes the result independent of units and origin.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ COMPONENTS = 5
 _LITERAL_GROUPS: Groups = ((0,), (1, 2), (3, 4))
 _SWEEP_PERCENT = (2.0, 98.0)
 _REST_STEPS, _REST_HALVINGS = 50, 10
-_ALL_STAGES, _SEARCH_STAGES = 7, 4  # of training the one-dimensional networks
+_ALL_STAGES, _SEARCH_STAGES = 7, 4  # training stages of the one-dimensional networks
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class _Sum:
     seed: int
 
     def encode(self, points: Array) -> Array:
-        """Return the parameters (N, 3) of metric coordinates (N, 6) by the networks, as published."""
+        """Return the parameters (N, 3) of metric coordinates (N, 6), encoded by the networks as published."""
         components = self.net.encode(points)
         return np.stack([part.encode(self.net, components) for part in self.parts], axis=1)
 
@@ -97,13 +97,13 @@ class _Sum:
 
 @dataclass(frozen=True, eq=False)
 class PaperFit(FittedForm):
-    """Hold a fitted model of the paper, which trims nothing, and its networks."""
+    """A fitted model of the paper with its networks; no frames are trimmed."""
 
     network_sum: _Sum
     root: Array  # L (6, 6) of the metric coordinates log(M) @ L
 
     def reconstruct_as_published(self, motion: Array) -> Array:
-        """Return motions (N, 4, 4) encoded and decoded by the networks, not projected, before any shift."""
+        """Return motions (N, 4, 4) encoded and decoded by the networks, without projection and rest offset."""
         return _rebuilt(self.network_sum, motion, self.root)
 
 
@@ -113,14 +113,14 @@ def fit_paper(
     """Fit the paper's model.
 
     Args:
-        shown: which parameters the data show, shape (3,).
-        literal: keep the paper's groups (1), (2, 3), (4, 5) whatever the components turn out to mean.
-        starts: networks trained from different starts; the sum with the smallest training error is kept.
-        seed: of the first start.
-        nets: trained networks of five components by seed; missing ones are added.
+        shown: parameters that the data show, shape (3,).
+        literal: keep the paper's groups (1), (2, 3), (4, 5), whichever motion the components describe.
+        starts: number of random initialisations; the sum with the smallest training error is kept.
+        seed: of the first initialisation.
+        nets: cache of trained networks of five components by seed, updated in place.
 
     Raises:
-        FittingError: a parameter is not in the data, or no component moves the incisal point that way.
+        FittingError: the data do not show a parameter, or no component moves the incisal point that way.
     """
     from jawusd.paper.nlpca import train_nlpca  # imports torch, which takes two seconds
 
@@ -149,7 +149,7 @@ def fit_paper(
     return PaperFit(model, np.ones(len(data), dtype=bool), notes, best, root)
 
 
-#: All methods, the paper's own included.
+#: Fitters by method, including the paper's.
 FORMS: Mapping[str, FormFitter] = {
     **fit.FORMS,
     "paper": lambda data, shown, config: fit_paper(data, shown, config.literal, config.starts, config.seed),
@@ -172,7 +172,7 @@ def _part(net: Nlpca, components: Array, group: tuple[int, ...], seed: int, stag
 
 
 def _groups_by_incisal_motion(net: Nlpca, points: Array, root: Array, incisor: Array) -> Groups:
-    """Return the components that open, shift and protrude most when swept alone, chosen in that order."""
+    """Return the components that open, shift and protrude the jaw most when swept alone, chosen in that order."""
     components = net.encode(points)
     reach = np.zeros((net.components, 3))
     for index in range(net.components):
@@ -189,7 +189,7 @@ def _groups_by_incisal_motion(net: Nlpca, points: Array, root: Array, incisor: A
 
 
 def _with_leftovers(base: _Sum, points: Array, error: Callable[[_Sum], float]) -> _Sum:
-    """Try every left-over component in the lateral group, the protrusive group or none; return the best sum."""
+    """Try to assign the remaining components to the three groups or to none; return the best sum."""
     used = {part.group[0] for part in base.parts}
     left = [index for index in range(base.net.components) if index not in used]
     components = base.net.encode(points)
@@ -207,7 +207,7 @@ def _with_leftovers(base: _Sum, points: Array, error: Callable[[_Sum], float]) -
 
 
 def _curves(found: _Sum, points: Array, root: Array, data: TrainingData) -> tuple[AdditiveModel, dict[str, object]]:
-    """Move the sum's rest to the closed bite and reparametrise its curves in mm; return notes beside the model."""
+    """Move the rest of a sum to the closed bite and reparametrise its curves in mm; return the model and notes."""
     encoded = found.encode(points)
     rest = found.rest(encoded)
     reached = encoded - rest
@@ -224,7 +224,7 @@ def _curves(found: _Sum, points: Array, root: Array, data: TrainingData) -> tupl
 
 
 def _shifted(part: _Part, net: Nlpca, rest: float, root: Array) -> Curve:
-    """Return the part as a curve of twists that is zero at t = 0, the closed bite."""
+    """Return the part as a curve of twists, zero at t = 0, the closed bite."""
 
     def curve(t: Array) -> tuple[Array, Array]:
         value, rate = part.value(net, t + rest)

@@ -1,4 +1,10 @@
-"""A network of nonlinear PCA: what it makes of data, and data of components. `nlpca_training` finds its weights."""
+"""Hierarchical nonlinear PCA: an autoencoder whose bottleneck components are ordered by explained variance.
+
+Scholz & Vigario, "Nonlinear PCA: a new hierarchical approach" (2002), with the defaults of Scholz's toolbox: layers
+d-(2+2k)-k-(2+2k)-d with tanh hidden units, half the summed squared error of the reconstructions from the first 1, 2,
+.. k components plus 0.01 times that from all but the first, weight decay 1e-3, data scaled to a largest standard
+deviation of 0.1, weights initialised in U(-0.1, 0.1), and components reordered while training.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +19,15 @@ from scipy.optimize import minimize
 
 from jawusd.base.arrays import Array
 
+_SCALED_SD = 0.1
+_WEIGHT_DECAY = 1e-3
+_WITHOUT_FIRST = 0.01  # weight of the reconstruction error from components 2..k
+_START = 0.1
+_STAGES = (60, 100, 150, 200, 300, 400, 1800)  # iterations between reorderings of the components, 3000 in all
+_MEMORY = 20
+_GRADIENT_TOLERANCE, _COST_TOLERANCE = 1e-7, 1e-12
+Values = TypeVar("Values", Array, torch.Tensor)
+
 
 @dataclass(frozen=True)
 class Nlpca:
@@ -22,11 +37,11 @@ class Nlpca:
     layers: tuple[Array, ...]
     scale: float  # factor on the data before the network
     centre: Array  # subtracted from the data first, shape (D,)
-    cost: float
+    cost: float  # of the training
 
     @property
     def components(self) -> int:
-        """The number of components."""
+        """Number of components."""
         return self.layers[2].shape[1]
 
     def encode(self, data: Array) -> Array:
@@ -46,25 +61,14 @@ class Nlpca:
         return ((1 - hidden**2) * (direction @ W3)) @ W4 / self.scale
 
 
-_SCALED_SD = 0.1
-_WEIGHT_DECAY = 1e-3
-_WITHOUT_FIRST = 0.01  # weight of the error of components 2..k
-_START = 0.1
-_STAGES = (60, 100, 150, 200, 300, 400, 1800)  # iterations between reorderings of the components, 3000 in all
-_MEMORY = 20
-_GRADIENT_TOLERANCE, _COST_TOLERANCE = 1e-7, 1e-12
-
-Values = TypeVar("Values", Array, torch.Tensor)
-
-
 def train_nlpca(data: Array, components: int, seed: int, *, centre: bool = False, stages: int = len(_STAGES)) -> Nlpca:
-    """Train a network with L-BFGS; the same seed gives the same network.
+    """Train a network with L-BFGS, deterministically for a given seed.
 
     Args:
         data: shape (N, D).
         components: size k of the bottleneck.
-        centre: subtract the mean first; the toolbox does not.
-        stages: of training; 4 of 7 (500 iterations of 3000) come within a few percent in a tenth of the time.
+        centre: subtract the mean first, unlike the toolbox.
+        stages: number of training stages; 4 of 7 come within a few percent in a tenth of the time.
     """
     mean = data.mean(0) if centre else np.zeros(data.shape[1])
     scale = _SCALED_SD / max(float((data - mean).std(0).max()), 1e-12)
@@ -94,7 +98,7 @@ def train_nlpca(data: Array, components: int, seed: int, *, centre: bool = False
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Keep torch on one thread: faster for networks of a dozen units, and sums keep their order."""
+    """Limit torch to one thread, which is faster for tiny networks and makes sums deterministic."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -112,7 +116,7 @@ def _shapes(width: int, components: int) -> list[tuple[int, ...]]:
 
 
 def _hierarchy(components: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return which components each reconstruction uses, shape (S, 1, k), and its weight in the cost, shape (S,)."""
+    """Return the component mask of each reconstruction, shape (S, 1, k), and its weight in the cost, shape (S,)."""
     if components == 1:
         return torch.ones(1, 1, 1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
     masks = np.vstack([np.tril(np.ones((components, components))), np.r_[0.0, np.ones(components - 1)]])
@@ -140,7 +144,7 @@ def _split(flat: Values, shapes: list[tuple[int, ...]]) -> list[Values]:
 
 
 def _ordered(flat: Array, shapes: list[tuple[int, ...]], data: Array) -> Array:
-    """Return the weights with components reordered so that each next one explains most of the remaining variance."""
+    """Return the weights with components reordered greedily by the remaining variance they explain."""
     W1, b1, W2, b2, W3, b3, W4, b4 = _split(flat, shapes)
     components = np.tanh(data @ W1 + b1) @ W2 + b2
     order: list[int] = []

@@ -1,6 +1,6 @@
-"""The optimiser of the paper (section 4): descent along finite differences, then a dense look around.
+"""The optimiser of the paper (section 4): descent along finite differences, then a dense local search.
 
-It exists to be compared with; `tracking.contour.solver` is faster and more accurate.
+It exists for comparison; `tracking.contour.solver` is faster and more accurate.
 """
 
 from __future__ import annotations
@@ -23,39 +23,38 @@ Line = Callable[[list[float]], Array]
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """Set up the paper's method; only lambda and the order of the steps stand in the paper.
+    """Settings of the paper's method. The paper specifies lambda and the order of the steps only.
 
-    The other numbers are the best of a few tried on a take with known truth; none of them changes the error by a factor
-    of two.
+    The other values were tuned on a synthetic take; none of them changes the error by a factor of two.
     """
 
     # lambda of eq. 7.
     boundary_weight: float = 0.4
-    # Resolution at the teeth [px/mm]: that of the paper's 940 x 480 buffer, nearly, and of the default solver.
+    # Resolution at the teeth [px/mm]: about that of the paper's 940 x 480 buffer and of the default solver.
     working_px_per_mm: float = 7.2
-    # Half step of the finite differences: below it pixel counts jump, above it curvature enters.
+    # Half step of the finite differences: smaller steps see discrete pixel jumps, larger ones curvature.
     difference_rad: float = radians(0.3)
     difference_mm: float = 0.15
-    # Length of the search line: the motion between two frames of one exercise step.
+    # Length of the line search: the motion between two frames of an exercise.
     reach_rad: float = radians(1.0)
     reach_mm: float = 1.0
-    # Interval at which golden-section search stops: motions of a tenth of a pixel.
+    # Interval at which the golden-section search stops: a motion of a tenth of a pixel.
     tolerance_rad: float = radians(0.01)
     tolerance_mm: float = 0.01
     # Rounds of rotation and translation; most frames need fewer than ten.
     most_rounds: int = 40
-    # Dense samples: how many per degree of freedom (odd), and how far apart.
+    # Dense samples: number per degree of freedom (odd), and spacing.
     dense_samples: int = 3
     dense_rad: float = radians(0.2)
     dense_mm: float = 0.1
-    # Whether boundary pixels in the mask of the other arch go uncounted. The paper counts them, which drags the lower
-    # arch out from behind the upper one in closed bites.
+    # Whether to ignore boundary pixels inside the mask of the other arch. The paper counts them, which pulls the lower
+    # arch out from behind the upper one when the teeth are closed.
     other_row_hides: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class PaperSolution:
-    """Hold the outcome for one arch at one instant."""
+    """Result for one arch at one instant."""
 
     pose: Array  # T_world_scan, shape (4, 4)
     energy: float  # E of eq. 6 there [px]
@@ -65,14 +64,14 @@ class PaperSolution:
 def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig) -> PaperSolution:
     """Minimise the energy of one arch at one instant.
 
-    The six numbers are those of eq. 6, R = Rz(theta_z) Ry(theta_y) Rx(theta_x) and t, taken from the start: zero is
-    the pose of the previous frame, and rotations turn about the teeth's centroid. The paper leaves that choice open.
+    The six parameters are those of eq. 6, R = Rz(theta_z) Ry(theta_y) Rx(theta_x) and t, relative to the start: zero is
+    the pose of the previous frame, and rotations are about the centroid of the teeth. The paper leaves this open.
 
     Args:
         energy: E of poses (N, 4, 4), shape (N,).
         start: T_world_scan of the previous frame, shape (4, 4).
-        centre: point of the scan that rotations turn about [mm], shape (3,).
-        config: the method's numbers.
+        centre: centre of rotation, scan coordinates [mm], shape (3,).
+        config: settings of the method.
     """
 
     def at(parameters: Array) -> Array:
@@ -91,14 +90,14 @@ def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig
     half = config.dense_samples // 2
     around = best + spacing * np.array(list(product(range(-half, half + 1), repeat=6)))
     values = at(around)
-    # The middle sample is `best` itself; ties stay there.
+    # The middle sample is `best` itself and wins ties.
     if values.min() < lowest:
         best, lowest = around[values.argmin()], float(values.min())
     return PaperSolution(_poses(start, centre, best[None])[0], lowest, rounds)
 
 
 def _descend(at: Energy, best: Array, lowest: float, rotation: bool, config: PaperConfig) -> tuple[Array, float]:
-    """Take one step in rotation or in translation; return the better of the two ends with its energy."""
+    """Take one step in rotation or in translation; return the better of start and end with its energy."""
     block = slice(0, 3) if rotation else slice(3, 6)
     step = config.difference_rad if rotation else config.difference_mm
     nudges = np.zeros((6, 6))
@@ -118,15 +117,15 @@ def _descend(at: Energy, best: Array, lowest: float, rotation: bool, config: Pap
 
 
 def golden_section(line: Line, reach: float, tolerance: float) -> tuple[float, float]:
-    """Search a minimum on [0, reach] by golden sections (J. Kiefer, Proc. AMS 4, 1953).
+    """Find a minimum on [0, reach] by golden-section search (J. Kiefer, Proc. AMS 4, 1953).
 
     Args:
-        line: values at a list of places.
+        line: function values at a list of points.
         reach: end of the interval.
-        tolerance: length of the interval at which the search ends.
+        tolerance: interval length at which the search stops.
 
     Returns:
-        The best place looked at last, and its value.
+        The better of the last two points, and its value.
     """
     low, high = 0.0, reach
     a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
@@ -144,7 +143,7 @@ def golden_section(line: Line, reach: float, tolerance: float) -> tuple[float, f
 
 
 def _poses(start: Array, centre: Array, parameters: Array) -> Array:
-    """Return T_world_scan of (N, 6) angles and translations from the start, shape (N, 4, 4)."""
+    """Return T_world_scan of angles and translations (N, 6) relative to the start, shape (N, 4, 4)."""
     cx, cy, cz = np.cos(parameters[:, :3]).T
     sx, sy, sz = np.sin(parameters[:, :3]).T
     R = np.array(

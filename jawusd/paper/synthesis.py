@@ -1,4 +1,4 @@
-"""Paper Fig. 13: random poses of a model within its bounds, and their distances to the captured poses."""
+"""Paper Fig. 13: random poses of a model within its bounds, and their distances from the captured poses."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from jawusd.fitting.metric import MandibleMetric
 POSES = 1000
 BOX, POLYGONS, SLICES = "static: box", "dynamic: two polygons", "dynamic: slice hull"
 
-_BATCH, _BATCHES = 4000, 50  # a bound that fills less than a half percent of its box gives fewer poses
+_BATCH, _BATCHES = 4000, 50  # rejection sampling; bounds filling less than 0.5 % of their box yield fewer poses
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Hold the bounds of one model."""
+    """Bounds of one model."""
 
     box: Array  # captured range of each parameter [mm], shape (3, 2)
     polygons: PolygonBound  # the paper's alpha shapes
@@ -41,7 +41,7 @@ class Bounds:
         return cls(box, polygons, (lateral, protrusive), SliceHull.from_arrays(hull), valid_box(hull))
 
     def draw(self, rng: np.random.Generator) -> dict[str, Array]:
-        """Return up to `POSES` parameters (n, 3) [mm] spread evenly over each bound, by its name."""
+        """Return up to `POSES` uniformly distributed parameters (n, 3) [mm] within each bound, by its name."""
         return {
             BOX: _spread(self.box, lambda d: np.full(len(d), -1.0), rng),
             POLYGONS: _spread(self.box, self.polygons.signed_distance, rng),
@@ -60,8 +60,8 @@ def _spread(box: Array, excess: Callable[[Array], Array], rng: np.random.Generat
 
 
 def distance_to_nearest(metric: MandibleMetric, motion: Array, captured: Array) -> Array:
-    """Return the largest vertex distance (n,) [mm] of motions (n, 4, 4) to the nearest captured one of (N, 4, 4)."""
-    # The rms distance is Euclidean in these columns and never above the largest one, so that only captured poses
+    """Return the largest vertex distance (n,) [mm] of motions (n, 4, 4) to the nearest captured motion (N, 4, 4)."""
+    # The rms distance is Euclidean in these columns and never exceeds the largest distance, so only captured poses
     # within the best known largest distance can be nearer.
     at, places = _columns(metric, motion), _columns(metric, captured)
     tree = cKDTree(places)
@@ -75,9 +75,9 @@ def distance_to_nearest(metric: MandibleMetric, motion: Array, captured: Array) 
 
 
 def captured_reference(metric: MandibleMetric, captured: Array, folds: int) -> Array:
-    """Return the distance of each captured motion (N, 4, 4) to the nearest one outside its own part of the take [mm].
+    """Return the distance of each captured motion (N, 4, 4) to the nearest one of another part of the take [mm].
 
-    The motions are in the order of time; the take is divided into `folds` contiguous parts.
+    The motions are in temporal order; the take is split into `folds` contiguous parts.
     """
     fold = np.arange(len(captured)) * folds // len(captured)
     parts = [distance_to_nearest(metric, captured[fold == k], captured[fold != k]) for k in range(folds)]

@@ -1,4 +1,4 @@
-"""A whole take with the paper's method: from the picks, every frame from the pose of the one before."""
+"""A whole take tracked with the paper's method: from the picks on, each frame starts at the pose of its neighbour."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.initialization.bootstrap import pose_from_picks
 
-_FEWEST_MASKS = 2  # one view leaves the depth unknown
+_FEWEST_MASKS = 2  # depth is ambiguous in one view
 
 Backend = Literal["cpu", "gl"]
 
 
 @dataclass(frozen=True, eq=False)
 class _Record:
-    """Hold one instant: poses (2, 4, 4), status (2,), coverage error (2, C)."""
+    """Result of one instant: poses (2, 4, 4), status (2,), coverage error (2, C)."""
 
     poses: Array
     status: NDArray[np.int8]
@@ -50,22 +50,22 @@ def track_capture_paper(
 ) -> Tracks:
     """Track both arches through a capture with the paper's method.
 
-    It knows no failure and no uncertainty: an arch with two masks or more counts as tracked however badly it fits, and
-    covariances, sigmas, residuals and matched lengths of the result are NaN throughout, which says "not known" and
-    not "certain"; a fit to such tracks weighs all frames alike. `coverage_error` is what there is to judge them by.
+    The method detects neither failure nor uncertainty: an arch with at least two masks counts as tracked however badly
+    it fits. Covariances, sigmas, residuals and matched lengths are NaN, meaning unknown, and models fitted to these
+    tracks weight all frames equally. The only quality measure is `coverage_error`.
 
     Args:
-        capture: gives masks, bootstrap picks and frame range.
+        capture: masks, bootstrap picks and frame range.
         cameras, offsets: as for `track_capture`.
         upper, lower: teeth scans in one frame [mm], with the boundary of interest painted green.
-        backend: where pixels are drawn and counted.
+        backend: where pixels are rendered and counted.
         threads: worker threads of the CPU backend; the result does not depend on it.
-        progress: called with frames done and frames in all, once per frame.
+        progress: called after each frame with the number of frames done and the total.
 
     Raises:
-        TrackingError: no picks, one camera only, or a scan without boundary of interest.
+        TrackingError: there are no picks, only one camera, or a scan has no boundary of interest.
         CaptureError: a mask cannot be read.
-        MissingDependencyError: the GL backend has no OpenGL to work with.
+        MissingDependencyError: the GL backend is chosen and OpenGL is unavailable.
     """
     config = config or PaperConfig()
     table = {camera.name: camera for camera in cameras}
@@ -107,15 +107,15 @@ def track_capture_paper(
 def _picks(capture: Capture) -> Bootstrap:
     if capture.bootstrap is None:
         raise TrackingError(
-            "the capture has no [bootstrap] picks, which the paper's method starts from",
+            "the capture has no [bootstrap] picks, which the paper's method requires",
             path=capture.folder / "capture.toml",
-            hint="Add three or more picks per row of teeth, each seen by two cameras.",
+            hint="Add at least three picks per arch, each seen by two cameras.",
         )
     return capture.bootstrap
 
 
 def _start_poses(bootstrap: Bootstrap, cameras: Mapping[str, Camera], meshes: tuple[Mesh, Mesh]) -> Array:
-    """Return T_world_upper, T_world_lower from the picks, shape (2, 4, 4)."""
+    """Return T_world_upper and T_world_lower from the picks, shape (2, 4, 4)."""
     picks = (bootstrap.upper, bootstrap.lower)
     return np.stack([pose_from_picks(picks[r], meshes[r].vertices, cameras, ARCH_NAMES[r])[0] for r in ARCHES])
 
@@ -123,10 +123,10 @@ def _start_poses(bootstrap: Bootstrap, cameras: Mapping[str, Camera], meshes: tu
 def _energies(
     scans: Sequence[PaperScan], config: PaperConfig, backend: Backend, threads: int, stack: ExitStack
 ) -> list[PaperEnergy]:
-    """Return the energy of both arches; what they hold is freed with the stack."""
+    """Return the energies of both arches; closing the stack frees their resources."""
     counters: list[PixelCounter]
     if backend == "gl":
-        # Only here: without moderngl the module does not import, and the CPU backend needs none.
+        # Imported here because the module requires moderngl, which the CPU backend does not need.
         from jawusd.paper.gl import GlCounter, open_context
 
         context = open_context()
@@ -152,7 +152,7 @@ def _instant(
     last: Array,
     views: Sequence[View],
 ) -> _Record:
-    """Align both arches, each by itself; an arch without enough masks keeps its pose and counts as lost."""
+    """Align both arches independently; an arch with too few masks keeps its pose and counts as lost."""
     poses, status = last.copy(), np.full(2, LOST, np.int8)
     coverage = np.full((2, len(views)), np.nan)
     for r in ARCHES:
@@ -162,7 +162,7 @@ def _instant(
         energy = energies[r]
         energy.show([v for v, there in zip(views, present) if there], r, last[r], config.other_row_hides)
         poses[r] = solve_paper(energy, last[r], scans[r].centre, config).pose
-        with np.errstate(invalid="ignore"):  # a mask may be empty at the working size
+        with np.errstate(invalid="ignore"):  # a mask may be empty at the working resolution
             coverage[r, present] = energy.uncovered_px(poses[r]) / energy.mask_px
         status[r] = TRACKED if present.all() else PARTIAL
     return _Record(poses, status, coverage)

@@ -32,6 +32,16 @@ _NEAR_PX = 2.0  # of the search: how far off a line still counts half
 # Usual bites: lower front edges behind the upper ones, and how far both rows overlap there [mm].
 _OVERJET_MM, _OVERBITE_MM = 2.5, 2.0
 
+_WIDTH_PX = 360  # of the pictures that candidates are aligned in
+_FACES = 6000  # crown faces per row, enough for these pictures
+_CANDIDATES, _FINALISTS = 20, 4  # of each handedness
+# Gates of the steps [mm]: from a tooth off to half a tooth off; then with rows slid along one another.
+_WIDE_GATES, _SLID_GATES = (4.0, 4.0, 3.5, 3.5, 3.0, 3.0, 2.5, 2.5), (3.0, 3.0, 2.5, 2.0, 2.0, 2.0)
+# How far the lower row may be from a usual bite. All are looked at, the best few aligned.
+_ASIDE_MM, _UP_MM, _AHEAD_MM = (-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-4.0, -2.0, 0.0, 2.0, 4.0)
+_SLIDES = 4
+_MISFIT_GATE_MM = 1.5
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -179,17 +189,6 @@ def _seen_spectra(
         if any_line.any():
             near[k] = np.exp2(-((distance_transform_edt(~any_line) / _NEAR_PX) ** 2))
     return np.asarray(rfft2(near), np.complex128)
-
-
-_WIDTH_PX = 360  # of the pictures that candidates are aligned in
-_FACES = 6000  # crown faces per row, enough for these pictures
-_CANDIDATES, _FINALISTS = 20, 4  # of each handedness
-# Gates of the steps [mm]: from a tooth off to half a tooth off; then with rows slid along one another.
-_WIDE_GATES, _SLID_GATES = (4.0, 4.0, 3.5, 3.5, 3.0, 3.0, 2.5, 2.5), (3.0, 3.0, 2.5, 2.0, 2.0, 2.0)
-# How far the lower row may be from a usual bite. All are looked at, the best few aligned.
-_ASIDE_MM, _UP_MM, _AHEAD_MM = (-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-4.0, -2.0, 0.0, 2.0, 4.0)
-_SLIDES = 4
-_MISFIT_GATE_MM = 1.5
 
 
 @dataclass(frozen=True, eq=False)

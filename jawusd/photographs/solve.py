@@ -21,6 +21,24 @@ from jawusd.tracking.initialization.occlusion import crown_surface
 #: the focal length the distance changes so that the teeth stay as large: large steps of it are then harmless.
 UNKNOWNS = 8
 
+# How far apart or into one another the nearest parts of two scanned rows are when the teeth are together [mm].
+_SIGMA_MM = 0.15
+_SHARE = 0.04  # of the lower crowns on a side: what touches there
+_REACH_MM = 3.0  # farther inside, a point is past the base of a crown
+# What is known beforehand, with standard deviations: telephones are held 80 to 200 mm from the teeth, macro lenses 200
+# to 400 [log]; distortion [-].
+_DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02
+# One camera takes all photographs; what focusing does to its focal length [log].
+_LOG_FOCAL = 0.05
+# How far a usual bite is off [rad, mm]; about the centre of the lower teeth.
+_BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)
+# Standard deviation of a step [rad, mm, log, -]: damps directions that lines do not show.
+_LARGEST_STEP = np.array([0.1] * 3 + [3.0, 3.0, 30.0] + [0.2, 0.02])
+# By how much a drawn line is off, where teeth end and along the gum, and a stretch of it that is off alike.
+_LINE_MM, _GUM_LINE_MM, _STRETCH_MM = 0.15, 0.3, 2.0
+_GUM_MM = 0.5  # how far scans' crowns reach less far than crowns in pictures, or farther
+_SHARED = 8  # unknowns of all photographs: twist of the bite about the centre of the lower teeth, gum lines
+
 
 @dataclass(frozen=True, eq=False)
 class PhotoPose:
@@ -88,12 +106,6 @@ def _radius2(flat: Array, size_px: tuple[int, int]) -> Array:
     return np.asarray((flat**2).sum(1) / (0.5 * size_px[0]) ** 2, np.float64)
 
 
-# How far apart or into one another the nearest parts of two scanned rows are when the teeth are together [mm].
-_SIGMA_MM = 0.15
-_SHARE = 0.04  # of the lower crowns on a side: what touches there
-_REACH_MM = 3.0  # farther inside, a point is past the base of a crown
-
-
 class Contact:
     """Draw both rows together until they touch on the left and on the right."""
 
@@ -134,21 +146,6 @@ class Contact:
         # Close by, the plane is a better surface than its nearest piece.
         away = np.where(distance < 1.0, behind, np.where(inside, -distance, distance))
         return away, normals
-
-
-# What is known beforehand, with standard deviations: telephones are held 80 to 200 mm from the teeth, macro lenses 200
-# to 400 [log]; distortion [-].
-_DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02
-# One camera takes all photographs; what focusing does to its focal length [log].
-_LOG_FOCAL = 0.05
-# How far a usual bite is off [rad, mm]; about the centre of the lower teeth.
-_BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)
-# Standard deviation of a step [rad, mm, log, -]: damps directions that lines do not show.
-_LARGEST_STEP = np.array([0.1] * 3 + [3.0, 3.0, 30.0] + [0.2, 0.02])
-# By how much a drawn line is off, where teeth end and along the gum, and a stretch of it that is off alike.
-_LINE_MM, _GUM_LINE_MM, _STRETCH_MM = 0.15, 0.3, 2.0
-_GUM_MM = 0.5  # how far scans' crowns reach less far than crowns in pictures, or farther
-_SHARED = 8  # unknowns of all photographs: twist of the bite about the centre of the lower teeth, gum lines
 
 
 @dataclass(frozen=True, eq=False)

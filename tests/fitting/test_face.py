@@ -81,5 +81,5 @@ def test_a_mapping_no_better_than_shares_is_refused(take):
     d = rig.denormalized(np.column_stack([shares[:, :2], np.maximum(shares[:, 2], 0)]))
     opening, side, forward = rig.normalized(d).T
     weights = np.stack([opening, np.maximum(side, 0), np.maximum(-side, 0), forward], axis=1)
-    with pytest.raises(FittingError, match="would not help"):
+    with pytest.raises(FittingError, match="would not be an improvement"):
         fit_arkit(rig, FaceCapture(np.arange(len(d)) * 1.0, weights, JAW_FPS, ""), times, d, 0.0)

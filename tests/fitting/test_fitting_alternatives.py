@@ -211,7 +211,7 @@ def test_paper_model_rests_at_the_closed_bite(published):
 
 def test_a_component_that_collapsed_is_named():
     still = lambda t: (np.zeros((len(t), 6)), np.zeros((len(t), 6)))  # noqa: E731
-    with pytest.raises(FittingError, match="moves nothing"):
+    with pytest.raises(FittingError, match="curve moves the incisal point by"):
         in_millimetres(still, (-1.0, 1.0), np.eye(6), np.array([0.0, -30.0, 80.0]), 1)
 
 

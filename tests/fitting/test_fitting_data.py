@@ -101,14 +101,14 @@ def test_motion_starts_at_the_closed_bite_in_anatomical_axes(person):
 
 def test_unusable_poses_are_refused_by_name(take, anatomy):
     frames = np.arange(len(take))
-    with pytest.raises(FittingError, match="14 usable poses, at least 15"):
+    with pytest.raises(FittingError, match="14 poses are usable, at least 15"):
         select_poses(frames[:14], take[:14], anatomy)
     scaled = take.copy()
     scaled[5, :3, :3] *= 1.05
     with pytest.raises(FittingError, match="frame 5 is not rigid"):
         select_poses(frames, scaled, anatomy)
     jitter = se3_exp(np.random.default_rng(3).normal(size=(100, 6)) * [1e-4, 1e-4, 1e-4, 0.02, 0.02, 0.02])
-    with pytest.raises(FittingError, match="all alike"):
+    with pytest.raises(FittingError, match="hardly differ"):
         select_poses(frames[:100], take[50] @ jitter, anatomy)
     with pytest.raises(ValueError, match="poses must have shape"):
         select_poses(frames, take[:, :3], anatomy)

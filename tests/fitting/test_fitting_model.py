@@ -241,5 +241,5 @@ def test_senseless_configuration_is_refused(change):
 def test_wrong_shapes_are_refused(person, take):
     with pytest.raises(ValueError, match="landmarks"):
         fit(person, take, landmarks=person.landmarks[:4])
-    with pytest.raises(FittingError, match="usable poses"):
+    with pytest.raises(FittingError, match="poses are usable"):
         fit(person, take[:10])

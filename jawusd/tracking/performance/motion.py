@@ -20,6 +20,19 @@ _MISS = np.r_[[0.01] * 3, [0.7] * 3, [0.7] * 3]
 STEADY, KNOWN = 0.05, 1e-4
 _DAMPING = 0.8  # of the velocity: a stroke ends sooner than it goes on
 
+# Variance of the prior over the mean square of what was seen [-]: motion is even most of the time and jerky where it
+# counts. 1, 3 and 9 are alike within a twentieth for one camera, and too stiff a prior costs most.
+_LOOSE = 4.0
+# Least variances of second differences [rad, mm]: a head that rests still trembles.
+_LEAST_HEAD = np.r_[[1e-4] * 3, [0.01] * 3] ** 2
+_LEAST_JAW = np.full(3, 0.02**2)
+_FEWEST_BENDS = 20  # second differences that tell how a jaw moves
+_USUAL_JAW = np.array([0.3, 0.2, 0.1]) ** 2  # without them: exercises at 24 frames a second [mm]
+_USUAL_HEAD = np.r_[[1e-3] * 3, [0.1] * 3] ** 2
+_OUTLIERS = 99.0  # percentile of the second differences beyond which frames were left out between them
+# Variance of second and of fourth differences of noise over that of the noise.
+_NOISE_BEND, _NOISE_FOURTH = 6.0, 70.0
+
 
 class Prediction:
     """Extrapolate the motion of head and jaw with a damped velocity.
@@ -53,20 +66,6 @@ class Prediction:
         self._velocity = moved if found.all() and not self.blind.any() else np.zeros(LOCAL)
         self.blind = np.where(found, 0, self.blind + 1)
         self.last = pose
-
-
-# Variance of the prior over the mean square of what was seen [-]: motion is even most of the time and jerky where it
-# counts. 1, 3 and 9 are alike within a twentieth for one camera, and too stiff a prior costs most.
-_LOOSE = 4.0
-# Least variances of second differences [rad, mm]: a head that rests still trembles.
-_LEAST_HEAD = np.r_[[1e-4] * 3, [0.01] * 3] ** 2
-_LEAST_JAW = np.full(3, 0.02**2)
-_FEWEST_BENDS = 20  # second differences that tell how a jaw moves
-_USUAL_JAW = np.array([0.3, 0.2, 0.1]) ** 2  # without them: exercises at 24 frames a second [mm]
-_USUAL_HEAD = np.r_[[1e-3] * 3, [0.1] * 3] ** 2
-_OUTLIERS = 99.0  # percentile of the second differences beyond which frames were left out between them
-# Variance of second and of fourth differences of noise over that of the noise.
-_NOISE_BEND, _NOISE_FOURTH = 6.0, 70.0
 
 
 @dataclass(frozen=True, eq=False)

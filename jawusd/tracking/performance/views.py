@@ -17,6 +17,9 @@ from jawusd.tracking.contour.views import View
 
 _FAST = 1  # zlib level: masks shrink to a fiftieth at once
 
+#: What is known of the logarithm of an unknown focal length, standard deviation [-]: a guess from the kind of lens.
+PRIOR_LOG_FOCAL = 0.1
+
 
 class Views(Protocol):
     """Show the teeth in all cameras at instants of the reference camera, as `MaskViews` does."""
@@ -58,10 +61,6 @@ class KeptViews:
             self._kept[frame] = [_Kept.of(view) for view in views]
             return views
         return [kept.unpacked() for kept in self._kept[frame]]
-
-
-#: What is known of the logarithm of an unknown focal length, standard deviation [-]: a guess from the kind of lens.
-PRIOR_LOG_FOCAL = 0.1
 
 
 @dataclass(frozen=True, eq=False)

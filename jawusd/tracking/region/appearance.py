@@ -22,6 +22,13 @@ from jawusd.tracking.region.view import Counts, RegionView
 # Areas that teach the first colours [px]: inside crowns, outside of them, ring around them, beyond all.
 _INSIDE_PX, _OUTSIDE_PX, _RING_PX, _BEYOND_PX = 2.0, 3.0, 30.0, 4.0
 
+#: At which colours of teeth and of surroundings are taken up: usually, and on the first frame.
+RATES, FIRST_RATES = (0.1, 0.2), (0.5, 0.5)
+_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # at which the place of the gum line is taken up [-], and its bound
+#: Contour length over which borders of colours err alike: lips and shadows move those of whole teeth [px]. With the
+# length of drawn masks, 18, the NEES of the relative pose was 3.8 and 9.4 on a path-traced and a rasterised take.
+CORRELATION_PX = 110.0
+
 
 class Picture(NamedTuple):
     """Hold a part of an undistorted picture around the teeth."""
@@ -47,14 +54,6 @@ def first_colours(picture: Picture, poses: Array, scans: Sequence[Scan]) -> Came
     outside = to_crown > _OUTSIDE_PX
     near = outside & (to_crown < _RING_PX)
     return CameraColours(colour_bins(picture.rgb), Areas(inside, near, near & gum, to_any > _BEYOND_PX))
-
-
-#: At which colours of teeth and of surroundings are taken up: usually, and on the first frame.
-RATES, FIRST_RATES = (0.1, 0.2), (0.5, 0.5)
-_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # at which the place of the gum line is taken up [-], and its bound
-#: Contour length over which borders of colours err alike: lips and shadows move those of whole teeth [px]. With the
-# length of drawn masks, 18, the NEES of the relative pose was 3.8 and 9.4 on a path-traced and a rasterised take.
-CORRELATION_PX = 110.0
 
 
 class LearnedColours:

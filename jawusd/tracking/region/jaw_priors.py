@@ -38,6 +38,10 @@ _NEWS = 0.1  # share of a frame that neighbouring frames do not already give
 _BACK = 0.25, 0.005  # way back of an incisal point that goes down, per mm and per mm^2: a mean of the same joints
 _DOUBT = 4.0  # squared distance per coordinate from which frames teach less: they may be wrong [-]
 
+# How far points of the lower teeth lie above the closed bite of the scans, standard deviation [mm]: what registrations
+# of bites are off by. Squared distance in these [-] from which the scans' bite rather than the pose may be wrong.
+_ABOVE_MM, _BITE_DOUBT = 0.2, 4.0
+
 
 class CondyleMotion:
     """Learn where both condyles are for every place of the incisal point.
@@ -142,11 +146,6 @@ def _features(incisor: Array) -> tuple[Array, Array]:
     i, j = np.triu_indices(3)
     products = x[i, None] * unit[j] + x[j, None] * unit[i]
     return np.concatenate([[1.0], x, x[i] * x[j]]), np.concatenate([np.zeros((1, 3)), unit, products])
-
-
-# How far points of the lower teeth lie above the closed bite of the scans, standard deviation [mm]: what registrations
-# of bites are off by. Squared distance in these [-] from which the scans' bite rather than the pose may be wrong.
-_ABOVE_MM, _BITE_DOUBT = 0.2, 4.0
 
 
 @dataclass(frozen=True, eq=False)

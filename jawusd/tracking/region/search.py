@@ -43,6 +43,22 @@ _SHIFTS_MM = [
     *((0.0, far, 0.0) for far in _FAR_MM),
 ]
 
+# Gates of an alignment from the prediction, from farther, of the brief trial of a start, and with all faces at last;
+# distance of contour samples, motion that redraws scans [px].
+_NEAR_GATES_PX, _FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
+_TRIAL_GATES_PX, _LAST_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
+_FACES = 6_000  # of the crowns until the last steps: with no more at all, incisal points were 0.02 mm worse
+# Variance of borders times the length over which they err alike, against which expected condyles are weighed [px^3]:
+# where the jaw is well seen, and in doubtful frames. With the greater one everywhere, the incisal points of two takes
+# were 0.006 mm worse; with the lesser one a jaw drifted whose edges front teeth and lips hid.
+_LOOSE_PX3, _FIRM_PX3 = 3.0, 15.0
+_BORDER_PX3 = 0.7**2 * CORRELATION_PX  # the same as residuals show it
+# Contour that fits worth as much as a standard deviation squared of the condyles [px]: a sample beyond the gate costs
+# Tukey's loss of 4.685^2 / 6, and samples err alike over the length above.
+_STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
+_FAST_MM = 1.0  # predicted motion from which other starts are tried
+_HOPEFUL, _FINALISTS = 24, 3  # starts of a search that are tried, and that are followed to the end
+
 
 def head_shifts(T_world_head: Array, axes: Array) -> Array:
     """Return motions of the head in the world, shape (N, 4, 4); `axes` rotate from scan to left, up, front (3, 3)."""
@@ -86,23 +102,6 @@ def likeliest(
             inside = (x >= 0) & (y >= 0) & (x < like.shape[1]) & (y < like.shape[0])
             worth[k] += float(like[y[inside], x[inside]].sum())
     return [int(k) for k in np.argsort(-worth, kind="stable")]
-
-
-# Gates of an alignment from the prediction, from farther, of the brief trial of a start, and with all faces at last;
-# distance of contour samples, motion that redraws scans [px].
-_NEAR_GATES_PX, _FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
-_TRIAL_GATES_PX, _LAST_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
-_FACES = 6_000  # of the crowns until the last steps: with no more at all, incisal points were 0.02 mm worse
-# Variance of borders times the length over which they err alike, against which expected condyles are weighed [px^3]:
-# where the jaw is well seen, and in doubtful frames. With the greater one everywhere, the incisal points of two takes
-# were 0.006 mm worse; with the lesser one a jaw drifted whose edges front teeth and lips hid.
-_LOOSE_PX3, _FIRM_PX3 = 3.0, 15.0
-_BORDER_PX3 = 0.7**2 * CORRELATION_PX  # the same as residuals show it
-# Contour that fits worth as much as a standard deviation squared of the condyles [px]: a sample beyond the gate costs
-# Tukey's loss of 4.685^2 / 6, and samples err alike over the length above.
-_STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
-_FAST_MM = 1.0  # predicted motion from which other starts are tried
-_HOPEFUL, _FINALISTS = 24, 3  # starts of a search that are tried, and that are followed to the end
 
 
 class Look(NamedTuple):

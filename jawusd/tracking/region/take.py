@@ -38,6 +38,11 @@ _LEAST_SHARE = 0.3
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 _MOST = 0.6  # share of frames; a run of good frames this long suggests trimming the ends of the take
 
+#: How borders of colours lie beside the teeth's edges: up to half a pixel inside, as teeth darken towards them; where
+#: the gum line is found was learned on the way.
+BORDERS = AnnotatorPrior(edge_px=0.3, gum_px=0.08, gum_mm=0.02, arch_px=0.25, arch_mm=0.01, camera_px=0.08, frames=5.0)
+FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)
+
 
 def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list[Finding]:
     """Return a warning for each camera whose pictures fit the teeth far less than those of the others.
@@ -125,12 +130,6 @@ def footage_doubts(tracks: Tracks) -> list[Finding]:
         hint = f"If the others are dark, as in light flashes, write frames = {kept} in capture.toml. {hint}"
     value, limit = round(100 * share, 1), 100 * _FEW
     return [Finding("footage_doubtful", "warning", message, value, limit, frame=int(tracks.frames[worst]), hint=hint)]
-
-
-#: How borders of colours lie beside the teeth's edges: up to half a pixel inside, as teeth darken towards them; where
-#: the gum line is found was learned on the way.
-BORDERS = AnnotatorPrior(edge_px=0.3, gum_px=0.08, gum_mm=0.02, arch_px=0.25, arch_mm=0.01, camera_px=0.08, frames=5.0)
-FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)
 
 
 @dataclass(frozen=True, eq=False)

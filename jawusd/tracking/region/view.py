@@ -21,6 +21,20 @@ from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
 
 _AHEAD_PX = 2.0  # outside of a crown's silhouette, where it is looked whether gum lies behind
 
+_SHUTTER = 0.5  # share of a frame's time that it is exposed: unknown, usual for film
+# Motion during the exposure at which a border counts half in the last look [px]: what is measured of a ramp of light is
+# the less sure the longer it is, in variance as the square. Chosen on two path-traced mouths, two others were seen;
+# NEES of all four 0.74, 0.35, 0.77, 0.31, without it 1.54, 0.44, 1.04, 0.40. Looks before the last tell by the share
+# of the contour that fits whether teeth are lost, which fast ones are not.
+_BLURRED_PX = 10.0
+_LEARNED_PX = (2, 7)  # distances from borders between which colours are learned
+# Of the place of the gum line: least weight of a border [-], farthest [px], fewest samples.
+_SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
+_CLEAR_RATIO = 1.0  # mean log ratio on both sides from which a border counts in full [-]
+_SHARPEN_PX = 5.0  # reach from which on borders are refined by colour
+_CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # of colours half way [8-bit steps], [px]
+_CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
+
 
 @numba.njit(nogil=True, cache=True)
 def choose_tables(
@@ -70,21 +84,6 @@ def measure_blur(samples: Array, before: Array, shutter: float, out: Array) -> N
         u = (before[0, 0] * x + before[0, 1] * y + before[0, 2] * z + before[0, 3]) / w
         v = (before[1, 0] * x + before[1, 1] * y + before[1, 2] * z + before[1, 3]) / w
         out[s] = shutter * abs((sample[U] - u) * sample[NX] + (sample[V] - v) * sample[NY])
-
-
-_SHUTTER = 0.5  # share of a frame's time that it is exposed: unknown, usual for film
-# Motion during the exposure at which a border counts half in the last look [px]: what is measured of a ramp of light is
-# the less sure the longer it is, in variance as the square. Chosen on two path-traced mouths, two others were seen;
-# NEES of all four 0.74, 0.35, 0.77, 0.31, without it 1.54, 0.44, 1.04, 0.40. Looks before the last tell by the share
-# of the contour that fits whether teeth are lost, which fast ones are not.
-_BLURRED_PX = 10.0
-_LEARNED_PX = (2, 7)  # distances from borders between which colours are learned
-# Of the place of the gum line: least weight of a border [-], farthest [px], fewest samples.
-_SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
-_CLEAR_RATIO = 1.0  # mean log ratio on both sides from which a border counts in full [-]
-_SHARPEN_PX = 5.0  # reach from which on borders are refined by colour
-_CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # of colours half way [8-bit steps], [px]
-_CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
 
 
 @dataclass(frozen=True, eq=False)
