@@ -1,6 +1,6 @@
-"""The bite from photographs of closed teeth, taken with uncalibrated cameras.
+"""The bite estimated from photographs of closed teeth taken with an uncalibrated camera.
 
-Uses the contours of `tracking`; nothing but `pipeline` imports it.
+Uses scans and contours of `tracking`. Imported by `pipeline` alone; must not import other stages.
 """
 
 from jawusd.photographs.align import PhotoAlignment, align_photographs

@@ -1,4 +1,4 @@
-"""Photographs of teeth that are together: pose and focal length of each, and the bite that they share."""
+"""Photographs of closed teeth: pose and focal length of each one, and the bite they share."""
 
 from __future__ import annotations
 
@@ -13,45 +13,42 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.photographs import AlignedPhoto, AlignedPhotos
 from jawusd.geometry import transform_point, transform_points
 from jawusd.photographs.drawing import Drawing
-from jawusd.photographs.search import Found, Rows, find_first, find_next, usual_bites
+from jawusd.photographs.search import ArchPair, PhotoStart, find_first, find_next, typical_bites
 from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, match, middle_of, seen_outlines
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan, prepare_scan
 
-# Sizes at which all photographs are aligned together, with the gates of the steps [mm].
+# Resolutions of the coarse-to-fine alignment, with the gates of its steps [mm].
 _STAGES = (
     (0.25, (3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 2.0, 2.0)),
     (0.5, (2.0, 2.0, 1.5, 1.5, 1.2, 1.2, 1.0, 1.0)),
     (1.0, (1.0,) * 8),
 )
-_AT_WIDTH_PX = 1440.0  # figures in px are for pictures of this width
-_TURN_PX = 10.0  # at that width: outlines across a line are not its own
-_CLEAR_MISFIT = 0.2  # a first photograph below this is not searched for among the others
-# Misfit of lines at half a millimetre beyond which crowns are not those of a picture: 0.28 to 0.36 with the right ones
-# of two patients (six photographs, none refused), 0.55 to 0.70 with those of the other one (six photographs). Front
-# views alone of a synthetic person: 0.08 to 0.10, with the crowns of four others 0.32 to 0.56.
-_GATE_MM, _MOST_MISFIT = 0.5, 0.45
-_SAME_HAND = 1.15  # ratio of the misfits of both handednesses below which they cannot be told apart
-_APART_MM = 1.5
+_AT_WIDTH_PX = 1440.0  # reference width; distances in px are scaled to it
+_TURN_PX = 10.0  # penalty for a difference in direction when lines are matched to outlines, at that width
+_CLEAR_MISFIT = 0.2  # a photograph with a smaller misfit is accepted as the first one
+_GATE_MM, _MOST_MISFIT = 0.5, 0.45  # gate of the final misfit, and misfit above which the scans are another person's
+_SAME_HAND = 1.15  # ratio of the misfits, mirrored to not mirrored, below which the choice is ambiguous
+_APART_MM = 1.5  # largest plausible distance between the bites of single photographs and of all
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoAlignment:
-    """Hold what photographs tell, and what draws it."""
+    """Result of an alignment, with the data needed to draw it."""
 
     result: AlignedPhotos
-    bite: Bite  # poses at the size of the pictures
-    rows: Rows
+    bite: Bite  # poses at the full size of the photographs
+    rows: ArchPair
 
 
 def align_photographs(
     drawings: Sequence[Drawing], meshes: Sequence[Mesh], progress: Callable[[str, int, int], None]
 ) -> PhotoAlignment:
-    """Align both rows of teeth with lines drawn in photographs of one bite, taken with one uncalibrated camera.
+    """Align both arches with lines drawn in photographs of one bite, taken with one uncalibrated camera.
 
     Args:
-        drawings: the lines of each photograph; names differ.
-        meshes: upper and lower scan, each in any frame of its own [mm].
-        progress: called with a stage, how much of it is done, and how much there is.
+        drawings: lines of each photograph; names must be unique.
+        meshes: upper and lower scan, each in an arbitrary frame [mm].
+        progress: called with the stage, the number of photographs done, and the total.
 
     Raises:
         TrackingError: a scan has too few faces.
@@ -73,10 +70,10 @@ def align_photographs(
 
 def _starts(
     drawings: Sequence[Drawing], scans: Sequence[Scan], contact: Contact, progress: Callable[[str, int, int], None]
-) -> list[Found]:
-    """Return how each photograph begins: one without knowing the bite, the others from its bite."""
-    usual = usual_bites(scans)
-    leads: list[tuple[int, Found]] = []
+) -> list[PhotoStart]:
+    """Return the start of each photograph: one is found for an unknown bite, the others with its bite."""
+    usual = typical_bites(scans)
+    leads: list[tuple[int, PhotoStart]] = []
     for k, drawing in enumerate(drawings):
         progress("search", k, len(drawings))
         leads.append((k, find_first(drawing, scans, usual, contact)))
@@ -91,8 +88,8 @@ def _starts(
     return starts
 
 
-def _refined(bite: Bite, lines: Sequence[Drawing], rows: Rows, contact: Contact) -> Bite:
-    """Return photographs and bite aligned at growing sizes."""
+def _refined(bite: Bite, lines: Sequence[Drawing], rows: ArchPair, contact: Contact) -> Bite:
+    """Return photographs and bite, aligned coarse to fine."""
     for share, gates in _STAGES:
         photos = []
         for photo, own in zip(bite.photos, lines, strict=True):
@@ -109,8 +106,8 @@ def _refined(bite: Bite, lines: Sequence[Drawing], rows: Rows, contact: Contact)
     return Bite(tuple(photos), bite.T_upper_lower, bite.gum_mm)
 
 
-def _together(alone: Sequence[Bite], lines: Sequence[Drawing], rows: Rows, contact: Contact) -> Bite:
-    """Return all photographs with one bite, begun from the bite of each one, the best."""
+def _together(alone: Sequence[Bite], lines: Sequence[Drawing], rows: ArchPair, contact: Contact) -> Bite:
+    """Return all photographs aligned to one bite, the best result over starts from each single bite."""
     if len(alone) == 1:
         return alone[0]
     photos = tuple(bite.photos[0] for bite in alone)
@@ -122,8 +119,10 @@ def _together(alone: Sequence[Bite], lines: Sequence[Drawing], rows: Rows, conta
     return min(tried, key=lambda entry: entry[0])[1]
 
 
-def _result(joint: Bite, alone: Sequence[Bite], starts: Sequence[Found], rows: Rows, contact: Contact) -> AlignedPhotos:
-    """Return the figures of an alignment."""
+def _result(
+    joint: Bite, alone: Sequence[Bite], starts: Sequence[PhotoStart], rows: ArchPair, contact: Contact
+) -> AlignedPhotos:
+    """Return the numeric results of an alignment."""
     point = _lower_incisor(rows)
     misfits = Aligner(rows.fine, rows.usual.T_upper_lower, None).misfit(joint, _GATE_MM).max(1)
     photos = []
@@ -152,15 +151,15 @@ def _result(joint: Bite, alone: Sequence[Bite], starts: Sequence[Found], rows: R
     return AlignedPhotos(joint.T_upper_lower, joint.gum_mm, depth, tuple(photos), _findings(photos))
 
 
-def _line_distances(photo: Photo, joint: Bite, rows: Rows) -> tuple[Array, Array]:
-    """Return distances of all drawn points from outlines, and of those not along the gum [px of 1440], (N,), (M,)."""
+def _line_distances(photo: Photo, joint: Bite, rows: ArchPair) -> tuple[Array, Array]:
+    """Return the distances from outlines of all drawn points (N,) and of those off the gum line (M,) [px of 1440]."""
     to_usual = _AT_WIDTH_PX / photo.drawing.size_px[0]
     found = match(seen_outlines(rows.fine, photo, joint), photo.drawing, _TURN_PX / to_usual)
     distance = to_usual * np.linalg.norm(found.outlines.pixels - photo.drawing.pixels, axis=1)
     return distance, distance[found.outlines.gum < 0.5]
 
 
-def _lower_incisor(rows: Rows) -> Array:
+def _lower_incisor(rows: ArchPair) -> Array:
     """Return the highest point of the lower front teeth, scan coordinates [mm], shape (3,)."""
     points = rows.fine[1].scan.crown_vertices()
     _, up, front = transform_points(rows.usual.T_anatomical_lower, points).T
@@ -169,24 +168,24 @@ def _lower_incisor(rows: Rows) -> Array:
 
 
 def _findings(photos: Sequence[AlignedPhoto]) -> tuple[Finding, ...]:
-    """Return what is doubtful about an alignment."""
+    """Return the findings about an alignment."""
     out = []
     for photo in photos:
         if photo.misfit > _MOST_MISFIT:
-            message = f"the crowns do not fit its lines (misfit {photo.misfit:.2f}, allowed {_MOST_MISFIT})"
-            hint = "Check that the scans are this person's and unchanged since, and that the teeth are together."
+            message = f"the crowns do not fit the drawn lines (misfit {photo.misfit:.2f}, allowed {_MOST_MISFIT})"
+            hint = "Check that the scans are of this person and up to date, and that the teeth are closed."
             out.append(
                 Finding("photo_unfit", "error", message, photo.misfit, _MOST_MISFIT, camera=photo.name, hint=hint)
             )
         elif photo.other_hand < _SAME_HAND:
-            message = f"it fits about as well if it is {'not ' if photo.mirrored else ''}mirrored"
+            message = f"it fits about equally well {'un' if photo.mirrored else ''}mirrored"
             out.append(Finding("photo_hand", "warning", message, photo.other_hand, _SAME_HAND, camera=photo.name))
         if photo.alone_off_mm > _APART_MM:
             message = (
-                f"alone it places the lower incisor {photo.alone_off_mm:.1f} mm from where all photographs do "
+                f"alone it places the lower incisor {photo.alone_off_mm:.1f} mm from the joint result "
                 f"(allowed {_APART_MM} mm)"
             )
-            hint = "One view tells little along its line of sight; other bites in other photographs do as much."
+            hint = "A single view is inaccurate along its line of sight; photographs of different bites also disagree."
             out.append(
                 Finding("photo_bite", "warning", message, photo.alone_off_mm, _APART_MM, camera=photo.name, hint=hint)
             )

@@ -1,4 +1,4 @@
-"""Crowns tooth by tooth: their pictures, and the outlines that a photograph would show of them."""
+"""Crowns split into teeth: their renderings, and the outlines visible in a photograph."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from jawusd.geometry import transform_points
 from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.tracking.contour.scan import Faces, Scan
 
-_FEWEST_FACES = 50  # pieces with fewer faces are crumbs of the scan
-_MOST_TEETH = 120  # per arch: labels of both arches are bytes
-# The wall in place of gum: parts along the row, where on the height of the crowns it begins [-], how high it is [mm].
+_FEWEST_FACES = 50  # smaller pieces are scan debris
+_MOST_TEETH = 120  # per arch, as labels of both arches share one byte
+# Substitute wall for missing gum: segments along the arch, start as a share of the crown height [-], height [mm].
 _WALL_PARTS, _WALL_FROM, _WALL_MM = 24, 0.75, 15.0
-_SMOOTH_PX = 2.0  # over which the direction of an outline is averaged
+_SMOOTH_PX = 2.0  # Gaussian over which the direction of an outline is averaged
 
 
 @dataclass(frozen=True, eq=False)
 class Crowns:
-    """Hold one arch as separate pieces: teeth where the scan has them apart, else the whole row."""
+    """One arch split into pieces: single teeth where the scan separates them, otherwise the whole arch."""
 
     scan: Scan
     teeth: tuple[Faces, ...]  # crown faces of every piece, each of shape (F, 3)
@@ -34,15 +34,15 @@ class Crowns:
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """Hold points on the visible outlines of all teeth in one picture.
+    """Points on the visible outlines of all teeth in one image.
 
     Attributes:
         points: on the crowns, scan coordinates of their own arch [mm], shape (N, 3).
         arch: 0 upper, 1 lower, shape (N,).
-        tooth: number of the piece, counted through both arches from 1, shape (N,).
-        pixels: where they are in the picture [px], shape (N, 2).
-        normals: unit vectors out of the tooth in the picture, shape (N, 2).
-        gum: 1 where the outline faces its gum, 0 from a right angle on [-], shape (N,).
+        tooth: number of the piece, from 1, continuing from the upper to the lower arch, shape (N,).
+        pixels: image positions [px], shape (N, 2).
+        normals: unit vectors out of the tooth in the image, shape (N, 2).
+        gum: 1 where the outline faces its gum, decreasing to 0 at a right angle [-], shape (N,).
     """
 
     points: Array
@@ -53,7 +53,7 @@ class Outlines:
     gum: Array
 
     def take(self, index: NDArray[np.int64]) -> Outlines:
-        """Return some of the points, which may repeat."""
+        """Return the points at some indices, which may repeat."""
         return Outlines(
             self.points[index],
             self.arch[index],
@@ -65,9 +65,9 @@ class Outlines:
 
 
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
-    """Return the crowns of a scan as connected pieces, with a wall in place of gum where the scan has none.
+    """Return the crowns of a scan as connected pieces, with a substitute wall if the scan has no gum.
 
-    Without it, teeth of the far side would be seen where gum hides them.
+    Without the wall, teeth of the far side would be visible where gum hides them.
 
     Args:
         scan: one arch.
@@ -87,10 +87,10 @@ def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
 
 
 def _with_wall(scan: Scan, T_anatomical_scan: Array, to_gum: Array) -> Scan:
-    """Return the scan with a wall of gum that stands on the middle of its row of teeth."""
+    """Return the scan with a wall of gum along the middle of its arch."""
     points = scan.crown_vertices()
     flat = transform_points(T_anatomical_scan, points)
-    # Seen from amid the arch, teeth follow one another by angle.
+    # Seen from inside the arch, teeth are ordered by angle.
     angle = np.arctan2(flat[:, 0] - np.median(flat[:, 0]), flat[:, 2] - np.percentile(flat[:, 2], 25))
     bins = np.digitize(angle, np.linspace(angle.min(), angle.max(), _WALL_PARTS + 1)[1:-1])
     height = points @ to_gum
@@ -113,11 +113,11 @@ def _with_wall(scan: Scan, T_anatomical_scan: Array, to_gum: Array) -> Scan:
 def draw_teeth(
     crowns: Sequence[Crowns], matrices: Sequence[Array], shape: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return inverse depth [1/mm] and the number of the tooth seen (0: none) at every pixel, shape (h, w) each.
+    """Return the inverse depth [1/mm] and the number of the visible tooth (0: none) per pixel, shape (h, w) each.
 
     Args:
         crowns, matrices: upper and lower, with their projections from scan [mm] to homogeneous px, shape (3, 4).
-        shape: height and width of the picture [px].
+        shape: height and width of the image [px].
     """
     depth, labels = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
     number = 0
@@ -134,7 +134,7 @@ def draw_teeth(
 def outlines_of(
     crowns: Sequence[Crowns], matrices: Sequence[Array], depth: NDArray[np.float32], labels: NDArray[np.uint8]
 ) -> Outlines:
-    """Return where teeth end in a picture drawn by `draw_teeth`: between pixels, on the tooth that is in front."""
+    """Return the outlines of teeth rendered by `draw_teeth`: between pixels, assigned to the tooth in front."""
     found = [_ends(depth, labels), _ends(depth.T, labels.T)]
     (x, y, inside_x, inside_y), (y2, x2, inside_y2, inside_x2) = found
     pixels = np.column_stack([np.r_[x, x2], np.r_[y, y2]])
@@ -159,17 +159,17 @@ def outlines_of(
 
 
 def _ends(depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[Array, Array, Array, Array]:
-    """Return where teeth end along rows: column and row of the end, column and row of the pixel on the tooth."""
+    """Return the ends of teeth along pixel rows: column and row of the end, column and row of its tooth pixel."""
     rows, columns = np.nonzero(labels[:, 1:] != labels[:, :-1])
     right_is_near = depth[rows, columns + 1] > depth[rows, columns]
-    # Gum in front has number 0: what ends there is the tooth behind it.
+    # Gum in front has number 0; the outline belongs to the tooth behind it.
     right_is_near = np.where(labels[rows, columns] == 0, True, right_is_near & (labels[rows, columns + 1] > 0))
     row = rows.astype(np.float64)
     return np.asarray(columns + 0.5, np.float64), row, (columns + right_is_near).astype(np.float64), row
 
 
 def _outward(tooth: NDArray[np.bool_], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Array:
-    """Return unit vectors out of a tooth (h, w) at pixels, (x, y), shape (N, 2); 0 where none is clear."""
+    """Return unit vectors (x, y) out of a tooth mask (h, w) at pixels, shape (N, 2); 0 where ambiguous."""
     reach = int(4 * _SMOOTH_PX)
     top, left = max(0, rows.min() - reach), max(0, columns.min() - reach)
     part = tooth[top : rows.max() + reach + 1, left : columns.max() + reach + 1].astype(np.float32)

@@ -1,4 +1,4 @@
-"""Lines that somebody drew along the teeth of a photograph, as points with directions."""
+"""Lines drawn by hand along the teeth in a photograph, as points with directions."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 
-_WIDTH_PX = 1.8  # Gaussian that makes lines a few pixels wide one ridge
-_FAINT = 0.12  # share of the strongest ridges below which there is no line
-_SHORTEST_PX = 60  # strokes that are shorter and touch no other line are slips of the pen
+_WIDTH_PX = 1.8  # Gaussian that turns lines a few pixels wide into a single ridge
+_FAINT = 0.12  # threshold of the ridge strength, relative to the strongest ridges
+_SHORTEST_PX = 60  # shorter isolated strokes are ignored
 _FEWEST_POINTS = 300
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """Hold the lines drawn in one picture.
+    """Lines drawn in one photograph.
 
     Attributes:
         name: of the photograph, for messages.
-        pixels: points of the lines about a pixel apart [px], shape (N, 2).
-        normals: unit vectors across the lines, of either sign, shape (N, 2).
-        size_px: width and height of the picture.
+        pixels: points on the lines, about a pixel apart [px], shape (N, 2).
+        normals: unit vectors across the lines, of arbitrary sign, shape (N, 2).
+        size_px: width and height of the image.
     """
 
     name: str
@@ -35,12 +35,12 @@ class Drawing:
     size_px: tuple[int, int]
 
     def mirrored(self) -> Drawing:
-        """Return the drawing as seen in a mirror, left and right exchanged."""
+        """Return the drawing with left and right mirrored."""
         flip = np.array([-1.0, 1.0])
         return Drawing(self.name, self.pixels * flip + [self.size_px[0] - 1.0, 0.0], self.normals * flip, self.size_px)
 
     def shrunk(self, factor: float) -> Drawing:
-        """Return the drawing smaller by a factor, with fewer points."""
+        """Return the drawing downscaled by a factor, with fewer points."""
         size = (max(1, round(self.size_px[0] * factor)), max(1, round(self.size_px[1] * factor)))
         every = slice(None, None, max(1, round(1.0 / factor)))
         pixels = (self.pixels[every] + 0.5) * factor - 0.5
@@ -48,13 +48,13 @@ class Drawing:
 
 
 def read_lines(picture: NDArray[np.uint8], name: str) -> Drawing:
-    """Return the middles of the bright lines of a gray picture (h, w).
+    """Return the centrelines of bright lines in a grey image (h, w).
 
-    A line is where the smoothed picture has its maximum across the direction of strongest curvature, to a fraction of
-    a pixel (Steger, An unbiased detector of curvilinear structures, 1998, section 3).
+    A centreline is a maximum of the smoothed image across the direction of strongest curvature, with sub-pixel
+    accuracy (Steger, An unbiased detector of curvilinear structures, 1998, section 3).
 
     Raises:
-        TrackingError: the picture shows hardly any line.
+        TrackingError: the image contains too few lines.
     """
     soft = gaussian_filter(picture.astype(np.float64), _WIDTH_PX)
     dy, dx = np.gradient(soft)
@@ -64,7 +64,7 @@ def read_lines(picture: NDArray[np.uint8], name: str) -> Drawing:
     strength = -(0.5 * (dxx + dyy) - np.hypot(half, mixed))
     rows, columns = np.nonzero(strength > max(_FAINT * np.percentile(strength, 99.9), 1e-6))
     angle = 0.5 * np.arctan2(mixed, half)[rows, columns]
-    # The direction of the most negative curvature stands across that of the largest.
+    # The direction of the most negative curvature is perpendicular to that of the largest.
     nx, ny = -np.sin(angle), np.cos(angle)
     along = nx * dx[rows, columns] + ny * dy[rows, columns]
     step = along / strength[rows, columns]
@@ -79,21 +79,21 @@ def read_lines(picture: NDArray[np.uint8], name: str) -> Drawing:
     if keep.sum() < _FEWEST_POINTS:
         raise TrackingError(
             f"{name}: {keep.sum()} px of lines are drawn, at least {_FEWEST_POINTS} are needed",
-            hint="Draw bright lines along the outlines of the teeth on black.",
+            hint="Draw bright lines along the outlines of the teeth on a black background.",
         )
     return Drawing(name, pixels[keep], normals[keep], (picture.shape[1], picture.shape[0]))
 
 
 def features(pixels: Array, normals: Array, turn_px: float) -> Array:
-    """Return points whose distances count place and direction, (x, y, cos 2a, sin 2a), shape (N, 4).
+    """Return features (x, y, cos 2a, sin 2a), shape (N, 4), whose distances combine position and direction.
 
-    Lines across one another are as far apart as lines `turn_px` times two from one another; signs do not count.
+    Perpendicular lines have a distance of 2 `turn_px`; the sign of a normal is irrelevant.
     """
     double = np.column_stack([normals[:, 0] ** 2 - normals[:, 1] ** 2, 2 * normals[:, 0] * normals[:, 1]])
     return np.hstack([pixels, turn_px * double])
 
 
 def nearest(these: Array, others: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return distance to and number of the nearest of `others` for each of these `features`."""
+    """Return the distance to and index of the nearest of `others` for each of these `features`."""
     distance, index = cKDTree(others).query(these)
     return distance, index

@@ -1,4 +1,4 @@
-"""Where a search of photographs begins: all views of both rows, their outlines laid over the drawn lines."""
+"""Initial poses of photographs: an exhaustive search over views, with outlines correlated with the drawn lines."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, PhotoPose
 from jawusd.tracking.contour.scan import Scan, thinned
 
 _PX_PER_MM = 2.5
-_DISTANCE_MM = 200.0  # from which dental photographs are taken, usually
-_FRONT_MM = np.array([0.0, 0.0, 15.0])  # from the point about which views turn to the front edges
+_DISTANCE_MM = 200.0  # typical distance of dental photographs
+_FRONT_MM = np.array([0.0, 0.0, 15.0])  # offset of the front edges from the centre of rotation of the views
 _YAW = np.radians(np.arange(-75, 76, 15.0))
 _PITCH = np.radians(np.arange(-20, 21, 10.0))
 _ROLL = np.radians([-10.0, 0.0, 10.0])
-# Widths that the picture may have at the teeth [mm].
+# Candidate widths of the field of view at the teeth [mm].
 _WIDTHS_MM = 38.0 * 1.1 ** np.arange(9)
 _ROWS_APART_MM = 10.0
-_SECTORS = 4  # of directions; lines count only where theirs agree
-_NEAR_PX = 2.0  # of the search: how far off a line still counts half
-# Usual bites: lower front edges behind the upper ones, and how far both rows overlap there [mm].
+_SECTORS = 4  # direction bins; lines match outlines of the same bin only
+_NEAR_PX = 2.0  # distance at which a line counts half
+# Typical bite: overjet and overbite of the front teeth [mm].
 _OVERJET_MM, _OVERBITE_MM = 2.5, 2.0
 
-_WIDTH_PX = 360  # of the pictures that candidates are aligned in
-_FACES = 6000  # crown faces per row, enough for these pictures
-_CANDIDATES, _FINALISTS = 20, 4  # of each handedness
-# Gates of the steps [mm]: from a tooth off to half a tooth off; then with rows slid along one another.
+_WIDTH_PX = 360  # image width at which candidates are aligned
+_FACES = 6000  # crown faces per arch, sufficient at this resolution
+_CANDIDATES, _FINALISTS = 20, 4  # mirrored and not mirrored, each
+# Gates of the steps [mm]: from one tooth width to half of it; then with shifted bites.
 _WIDE_GATES, _SLID_GATES = (4.0, 4.0, 3.5, 3.5, 3.0, 3.0, 2.5, 2.5), (3.0, 3.0, 2.5, 2.0, 2.0, 2.0)
-# How far the lower row may be from a usual bite. All are looked at, the best few aligned.
+# Shifts of the lower arch from a typical bite. All are scored, the best few aligned.
 _ASIDE_MM, _UP_MM, _AHEAD_MM = (-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-4.0, -2.0, 0.0, 2.0, 4.0)
 _SLIDES = 4
 _MISFIT_GATE_MM = 1.5
@@ -45,7 +45,7 @@ _MISFIT_GATE_MM = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Hold one way in which a photograph may show the teeth."""
+    """A candidate view of a photograph."""
 
     share: float  # of the drawn lines that are near an outline [-]
     T_cam_upper: Array  # shape (4, 4)
@@ -54,36 +54,36 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class UsualBite:
-    """Hold where two rows stand if they meet as rows usually do."""
+class TypicalBite:
+    """Poses of two arches in a typical bite."""
 
     T_anatomical_upper: Array  # upper scan to (left, up, front) axes, shape (4, 4)
     T_anatomical_lower: Array  # shape (4, 4)
 
     @property
     def frames(self) -> tuple[Array, Array]:
-        """Return both frames, upper and lower."""
+        """Both frames, upper and lower."""
         return self.T_anatomical_upper, self.T_anatomical_lower
 
     @property
     def T_upper_lower(self) -> Array:
-        """Return the bite, shape (4, 4)."""
+        """The bite, shape (4, 4)."""
         return se3_inverse(self.T_anatomical_upper) @ self.T_anatomical_lower
 
 
-def usual_bites(scans: Sequence[Scan]) -> list[UsualBite]:
-    """Return each way in which two rows may stand over one another.
+def typical_bites(scans: Sequence[Scan]) -> list[TypicalBite]:
+    """Return the possible typical bites of two arches.
 
-    Each row's plane and forward direction follow from its shape. Which side of a row is up follows from its gum, if it
-    has one; else both are returned.
+    The plane and forward direction of an arch follow from its shape, and its vertical direction from its gum. Without
+    gum, both vertical directions are returned.
     """
     frames = [[_row_frame(scan, r, side) for side in _sides(scan, r)] for r, scan in enumerate(scans)]
     shift = make_transform(np.eye(3), np.array([0.0, _OVERBITE_MM, -_OVERJET_MM]))
-    return [UsualBite(upper, shift @ lower) for upper, lower in product(*frames)]
+    return [TypicalBite(upper, shift @ lower) for upper, lower in product(*frames)]
 
 
 def _sides(scan: Scan, arch: int) -> list[float]:
-    """Return the signs that the least axis of a row may have to point up."""
+    """Return the possible signs of an arch's smallest principal axis such that it points up."""
     if len(scan.gum_faces) < len(scan.crown_faces) // 10:
         return [1.0, -1.0]
     gum = scan.vertices[np.unique(scan.gum_faces)].mean(0) - scan.centre
@@ -97,10 +97,10 @@ def _least_axis(scan: Scan) -> Array:
 
 
 def _row_frame(scan: Scan, arch: int, side: float) -> Array:
-    """Return T_anatomical_scan of one row, its origin amid the edges of its front teeth, shape (4, 4)."""
+    """Return T_anatomical_scan of one arch, with its origin at the edges of the front teeth, shape (4, 4)."""
     points = scan.crown_vertices(4000)
     up = side * _least_axis(scan)
-    # The frame of a bite whose other row would be this one again, moved.
+    # The frame of a bite whose other arch is a shifted copy of this one.
     T = anatomical_frame(points, points - _ROWS_APART_MM * up)
     x, y, z = (points @ T[:3, :3].T).T
     edge = np.percentile(y[z > np.percentile(z, 90)], 2 if arch == 0 else 98)
@@ -108,16 +108,16 @@ def _row_frame(scan: Scan, arch: int, side: float) -> Array:
 
 
 def searched(
-    drawing: Drawing, crowns: Sequence[Crowns], usual: UsualBite, T_upper_lower: Array, count: int
+    drawing: Drawing, crowns: Sequence[Crowns], usual: TypicalBite, T_upper_lower: Array, count: int
 ) -> list[Candidate]:
-    """Return the most promising views of both rows, at most one for each direction, best first.
+    """Return the most promising views of both arches, at most one per viewing direction, best first.
 
     Args:
         drawing: the lines of the photograph.
-        crowns: upper and lower, thin enough to be drawn thousands of times.
-        usual: says where left, up and front are.
-        T_upper_lower: the bite to search with, shape (4, 4).
-        count: how many candidates to return of each handedness.
+        crowns: upper and lower, decimated for fast rendering.
+        usual: gives the anatomical axes.
+        T_upper_lower: the assumed bite, shape (4, 4).
+        count: number of candidates to return, mirrored and not mirrored each.
     """
     size = next_fast_len(int(1.3 * _PX_PER_MM * _WIDTHS_MM.max()), real=True)
     drawn = list(_drawn_spectra(drawing, size))
@@ -135,7 +135,7 @@ def searched(
             if mirrored in best and share <= best[mirrored].share:
                 continue
             row, column = np.unravel_index(int(overlap.argmax()), overlap.shape)
-            # Shifts of the outlines against the middle of the drawn picture, as places of the teeth.
+            # Shift of the outlines relative to the image centre, as a position of the teeth.
             shift = [(k + size // 2) % size - size // 2 for k in (column, row)]
             pose = base.copy()
             pose[:2, 3] += np.array(shift) / _PX_PER_MM
@@ -146,14 +146,14 @@ def searched(
 
 
 def _facing(turn: tuple[float, float, float]) -> Array:
-    """Return the turn from (left, up, front) axes to a camera in front, (right, down, ahead), shape (3, 3)."""
+    """Return the rotation from (left, up, front) axes to a camera in front, (right, down, ahead), shape (3, 3)."""
     yaw, pitch, roll = turn
     facing = np.diag([1.0, -1.0, -1.0])
     return np.asarray(so3_exp([0, 0, roll]) @ so3_exp([pitch, 0, 0]) @ facing @ so3_exp([0, yaw, 0]), np.float64)
 
 
 def _drawn_spectra(drawing: Drawing, size: int) -> Iterator[tuple[float, bool, NDArray[np.complex128], float]]:
-    """Yield width of the picture at the teeth [mm], mirrored, spectra by sector, and number of points."""
+    """Yield the field of view at the teeth [mm], mirrored or not, spectra by direction bin, and number of points."""
     for mirrored in (False, True):
         lines = drawing.mirrored() if mirrored else drawing
         middle = 0.5 * (np.array(drawing.size_px) - 1.0)
@@ -164,7 +164,7 @@ def _drawn_spectra(drawing: Drawing, size: int) -> Iterator[tuple[float, bool, N
 
 
 def _by_sector(pixels: Array, normals: Array, size: int) -> Array:
-    """Return pictures that count points by the sector of their direction, shape (_SECTORS, size, size)."""
+    """Return binary images of points by direction bin, shape (_SECTORS, size, size)."""
     out = np.zeros((_SECTORS, size, size))
     sector = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / np.pi * _SECTORS).astype(int) % _SECTORS
     column, row = np.round(pixels).astype(int).T
@@ -176,7 +176,7 @@ def _by_sector(pixels: Array, normals: Array, size: int) -> Array:
 def _seen_spectra(
     crowns: Sequence[Crowns], T_cam_upper: Array, T_upper_lower: Array, size: int
 ) -> NDArray[np.complex128]:
-    """Return spectra of pictures that are 1 on outlines and fall off around them, shape (_SECTORS, h, w)."""
+    """Return spectra of images that are 1 on outlines and decrease with distance, shape (_SECTORS, h, w)."""
     focal = _PX_PER_MM * _DISTANCE_MM
     K = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
     matrices = [K @ T_cam_upper[:3], K @ (T_cam_upper @ T_upper_lower)[:3]]
@@ -192,15 +192,15 @@ def _seen_spectra(
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """Hold both rows of teeth, fine and thin, standing as rows usually do."""
+class ArchPair:
+    """Both arches split into teeth, full and decimated, in a typical bite."""
 
-    usual: UsualBite
+    usual: TypicalBite
     fine: tuple[Crowns, Crowns]
     thin: tuple[Crowns, Crowns]
 
     @classmethod
-    def of(cls, scans: Sequence[Scan], usual: UsualBite) -> Rows:
+    def of(cls, scans: Sequence[Scan], usual: TypicalBite) -> ArchPair:
         """Split both scans into teeth."""
         fine, thin = (
             [split_teeth(scan, T, r) for r, (scan, T) in enumerate(zip(some, usual.frames, strict=True))]
@@ -210,21 +210,21 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """Hold how one photograph begins."""
+class PhotoStart:
+    """Initial pose of one photograph."""
 
     misfit: float  # of its lines, see `Aligner.misfit` [-]
-    other_misfit: float  # the same if the photograph had been mirrored the other way
+    other_misfit: float  # the same with the opposite choice of mirroring
     mirrored: bool
-    bite: Bite  # of this photograph alone, at a reduced size
-    rows: Rows
+    bite: Bite  # of this photograph alone, at reduced size
+    rows: ArchPair
 
 
-def find_first(drawing: Drawing, scans: Sequence[Scan], usual: Sequence[UsualBite], contact: Contact) -> Found:
-    """Return the best start of a photograph of rows whose bite nobody knows, out of the usual bites."""
+def find_first(drawing: Drawing, scans: Sequence[Scan], usual: Sequence[TypicalBite], contact: Contact) -> PhotoStart:
+    """Return the best start of a photograph with an unknown bite, searching around typical bites."""
     tried = []
     for bite in usual:
-        rows = Rows.of(scans, bite)
+        rows = ArchPair.of(scans, bite)
         found = _aligned_candidates(drawing, rows, rows.usual.T_upper_lower, _CANDIDATES)
         tried += [(misfit, mirrored, one, rows) for misfit, mirrored, one in found]
     tried.sort(key=lambda one: one[0])
@@ -237,8 +237,8 @@ def find_first(drawing: Drawing, scans: Sequence[Scan], usual: Sequence[UsualBit
     return _best(ends)
 
 
-def _slid(bite: Bite, rows: Rows, aligner: Aligner) -> list[Bite]:
-    """Return a photograph with the bites among slid ones that fit best as they are, and the one that it has."""
+def _slid(bite: Bite, rows: ArchPair, aligner: Aligner) -> list[Bite]:
+    """Return a photograph with its own bite and the shifted bites that fit best."""
     axes = rows.usual.T_anatomical_upper[:3, :3]
     out = []
     for slide in product(_ASIDE_MM, _UP_MM, _AHEAD_MM):
@@ -248,12 +248,12 @@ def _slid(bite: Bite, rows: Rows, aligner: Aligner) -> list[Bite]:
 
 
 def _misfit(aligner: Aligner, bite: Bite) -> float:
-    """Return the misfit of one photograph, both rows alike."""
+    """Return the misfit of one photograph, averaged over both arches."""
     return float(aligner.misfit(bite, _MISFIT_GATE_MM).mean())
 
 
-def find_next(drawing: Drawing, rows: Rows, T_upper_lower: Array, contact: Contact) -> Found:
-    """Return the best start of a photograph of a bite that another photograph has given, roughly."""
+def find_next(drawing: Drawing, rows: ArchPair, T_upper_lower: Array, contact: Contact) -> PhotoStart:
+    """Return the best start of a photograph whose bite is roughly known from another photograph."""
     found = _aligned_candidates(drawing, rows, T_upper_lower, _CANDIDATES)
     aligner = Aligner(rows.thin, rows.usual.T_upper_lower, contact)
     ends = []
@@ -264,9 +264,9 @@ def find_next(drawing: Drawing, rows: Rows, T_upper_lower: Array, contact: Conta
 
 
 def _aligned_candidates(
-    drawing: Drawing, rows: Rows, T_upper_lower: Array, count: int
+    drawing: Drawing, rows: ArchPair, T_upper_lower: Array, count: int
 ) -> list[tuple[float, bool, Bite]]:
-    """Return misfit, mirrored and poses of the most promising views after some steps, best first."""
+    """Return misfit, mirroring and poses of the most promising views after some steps, best first."""
     aligner = Aligner(rows.thin, rows.usual.T_upper_lower, None)
     factor = _WIDTH_PX / drawing.size_px[0]
     out = []
@@ -278,13 +278,13 @@ def _aligned_candidates(
     return sorted(out, key=lambda entry: entry[0])
 
 
-def _finalists(tried: Sequence[tuple[float, bool, Bite, Rows]]) -> list[tuple[float, bool, Bite, Rows]]:
-    """Return the best starts, some of each handedness, so that the other one is refused on its merits."""
+def _finalists(tried: Sequence[tuple[float, bool, Bite, ArchPair]]) -> list[tuple[float, bool, Bite, ArchPair]]:
+    """Return the best starts, some mirrored and some not, so that both are compared fairly."""
     ordered = sorted(tried, key=lambda one: one[0])
     return [one for way in (False, True) for one in [o for o in ordered if o[1] is way][:_FINALISTS]]
 
 
-def _best(ends: Sequence[tuple[float, bool, Bite, Rows]]) -> Found:
+def _best(ends: Sequence[tuple[float, bool, Bite, ArchPair]]) -> PhotoStart:
     misfit, mirrored, bite, rows = min(ends, key=lambda one: one[0])
     other = min((one[0] for one in ends if one[1] is not mirrored), default=1.0)
-    return Found(misfit, other, mirrored, bite, rows)
+    return PhotoStart(misfit, other, mirrored, bite, rows)

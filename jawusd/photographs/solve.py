@@ -1,4 +1,7 @@
-"""The camera of a photograph that nobody calibrated: one focal length, the middle of the picture, one distortion."""
+"""Joint alignment of both arches with photographs: one bite, and a pose and lens for each photograph.
+
+The camera model has one focal length, the principal point at the image centre, and one distortion coefficient.
+"""
 
 from __future__ import annotations
 
@@ -17,68 +20,65 @@ from jawusd.tracking.contour.equations import motion_about
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.initialization.occlusion import crown_surface
 
-#: Unknowns of a photograph: twist of the upper teeth about their centre [rad, mm], log focal length, distortion. With
-#: the focal length the distance changes so that the teeth stay as large: large steps of it are then harmless.
+#: Unknowns of a photograph: twist of the upper teeth about their centre [rad, mm], log focal length, distortion. A step
+#: in focal length also changes the distance such that the size of the teeth stays the same, which permits large steps.
 UNKNOWNS = 8
 
-# How far apart or into one another the nearest parts of two scanned rows are when the teeth are together [mm].
-_SIGMA_MM = 0.15
-_SHARE = 0.04  # of the lower crowns on a side: what touches there
-_REACH_MM = 3.0  # farther inside, a point is past the base of a crown
-# What is known beforehand, with standard deviations: telephones are held 80 to 200 mm from the teeth, macro lenses 200
-# to 400 [log]; distortion [-].
+_SIGMA_MM = 0.15  # gap or penetration of scanned teeth in contact, standard deviation
+_SHARE = 0.04  # share of the lower crowns on a side that is in contact
+_REACH_MM = 3.0  # greater depths are beyond the base of a crown
+# Prior distance, with the standard deviation of its logarithm, and standard deviation of the distortion [-]: phones are
+# held 80 to 200 mm from the teeth, macro lenses 200 to 400 mm.
 _DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02
-# One camera takes all photographs; what focusing does to its focal length [log].
-_LOG_FOCAL = 0.05
-# How far a usual bite is off [rad, mm]; about the centre of the lower teeth.
-_BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)
-# Standard deviation of a step [rad, mm, log, -]: damps directions that lines do not show.
+_LOG_FOCAL = 0.05  # variation of the log focal length between photographs of one camera, by focusing
+_BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)  # of the bite about a typical one, at the lower teeth's centre [rad, mm]
+# Standard deviation of a step [rad, mm, log, -]: damps directions that the lines do not determine.
 _LARGEST_STEP = np.array([0.1] * 3 + [3.0, 3.0, 30.0] + [0.2, 0.02])
-# By how much a drawn line is off, where teeth end and along the gum, and a stretch of it that is off alike.
+# Error of a drawn line along tooth edges and along the gum, and its correlation length.
 _LINE_MM, _GUM_LINE_MM, _STRETCH_MM = 0.15, 0.3, 2.0
-_GUM_MM = 0.5  # how far scans' crowns reach less far than crowns in pictures, or farther
-_SHARED = 8  # unknowns of all photographs: twist of the bite about the centre of the lower teeth, gum lines
+_GUM_MM = 0.5  # difference between the gum lines of scan and photograph, standard deviation
+_SHARED = 8  # shared unknowns: twist of the bite about the centre of the lower teeth, gum-line offset per arch
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoPose:
-    """Hold where a photograph was taken and with what lens."""
+    """Pose and lens of a photograph."""
 
     T_cam_upper: Array  # shape (4, 4)
-    focal_px: float  # at the size of the picture
-    distortion: float  # k1 of x (1 + k1 r^2), r the distance from the middle over half the width of the picture
+    focal_px: float  # at the size of the image
+    distortion: float  # k1 of x (1 + k1 r^2), with r the distance from the centre over half the image width
 
     def stepped(self, centre: Array, step: Array) -> PhotoPose:
-        """Return the pose after a step (8,) of the unknowns; `centre` is that of the upper teeth, camera [mm]."""
+        """Return the pose after a step (8,) of the unknowns; `centre` of the upper teeth in camera coordinates [mm]."""
         pose = orthonormalise(motion_about(centre, step[:6]) @ self.T_cam_upper)
         pose[2, 3] += centre[2] * np.expm1(step[6])
         return PhotoPose(pose, self.focal_px * float(np.exp(step[6])), self.distortion + float(step[7]))
 
     def scaled(self, factor: float) -> PhotoPose:
-        """Return the pose for the picture shrunk by a factor."""
+        """Return the pose for the image scaled by a factor."""
         return replace(self, focal_px=self.focal_px * factor)
 
     def opencv_k1(self, size_px: tuple[int, int]) -> float:
-        """Return the distortion as OpenCV's k1, of directions instead of half widths."""
+        """Return the distortion as OpenCV's k1, which applies to normalised image coordinates."""
         return self.distortion * (2.0 * self.focal_px / size_px[0]) ** 2
 
     def camera_matrix(self, size_px: tuple[int, int]) -> Array:
-        """Return the projection without distortion from camera [mm] to homogeneous px, shape (3, 3)."""
+        """Return the undistorted projection from camera [mm] to homogeneous px, shape (3, 3)."""
         u, v = middle_of(size_px)
         return np.array([[self.focal_px, 0.0, u], [0.0, self.focal_px, v], [0.0, 0.0, 1.0]])
 
     def pixels(self, points: Array, size_px: tuple[int, int]) -> Array:
-        """Return where points in camera coordinates (N, 3) [mm] are seen [px], shape (N, 2)."""
+        """Project points in camera coordinates (N, 3) [mm] to the image [px], shape (N, 2)."""
         flat = self.focal_px * points[:, :2] / points[:, 2:]
         return flat * (1.0 + self.distortion * _radius2(flat, size_px))[:, None] + middle_of(size_px)
 
     def slopes(
         self, points: Array, directions: Array, size_px: tuple[int, int], distance_mm: float
     ) -> tuple[Array, Array]:
-        """Return the derivative along image directions by the camera point (N, 3) [px/mm] and by the lens (N, 2).
+        """Return derivatives along image directions by the camera point (N, 3) [px/mm] and by the lens (N, 2).
 
-        The lens columns are log focal length, with the distance of the teeth, and distortion. `directions` are unit
-        vectors, shape (N, 2).
+        The lens columns are log focal length, with the coupled change of distance, and distortion. `directions` are
+        unit vectors, shape (N, 2).
         """
         flat = self.focal_px * points[:, :2] / points[:, 2:]
         r2 = _radius2(flat, size_px)
@@ -92,12 +92,12 @@ class PhotoPose:
 
 
 def middle_of(size_px: tuple[int, int]) -> Array:
-    """Return the middle of a picture [px], shape (2,)."""
+    """Return the centre of an image [px], shape (2,)."""
     return 0.5 * (np.array(size_px, np.float64) - 1.0)
 
 
 def to_camera(pose: PhotoPose, T_upper_lower: Array, points: Array, arch: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return scan points (N, 3) of both arches in upper scan and in camera coordinates [mm], shape (N, 3) each."""
+    """Return scan points (N, 3) of both arches in upper-scan and in camera coordinates [mm], shape (N, 3) each."""
     in_upper = np.where(arch[:, None] == 1, transform_points(T_upper_lower, points), points)
     return in_upper, transform_points(pose.T_cam_upper, in_upper)
 
@@ -107,19 +107,19 @@ def _radius2(flat: Array, size_px: tuple[int, int]) -> Array:
 
 
 class Contact:
-    """Draw both rows together until they touch on the left and on the right."""
+    """Contact prior: closed teeth touch on the left and on the right."""
 
     def __init__(self, scans: Sequence[Scan]) -> None:
         """Prepare the surfaces of the upper and the lower crowns."""
         self._upper, self._lower = (crown_surface(scan) for scan in scans)
         self._tree = cKDTree(self._upper.points)
         centred = self._lower.points - scans[1].centre
-        # The longest axis of a row runs from left to right, unless half of it is missing: then either half is a side.
+        # The longest axis of an arch runs from left to right, unless half of the arch is missing.
         across = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
         self._sides = [across > np.percentile(across, 60), across < np.percentile(across, 40)]
 
     def equations(self, T_upper_lower: Array, centre: Array) -> tuple[Array, Array, Array]:
-        """Return slopes (N, 6) by a twist of the bite about `centre`, distances [mm] and weights [1/mm^2]."""
+        """Return derivatives (N, 6) by a twist of the bite about `centre`, distances [mm] and weights [1/mm^2]."""
         points = transform_points(T_upper_lower, self._lower.points)
         away, normals = self._signed(points)
         slopes, residuals, weights = [], [], []
@@ -132,51 +132,51 @@ class Contact:
         return np.vstack(slopes), np.concatenate(residuals), np.concatenate(weights)
 
     def depth_mm(self, T_upper_lower: Array) -> float:
-        """Return how deep crowns run into one another where they do so most, but for a speck [mm]."""
+        """Return the greatest penetration of the crowns, apart from outliers [mm]."""
         away, _ = self._signed(transform_points(T_upper_lower, self._lower.points))
         return max(0.0, -float(np.percentile(away, 0.2)))
 
     def _signed(self, points: Array) -> tuple[Array, Array]:
-        """Return distances from the upper crowns, negative inside [mm], shape (N,), and the normals there (N, 3)."""
+        """Return signed distances from the upper crowns, negative inside [mm], shape (N,), and their normals (N, 3)."""
         distance, index = self._tree.query(points)
         normals = self._upper.normals[index]
         off = points - self._upper.points[index]
         behind = np.einsum("ij,ij->i", off, normals)
         inside = (behind < -0.7 * distance) & (distance < _REACH_MM) & ~self._upper.border[index]
-        # Close by, the plane is a better surface than its nearest piece.
+        # Near the surface, the distance from the tangent plane is more accurate than that from the nearest point.
         away = np.where(distance < 1.0, behind, np.where(inside, -distance, distance))
         return away, normals
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """Hold the lines of one photograph, as if it had not been taken over a mirror, and its pose."""
+    """Lines of one photograph, unmirrored, and its pose."""
 
     drawing: Drawing
     pose: PhotoPose
 
     def shrunk(self, factor: float) -> Photo:
-        """Return the photograph smaller by a factor."""
+        """Return the photograph downscaled by a factor."""
         return Photo(self.drawing.shrunk(factor), self.pose.scaled(factor))
 
 
 @dataclass(frozen=True, eq=False)
 class Bite:
-    """Hold poses of photographs and the bite they share."""
+    """Poses of photographs and the bite they share."""
 
     photos: tuple[Photo, ...]
     T_upper_lower: Array  # shape (4, 4)
-    gum_mm: Array  # by how much gum lines are drawn nearer to the gum than crowns reach, upper and lower, shape (2,)
+    gum_mm: Array  # offset of the drawn gum lines from the crowns' edges towards the gum, upper and lower, shape (2,)
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Hold drawn points with the outline each one is nearest to.
+    """Drawn points matched to outlines.
 
     Attributes:
-        outlines: of the teeth, a row per drawn point.
-        off_px: signed distance of the outline from the drawn point along its normal, shape (N,).
-        apart: distance in place and direction, see `features` [px], shape (N,).
+        outlines: the matched outline point of each drawn point.
+        off_px: signed distance of the outline from the drawn point along the outline's normal, shape (N,).
+        apart: distance in position and direction, see `features` [px], shape (N,).
     """
 
     outlines: Outlines
@@ -185,7 +185,7 @@ class Match:
 
 
 def match(seen: Outlines, drawing: Drawing, turn_px: float) -> Match:
-    """Return for each drawn point the nearest outline of like direction."""
+    """Match each drawn point to the nearest outline of similar direction."""
     drawn, there = (features(one.pixels, one.normals, turn_px) for one in (drawing, seen))
     apart, index = nearest(drawn, there)
     own = seen.take(index)
@@ -193,7 +193,7 @@ def match(seen: Outlines, drawing: Drawing, turn_px: float) -> Match:
 
 
 def seen_outlines(crowns: Sequence[Crowns], photo: Photo, bite: Bite) -> Outlines:
-    """Return the outlines of all teeth as somebody would draw them in a photograph."""
+    """Return the outlines of all teeth expected in a photograph."""
     width, height = photo.drawing.size_px
     K = photo.pose.camera_matrix(photo.drawing.size_px)
     T = photo.pose.T_cam_upper
@@ -205,22 +205,22 @@ def seen_outlines(crowns: Sequence[Crowns], photo: Photo, bite: Bite) -> Outline
 
 
 class Aligner:
-    """Align rows of teeth with photographs by Gauss-Newton on the distances of outlines."""
+    """Gauss-Newton alignment of both arches with photographs, on distances between drawn lines and outlines."""
 
     def __init__(self, crowns: Sequence[Crowns], usual_bite: Array, contact: Contact | None) -> None:
-        """Take both rows, the bite that rows usually have, and their contact if they are to touch."""
+        """Store both arches, a typical bite as prior, and the contact prior, if it is to be used."""
         self._crowns, self._usual, self._contact = crowns, usual_bite, contact
 
     def aligned(self, bite: Bite, gates_mm: Sequence[float]) -> Bite:
-        """Return photographs and bite after a step for every gate [mm] beyond which lines do not count."""
+        """Return photographs and bite after one step per gate [mm], the residual above which lines are ignored."""
         for gate_mm in gates_mm:
             bite = self._step(bite, gate_mm)
         return bite
 
     def misfit(self, bite: Bite, gate_mm: float) -> Array:
-        """Return the mean squared distance of lines over that of the gate, at most 1, by photograph and row, (P, 2).
+        """Return the mean squared line distance relative to the gate, capped at 1, per photograph and arch, (P, 2).
 
-        Lines count for the row whose outline is nearest; 1 where a row has none.
+        A line counts for the arch of its nearest outline; an arch without lines has misfit 1.
         """
         out = np.ones((len(bite.photos), 2))
         for k, photo in enumerate(bite.photos):
@@ -261,7 +261,7 @@ class Aligner:
     def _equations(
         self, photo: Photo, bite: Bite, centre: Array, centre_lower: Array, gate_mm: float
     ) -> tuple[Array, Array, Array]:
-        """Return slopes (N, 16) by the photograph's and the shared unknowns, residuals [px] and weights [1/px^2]."""
+        """Return derivatives (N, 16) by own and shared unknowns, residuals [px] and weights [1/px^2]."""
         px_per_mm = _px_per_mm(photo, self._crowns)
         seen = seen_outlines(self._crowns, photo, bite)
         found = match(seen, photo.drawing, 0.5 * gate_mm * px_per_mm)
@@ -274,24 +274,24 @@ class Aligner:
         J = np.hstack([turns[0], by_point, by_lens, turns[1], in_bite, by_gum])
         share = np.clip(1.0 - (found.apart / (gate_mm * px_per_mm)) ** 2, 0.0, None) ** 2
         sigma_px = px_per_mm * (_LINE_MM + (_GUM_LINE_MM - _LINE_MM) * own.gum)
-        # Neighbouring points of a line are off alike, so a stretch of it counts once.
+        # Errors of neighbouring points are correlated, so each correlation length counts once.
         return J, found.off_px, share / sigma_px**2 / max(1.0, _STRETCH_MM * px_per_mm)
 
     def _bite_prior(self, T_upper_lower: Array) -> tuple[Array, Array, Array]:
-        """Return slopes, differences and weights of what is known of bites."""
+        """Return derivatives, residuals and weights of the bite prior."""
         turn = so3_log(T_upper_lower[:3, :3] @ self._usual[:3, :3].T)
         here, usual = (transform_point(T, self._crowns[1].scan.centre) for T in (T_upper_lower, self._usual))
         return np.eye(6), np.r_[turn, here - usual], _BITE_SIGMA**-2
 
 
 def _add(H: Array, g: Array, part: NDArray[np.int64], J: Array, residual: Array, weight: Array) -> None:
-    """Add residuals with slopes by some of the unknowns to the normal equations."""
+    """Add residuals with derivatives J by a subset of the unknowns to the normal equations."""
     H[np.ix_(part, part)] += J.T @ (weight[:, None] * J)
     g[part] -= J.T @ (weight * residual)
 
 
 def _lens_prior(pose: PhotoPose, centre: Array) -> tuple[Array, Array, Array]:
-    """Return slopes, differences and weights of what is known of distance and distortion."""
+    """Return derivatives, residuals and weights of the priors on distance and distortion."""
     J = np.zeros((2, UNKNOWNS))
     J[0, 5], J[0, 6], J[1, 7] = 1.0 / centre[2], 1.0, 1.0
     return (
@@ -302,7 +302,7 @@ def _lens_prior(pose: PhotoPose, centre: Array) -> tuple[Array, Array, Array]:
 
 
 def _one_lens(photos: Sequence[Photo]) -> tuple[Array, Array, Array]:
-    """Return slopes, differences and weights by the log focal lengths: all are about their mean."""
+    """Return derivatives, residuals and weights of the prior that all log focal lengths are near their mean."""
     logs = np.log([photo.pose.focal_px / photo.drawing.size_px[0] for photo in photos])
     return np.eye(len(logs)) - 1.0 / len(logs), logs - logs.mean(), np.full(len(logs), _LOG_FOCAL**-2)
 

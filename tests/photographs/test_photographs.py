@@ -8,7 +8,7 @@ from closed_mouth import FOCAL, SIZE, VIEWS, Mouth, search_little
 from jawusd.base.errors import TrackingError
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_point
 from jawusd.photographs import align, read_lines
-from jawusd.photographs.search import Rows, usual_bites
+from jawusd.photographs.search import ArchPair, typical_bites
 from jawusd.photographs.solve import UNKNOWNS, Aligner, Bite, Contact, Photo, PhotoPose
 from jawusd.tracking.contour.scan import prepare_scan
 
@@ -23,12 +23,12 @@ def rows(mouth):
     scans = [prepare_scan(mesh, name) for mesh, name in zip(mouth.meshes, ("upper", "lower"))]
     # of both sides that either row may stand on, the true ones
     usual = min(
-        usual_bites(scans),
+        typical_bites(scans),
         key=lambda one: (
             mouth.off_mm(one.T_upper_lower) - 50 * one.T_anatomical_upper[1, :3] @ mouth.T_own[0][:3, :3][:, 1]
         ),
     )
-    return Rows.of(scans, usual), Contact(scans)
+    return ArchPair.of(scans, usual), Contact(scans)
 
 
 def test_lines_are_found_to_a_fraction_of_a_pixel():
