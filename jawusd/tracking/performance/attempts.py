@@ -1,4 +1,4 @@
-"""Attempts at one instant, and whether the pictures bear them out."""
+"""Alignment attempts at one instant, and their acceptance."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
 from jawusd.tracking.performance.views import Growth
 
-#: How unsure head and jaw are at most, standard deviations [rad, mm, mm]: after many frames without teeth.
-MOST_UNSURE = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
-# Matched contour below which an arch tells nothing [px]: 2 mm of tooth edge. Without a rig more is needed.
+#: Largest standard deviations of head and jaw, after many frames without visible teeth [rad, mm, mm].
+LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
+# Matched contour below which an arch is not accepted [px]: 2 mm of tooth edge. Tracking without a rig requires more.
 _LEAST_MATCHED_PX = 15.0
-_TYPICAL_PX = 0.4  # residual of masks by hand at the working size
+_TYPICAL_PX = 0.4  # residual of hand-drawn masks at the working resolution
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """Hold what is known about a frame.
+    """Result of one frame.
 
     Attributes:
-        pose: where head and jaw are, found or carried on.
-        solution: the outlines there, None without any mask.
-        use: the masks whose outlines count, shape (2, C): present ones of arches that were found.
-        present: the masks there are, shape (2, C).
-        uncovered: share of every mask the scan leaves uncovered, NaN without one, shape (2, C).
-        growth: how the outlines grow with focal lengths, where these are unknown.
-        doubtful: less of the contour fits than usual, so that another pose may be right.
+        pose: measured or extrapolated pose of head and jaw.
+        solution: matched outlines at the pose, None without any mask.
+        use: masks that count, shape (2, C): those present, of arches that were found.
+        present: available masks, shape (2, C).
+        uncovered: share of every mask not covered by the scan, NaN without a mask, shape (2, C).
+        growth: derivatives of the outlines by unknown focal lengths.
+        doubtful: less of the contour fits than usual, so the pose may be wrong.
     """
 
     pose: Pose
@@ -49,18 +49,18 @@ class FrameFit:
 
     @property
     def found(self) -> Mask:
-        """Which arches were found, shape (2,)."""
+        """Arches that were found, shape (2,)."""
         return np.asarray(self.use.any(1))
 
     @property
     def missed(self) -> Mask:
-        """Which arches have masks that nothing fits, shape (2,)."""
+        """Arches with masks that were not found, shape (2,)."""
         return np.asarray(self.present.any(1) & ~self.found)
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Hold an attempt at an instant; uncovered pixels and all pixels of the masks have shape (2, C)."""
+    """An alignment attempt; uncovered and total pixels of the masks have shape (2, C)."""
 
     pose: Pose
     solution: Solution
@@ -69,7 +69,7 @@ class Trial:
     mask_px: Array
 
     def objective(self, price: float) -> float:
-        """Return what ranks attempts: contour that fits less the price of uncovered mask [px]."""
+        """Return the score that ranks attempts: matched contour minus the price of uncovered mask [px]."""
         return float((score_px(self.solution) - price * self.uncovered_px)[self.use].sum())
 
     @property
@@ -80,18 +80,18 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """Hold the pictures of one instant, drawn into by all attempts."""
+    """Views of one instant and the rendering shared by all attempts."""
 
     views: Sequence[View]
     rendering: Rendering
-    present: Mask  # the masks there are, shape (2, C)
+    present: Mask  # available masks, shape (2, C)
 
 
 class Attempts:
-    """Align instants, and judge by what is usual in the take."""
+    """Aligns instants, and accepts results by the usual residual of the take."""
 
     def __init__(self, instants: InstantSolver, outline_weight: Array, usual_px: Array | None = None) -> None:
-        """Start with a known residual of good frames per arch, shape (2,), or none.
+        """Start, if given, with a known usual residual per arch, shape (2,).
 
         The outline weight is that of `InstantSolver.align`.
         """
@@ -101,23 +101,23 @@ class Attempts:
             self._residuals.append(usual_px)
 
     def instant(self, views: Sequence[View]) -> Instant:
-        """Return what attempts at these pictures share."""
+        """Prepare the data shared by all attempts at these views."""
         return Instant(views, self.instants.solver.rendering(views), present_masks(views))
 
     def remember(self, fit: FrameFit) -> None:
-        """Take a frame as an example of what is usual."""
+        """Add a frame to the statistics of the usual residual."""
         if fit.solution is not None and fit.found.all():
             self._residuals.append(residual_px(fit.solution))
 
-    def near(self, start: Pose, instant: Instant, sigma: Array = MOST_UNSURE) -> FrameFit:
-        """Align an instant near a start that is off by standard deviations of shape (9,), and judge."""
+    def near(self, start: Pose, instant: Instant, sigma: Array = LARGEST_SIGMA) -> FrameFit:
+        """Align an instant near a start with standard deviations of shape (9,); reject arches that do not fit."""
         if not instant.present.any():
-            return nothing_seen(start, instant)
+            return empty_fit(start, instant)
         expected = Expected(start, sigma**-2.0)
         return self.judged(self.attempt(start, expected, instant, instant.present, self.config.wide_gates_px), instant)
 
     def attempt(self, start: Pose, expected: Expected, instant: Instant, use: Mask, gates: Sequence[float]) -> Trial:
-        """Align with some masks, shape (2, C), from a start."""
+        """Align a subset of the masks, shape (2, C), from a start."""
         views, rendering = instant.views, instant.rendering
         aligned = self.instants.align(start, views, use, gates, expected, self._weight, rendering)
         uncovered, total = np.zeros(use.shape), np.zeros(use.shape)
@@ -128,7 +128,7 @@ class Attempts:
         return Trial(aligned.pose, aligned.solution, use, uncovered, total)
 
     def bad(self, trial: Trial) -> Mask:
-        """Tell which arches have masks that the pose does not fit, shape (2,)."""
+        """Return which arches do not fit their masks, shape (2,)."""
         c = self.config
         usual = np.median(self._residuals, axis=0) if self._residuals else np.full(2, np.inf)
         rough = ~(residual_px(trial.solution) <= c.lost_residual * c.suspect_residual * usual)
@@ -137,19 +137,19 @@ class Attempts:
         return np.asarray(trial.use.any(1) & (rough | uncovered | few))
 
     def judged(self, trial: Trial, instant: Instant) -> FrameFit:
-        """Return the attempt without the arches that it does not fit."""
+        """Return the attempt as a fit, without the arches that do not fit."""
         use = trial.use & ~self.bad(trial)[:, None]
         return FrameFit(trial.pose, trial.solution, use, instant.present, trial.uncovered)
 
 
-def nothing_seen(pose: Pose, instant: Instant) -> FrameFit:
-    """Return the fit of an instant that shows nothing, at the pose that is expected."""
+def empty_fit(pose: Pose, instant: Instant) -> FrameFit:
+    """Return the fit of an instant without masks, at the expected pose."""
     none = np.zeros_like(instant.present)
     return FrameFit(pose, None, none, instant.present, np.full(none.shape, np.nan))
 
 
 def usual_residual_px(fits: Iterable[FrameFit]) -> Array:
-    """Return the median residual of the arches that were found [px], shape (2,)."""
+    """Return the median residual over the fits in which an arch was found [px], shape (2,)."""
     listed = [(residual_px(fit.solution), fit.found) for fit in fits if fit.solution is not None]
     values = [[residual[r] for residual, found in listed if found[r]] for r in ARCHES]
     return np.array([np.median(own) if own else _TYPICAL_PX for own in values])

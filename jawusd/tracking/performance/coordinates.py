@@ -1,6 +1,6 @@
-"""Head pose and jaw parameters as the unknowns of a frame, and how both arches move with them.
+"""The unknowns of a frame, head pose and jaw parameters, and the derivatives of both arches by them.
 
-The head turns and moves by twists in its own axes about the middle of the upper crowns, the pivot; the jaw parameters
+The head moves by twists in its own axes about the centre of the upper crowns, the pivot; the jaw parameters
 follow. A frame has nine unknowns: omega [rad], v [mm], d1, d2, d3 [mm].
 """
 
@@ -30,14 +30,14 @@ LOCAL = 9
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Hold where the head is and how the jaw stands."""
+    """Head pose and jaw parameters."""
 
     head: Array  # T_world_upper, shape (4, 4)
     d: Array  # jaw parameters [mm], shape (3,)
 
 
 class Coordinates:
-    """Turn head poses and jaw parameters into poses of both arches, with their derivatives.
+    """Conversion of head poses and jaw parameters to poses of both arches, with derivatives.
 
     Attributes:
         jaw: the person's rig.
@@ -45,7 +45,7 @@ class Coordinates:
     """
 
     def __init__(self, jaw: JawRig, scans: Sequence[Scan]) -> None:
-        """Take the pivots from the scans, upper and lower."""
+        """Set the pivot to the centre of the upper scan; `scans` are upper and lower."""
         self.jaw, self.pivot, self._lower_centre = jaw, scans[0].centre, scans[1].centre
         self._to_pivot = make_transform(np.eye(3), -self.pivot)
         self._from_pivot = make_transform(np.eye(3), self.pivot)
@@ -59,7 +59,7 @@ class Coordinates:
         return Pose(arches[0].copy(), self.jaw.encode(se3_inverse(arches[0]) @ arches[1])[0])
 
     def slopes(self, pose: Pose) -> tuple[Array, Array]:
-        """Return how the left world twists of both arches about their centres follow from the unknowns, (6, 9) each.
+        """Return the derivatives of both arches' left world twists about their centres by the unknowns, (6, 9) each.
 
         The centres are those of the crowns, as in `Solution.centres`.
         """

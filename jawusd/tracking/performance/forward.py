@@ -1,4 +1,4 @@
-"""The first pass: frame after frame from predictions, lost and found again."""
+"""The first pass: frame by frame from predictions, with recovery after losses."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from jawusd.geometry import transform_points
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.pose_search import shift_to_masks
-from jawusd.tracking.performance.attempts import Attempts, FrameFit, Instant, nothing_seen
+from jawusd.tracking.performance.attempts import Attempts, FrameFit, Instant, empty_fit
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected
 from jawusd.tracking.performance.motion import STEADY, Prediction
 
-_KEPT_JAWS = 12  # jaw parameters kept to start from after a loss
-_APART_MM = 3.0  # of the lower incisal point between two of them: within the solver's basin of each other
+_KEPT_JAWS = 12  # jaw parameters remembered as starts after a loss
+_APART_MM = 3.0  # least distance of the lower incisal point between them, within the solver's basin of convergence
 _FINALISTS = 3
 
 
 class ForwardPass:
-    """Align frame after frame in one direction."""
+    """Aligns frame by frame in one temporal direction."""
 
     def __init__(self, attempts: Attempts, begin: FrameFit, *, fixed_head: bool = False) -> None:
-        """Go on from a frame; with a fixed head only the jaw moves."""
+        """Continue from a frame; with a fixed head, only the jaw moves."""
         self._attempts, self._coordinates = attempts, attempts.instants.coordinates
         self._motion = Prediction(self._coordinates, begin.pose, begin.found, head=STEADY if fixed_head else 1.0)
         self._jaws: list[Array] = []
@@ -42,7 +42,7 @@ class ForwardPass:
     def _fit(self, expected: Expected, instant: Instant) -> FrameFit:
         attempts, config = self._attempts, self._attempts.config
         if not instant.present.any():
-            return nothing_seen(expected.pose, instant)
+            return empty_fit(expected.pose, instant)
         gates = config.gates_from(config.first_gate_px)
         trial = attempts.attempt(expected.pose, expected, instant, instant.present, gates)
         if not attempts.bad(trial).any():
@@ -57,12 +57,12 @@ class ForwardPass:
             return replace(fit, pose=expected.pose)
         if fit.found.all() or not fit.missed.any():
             return fit
-        # What does not fit must not pull at the rest.
+        # Realign without the arch that does not fit, as it would bias the other one.
         alone = attempts.attempt(expected.pose, expected, instant, fit.use, config.wide_gates_px)
         return attempts.judged(alone, instant)
 
     def _other_starts(self, expected: Expected, instant: Instant) -> list[Pose]:
-        """Return where else to look: the prediction, the last pose, and known jaws with the head on its masks."""
+        """Return further starts: the prediction, the last pose, and known jaws with the head moved to its masks."""
         jaws = [expected.pose.d, *(self._jaws if self._motion.blind.any() else ())]
         arch = 0 if instant.present[0].any() else 1
         scan, shifted = self._attempts.instants.solver.scans[arch], []
@@ -71,18 +71,18 @@ class ForwardPass:
             shift = shift_to_masks(scan, self._coordinates.arches(pose)[arch], arch, instant.views, instant.present)
             shifted.append(replace(pose, head=translation(shift) @ pose.head))
         if len(shifted) > _FINALISTS:
-            worth = [self._worth(pose, expected, instant) for pose in shifted]
-            shifted = [shifted[k] for k in np.argsort(worth)[::-1][:_FINALISTS]]
+            scores = [self._score(pose, expected, instant) for pose in shifted]
+            shifted = [shifted[k] for k in np.argsort(scores)[::-1][:_FINALISTS]]
         return [expected.pose, self._motion.last, *shifted]
 
-    def _worth(self, start: Pose, expected: Expected, instant: Instant) -> float:
-        """Return how well a start does after a few steps [px]."""
+    def _score(self, start: Pose, expected: Expected, instant: Instant) -> float:
+        """Return the objective of a start after a few steps [px]."""
         config, around = self._attempts.config, replace(expected, pose=start)
         trial = self._attempts.attempt(start, around, instant, instant.present, config.trial_gates_px)
         return trial.objective(config.uncovered_price)
 
     def _remember(self, fit: FrameFit) -> None:
-        """Keep what the next frames are judged by, and jaws unlike those kept to start from after a loss."""
+        """Update the usual residual, and remember the jaw as a start if it differs from those remembered."""
         self._attempts.remember(fit)
         if not fit.found.all():
             return

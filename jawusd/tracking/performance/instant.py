@@ -1,4 +1,4 @@
-"""Align head and jaw with the pictures of one instant."""
+"""Alignment of head and jaw with the masks of one instant."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from jawusd.tracking.contour.solver import ContourSolver, Matched
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
 
-# How softly the bound of the rig holds [mm]: it is only as wide as the take the rig was made from, and a hard one loses
-# jaws for good that go beyond.
+# Softness of the rig's bound [mm]. The bound is only as wide as the take the rig was made from, and with a hard bound,
+# a jaw that exceeds it would be lost.
 BOUND_MM = 1.0
 _QUICK_FACES, _QUICK_REDRAW_PX = 6_000, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Say where head and jaw are expected before an instant is looked at."""
+    """Prior of head and jaw at an instant."""
 
     pose: Pose
     precision: Array  # of the step away from there, shape (9,)
@@ -31,14 +31,14 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """Hold an alignment: the pose, and what the outlines say about it."""
+    """An alignment: the pose and its matched outlines."""
 
     pose: Pose
     solution: Solution
 
 
 class InstantSolver:
-    """Gauss-Newton in head pose and jaw parameters; of instants before, only drawings are kept."""
+    """Gauss-Newton in head pose and jaw parameters; only renderings are kept between instants."""
 
     def __init__(self, solver: ContourSolver, coordinates: Coordinates) -> None:
         self.solver, self.coordinates = solver, coordinates
@@ -54,15 +54,15 @@ class InstantSolver:
         outline_weight: Array,
         rendering: Rendering | None = None,
     ) -> Aligned:
-        """Return the likeliest pose.
+        """Return the most likely pose.
 
         Args:
-            start: where to begin.
-            views, use: one picture per camera, and which masks take part, shape (2, C).
+            start: initial pose.
+            views, use: one view per camera, and the masks to use, shape (2, C).
             gates_px: residual gate of every step.
-            expected: what is known without the pictures.
+            expected: the prior.
             outline_weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
-            rendering: of these views, if there is one.
+            rendering: of these views; default: a new one.
         """
         rendering = rendering or self.solver.rendering(views)
         pose, left, moved_mm = start, tuple(gates_px), np.inf
@@ -89,11 +89,11 @@ class InstantSolver:
         final: bool = False,
         matched: list[Matched] | None = None,
     ) -> Solution:
-        """Match the outlines at a pose and sum up their residuals; see `ContourSolver.linearise`."""
+        """Match the outlines at a pose and accumulate their normal equations; see `ContourSolver.linearise`."""
         return self.solver.linearise(self.coordinates.arches(pose), views, use, gate, rendering, final, matched)
 
     def equations(self, pose: Pose, state: Solution, outline_weight: Array) -> tuple[Array, Array]:
-        """Return precision (9, 9) and right side (9,) of a step, from outlines and bound."""
+        """Return the normal matrix (9, 9) and right-hand side (9,) of a step, from outlines and bound."""
         matrix, right = bound_equations(self.coordinates, pose.d)
         for r, slope in zip(ARCHES, self.coordinates.slopes(pose), strict=True):
             precision, gradient = state.outline.precision[r].sum(0), state.outline.gradient[r].sum(0)
@@ -102,13 +102,13 @@ class InstantSolver:
         return matrix, right
 
     def _motion_mm(self, step: Array) -> float:
-        """Return about how far crowns move in a step [mm]."""
+        """Return an estimate of how far crowns move in a step [mm]."""
         turn = float(np.linalg.norm(step[HEAD][:3])) * self.solver.scans[0].radius_mm
         return turn + float(np.linalg.norm(step[HEAD][3:])) + float(np.linalg.norm(step[JAW]))
 
 
 def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
-    """Return precision (9, 9) and right side (9,) of the soft bound: nothing inside, a quadratic outside."""
+    """Return the normal matrix (9, 9) and right-hand side (9,) of the soft bound: zero inside, quadratic outside."""
     matrix, right = np.zeros((LOCAL, LOCAL)), np.zeros(LOCAL)
     margin = float(coordinates.jaw.margin(d))
     if margin < 0:
@@ -119,11 +119,11 @@ def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
 
 
 def quick(solver: ContourSolver) -> ContourSolver:
-    """Return a solver of thinned scans that draws them less often, for the many steps of a first pass."""
+    """Return a solver with decimated scans and rarer redraws, for the many steps of the first pass."""
     scans = [thinned(replace(scan.thin or scan, thin=None), _QUICK_FACES) for scan in solver.scans]
     return ContourSolver(scans, replace(solver.config, redraw_px=_QUICK_REDRAW_PX))
 
 
 def whole(solver: ContourSolver) -> ContourSolver:
-    """Return a solver that always takes all faces."""
+    """Return a solver that always uses all faces."""
     return ContourSolver([replace(scan, thin=None) for scan in solver.scans], solver.config)

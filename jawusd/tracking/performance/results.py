@@ -1,4 +1,4 @@
-"""What a solve found as a performance, and a performance as tracks, so that whatever reads tracks reads it."""
+"""The result of a solve as a performance, and its conversion to tracks."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def performance_of(
         pivot: point of the upper scan the head turns about [mm], shape (3,).
         frames: of the reference camera, in the order of the fits.
         smoothed: the take after the second pass.
-        camera_names: in the order of the views.
+        camera_names: in view order.
         fps: frames per second.
-        free_focal: focal lengths were estimated, over those of the cameras.
+        free_focal: focal lengths were estimated, relative to those of the cameras.
     """
     fits = smoothed.fits
     d = np.stack([fit.pose.d for fit in fits])
@@ -73,13 +73,13 @@ def performance_of(
 def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     """Return the poses of both arches with their covariances.
 
-    Every frame has final poses; arches out of sight count as lost and have no raw ones. The standard deviations of the
-    landmarks include what the rig itself does not know.
+    Every frame has final poses; arches out of sight count as lost and have no raw poses. The standard deviations of the
+    landmarks include the uncertainty of the rig.
     """
     p = performance
     head, relative = p.T_world_upper, jaw.pose(p.d)
     lower = head @ relative
-    # Left twists by the nine unknowns: of the head in the world, of the mandible in the skull frame.
+    # Derivatives of left twists by the nine unknowns: of the head in the world, of the mandible in the skull frame.
     turn = se3_adjoint(head @ make_transform(np.eye(3), p.pivot))
     by_d = se3_left_jacobian(jaw.twist(p.d)) @ jaw.jacobian(p.d)
     of_upper, of_lower = np.zeros((2, len(p.frames), 6, 9))
@@ -90,7 +90,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     meta = TracksMeta(solver="performance", tolerance_mm=jaw.tolerance_mm)
     meta.update(_known_notes(p))
     moved = jaw.meta.get("registration")
-    if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is posed as the rig has it
+    if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is registered as in the rig
         meta["registration"] = cast(Registration, moved)
     count, cameras = len(p.frames), len(p.camera_names)
     raw = {"upper": head.copy(), "lower": lower.copy(), "relative": relative.copy()}
@@ -124,7 +124,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
 
 
 def rig_sigma_mm(jaw: JawRig) -> Array:
-    """Return how far off the rig itself is at each landmark [mm], shape (5,); 0 where it does not say."""
+    """Return the standard deviation of the rig at each landmark [mm], shape (5,); 0 where it is unknown."""
     known = jaw.meta.get("uncertainty")
     table = known if isinstance(known, dict) else {}
     return np.array([float(table.get(name, {}).get("base_mm", 0.0)) for name in LANDMARKS])
@@ -135,7 +135,7 @@ def _spread(slope: Array, covariance: Array) -> Array:
 
 
 def _of_rig(jaw: JawRig, relative: Array) -> Array:
-    """Return the covariance of T_upper_lower that lets each landmark stray as far as the rig does, shape (F, 6, 6)."""
+    """Return the covariance of T_upper_lower that gives each landmark the rig's uncertainty, shape (F, 6, 6)."""
     variance = rig_sigma_mm(jaw) ** 2
     out = np.zeros((len(relative), 6, 6))
     if not variance.all():
@@ -145,7 +145,7 @@ def _of_rig(jaw: JawRig, relative: Array) -> Array:
         for point, spread in zip(jaw.landmarks @ pose[:3, :3].T + pose[:3, 3], variance, strict=True):
             J = np.hstack([-hat(point), np.eye(3)])
             precision += J.T @ J * (3.0 / spread)
-        # Five landmarks would otherwise count as independent witnesses of one pose.
+        # Five landmarks on a rigid body are not independent measurements of its pose.
         out[k] = np.linalg.inv(precision) * len(variance) / 2
     return out
 

@@ -1,4 +1,4 @@
-"""A whole performance: the start, frame after frame both ways, back into the gaps, then all frames at once."""
+"""The solve of a shot: start, first pass in both directions, backward pass into gaps, then all frames jointly."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """Say what to solve.
+    """Input of a solve.
 
     Attributes:
-        views: the pictures.
-        camera_names: of the pictures, in their order.
-        frames: first instant of the reference camera, and one past the last.
-        start_frame, start: where to begin.
+        views: source of the views.
+        camera_names: in view order.
+        frames: range of reference-camera frames, end exclusive.
+        start_frame, start: initial frame and pose.
         fps: frames per second.
-        fixed_head: the cameras are worn: the head does not move before them.
-        free_focal: the focal lengths are guesses.
+        fixed_head: the cameras are head-mounted, so the head pose is constant.
+        free_focal: estimate the focal lengths.
     """
 
     views: Views
@@ -71,9 +71,9 @@ def solve_performance(
     Args:
         jaw: the person's rig.
         scans: upper and lower teeth, prepared.
-        shot: pictures, frames and where to begin.
-        config: the tracker's numbers.
-        progress: called with frames done and frames in all, once per frame.
+        shot: views, frames and start.
+        config: settings of the tracker.
+        progress: called after each frame with the number of frames done and the total.
 
     Raises:
         TrackingError: the teeth do not fit the start.
@@ -95,7 +95,7 @@ def solve_performance(
 
 
 class _Take:
-    """Keep the fits of all frames."""
+    """Fits of all frames."""
 
     def __init__(self, jaw: JawRig, solver: ContourSolver, shot: Shot, progress: Progress) -> None:
         self._jaw, self._config, self._shot, self._progress = jaw, solver.config, shot, progress
@@ -106,16 +106,16 @@ class _Take:
         self.fits: dict[int, FrameFit] = {}
 
     def first_pass(self) -> None:
-        """Align every frame from the start on, both ways, then back into the gaps."""
+        """Align every frame from the start in both directions, then backwards into gaps."""
         first, stop = self._shot.frames
         start = self._shot.start_frame
         attempts = Attempts(self._quick, self._weight)
         begun = attempts.near(self._shot.start, attempts.instant(self._views.at(start)))
         if not begun.found.all():
             raise TrackingError(
-                "the teeth with the rig's jaw do not fit the masks where the solve begins",
+                "the teeth posed by the rig do not fit the masks of the start frame",
                 frame=start,
-                hint="Check that the rig is of this person, and masks and calibration of this frame.",
+                hint="Check that the rig is of this person, and the masks and calibration at this frame.",
             )
         self.fits[start] = begun
         for frames in (range(start + 1, stop), range(start - 1, first - 1, -1)):
@@ -126,7 +126,7 @@ class _Take:
         self._close_gaps()
 
     def _close_gaps(self) -> None:
-        """Align backwards into every run of frames with something missed, from the frame after it."""
+        """Align backwards from the frame after each run of frames in which an arch was missed."""
         usual = usual_residual_px(self.fits.values())
         after: ForwardPass | None = None
         for frame in sorted(self.fits, reverse=True):
@@ -143,7 +143,7 @@ class _Take:
                     self.fits[frame] = again
 
     def second_pass(self) -> Smoothed:
-        """Return all frames refined together."""
+        """Refine all frames jointly."""
         frames = sorted(self.fits)
         shot, cameras = self._shot, len(self._shot.camera_names)
         smoother = Smoother(
@@ -175,19 +175,19 @@ def solve_capture(
     """Solve the performance of a capture.
 
     Args:
-        capture: gives masks, frame range and picks; without picks the teeth are searched.
+        capture: masks, frame range and optional picks; without picks, the start is searched.
         cameras: calibrated; world lengths in mm.
         offsets: reference frame minus own frame number, per camera name.
-        upper, lower: teeth scans in one frame, as the rig knows them [mm].
+        upper, lower: teeth scans in one frame, the same as in the rig [mm].
         jaw: the person's rig.
-        config: the tracker's numbers.
-        fixed_head: the cameras are worn: the head does not move before them.
-        free_focal: the focal lengths of the calibration are guesses.
-        threads: of the search for the start; the result does not depend on it.
-        progress: called with frames done and frames in all, once per frame.
+        config: settings of the tracker.
+        fixed_head: the cameras are head-mounted, so the head pose is constant.
+        free_focal: estimate the focal lengths; those of the calibration are guesses.
+        threads: number of threads of the start search; the result does not depend on it.
+        progress: called after each frame with the number of frames done and the total.
 
     Raises:
-        TrackingError: no masks, or no frame on which the teeth can be aligned.
+        TrackingError: there are no masks, or no frame in which the teeth can be aligned.
         CaptureError: a mask cannot be read.
     """
     config = config or TrackingConfig()
@@ -216,7 +216,7 @@ def solve_capture(
 
 @dataclass(frozen=True, eq=False)
 class _Begin:
-    """Say where to begin, how that was found, and what is doubtful."""
+    """Start of a solve: frame and pose, how they were found, and findings."""
 
     frame: int
     pose: Pose
@@ -233,7 +233,7 @@ def _begin(
     jaw: JawRig,
     map_: Mapper,
 ) -> _Begin:
-    """Return a start from picks or by search; with one camera the rig takes part in it."""
+    """Return a start from picks or by search; with a single camera, the search uses the rig."""
     sources = masked_sources(capture.cameras, cameras, offsets, 1)
     if len(sources) > 1:
         start = find_start(capture, cameras, offsets, meshes, solver, map_)

@@ -1,7 +1,8 @@
-"""Where a solve begins with one camera: the person's jaw searched in its masks.
+"""The start of a solve with one camera: a search for head and jaw in its masks.
 
-One view tells the distance by size and perspective alone, and of size lips hide an unknown part. So all distances are
-tried at which the masks could be the teeth, with all orientations; then, for the most promising heads, the jaw's poses.
+In a single view, distance follows from apparent size and perspective only, and lips hide an unknown part of the teeth.
+The search therefore tries all distances at which the masks could be the teeth, with all orientations, and then the jaw
+poses for the most promising heads.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.pose_search import Candidate, Grid, Screen, coarse_scan, hinge_at_front, search_arch
 from jawusd.tracking.initialization.start_search import guessed_axes
-from jawusd.tracking.performance.attempts import MOST_UNSURE, Attempts, FrameFit, Instant
+from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameFit, Instant
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
 
 _PX_PER_MM = 2.0
-_ANYWHERE_MM = 200.0  # where a first look is taken, along the optical axis
-_SURVEYED, _FRAMES_TRIED = 24, 4
-# How wide the teeth are that a mask may show [mm]: from the front teeth alone to a whole arch, in steps of an eighth.
+_ANYWHERE_MM = 200.0  # initial distance along the optical axis, which sets the resolution of the views
+_SURVEYED, _FRAMES_TRIED = 24, 4  # frames surveyed for large masks, and frames searched
+# Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, in steps of an eighth.
 _WIDTHS_MM = 22.0 * 1.125 ** np.arange(10)
 _USUAL_WIDTH_MM = 42.0
 _GRID = Grid(
@@ -43,22 +44,20 @@ _GRID = Grid(
     reach_mm=(9.0, 7.5, 0.1),
 )
 _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
-# Heads that are kept, jaws tried with each, pairs that are aligned in a few steps, to the end, and at the working size.
+# Heads kept, jaws tried with each, pairs aligned in a few steps, pairs aligned fully, and at the working resolution.
 _HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 240, 32, 160, 24, 5
-# Price of a pixel of crown beyond the mask, in px of contour: lips may hide it, so it is little.
+# Price of a pixel of crown outside the mask, in px of contour. It is low, as lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
-_DISTINCT_MM = 3.0  # mean distance of the teeth between heads that are kept
-# Fit of the arch that fits worse beyond which there is no doubt, and below which there is no start [-]: as with more
-# cameras, see `start_causes.CLEAR_FIT`.
+_DISTINCT_MM = 3.0  # least mean distance of the teeth between heads that are kept
+# Fit of the worse arch above which a start is accepted at once, and below which it is rejected [-]; see
+# `start_causes.CLEAR_FIT` for several cameras.
 _CLEAR_FIT, _LEAST_FIT = 0.3, 0.1
-# How far candidates may lie from the pose they are aligned to, standard deviations [rad, mm, mm]: tried with 3 and 6
-# times less than at most on four frames of the example; 3 times did on twelve others too.
-_NEARBY = MOST_UNSURE / 3.0
+_NEARBY = LARGEST_SIGMA / 3.0  # standard deviations of a candidate about its pose [rad, mm, mm]
 
 
 @dataclass(frozen=True, eq=False)
 class FoundPose:
-    """Hold a start: frame, pose, and the fit of the arch that fits worse [-]."""
+    """A start: frame, pose, and the fit of the worse arch [-]."""
 
     frame: int
     pose: Pose
@@ -66,7 +65,7 @@ class FoundPose:
 
 
 class SingleStart:
-    """Search head and jaw on frames of one camera."""
+    """Search for head and jaw in frames of one camera."""
 
     def __init__(
         self, meshes: Sequence[Mesh], solver: ContourSolver, jaw: JawRig, T_anatomical_scan: Array, map_: Mapper = map
@@ -75,18 +74,18 @@ class SingleStart:
 
         Args:
             meshes: upper and lower teeth scans in one frame [mm].
-            solver: holds the same scans, prepared.
+            solver: solver with the same scans, prepared.
             jaw: the person's rig.
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
-            map_: runs orientations.
+            map_: map function that may run orientations in parallel.
         """
         solver = solver.exact()
         self._jaw, self._map, self._config = jaw, map_, solver.config
         self._coarse = tuple(coarse_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True))
         self._hinge = hinge_at_front(self._coarse[0].crown_vertices(), T_anatomical_scan)
         weight = np.full(2, 1.0 / solver.config.typical_noise_px3)
-        # With gates of the same pixels, three times as wide in mm, teeth half hidden by lips shrank to what is seen of
-        # them: from the true pose, they ended 30 mm farther away.
+        # Gates scale with the resolution. Otherwise they would be so wide in mm that teeth half hidden by lips would
+        # shrink to their visible part.
         small = self._config.with_gates_scaled(_PX_PER_MM / self._config.working_px_per_mm)
         rough = ContourSolver(self._coarse, small)
         self._rough = Attempts(InstantSolver(rough, Coordinates(jaw, self._coarse)), weight)
@@ -94,10 +93,10 @@ class SingleStart:
         self._jaws = spread_out(jaw, _JAWS)
 
     def find(self, footage: Footage) -> FoundPose:
-        """Return a start: the first frame that fits beyond doubt, or the one that fits best.
+        """Return the first start that fits clearly, or the one that fits best.
 
         Raises:
-            TrackingError: no frame of those tried fits.
+            TrackingError: none of the frames tried fits.
             CaptureError: a mask cannot be read.
         """
         best: FoundPose | None = None
@@ -110,15 +109,15 @@ class SingleStart:
                 break
         if best is None or best.fit < _LEAST_FIT:
             raise TrackingError(
-                f"the teeth were not found in the masks of the one camera on {len(frames)} frames tried "
+                f"the teeth were not found in the masks of the single camera; {len(frames)} frames were tried "
                 f"({', '.join(map(str, frames))})",
-                hint="Check that the rig is of this person, the focal length and the masks; begin the shot with the "
-                "teeth in sight, or give a second camera.",
+                hint="Check that the rig is of this person, and check focal length and masks; start the shot with the "
+                "teeth visible, or add a second camera.",
             )
         return best
 
     def at(self, footage: Footage, frame: int) -> FoundPose | None:
-        """Return the best pose on a frame, None if nothing fits."""
+        """Return the best pose in a frame, or None if nothing fits."""
         camera = footage.cameras[footage.sources[0].name]
         anywhere = camera.centre_world() + _ANYWHERE_MM * camera.T_cam_world[2, :3]
         with footage.views(anywhere, _PX_PER_MM) as masks:
@@ -131,7 +130,7 @@ class SingleStart:
             views = masks.at(frame)
         instant = self._rough.instant(views)
         ends = [self._after(pose, instant, self._rough.config.wide_gates_px) for pose in self._searched(views, places)]
-        ends = sorted(ends, key=_worth)[:_WINNERS]
+        ends = sorted(ends, key=_descending)[:_WINNERS]
         best: tuple[float, FrameFit] | None = None
         px_per_mm = self._config.working_px_per_mm
         for _, pose in ends:
@@ -143,9 +142,9 @@ class SingleStart:
         return None if best is None else FoundPose(frame, best[1].pose, best[0])
 
     def _searched(self, views: Sequence[View], places: Array) -> list[Pose]:
-        """Return the most promising heads with the most promising jaw of each.
+        """Return the most promising heads, each with its most promising jaw.
 
-        The upper arch alone tells little about the distance; a few steps with both arches tell more.
+        The upper arch alone hardly constrains the distance, so heads are ranked by a few steps with both arches.
         """
         found: list[Candidate] = []
         for pair in places:
@@ -156,15 +155,15 @@ class SingleStart:
         ]
         heads = self._distinct(sorted(found, key=lambda head: -head.objective))
         pairs = sorted(
-            (pair for some in self._map(partial(self._with_jaws, views), heads) for pair in some), key=_worth
+            (pair for some in self._map(partial(self._with_jaws, views), heads) for pair in some), key=_descending
         )
         instant = self._rough.instant(views)
         few = self._rough.config.trial_gates_px
         tried = [(self._after(pose, instant, few)[0], pose) for _, pose in pairs[:_TRIED]]
-        return [pose for _, pose in sorted(tried, key=_worth)[:_FINALISTS]]
+        return [pose for _, pose in sorted(tried, key=_descending)[:_FINALISTS]]
 
     def _distinct(self, found: Sequence[Candidate]) -> list[Candidate]:
-        """Return the best candidates that differ from one another."""
+        """Return the best candidates that are mutually distinct."""
         probes = self._coarse[0].probes[::20]
         kept: list[Candidate] = []
         places = np.empty((_HEADS, len(probes), 3))
@@ -179,21 +178,21 @@ class SingleStart:
         return kept
 
     def _with_jaws(self, views: Sequence[View], head: Candidate) -> list[tuple[float, Pose]]:
-        """Return the two most promising jaws with a head, with the objective of both arches."""
+        """Return the two most promising jaws for a head, with the objective of both arches."""
         place = transform_point(head.pose, self._coarse[1].centre)
         screen = Screen(views[0], 1, _PX_PER_MM, _SHIFTS @ head.pose[:3, :3].T, place)
         poses = head.pose @ self._jaw.pose(self._jaws)
         prices = np.array([self._outside_price(1, pose, views[0]) for pose in poses])
-        worth = screen.objectives(self._coarse[1], poses).max(axis=1) - prices
-        return [(head.objective + worth[k], Pose(head.pose, self._jaws[k])) for k in np.argsort(worth)[::-1][:2]]
+        scores = screen.objectives(self._coarse[1], poses).max(axis=1) - prices
+        return [(head.objective + scores[k], Pose(head.pose, self._jaws[k])) for k in np.argsort(scores)[::-1][:2]]
 
     def _outside_price(self, arch: int, pose: Array, view: View) -> float:
-        """Return the price of crowns drawn where there is no mask: teeth too near would cover any."""
+        """Return the price of crowns outside the mask; otherwise, teeth close to the camera would cover any mask."""
         bits = self._coarse[arch].silhouette(view.matrix @ pose, view.masks.shape[1:])
         return _OUTSIDE_PRICE * max(int(count_bits(bits)) - int((view.masks[arch] > 127).sum()), 0)
 
     def _after(self, pose: Pose, instant: Instant, gates: Sequence[float]) -> tuple[float, Pose]:
-        """Return how well both arches fit after some steps [px], and where they are then."""
+        """Return the objective of both arches after some steps [px], and the pose."""
         expected = Expected(pose, _NEARBY**-2.0)
         trial = self._rough.attempt(pose, expected, instant, instant.present, gates)
         arches = self._rough.instants.coordinates.arches(trial.pose)
@@ -202,20 +201,20 @@ class SingleStart:
         return trial.objective(price) - outside, trial.pose
 
     def _refined(self, pose: Pose, attempts: Attempts, views: Sequence[View]) -> tuple[float, FrameFit] | None:
-        """Return the fit of the worse arch after aligning, with the frame; None if an arch is not found."""
-        found = attempts.near(pose, attempts.instant(views), MOST_UNSURE)
+        """Return the fit of the worse arch after alignment, and the frame fit; None if an arch is not found."""
+        found = attempts.near(pose, attempts.instant(views), LARGEST_SIGMA)
         if found.solution is None or not found.found.all():
             return None
         scans = attempts.instants.solver.scans
         return float(arch_fit(scans, found.solution, views, self._config.uncovered_price).min()), found
 
 
-def _worth(entry: tuple[float, Pose]) -> float:
+def _descending(entry: tuple[float, Pose]) -> float:
     return -entry[0]
 
 
 def spread_out(jaw: JawRig, count: int) -> Array:
-    """Return captured jaw parameters far from one another, the bite among them, shape (at most count, 3) [mm]."""
+    """Return captured jaw parameters by farthest-point sampling, including the bite, shape (at most count, 3) [mm]."""
     d = np.vstack([np.zeros(3), jaw.captured_d])
     tips = transform_points(jaw.pose(d), jaw.landmarks[:1])[:, 0]
     chosen, distance = [0], np.linalg.norm(tips - tips[0], axis=1)
@@ -227,7 +226,7 @@ def spread_out(jaw: JawRig, count: int) -> Array:
 
 
 def _places(view: View) -> Array:
-    """Return where the middles of both masks are for every width the teeth may have [mm], shape (W, 2, 3)."""
+    """Return the centres of both masks in space for every candidate width of the teeth [mm], shape (W, 2, 3)."""
     middles, columns = np.ones((2, 3)), np.flatnonzero((view.masks > 127).any((0, 1)))
     for r, mask in enumerate(view.masks):
         rows, across = np.nonzero(mask > 127)

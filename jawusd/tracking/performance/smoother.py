@@ -1,4 +1,4 @@
-"""The second pass: all frames of a take at once, outlines matched anew each round, tied together by even motion."""
+"""The second pass: joint refinement of all frames under a smoothness prior; outlines are rematched in every round."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.quality import correlation_px, residual_px
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import Matched
-from jawusd.tracking.performance.attempts import MOST_UNSURE, Attempts, FrameFit, usual_residual_px
+from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameFit, usual_residual_px
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates
 from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.motion import Motion, head_bends, measured_motion
@@ -20,19 +20,19 @@ from jawusd.tracking.performance.system import TakeSystem
 from jawusd.tracking.performance.unknowns import DRAWN, HabitPrior, TakeState, Unknowns
 from jawusd.tracking.performance.views import Views, growth_of
 
-# How often outlines are matched anew; a third time changes less than a hundredth of a millimetre.
+# Rounds of rematching; a third one changes less than 0.01 mm.
 _ROUNDS = 2
-_FOCAL_ROUNDS = 6  # with unknown focal lengths, which move the head by centimetres along the line of sight
-#: True over computed variance of a frame's unknowns [-]: outline errors last for some frames, and the rig is not quite
-#: the person; neither is in the equations.
+_FOCAL_ROUNDS = 6  # with unknown focal lengths, which couple strongly with the distance of the head
+#: Ratio of true to computed variance of a frame's unknowns [-]: the equations ignore that outline errors persist over
+#: frames and that the rig deviates from the person.
 WIDER = 1.5**2
-# How far smoothed poses of frames that were missed may be off, standard deviations [rad, mm, mm].
+# Standard deviations of smoothed poses in frames where an arch was missed [rad, mm, mm].
 _NEARBY = np.r_[[0.05] * 3, [3.0] * 3, [3.0] * 3]
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """Hold a take after the second pass: its fits, their covariances (F, 9, 9), and the unknowns of the take."""
+    """A take after the second pass: fits, their covariances (F, 9, 9), and the unknowns of the take."""
 
     fits: list[FrameFit]
     covariance: Array
@@ -41,7 +41,7 @@ class Smoothed:
 
 
 class Smoother:
-    """Refine the fits of consecutive frames together."""
+    """Joint refinement of the fits of consecutive frames."""
 
     def __init__(
         self,
@@ -57,13 +57,20 @@ class Smoother:
         habits: HabitPrior = DRAWN,
         wider: float = WIDER,
     ) -> None:
-        """Take what aligns instants, the pictures, the frames in order, and how many cameras there are.
+        """Configure the refinement.
 
         Args:
-            views: None for fits whose outlines are matched where they are; with a fixed head these have the same one.
-            length_px: over which outlines err alike, where residuals do not show it.
-            habits: what is known of how far outlines reach over the teeth.
-            wider: true over computed variance of a frame's unknowns.
+            instants: solver of single instants.
+            views: source of the views; None if the outlines of the fits are to be used as matched, in which case fits
+                with a fixed head share its pose.
+            frames: in temporal order.
+            fps: frames per second.
+            cameras: number of cameras.
+            fixed_head: the head pose is constant.
+            free_focal: estimate the focal lengths.
+            length_px: correlation length of outline errors; default: estimated from the residuals.
+            habits: prior on the offset of outlines from the teeth's edges.
+            wider: ratio of true to computed variance of a frame's unknowns.
         """
         self._wider = wider
         self._cameras, self._rounds, self._length_px = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, length_px
@@ -80,8 +87,8 @@ class Smoother:
         """Return the most likely take.
 
         Args:
-            fits: of the first pass, in order of frames.
-            done: called with frames matched and frames to be matched in all.
+            fits: of the first pass, in frame order.
+            done: called with the number of frames matched and the total.
         """
         config, fits = self._instants.config, list(fits)
         state = TakeState.unknown(self._cameras)
@@ -106,15 +113,14 @@ class Smoother:
                 done(round_ * len(fits) + k + 1, total)
             weight = 1.0 / outline_variance(fits, config, self._length_px)
         sigma = np.zeros(self._cameras)
-        # The bound says on which side of it the jaw is, not where: with it, the median NEES of twelve solves by one
-        # camera was twice as large.
+        # Without the bound, which is an inequality and would make the covariance too small.
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, bounded=False))
         if self._unknowns.free_focal:
             sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
         return Smoothed(fits, covariance, state, sigma)
 
     def _with_one_head(self, fits: list[FrameFit]) -> list[FrameFit]:
-        """Return the fits with the same head, the mean of those found."""
+        """Return the fits with one common head pose, the median of those found."""
         seen = [fit for fit in fits if fit.found.all()] or fits
         first = seen[0].pose.head
         away = np.median([self._coordinates.head_steps(first, fit.pose.head) for fit in seen], axis=0)
@@ -127,19 +133,19 @@ class Smoother:
     def _system(
         self, fits: Sequence[FrameFit], state: TakeState, weight: Array, motion: Motion, *, bounded: bool = True
     ) -> TakeSystem:
-        """Return the equations of the take about where it stands, with or without the bound of the rig."""
+        """Linearise the take at its current state, with or without the bound of the rig."""
         unknowns = self._unknowns
         system = TakeSystem(len(fits), unknowns.local, unknowns.shared)
         weak = np.zeros(unknowns.local + unknowns.shared)
-        weak[unknowns.jaw] = MOST_UNSURE[JAW] ** -2.0
+        weak[unknowns.jaw] = LARGEST_SIGMA[JAW] ** -2.0
         if unknowns.head is not None:
-            weak[unknowns.head] = MOST_UNSURE[HEAD] ** -2.0
+            weak[unknowns.head] = LARGEST_SIGMA[HEAD] ** -2.0
         for k, fit in enumerate(fits):
             precision, right = unknowns.frame(fit, weight, bounded=bounded)
-            # Steps of what nothing measures stay finite.
+            # Regularises unknowns without measurements.
             system.add_frame(k, precision + np.diag(1e-3 * weak), right)
         system.add_shared(*unknowns.prior(state))
-        # Where nothing is seen, a velocity would carry the jaw on for good.
+        # In gaps, steps are penalised too, so that the jaw does not drift at constant velocity.
         unseen = np.array([not fit.found.all() for fit in fits])
         gap = (unseen[1:] | unseen[:-1])[:, None]
         poses = [fit.pose for fit in fits]
@@ -153,7 +159,7 @@ class Smoother:
         return system
 
     def _matched(self, fit: FrameFit, frame: int, state: TakeState) -> FrameFit:
-        """Match the outlines of a frame at its pose."""
+        """Rematch the outlines of a frame at its pose."""
         if not fit.use.any() or self._views is None:
             return fit
         views = state.corrected(self._views.at(frame))
@@ -165,7 +171,7 @@ class Smoother:
         return replace(fit, solution=solution, growth=growth)
 
     def _found_again(self, fits: list[FrameFit], weight: Array) -> list[FrameFit]:
-        """Look once more, from smoothed poses, for arches whose masks nothing fitted."""
+        """Retry, from smoothed poses, the arches with masks that were not found."""
         if self._views is None:
             return fits
         attempts = Attempts(self._instants, weight, usual_residual_px(fits))
@@ -177,14 +183,14 @@ class Smoother:
         return fits
 
     def _covariance(self, system: TakeSystem) -> tuple[Array, Array]:
-        """Return the covariance of every frame, (F, 9, 9), unknowns of the take included, and that of the take."""
+        """Return the covariances of the frames, marginalised over the take's unknowns, (F, 9, 9), and of the take."""
         found, unknowns = system.covariance(), self._unknowns
         wide = np.sqrt(unknowns.redundancy)
         shared = found.shared * np.outer(wide, wide)
         if not unknowns.fixed_head:
             own = self._wider * found.own + found.response @ shared @ np.swapaxes(found.response, 1, 2)
             return np.asarray(own, np.float64), found.shared
-        # The head is one of the unknowns of the take.
+        # The head pose is one of the unknowns of the take.
         response = np.zeros((system.frames, LOCAL, unknowns.shared))
         response[:, HEAD, :6] = np.eye(6)
         response[:, JAW] = found.response
@@ -194,9 +200,9 @@ class Smoother:
 
 
 def outline_variance(fits: Sequence[FrameFit], config: TrackingConfig, length_px: float | None = None) -> Array:
-    """Return the variance times correlation length of the outline errors per arch, over a take [px^3], shape (2,).
+    """Return variance times correlation length of the outline errors of a take, per arch [px^3], shape (2,).
 
-    The length is taken from the residuals unless it is given.
+    By default, the length is estimated from the residuals.
     """
     solutions = [(fit.solution, fit.found) for fit in fits if fit.solution is not None and fit.found.any()]
     if length_px is not None:

@@ -1,4 +1,4 @@
-"""The normal equations of a whole take: a band of frames that even motion couples, bordered by unknowns of the take."""
+"""Normal equations of a take: a block band of frames coupled by smoothness, bordered by unknowns of the take."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _STEP = (-1.0, 1.0)
 
 
 class TakeCovariance(NamedTuple):
-    """What the equations leave uncertain.
+    """Covariance of the solution.
 
     Attributes:
-        own: of the unknowns of each frame if those of the take were known, shape (N, L, L).
-        response: how they follow from the unknowns of the take, shape (N, L, G).
+        own: of each frame's unknowns, conditional on those of the take, shape (N, L, L).
+        response: derivative of each frame's unknowns by those of the take, shape (N, L, G).
         shared: of the unknowns of the take, shape (G, G).
     """
 
@@ -33,13 +33,13 @@ class _Eliminated(NamedTuple):
 
 
 class TakeSystem:
-    """Sum up precision and right side of N frames with L unknowns each and G unknowns of the take.
+    """Accumulated normal equations of N frames with L unknowns each and G unknowns of the take.
 
-    Frames are coupled with the next two only, so that time and memory grow with N.
+    Frames are coupled with the next two only, so time and memory are linear in N.
     """
 
     def __init__(self, frames: int, local: int, shared: int) -> None:
-        """Start empty."""
+        """Start with zero equations."""
         self.frames, self.local, self.shared = frames, local, shared
         self._blocks = [np.zeros((max(frames - k, 0), local, local)) for k in range(3)]  # frame with frame + k
         self._right = np.zeros((frames, local))
@@ -47,7 +47,7 @@ class TakeSystem:
         self._corner, self._corner_right = np.zeros((shared, shared)), np.zeros(shared)
 
     def add_frame(self, k: int, precision: Array, right: Array) -> None:
-        """Add what is known of a frame and of the take together, shapes (L + G, L + G) and (L + G,)."""
+        """Add the equations of a frame and the take, shapes (L + G, L + G) and (L + G,)."""
         n = self.local
         self._blocks[0][k] += precision[:n, :n]
         self._cross[k] += precision[:n, n:]
@@ -56,22 +56,22 @@ class TakeSystem:
         self._corner_right += right[n:]
 
     def add_shared(self, precision: Array, right: Array) -> None:
-        """Add what is known of the take alone, shapes (G,) and (G,)."""
+        """Add a diagonal prior on the take's unknowns, shapes (G,) and (G,)."""
         self._corner += np.diag(precision)
         self._corner_right += right
 
     def add_bends(self, columns: slice[int, int, None], bend: Array, weight: Array) -> None:
-        """Add that second differences are small.
+        """Penalise second differences.
 
         Args:
-            columns: which unknowns.
-            bend: second differences of frames 1 to N - 2 as they are, shape (N - 2, w).
+            columns: unknowns of a frame.
+            bend: current second differences at frames 1 to N - 2, shape (N - 2, w).
             weight: their precision, shape (w,) or (N - 2, w).
         """
         self._add(_BEND, columns, bend, weight)
 
     def add_steps(self, columns: slice[int, int, None], step: Array, weight: Array) -> None:
-        """Add that first differences are small; `step` has shape (N - 1, w), otherwise as `add_bends`."""
+        """Penalise first differences; `step` has shape (N - 1, w), otherwise as `add_bends`."""
         self._add(_STEP, columns, step, weight)
 
     def _add(self, pattern: tuple[float, ...], columns: slice[int, int, None], value: Array, weight: Array) -> None:
@@ -84,7 +84,7 @@ class TakeSystem:
                 self._blocks[b][a : a + count, diagonal, diagonal] += first * second * weight
 
     def solve(self) -> tuple[Array, Array]:
-        """Return the steps of all frames, shape (N, L), and of the take, shape (G,)."""
+        """Solve for the steps of all frames, shape (N, L), and of the take, shape (G,)."""
         found = self._eliminated(np.concatenate([self._right[..., None], self._cross], axis=-1)).sides
         alone, response = found[..., 0], found[..., 1:]
         corner = self._corner - np.einsum("nlg,nlh->gh", self._cross, response)
@@ -92,9 +92,9 @@ class TakeSystem:
         return alone - response @ shared, np.asarray(shared, np.float64)
 
     def covariance(self) -> TakeCovariance:
-        """Return the inverse, as far as it is needed.
+        """Return the required blocks of the inverse.
 
-        The diagonal blocks of a block tridiagonal inverse follow from one more sweep back (Takahashi et al. 1973).
+        The diagonal blocks of a block tridiagonal inverse follow from a second backward sweep (Takahashi et al. 1973).
         """
         found = self._eliminated(self._cross)
         shared = np.linalg.inv(self._corner - np.einsum("nlg,nlh->gh", self._cross, found.sides))
@@ -108,10 +108,10 @@ class TakeSystem:
         return TakeCovariance(own, -found.sides, np.asarray(shared, np.float64))
 
     def _eliminated(self, sides: Array) -> _Eliminated:
-        """Solve the band for right sides of shape (N, L, S).
+        """Solve the band for right-hand sides of shape (N, L, S).
 
-        By blocks of two frames, coupled with the next two only: LAPACK's band solvers lose a thousandfold where threads
-        wait for one another.
+        Block elimination over pairs of frames. LAPACK's band solvers can be a thousand times slower when their threads
+        compete.
         """
         diagonal, coupling = self._pairs()
         blocks, count = len(diagonal), sides.shape[-1]
@@ -132,7 +132,7 @@ class TakeSystem:
         return _Eliminated(found.reshape(2 * blocks, self.local, count)[: self.frames], inverse, coupling)
 
     def _pairs(self) -> tuple[Array, Array]:
-        """Return the blocks of pairs of frames, shape (M, 2 L, 2 L), and of each with the next one."""
+        """Return the diagonal blocks of pairs of frames, shape (M, 2 L, 2 L), and their coupling with the next pair."""
         width, count = self.local, (self.frames + 1) // 2
         diagonal = np.tile(np.eye(2 * width), (count, 1, 1))
         coupling = np.zeros((count, 2 * width, 2 * width))

@@ -1,7 +1,7 @@
-"""What is unknown of a whole take besides its frames, and the equations of a frame in all unknowns.
+"""The unknowns shared by all frames of a take, and the equations of a frame in all unknowns.
 
-Of the take: how far the masks reach over free edges and gum line, the same in all cameras; with a fixed head, where it
-is; and focal lengths that are not known.
+Shared are the offsets of masks from free edges and gum lines, equal in all cameras; the head pose if it is fixed; and
+unknown focal lengths.
 """
 
 from __future__ import annotations
@@ -24,47 +24,47 @@ _HABITS = 3  # of an arch, as in `OutlineSums`
 
 @dataclass(frozen=True)
 class HabitPrior:
-    """Say what is known of how far outlines reach over the teeth before a take is seen.
+    """Prior on an annotator's habits: the offsets of outlines from the teeth's edges.
 
     Attributes:
         sigma: standard deviations at free edges [px], at the gum line [px], along the gum [mm].
-        frames: as many frames of independent outlines tell as much about it as a whole take.
+        frames: number of independent frames that a whole take is equivalent to for estimating the habits.
     """
 
     sigma: tuple[float, float, float]
     frames: float
 
 
-#: One hand's habits from arch to arch; it draws the same teeth all over the take.
+#: Habits of hand-drawn masks.
 DRAWN = HabitPrior((0.15, 0.15, 0.05), 1.5)
 
 
 @dataclass(frozen=True, eq=False)
 class TakeState:
-    """Hold the unknowns of a take as far as they are known."""
+    """Current estimate of the unknowns of a take."""
 
     habits: Array  # of both arches, shape (2, 3): see `View.habits`
     log_focal: Array  # logarithm of true over calibrated focal length, shape (C,)
 
     @classmethod
     def unknown(cls, cameras: int) -> TakeState:
-        """Return what is known before anything is estimated."""
+        """Return the initial estimate."""
         return cls(np.zeros((2, _HABITS)), np.zeros(cameras))
 
     def corrected(self, views: Sequence[View]) -> list[View]:
-        """Return the views of an instant with what is known of the take."""
+        """Return the views of an instant, corrected by the estimate."""
         pairs = zip(views, self.log_focal.tolist(), strict=True)
         return [replace(with_focal(view, log_focal), habits=self.habits) for view, log_focal in pairs]
 
 
 class Unknowns:
-    """Say where the unknowns of frames and take stand, and set up equations in them.
+    """Layout of the unknowns of frames and take, and equations in them.
 
     Attributes:
-        local: how many a frame has.
-        shared: how many the take has.
-        jaw: where those of the jaw stand in a frame.
-        head: the same of the head, None if it is fixed.
+        local: number of unknowns per frame.
+        shared: number of unknowns of the take.
+        jaw: slice of the jaw in a frame.
+        head: slice of the head in a frame, None if it is fixed.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Unknowns:
         free_focal: int = 0,
         habits: HabitPrior = DRAWN,
     ) -> None:
-        """Lay them out for a take of so many frames, and so many cameras of unknown focal length: all, or none."""
+        """Lay out the unknowns; `free_focal` is the number of cameras if focal lengths are unknown, else 0."""
         self._coordinates, self.fixed_head, self.free_focal = coordinates, fixed_head, free_focal
         self._sigma_habits = np.tile(habits.sigma, 2)
         self.local = LOCAL - 6 if fixed_head else LOCAL
@@ -85,12 +85,12 @@ class Unknowns:
         self._habits = slice(6 if fixed_head else 0, (6 if fixed_head else 0) + 2 * _HABITS)
         self.focal = slice(self._habits.stop, self._habits.stop + free_focal)
         self.shared = self.focal.stop
-        # A take overrates what its frames tell about habits by so much.
+        # Factor by which the frames, which are not independent, overstate the information about habits.
         self.redundancy = np.ones(self.shared)
         self.redundancy[self._habits] = max(1.0, frames / habits.frames)
 
     def prior(self, state: TakeState) -> tuple[Array, Array]:
-        """Return precision and right side of what is known of the take without its frames, shapes (G,)."""
+        """Return the diagonal precision and right-hand side of the prior on the take's unknowns, shapes (G,)."""
         precision, off = np.zeros(self.shared), np.zeros(self.shared)
         precision[self._habits] = self.redundancy[self._habits] * self._sigma_habits**-2.0
         off[self._habits] = state.habits.ravel()
@@ -99,12 +99,12 @@ class Unknowns:
         return precision, -precision * off
 
     def frame(self, fit: FrameFit, weight: Array, *, bounded: bool = True) -> tuple[Array, Array]:
-        """Return precision and right side of a frame by its outlines and the bound, shapes (L + G, L + G) and (L + G,).
+        """Return normal matrix (L + G, L + G) and right-hand side (L + G,) of a frame, from outlines and bound.
 
         Args:
-            fit: the frame, matched where it is.
+            fit: the frame, with outlines matched at its pose.
             weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
-            bounded: with the bound of the rig.
+            bounded: include the bound of the rig.
         """
         pose, solution, found, size = fit.pose, fit.solution, fit.found, LOCAL + 2 * _HABITS + self.free_focal
         matrix, right = np.zeros((size, size)), np.zeros(size)
@@ -114,7 +114,7 @@ class Unknowns:
             if solution is None or not found[r]:
                 continue
             sums = solution.outline
-            # The rows: six twists of the arch, three habits.
+            # Rows: six twist components of the arch, three habits.
             to_twist, to_habit = np.zeros((6, size)), np.zeros((_HABITS, size))
             to_twist[:, :LOCAL] = slope
             to_habit[:, LOCAL + _HABITS * r : LOCAL + _HABITS * (r + 1)] = np.eye(_HABITS)

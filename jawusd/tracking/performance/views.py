@@ -1,4 +1,4 @@
-"""The pictures of a take, read once and kept small."""
+"""Views of a take: a compressed cache of them, and their dependence on unknown focal lengths."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import View
 
-_FAST = 1  # zlib level: masks shrink to a fiftieth at once
+_FAST = 1  # zlib level; masks shrink to a fiftieth even at the fastest level
 
-#: What is known of the logarithm of an unknown focal length, standard deviation [-]: a guess from the kind of lens.
+#: Prior standard deviation of the logarithm of an unknown focal length, guessed from the type of lens [-].
 PRIOR_LOG_FOCAL = 0.1
 
 
 class Views(Protocol):
-    """Show the teeth in all cameras at instants of the reference camera, as `MaskViews` does."""
+    """Source of the views of all cameras at instants of the reference camera, such as `MaskViews`."""
 
     def at(self, frame: int) -> list[View]:
-        """Return one picture per camera."""
+        """Return one view per camera."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """Hold a view with its masks packed."""
+    """A view with compressed masks."""
 
     view: View
     shape: tuple[int, ...]
@@ -48,14 +48,14 @@ class _Kept:
 
 
 class KeptViews:
-    """Read every instant once: decoding and undistorting cost more than aligning, and a take is gone over often."""
+    """Cache of views: decoding and undistorting are slower than aligning, and a take is processed repeatedly."""
 
     def __init__(self, source: Views) -> None:
         self._source = source
         self._kept: dict[int, Sequence[_Kept]] = {}
 
     def at(self, frame: int) -> list[View]:
-        """Return one picture per camera."""
+        """Return one view per camera."""
         if frame not in self._kept:
             views = self._source.at(frame)
             self._kept[frame] = [_Kept.of(view) for view in views]
@@ -65,7 +65,7 @@ class KeptViews:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Hold sums over matched samples per arch and view, as `OutlineSums`: g is how a sample grows with log focal [px].
+    """Sums over matched samples per arch and view, as `OutlineSums`; g is a sample's derivative by log focal [px].
 
     Attributes:
         twist: sum w J g, shape (2, C, 6).
@@ -80,7 +80,7 @@ class Growth:
 
 
 def growth_of(matched: Sequence[Matched], poses: Array, centres: Array, views: Sequence[View]) -> Growth:
-    """Return the sums over what was matched at poses (2, 4, 4) of both arches about their centres (2, 3)."""
+    """Return the sums over samples matched at poses (2, 4, 4) of both arches about their centres (2, 3)."""
     count = len(views)
     out = Growth(np.zeros((2, count, 6)), np.zeros((2, count, 3)), np.zeros((2, count)), np.zeros((2, count)))
     for found in matched:
@@ -97,7 +97,7 @@ def growth_of(matched: Sequence[Matched], poses: Array, centres: Array, views: S
 
 
 def _slopes(samples: Array, pose: Array, matrix: Array, centre: Array) -> Array:
-    """Return how far samples move along their normals [px] per unit of a left twist about a world point, (n, 6)."""
+    """Return the derivatives (n, 6) of samples along their normals [px] by a left twist about a world point."""
     points = transform_points(pose, samples[:, X : Z + 1])
     depth = points @ matrix[2, :3] + matrix[2, 3]
     across = matrix[:2, :3] - samples[:, [U, V], None] * matrix[2, :3]
@@ -106,7 +106,7 @@ def _slopes(samples: Array, pose: Array, matrix: Array, centre: Array) -> Array:
 
 
 def with_focal(view: View, log_factor: float) -> View:
-    """Return a view with another focal length, by the logarithm of the factor."""
+    """Return a view with its focal length scaled by exp(log_factor)."""
     if log_factor == 0.0:
         return view
     factor = float(np.exp(log_factor))
@@ -116,5 +116,5 @@ def with_focal(view: View, log_factor: float) -> View:
 
 
 def principal_point(matrix: Array) -> Array:
-    """Return where the optical axis meets the picture of a camera matrix (3, 4) without skew [px], shape (2,)."""
+    """Return the principal point of a camera matrix (3, 4) without skew [px], shape (2,)."""
     return np.asarray(matrix[:2, :3] @ matrix[2, :3] / (matrix[2, :3] @ matrix[2, :3]), np.float64)

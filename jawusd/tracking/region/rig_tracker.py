@@ -15,7 +15,7 @@ from jawusd.tracking.contour.quality import matched_px, score_px
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import present_masks
-from jawusd.tracking.performance.attempts import MOST_UNSURE, FrameFit
+from jawusd.tracking.performance.attempts import LARGEST_SIGMA, FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Pose
 from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
 from jawusd.tracking.performance.motion import Prediction
@@ -81,7 +81,7 @@ class RigTracker:
         """Learn the colours of a first frame from a pose of a few tenths of a millimetre; return the better pose."""
         arches = self._coordinates.arches(pose)
         self._colours.begin(cut(arches), arches)
-        sigma = MOST_UNSURE * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
+        sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
         for _ in range(_FIRST_ROUNDS):
             arches = self._coordinates.arches(pose)
             look = _Look(self._instants, self._colours, cut(arches), arches, self._whole)
@@ -192,10 +192,10 @@ class RigTracker:
         order = order[: self._pace.heads]
         for head in (shifts[k] @ expected.pose.head for k in order):
             start = replace(expected.pose, head=head)
-            around = Expected(start, MOST_UNSURE**-2.0)
+            around = Expected(start, LARGEST_SIGMA**-2.0)
             found = _better(found, look.align(start, around, _TRIAL_GATES_PX))
         gates = self._pace.wide_px or self._pace.gates_px
-        return look.align(found.pose, Expected(found.pose, MOST_UNSURE**-2.0), gates)
+        return look.align(found.pose, Expected(found.pose, LARGEST_SIGMA**-2.0), gates)
 
     def _searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
         """Try poses of the jaw all over its range, those first whose teeth lie where it looks like teeth."""
@@ -203,7 +203,7 @@ class RigTracker:
         places = [head @ jaw.pose(d) for d in self._jaws]
         order = likeliest(places, look.views, self._instants.solver.scans, 1, look.upper_crowns(found.pose))
         brief, loose = [], expected.precision.copy()
-        loose[JAW] = MOST_UNSURE[JAW] ** -2.0
+        loose[JAW] = LARGEST_SIGMA[JAW] ** -2.0
         for k in order[: self._pace.jaws]:
             start = replace(found.pose, d=self._jaws[k])
             brief.append(look.align(start, Expected(start, loose), _TRIAL_GATES_PX))
