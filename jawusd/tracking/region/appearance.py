@@ -1,4 +1,4 @@
-"""A part of a picture around the teeth, and the first colours that it teaches."""
+"""Appearance of teeth in every camera, learned while tracking, and the views that use it."""
 
 from __future__ import annotations
 
@@ -19,30 +19,29 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.colours import PATCHES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.view import Counts, RegionView
 
-# Areas that teach the first colours [px]: inside crowns, outside of them, ring around them, beyond all.
+# Distances that define the training areas of the initial colours [px]: inside crowns, outside, ring, background.
 _INSIDE_PX, _OUTSIDE_PX, _RING_PX, _BEYOND_PX = 2.0, 3.0, 30.0, 4.0
 
-#: At which colours of teeth and of surroundings are taken up: usually, and on the first frame.
+#: Learning rates of tooth and background colours, usually and in the first frame.
 RATES, FIRST_RATES = (0.1, 0.2), (0.5, 0.5)
-_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # at which the place of the gum line is taken up [-], and its bound
-#: Contour length over which borders of colours err alike: lips and shadows move those of whole teeth [px]. With the
-# length of drawn masks, 18, the NEES of the relative pose was 3.8 and 9.4 on a path-traced and a rasterised take.
+_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # learning rate of the gum-line offset [-], and its bound
+#: Correlation length of border errors along the contour [px]: lips and shadows affect whole teeth.
 CORRELATION_PX = 110.0
 
 
 class Picture(NamedTuple):
-    """Hold a part of an undistorted picture around the teeth."""
+    """Part of an undistorted image around the teeth."""
 
     camera: Camera  # the pinhole camera of the part
     rgb: NDArray[np.uint8]  # shape (h, w, 3)
 
 
-#: Cuts the pictures of an instant, one per camera or None, around T_world_upper and T_world_lower, shape (2, 4, 4).
+#: Crops the images of an instant, one per camera or None, around T_world_upper and T_world_lower, shape (2, 4, 4).
 Cut = Callable[[Array], Sequence[Picture | None]]
 
 
 def first_colours(picture: Picture, poses: Array, scans: Sequence[Scan]) -> CameraColours:
-    """Return the colours of a picture in which the scans have poses T_world_upper and T_world_lower (2, 4, 4)."""
+    """Learn the colours of an image in which the scans have poses T_world_upper and T_world_lower (2, 4, 4)."""
     shape = picture.rgb.shape[:2]
     labels = np.zeros((2, *shape), np.uint8)
     for r in ARCHES:
@@ -57,39 +56,39 @@ def first_colours(picture: Picture, poses: Array, scans: Sequence[Scan]) -> Came
 
 
 class LearnedColours:
-    """Hold the colours of all cameras and how far gum lines are found from those of the scans."""
+    """Colour models of all cameras, and the offsets of observed gum lines from those of the scans."""
 
     def __init__(self, scans: Sequence[Scan], cameras: Sequence[Camera], axes: Array) -> None:
-        """Know nothing yet.
+        """Start without statistics.
 
         Args:
             scans: upper and lower, in one frame.
-            cameras: in the order of the pictures.
+            cameras: in image order.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
         """
         self._scans, self._cameras, self.axes = tuple(scans), tuple(cameras), axes
-        # Seeded: the same scans give the same patches.
+        # Seeded, so that the same scans give the same patches.
         crowns = [scan.crown_vertices(3000) @ axes.T[:, [0, 2]] for scan in scans]
         self._patches = np.stack([kmeans2(points, PATCHES, seed=1, minit="++")[0] for points in crowns])
         self._colours: list[CameraColours | None] = [None] * len(cameras)
         self._gum_px = np.zeros((2, len(cameras)))
 
     def copy(self) -> LearnedColours:
-        """Return a copy that learns on its own."""
+        """Return a copy that learns independently."""
         out = copy(self)
         out._colours, out._gum_px = deepcopy(self._colours), self._gum_px.copy()
         return out
 
     def begin(self, pictures: Sequence[Picture | None], poses: Array) -> None:
-        """Learn the colours of a first frame from T_world_upper and T_world_lower there, shape (2, 4, 4)."""
+        """Initialise the colours in a frame with poses T_world_upper and T_world_lower, shape (2, 4, 4)."""
         self._colours = [None if p is None else first_colours(p, poses, self._scans) for p in pictures]
 
     def views(self, pictures: Sequence[Picture | None], before: Array) -> list[View]:
         """Return the views of an instant.
 
         Args:
-            pictures: one per camera.
-            before: T_world_upper and T_world_lower at the frame before, shape (2, 4, 4).
+            pictures: one image per camera.
+            before: T_world_upper and T_world_lower in the previous frame, shape (2, 4, 4).
         """
         out = []
         for c, picture in enumerate(pictures):
@@ -111,7 +110,7 @@ class LearnedColours:
         return out
 
     def counting(self, views: Sequence[View]) -> list[View]:
-        """Return the same views, collecting what the borders found in them teach, for `learn`."""
+        """Return the same views with counters that collect colours beside borders, for `learn`."""
         return [
             replace(view, edges=replace(view.edges, counts=Counts.zeros()))
             if isinstance(view.edges, RegionView)
@@ -122,17 +121,17 @@ class LearnedColours:
     def learn(
         self, views: Sequence[View], pictures: Sequence[Picture | None], poses: Array, rates: tuple[float, float]
     ) -> None:
-        """Take up the colours beside the borders found, and where the gum line is found against the scans'.
+        """Update the colours beside matched borders, and the offset of the gum line.
 
         Args:
-            views: of the pictures, with counts of one look at them.
-            pictures, poses: of this instant.
-            rates: weight of new tooth and of new outside colours, 0 .. 1.
+            views: of the images, with counts of one alignment.
+            pictures, poses: images and poses of this instant.
+            rates: learning rates of tooth and background colours, 0 .. 1.
         """
         for c, view in enumerate(views):
             colours = self._colours[c]
             picture = pictures[c]
-            if picture is not None and colours is None:  # its first picture
+            if picture is not None and colours is None:  # first image of this camera
                 self._colours[c] = first_colours(picture, poses, self._scans)
             if not isinstance(view.edges, RegionView) or view.edges.counts is None or colours is None:
                 continue

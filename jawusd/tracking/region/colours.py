@@ -1,4 +1,4 @@
-"""What teeth and what surrounds them look like in one camera: colour histograms, of all and by patch of an arch."""
+"""Colour model of teeth and surroundings in one camera: histograms, global and by patch of an arch."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from jawusd.base.arrays import Array, Mask
 PATCHES = 8  # per arch
 KINDS = 2  # free edges and gum line
 TABLES = PATCHES * KINDS  # per arch; table = KINDS * patch + kind
-_BITS = 4  # per channel: finer bins stay empty
+_BITS = 4  # per channel; finer bins would stay empty
 BINS = 1 << (3 * _BITS)
 
 _BLUR = 0.7  # of histograms [bins]
 _REACH = 2  # of the blur [bins]
-# Share of a colour that the blur takes to each other one along an axis; what would leave the cube stays at its side.
+# Blur matrix along one axis of the colour cube; the border is replicated.
 _SPREAD = gaussian_filter1d(np.eye(1 << _BITS), _BLUR, axis=0, mode="nearest", radius=_REACH)
-_LOCAL = 0.5  # share of a patch's own histogram
-_MOST = 3.0  # bound of the log ratios: no colour is certain
-_LIPS = 0.2  # share of skin and lips in what may lie outside of teeth anywhere
-_EMPTY = 2e-5  # probability of colours never seen
-_ENOUGH = 200.0  # counts from which a new histogram counts in full
-_ROUNDS = 3  # of sorting lips out of what lies under crowns
+_LOCAL = 0.5  # weight of a patch's own histogram
+_MOST = 3.0  # bound of the log ratios, as no colour is certain
+_LIPS = 0.2  # weight of skin and lips in the background model
+_EMPTY = 2e-5  # probability of unseen colours
+_ENOUGH = 200.0  # counts from which a new histogram has full weight
+_ROUNDS = 3  # iterations that separate lips from the pixels under crowns
 
 
 def colour_bins(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """Return the colour bin of every pixel of a picture (h, w, 3), shape (h, w)."""
+    """Return the colour bin of every pixel of an image (h, w, 3), shape (h, w)."""
     out = np.empty(rgb.shape[:2], np.uint16)
     _write_bins(rgb, out)
     return out
@@ -48,21 +48,21 @@ def _write_bins(rgb: NDArray[np.uint8], out: NDArray[np.uint16]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Areas:
-    """Name the pixels of a picture that teach a first model, each of shape (h, w)."""
+    """Pixels of an image for training the initial model, each of shape (h, w)."""
 
-    crowns: Mask  # well inside of projected crowns
+    crowns: Mask  # well inside projected crowns
     ring: Mask  # around them, within reach of the search
     gum: Mask  # under projected gum, away from crowns
-    far: Mask  # beyond all: skin and lips
+    far: Mask  # away from everything: skin and lips
 
 
 class CameraColours:
-    """Learn the colours of teeth and of what surrounds them, and rate colours by log likelihood ratios."""
+    """Colour model of teeth and surroundings that rates colours by log likelihood ratios."""
 
     def __init__(self, bins: NDArray[np.uint16], areas: Areas) -> None:
-        """Learn from a first picture, whose bins are given, shape (h, w).
+        """Learn from a first image with colour bins of shape (h, w).
 
-        Lips hide crowns, and more than crowns may lie around them: both are sorted out by classifying repeatedly.
+        Lips may hide crowns, and teeth may lie outside them: repeated classification removes both.
         """
 
         def count(where: Mask) -> Array:
@@ -83,12 +83,12 @@ class CameraColours:
         self.ratio = self._ratio()
 
     def learn(self, tooth: Array, outside: Array, rates: tuple[float, float]) -> None:
-        """Blend in the colours counted on both sides of found borders, each of shape (2, TABLES, BINS).
+        """Blend in the colours counted on both sides of matched borders, each of shape (2, TABLES, BINS).
 
         Args:
             rates: weight of new tooth and of new outside colours, 0 .. 1.
         """
-        # Free edges and gum line of a patch are the same teeth.
+        # Free edges and gum line of a patch belong to the same teeth.
         both = tooth.reshape(2, PATCHES, KINDS, BINS).sum(2)
         _blend(self._local_tooth.reshape(-1, KINDS, BINS), both.reshape(-1, BINS), rates[0])
         _blend(self._local_outside.reshape(-1, 1, BINS), outside.reshape(-1, BINS), rates[1])
@@ -97,7 +97,7 @@ class CameraColours:
         self.ratio = self._ratio()
 
     def _ratio(self) -> NDArray[np.float32]:
-        """Return the log ratio of tooth over anything else by arch, table and bin, shape (2, TABLES, BINS)."""
+        """Return the log ratio of tooth to background by arch, table and bin, shape (2, TABLES, BINS)."""
         out = np.empty((2 * TABLES, BINS), np.float32)
         beside = np.stack([self._outside, 0.5 * (self._gum + self._outside)])  # by kind
         inside, outside = self._local_tooth.reshape(-1, BINS), self._local_outside.reshape(-1, BINS)
@@ -109,14 +109,14 @@ class CameraColours:
 def _write_ratios(
     local_tooth: Array, local_outside: Array, tooth: Array, outside: Array, lips: Array, out: NDArray[np.float32]
 ) -> None:
-    """Write the log ratios of tables (T, B) with histograms of their own, of all teeth, beside both kinds, and of lips.
+    """Write the log ratios of tables (T, B), mixing local and global histograms and lips.
 
     Args:
-        local_tooth, local_outside: of the tables, empty where nothing was learned, shape (T, B).
+        local_tooth, local_outside: histograms by table, empty where nothing was learned, shape (T, B).
         tooth: of all teeth, shape (B,).
-        outside: of what lies beside borders of each kind, shape (KINDS, B).
+        outside: background beside borders of each kind, shape (KINDS, B).
         lips: of skin and lips, shape (B,).
-        out: receives, shape (T, B).
+        out: result, shape (T, B).
     """
     for t in range(len(out)):
         inner = _LOCAL if local_tooth[t].any() else 0.0
@@ -130,7 +130,7 @@ def _write_ratios(
 
 @numba.njit(nogil=True, cache=True)
 def _blend(known: Array, counts: Array, rate: float) -> None:
-    """Blend new counts (T, B), blurred, into histograms (T, K, B), all K alike, as much as there are counts."""
+    """Blend blurred counts (T, B) into histograms (T, K, B), the same for all K, weighted by the number of counts."""
     blurred = np.empty(BINS)
     for t in range(len(known)):
         total = counts[t].sum()
@@ -145,7 +145,7 @@ def _blend(known: Array, counts: Array, rate: float) -> None:
 
 @numba.njit(nogil=True, cache=True)
 def _blur(histogram: Array, out: Array) -> None:
-    """Blur a histogram (B,), most of which is empty, over neighbouring colours."""
+    """Blur a sparse histogram (B,) over neighbouring colours."""
     out[:] = 0.0
     side, reach = len(_SPREAD), _REACH
     for b in range(len(histogram)):
@@ -160,7 +160,7 @@ def _blur(histogram: Array, out: Array) -> None:
 
 
 def _blended(known: Array, counts: Array, rate: float) -> Array:
-    """Return a histogram (BINS,) with new counts blended in, if they are enough."""
+    """Return a histogram (BINS,) with new counts blended in if there are enough."""
     total = counts.sum()
     return known if total < 2 * _ENOUGH else (1 - rate) * known + rate * _smooth(counts / total)
 

@@ -1,6 +1,8 @@
-"""Widen what is claimed of frames whose condyles are where the rest of the take does not let them be, and judge takes.
+"""Use of the condylar motion of a whole take: inflated covariances of implausible frames, and fused poses.
 
-Masks made around a wrong pose confirm it, and colours may prefer it; but such poses seldom fit the jaw's own motion.
+Masks generated around a wrong pose confirm it, and colours may prefer it, but such poses rarely fit the jaw's own
+condylar motion. While a take is tracked, the condylar prior has a low weight, as few frames have trained it. Once all
+frames are known, each pose is fused with the prediction at full weight.
 """
 
 from __future__ import annotations
@@ -15,20 +17,17 @@ from jawusd.geometry import orthonormalise, relative_pose, se3_adjoint, se3_exp
 from jawusd.tracking.contour.quality import landmark_sigmas
 from jawusd.tracking.region.jaw_priors import CondyleMotion
 
-# Squared distance of the condyles from what is expected, per coordinate, from which a frame is strained: of 1,400 right
-# frames of five persons with closing lips and of three takes none had more than 1.7, of 17 frames 0.4 to 2.0 mm off 16
-# had more than 2.3.
-_STRAINED = 2.0
-_USUAL, _LEAST = 0.9, 0.25  # quantile of the take with which a strained frame is compared, and its least value
+_STRAINED = 2.0  # squared distance of the condyles per coordinate above which a frame is implausible
+_USUAL, _LEAST = 0.9, 0.25  # quantile of the take with which an implausible frame is compared, and its lower bound
 
 
 def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) -> Array:
-    """Teach a motion all frames; return by how much covariances are to be wider, 1 where nothing is strained (F,).
+    """Train a motion with all frames; return factors on the covariances (F,), 1 for plausible frames.
 
-    Their strain over the usual one (Birge 1932).
+    The factor is the squared distance relative to the usual one (Birge 1932).
 
     Args:
-        motion: one that was taught nothing yet.
+        motion: untrained.
         relative: T_upper_lower, shape (F, 4, 4).
         covariance: of their left twists about the skull origin, shape (F, 6, 6).
     """
@@ -40,7 +39,7 @@ def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) ->
 
 
 def widen_strained(tracks: Tracks, landmarks: Array, axes: Array) -> Tracks:
-    """Return tracks whose strained frames have a wider covariance; see `strain_factors`.
+    """Return tracks with inflated covariances of implausible frames; see `strain_factors`.
 
     Args:
         landmarks, axes: as in `CondyleMotion`.
@@ -63,7 +62,7 @@ def widen_strained(tracks: Tracks, landmarks: Array, axes: Array) -> Tracks:
 
 @dataclass(frozen=True, eq=False)
 class CondyleFusion:
-    """Weigh all poses of a take against where its own frames have the condyles; see `results.Fusion`.
+    """Fuses all poses of a take with its own condylar motion; see `results.Fusion`.
 
     Attributes:
         landmarks, axes: as in `CondyleMotion`.
@@ -73,9 +72,9 @@ class CondyleFusion:
     axes: Array
 
     def __call__(self, poses: Array, covariance: Array, between: Array) -> tuple[Array, Array, Array]:
-        """Return likelier poses with their covariances, which are wider first where condyles are out of the way.
+        """Return the fused poses and covariances; covariances of implausible frames are inflated before.
 
-        Frames with a lost arch stay as they are.
+        Frames with a lost arch are not changed.
 
         Args:
             poses: T_world_upper and T_world_lower, NaN where lost, shape (F, 2, 4, 4).
@@ -99,9 +98,9 @@ class CondyleFusion:
 
 
 def _fused(motion: CondyleMotion, relative: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return the left twist (6,) to the likeliest T_upper_lower by a measured one and the condyles, and its covariance.
+    """Return the left twist (6,) from a measured to the fused T_upper_lower, and its covariance.
 
-    One step: expected condyles bend little over what poses are off.
+    A single step suffices, as the prediction is nearly linear over pose errors.
     """
     residual, slope, variance = motion.residual(relative)
     pull = slope.T / variance
@@ -110,16 +109,16 @@ def _fused(motion: CondyleMotion, relative: Array, covariance: Array) -> tuple[A
 
 
 def _shared(poses: Array, covariance: Array, twist: Array, gained: Array) -> tuple[Array, Array]:
-    """Return the poses of both arches and their covariances after a twist of T_upper_lower, shared by their doubts.
+    """Distribute a twist of T_upper_lower over both arches by their covariances; return poses and covariances.
 
     Args:
         poses: T_world_upper and T_world_lower, shape (2, 4, 4).
         covariance: of their left twists about the world origin, shape (2, 6, 6).
         twist: left twist about the skull origin, shape (6,).
-        gained: by how much the covariance of that twist is less now, shape (6, 6).
+        gained: reduction of the covariance of that twist, shape (6, 6).
     """
     to_world = se3_adjoint(poses[0])
-    gains = covariance @ np.linalg.inv(covariance.sum(0))  # x_lower - x_upper is what the twist changes
+    gains = covariance @ np.linalg.inv(covariance.sum(0))  # the twist changes x_lower - x_upper
     moves = gains @ to_world @ twist * np.array([[-1.0], [1.0]])
     less = gains @ (to_world @ gained @ to_world.T) @ np.swapaxes(gains, 1, 2)
     return orthonormalise(se3_exp(moves) @ poses), covariance - less

@@ -1,6 +1,6 @@
-"""Find edges of crowns right before those of the other arch, where no border of colours is.
+"""Crown edges directly in front of the other arch's crowns, where tooth and background have the same colour.
 
-Every compiled function here releases the GIL and keeps no state.
+All compiled functions release the GIL and are stateless.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jawusd.tracking.contour.samples import NX, NY, U, V, pixel_of
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.region.edges import colour_at
 
-# Farthest that creases are looked for, and their edges from the darkest place; half steps to measure a slope over.
+# Search range of creases, and of their edges from the darkest point; half-pixel steps over which a slope is measured.
 _CREASE_PX, _BESIDE_PX, _CREASE_ARM = 6.0, 3.0, 3
 
 
@@ -30,21 +30,21 @@ def search_creases(
     out: Array,
     clearness: Array,
 ) -> None:
-    """Find edges of crowns right before those of the other arch: where light changes most at the dark line between.
+    """Find crown edges in front of the other arch, at the steepest brightness change beside the dark line between.
 
-    Either crown may be the darker one towards the line, but shading fades, and an edge is as sharp as the lens.
+    Either crown may darken towards the line, but shading is gradual, whereas the edge is as sharp as the lens.
 
     Args:
-        contrast: least difference between the brighter tooth and the line [8-bit steps].
-        weight: of such an edge [-].
-        The others are those of `edges.search_borders`; only samples without a border are looked at.
+        contrast: minimum difference between the brighter tooth and the line [8-bit steps].
+        weight: of the edges found [-].
+        Other arguments as for `edges.search_borders`; only samples without a border are processed.
     """
     reach = min(reach_px, _CREASE_PX)
     n = 2 * int(reach + _BESIDE_PX) + _CREASE_ARM
     line = np.empty(2 * n + 1)
     for s in range(len(samples)):
         sample = samples[s]
-        if clearness[s] != 0.0:  # found, or hidden
+        if clearness[s] != 0.0:  # border found, or sample hidden
             continue
         u, v, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
         beyond_x, beyond_y = u + 3 * nx, v + 3 * ny
@@ -55,7 +55,7 @@ def search_creases(
             line[k] = _light(rgb, u + t * nx, v + t * ny)
         low, at = np.inf, n
         for k in range(n - int(2 * reach), n + int(2 * reach) + 1):
-            p = line[k] + 0.25 * abs(k - n)  # of two lines the nearer one
+            p = line[k] + 0.25 * abs(k - n)  # prefers the nearer of two lines
             if p < low:
                 low, at = p, k
         least = line[at]
@@ -70,7 +70,7 @@ def search_creases(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _sharpest(line: Array, at: int, steps: int) -> float:
-    """Return the index near another one at which a line changes most steeply, up or down; NaN at an end."""
+    """Return the sub-sample index near `at` of the steepest change in a line; NaN at an end."""
     best, place = 0.0, np.nan
     before, slope = np.nan, np.nan
     first = max(at - steps, _CREASE_ARM)

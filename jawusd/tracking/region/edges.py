@@ -1,9 +1,9 @@
-"""Find the edges of teeth in the colours of a picture: along every normal, the likeliest place of the border.
+"""Tooth edges in a colour image: the most likely border along every contour normal.
 
-What lies inside it should look like teeth, what lies outside like anything else: the log ratios of both are summed to
-the likelihood of every place (as Stoiber et al. 2022 do along such lines). No mask is made.
+Pixels inside the border should look like teeth, pixels outside like background. The log ratios of both sum to the
+likelihood of every position (as in Stoiber et al. 2022). No mask is computed.
 
-Every compiled function here releases the GIL and keeps no state.
+All compiled functions release the GIL and are stateless.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V, pixel_o
 from jawusd.tracking.contour.scan import CROWN
 
 _MOST_STEPS = 10  # to either side of a sample
-_LEAST_CLEAR = 0.15  # share of the clear log ratio below which an edge is none
-_LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2  # of motion taken into account; of the pictures' code
+_LEAST_CLEAR = 0.15  # share of `clear_ratio` below which an edge is rejected
+_LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2  # range of compensated motion blur; gamma of the images
 _SMOOTH_PX = 1.0  # half the width over which slopes are measured
-_PER_CODE = 8  # entries of the table of light for each code
+_PER_CODE = 8  # linearisation table entries per 8-bit step
 _LIGHT = (np.arange(255 * _PER_CODE + 1) / (255 * _PER_CODE)) ** _GAMMA
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _within(bins: NDArray[np.uint16], x: float, y: float) -> bool:
-    """Tell whether there are four pixels around a place to interpolate between."""
+    """Return whether a position can be interpolated bilinearly."""
     return x >= 0 and y >= 0 and x < bins.shape[1] - 1 and y < bins.shape[0] - 1
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _ratio_at(bins: NDArray[np.uint16], table: NDArray[np.float32], x: float, y: float) -> float:
-    """Interpolate the log ratio of a table bilinearly; 0, which says nothing, outside of the picture."""
+    """Interpolate the log ratio of a table bilinearly; neutral 0 outside the image."""
     if not _within(bins, x, y):
         return 0.0
-    # Unsigned: compiled look-ups then do not ask whether an index counts from the end.
+    # Unsigned indices avoid numba's check for negative ones.
     i = np.uint32(x)
     j = np.uint32(y)
     one = np.uint32(1)
@@ -62,21 +62,21 @@ def search_borders(
     out: Array,
     clearness: Array,
 ) -> None:
-    """Write the signed distance [px] from every contour sample to the likeliest border of teeth on its normal.
+    """Write the signed distance [px] from every contour sample to the most likely tooth border on its normal.
 
     Args:
         samples: shape (n, COLUMNS).
-        tables: row of `ratio` that holds for each sample, shape (n,).
+        tables: row of `ratio` for each sample, shape (n,).
         bins: colour bin of every pixel, shape (h, w).
-        ratio: log likelihood ratio of tooth over anything else by colour bin, bounded [-], shape (T, B).
-        own_labels, other_labels: what is seen of this and of the other arch alone: CROWN, GUM or 0, shape (h, w).
+        ratio: bounded log likelihood ratio of tooth to background by colour bin [-], shape (T, B).
+        own_labels, other_labels: rendered labels of this and of the other arch: CROWN, GUM or 0, shape (h, w).
         other_inverse_depth: rendered inverse depth of the other arch's scan [1/mm], 0 = empty, shape (h, w).
         reach_px: search distance on either side.
-        tolerance_mm: depth difference between the arches that counts as real.
-        cos_limit: least cosine between the sample's normal and the fall of the ratio at the border.
-        clear_ratio: mean log ratio on both sides from which a border counts in full [-].
-        out: receives, shape (n,): the distance, positive outwards; NaN where the sample is hidden or nothing is found.
-        clearness: receives the weight of each, 0 .. 1, NaN where the other arch hides it, shape (n,).
+        tolerance_mm: minimum depth difference between the arches for occlusion.
+        cos_limit: minimum cosine between the sample's normal and the direction in which the ratio falls.
+        clear_ratio: mean log ratio on both sides from which a border has full weight [-].
+        out: result, shape (n,): distance, positive outwards; NaN where the sample is hidden or no border is found.
+        clearness: result, shape (n,): weight, 0 .. 1; NaN where the other arch hides the sample.
     """
     step = max(1.0, reach_px / _MOST_STEPS)
     n = int(np.ceil(reach_px / step)) + 3
@@ -102,14 +102,14 @@ def search_borders(
         gx = _ratio_at(bins, table, ex + e, ey) - _ratio_at(bins, table, ex - e, ey)
         gy = _ratio_at(bins, table, ex, ey + e) - _ratio_at(bins, table, ex, ey - e)
         if -(gx * nx + gy * ny) < cos_limit * np.sqrt(gx * gx + gy * gy):
-            continue  # runs across the contour: a lip or a neighbouring tooth
+            continue  # crosses the contour: a lip or a neighbouring tooth
         out[s] = d
         clearness[s] = min(1.0, clear)
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _hidden(sample: Array, other_inverse_depth: NDArray[np.float32], tolerance_mm: float) -> bool:
-    """Tell whether the other arch lies in front of a sample."""
+    """Return whether the other arch lies in front of a sample."""
     i, j = pixel_of(sample[U]), pixel_of(sample[V])
     if i < 0 or j < 0 or j >= other_inverse_depth.shape[0] or i >= other_inverse_depth.shape[1]:
         return False
@@ -128,7 +128,7 @@ def _read_line(
     own_labels: NDArray[np.uint8],
     other_labels: NDArray[np.uint8],
 ) -> None:
-    """Read the log ratios along a normal; 0 past the own crown inwards, and past any crown outwards."""
+    """Read the log ratios along a normal; 0 inwards beyond the own crown, and outwards beyond any crown."""
     x, y, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
     r[:] = 0.0
     for i in range(n, 2 * n + 1):
@@ -150,7 +150,7 @@ def _read_line(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _likeliest(r: Array, n: int, step: float, reach_px: float) -> int:
-    """Return the index of the likeliest border; -1 if it lies at the end of the line."""
+    """Return the index of the most likely border; -1 if it lies at the end of the line."""
     total = 0.0
     best = -np.inf
     at = -1
@@ -166,7 +166,7 @@ def _likeliest(r: Array, n: int, step: float, reach_px: float) -> int:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _zero_crossing(r: Array, n: int, step: float, k: int) -> float:
-    """Return where the ratio falls through 0 next to index k, else the place of k [px]."""
+    """Return the position where the ratio falls through 0 near index k, otherwise that of k [px]."""
     d = (k - n) * step
     near = np.inf
     for m in range(k - 2, k + 2):
@@ -179,7 +179,7 @@ def _zero_crossing(r: Array, n: int, step: float, k: int) -> float:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def colour_at(rgb: NDArray[np.uint8], x: float, y: float) -> tuple[float, float, float]:
-    """Interpolate a colour bilinearly; beyond the picture it is that of its rim."""
+    """Interpolate a colour bilinearly, clamping at the image border."""
     x = min(max(x, 0.0), rgb.shape[1] - 1.001)
     y = min(max(y, 0.0), rgb.shape[0] - 1.001)
     i = int(x)
@@ -198,7 +198,7 @@ def colour_at(rgb: NDArray[np.uint8], x: float, y: float) -> tuple[float, float,
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _light(code: float) -> float:
-    """Return the light of a code, 0 .. 255, to 1e-7 of white; powers would take half of the time of all else."""
+    """Linearise a gamma-encoded value, 0 .. 255, with an error of 1e-7; a table is much faster than powers."""
     x = code * _PER_CODE
     k = min(int(x), 255 * _PER_CODE - 1)
     return _LIGHT[k] + (x - k) * (_LIGHT[k + 1] - _LIGHT[k])
@@ -214,15 +214,15 @@ def sharpen(
     out: Array,
     clearness: Array,
 ) -> None:
-    """Move every border found to where the colour changes most steeply from what lies inside to what lies outside.
+    """Refine every border to the steepest colour change between its inside and outside.
 
-    Where it is half way between both is no measure of the edge: crowns darken towards it as they turn away from light.
+    The midpoint between both colours would be biased, as crowns darken towards their edges.
 
     Args:
-        contrast: least difference of both sides' mean colours [8-bit steps].
+        contrast: minimum difference of both sides' mean colours [8-bit steps].
         reach_px: how far a border may move.
-        blur_px: motion during the exposure along the normals, shape (n,): so wide is a blurred edge.
-        out, clearness: as `search_borders` writes them; borders without a steepest place lose most of their weight.
+        blur_px: motion during the exposure along the normals, the width of a blurred edge, shape (n,).
+        out, clearness: as written by `search_borders`; borders without a steepest point lose most of their weight.
     """
     inner = np.empty(3)
     outer = np.empty(3)
@@ -245,8 +245,8 @@ def sharpen(
                 outer[c] += beyond[c] / 3
         if ((inner - outer) ** 2).sum() < contrast * contrast:
             continue
-        # Pictures of moving edges are ramps of light, not of its code: their middle is the steepest place of what is
-        # blurred as much again.
+        # A moving edge is a ramp in linear light, not in gamma-encoded values. Its middle is the steepest point after a
+        # second blur of the same width.
         power = _GAMMA if blur_px[s] > _LEAST_BLUR_PX else 1.0
         norm = 0.0
         for c in range(3):
@@ -271,12 +271,12 @@ def sharpen(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _steepest(line: Array, steps: int, arm: int) -> float:
-    """Return where a line falls most steeply, in samples from its middle; NaN if that is at an end or nowhere.
+    """Return where a line falls most steeply, in samples from its middle; NaN if at an end or nowhere.
 
     Args:
         line: 2 (steps + arm) + 1 samples.
-        steps: of the search to either side.
-        arm: samples to either side whose difference, weighed linearly, is the slope.
+        steps: search steps to either side.
+        arm: samples to either side whose linearly weighted difference is the slope.
     """
     before, slope = np.nan, np.nan
     best, place = 0.0, np.nan
@@ -306,11 +306,11 @@ def count_colours(
     tooth: Array,
     outside: Array,
 ) -> None:
-    """Count the colours on both sides of borders that were found within 2 px.
+    """Count the colours on both sides of borders found within 2 px.
 
     Args:
-        near_px, far_px: distances from the contour that are counted.
-        tooth, outside: added to, shape (T, B).
+        near_px, far_px: range of distances from the contour that is counted.
+        tooth, outside: counts to update, shape (T, B).
     """
     for s in range(len(samples)):
         if not clearness[s] > 0.3 or not abs(distances[s]) < 2:

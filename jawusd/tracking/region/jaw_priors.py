@@ -1,8 +1,8 @@
-"""Keep the condyles where they go with the incisal point, as the frames so far show it.
+"""Priors on the jaw: condyles that follow the incisal point, and teeth that do not interpenetrate.
 
-When the teeth touch, or lips leave little of them in sight, the contour hardly tells whether the front teeth are higher
-and the condyles lower. In one jaw, the place of the incisal point nearly tells those of both condyles: mandibles move
-with about three freedoms (Zoss et al. 2018).
+When the teeth touch, or lips hide most of them, the contour hardly constrains the rotation of the jaw that raises the
+front teeth and lowers the condyles. In one jaw, the position of the incisal point nearly determines both condyles, as
+mandibles have about three degrees of freedom (Zoss et al. 2018). The relation is learned from earlier frames.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ from jawusd.geometry import hat, relative_pose, rigid_fit, se3_adjoint, se3_inve
 from jawusd.tracking.contour.equations import NormalEquations, Solution, translation
 from jawusd.tracking.contour.quality import landmark_sigmas
 
-_UNIT_MM = (5.0, 20.0, 5.0)  # motion of the incisal point to the left, up and forwards that is a unit
-# Motion of the left condyle to the left, up and forwards [mm] by 1, x, y, z, xx, xy, xz, yy, yz, zz: means of 60 joints
-# of `jawusd.synthetic.person`, whose ranges come from the literature. It slides down the eminence as the jaw opens, is
-# protruded, or moves to the right. The right one mirrors it.
+_UNIT_MM = (5.0, 20.0, 5.0)  # normalisation of the incisal point's motion to the left, up and forwards
+# Mean motion of the left condyle to the left, up and forwards [mm] as coefficients of 1, x, y, z, xx, xy, xz, yy, yz,
+# zz, over 60 joints of `jawusd.synthetic.person`, whose ranges come from the literature. The right condyle mirrors it.
 _USUAL_MM = np.array(
     [
         [0.0, 1.1, 0.0, 0.0, 0.0, 0.2, -0.4, 0.0, 0.0, 0.0],
@@ -27,71 +26,70 @@ _USUAL_MM = np.array(
         [0.0, -1.8, -7.1, 3.7, 0.0, -0.3, 0.0, 1.1, 0.5, 0.0],
     ]
 )
-_ODD = np.array([False, True, False, False, False, True, True, False, False, False])  # in x
-# How far those of a person are from it, standard deviation to the side, up and forwards [mm], products by a part of it;
-# of two persons not made by that model the largest differences were 2.3 and 2.6 mm. The constant is an error of the
-# scans' bite.
+_ODD = np.array([False, True, False, False, False, True, True, False, False, False])  # terms odd in x
+# Standard deviations of a person's coefficients to the side, up and forwards [mm], the factor for products, and the
+# standard deviation of the constant, an error of the scans' bite.
 _SPREAD_MM, _PRODUCTS, _CONSTANT_MM = (0.4, 1.5, 1.5), 0.5, 1.0
-# Distance of found condyles from a jaw's own polynomials, standard deviation to the side, up and forwards [mm].
+# Residuals of condyles about a jaw's own polynomials, standard deviations to the side, up and forwards [mm].
 _OFF_MM = (0.3, 0.8, 0.5)
-_NEWS = 0.1  # share of a frame that neighbouring frames do not already give
-_BACK = 0.25, 0.005  # way back of an incisal point that goes down, per mm and per mm^2: a mean of the same joints
-_DOUBT = 4.0  # squared distance per coordinate from which frames teach less: they may be wrong [-]
+_NEWS = 0.1  # weight of a frame, as neighbouring frames are correlated
+_BACK = 0.25, 0.005  # backward motion of the incisal point in opening, per mm and per mm^2: mean of the same joints
+_DOUBT = 4.0  # squared distance per coordinate at which the weight of a frame is halved, as it may be wrong [-]
 
-# How far points of the lower teeth lie above the closed bite of the scans, standard deviation [mm]: what registrations
-# of bites are off by. Squared distance in these [-] from which the scans' bite rather than the pose may be wrong.
+# Standard deviation of the lower teeth above the closed bite of the scans [mm], by errors of the bite registration; and
+# the squared distance in these [-] at which the weight is halved, as the scans' bite may be wrong instead of the pose.
 _ABOVE_MM, _BITE_DOUBT = 0.2, 4.0
 
 
 class CondyleMotion:
-    """Learn where both condyles are for every place of the incisal point.
+    """Learned map from the position of the incisal point to those of both condyles.
 
     Bayesian linear regression (Bishop 2006, section 3.3) of the motion of both condyles on the incisal point's, all
     within the skull, by polynomials of the second degree.
     """
 
     def __init__(self, landmarks: Array, axes: Array) -> None:
-        """Know nothing but what holds of any jaw.
+        """Start with the prior, which holds for any jaw.
 
         Args:
             landmarks: as in `geometry.LANDMARKS`, in scan coordinates [mm], shape (5, 3).
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
         """
         self._points, self.axes = landmarks[[0, -2, -1]], axes
-        self.hinge = np.asarray(landmarks[-2:].mean(0), np.float64)  # amid the condyles, shape (3,)
+        self.hinge = np.asarray(landmarks[-2:].mean(0), np.float64)  # midpoint of the condyles, shape (3,)
         spread = np.tile(_SPREAD_MM, 2)
         self._off = np.square(np.tile(_OFF_MM, 2))
-        usual = np.concatenate([_USUAL_MM, np.where(_ODD, [[1.0], [-1.0], [-1.0]], [[-1.0], [1.0], [1.0]]) * _USUAL_MM])
-        first = np.repeat(1.0 / spread[:, None] ** 2, usual.shape[1], axis=1)
+        mean = np.concatenate([_USUAL_MM, np.where(_ODD, [[1.0], [-1.0], [-1.0]], [[-1.0], [1.0], [1.0]]) * _USUAL_MM])
+        first = np.repeat(1.0 / spread[:, None] ** 2, mean.shape[1], axis=1)
         first[:, 0] = 1.0 / _CONSTANT_MM**2
         first[:, 4:] /= _PRODUCTS**2
-        self._precision = first[:, :, None] * np.eye(usual.shape[1])  # of the coefficients, shape (6, K, K)
-        self._sums = first * usual  # precision times mean, shape (6, K)
+        self._precision = first[:, :, None] * np.eye(mean.shape[1])  # of the coefficients, shape (6, K, K)
+        self._sums = first * mean  # precision times mean, shape (6, K)
 
     def learn(self, relative: Array, covariance: Array) -> None:
-        """Take up a frame: T_upper_lower (4, 4), and the covariance (6, 6) of its left twist about the skull origin."""
+        """Learn from T_upper_lower (4, 4), and the covariance (6, 6) of its left twist about the skull origin."""
         incisor, condyles = self._shifts(relative)
         features = _features(incisor)[0]
         known = self._off + np.repeat(landmark_sigmas(relative, covariance, self._points[1:]) ** 2, 3)
         if not np.isfinite(known).all():
             return
-        strange = _DOUBT / (_DOUBT + self.strain(relative) / len(known))
-        weight = _NEWS * strange / known
+        trust = _DOUBT / (_DOUBT + self.strain(relative) / len(known))
+        weight = _NEWS * trust / known
         self._precision += weight[:, None, None] * np.outer(features, features)
         self._sums += (weight * condyles)[:, None] * features
 
     def expected(self, incisor: Array) -> tuple[Array, Array, Array]:
-        """Return the motion of the condyles for one of the incisal point (3,): mean (6,), slope (6, 3), variance (6,).
+        """Predict the condyles' motion from the incisal point's (3,): mean (6,), derivative (6, 3), variance (6,).
 
         In anatomical axes [mm]; left condyle first.
         """
         features, slopes = _features(incisor)
         means = np.linalg.solve(self._precision, self._sums[..., None])[..., 0]
-        open_questions = np.linalg.solve(self._precision, np.broadcast_to(features, means.shape)[..., None])[..., 0]
-        return means @ features, means @ slopes, self._off + open_questions @ features
+        uncertain = np.linalg.solve(self._precision, np.broadcast_to(features, means.shape)[..., None])[..., 0]
+        return means @ features, means @ slopes, self._off + uncertain @ features
 
     def strain(self, relative: Array) -> float:
-        """Return the squared distance of the condyles from where they are expected, in standard deviations.
+        """Return the squared Mahalanobis distance of the condyles from their predicted positions.
 
         `relative` is T_upper_lower (4, 4).
         """
@@ -100,21 +98,21 @@ class CondyleMotion:
         return float((np.square(condyles - mean) / variance).sum())
 
     def placed(self, left_mm: float, down_mm: float, forward_mm: float) -> Array:
-        """Return T_upper_lower (4, 4) of a jaw with the incisal point there, so far before where opening takes it."""
+        """Return T_upper_lower (4, 4) for an incisal point; `forward_mm` is relative to the path of plain opening."""
         back = _BACK[0] * down_mm + _BACK[1] * down_mm**2
         incisor = np.array([left_mm, -down_mm, forward_mm - back])
         moves = np.concatenate([incisor, self.expected(incisor)[0]]).reshape(3, 3)
         return rigid_fit(self._points, self._points + moves @ self.axes)
 
     def _shifts(self, relative: Array) -> tuple[Array, Array]:
-        """Return how incisal point (3,) and condyles (6,) have moved from the closed bite, anatomical axes [mm]."""
+        """Return displacements of incisal point (3,) and condyles (6,) from the closed bite, anatomical axes [mm]."""
         moved = (transform_point(relative, self._points) - self._points) @ self.axes.T
         return moved[0], moved[1:].ravel()
 
     def residual(self, relative: Array) -> tuple[Array, Array, Array]:
-        """Return condyles less what is expected [mm], their slopes, and variances [mm^2]; shapes (6,), (6, 6), (6,).
+        """Return the residuals of the condyles [mm], derivatives, and variances [mm^2]; shapes (6,), (6, 6), (6,).
 
-        `relative` is T_upper_lower (4, 4); the slopes are by its left twist about the skull origin.
+        `relative` is T_upper_lower (4, 4); the derivatives are by its left twist about the skull origin.
         """
         points = transform_point(relative, self._points)
         slopes = [self.axes @ np.hstack([-hat(point), np.eye(3)]) for point in points]
@@ -125,13 +123,13 @@ class CondyleMotion:
 
 @dataclass(frozen=True, eq=False)
 class CondyleTerm:
-    """Pull both condyles towards where they are expected."""
+    """Pull both condyles towards their predicted positions."""
 
     motion: CondyleMotion
     noise_px3: float  # outline variance times correlation length
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the squared distances at the state's poses, in units of the outline sums."""
+        """Add the squared distances at the solution's poses, in units of the outline sums."""
         residual, slope, variance = self.motion.residual(relative_pose(state.poses[0], state.poses[1]))
         to_skull = se3_adjoint(se3_inverse(state.poses[0]))
         upper, lower = (slope @ to_skull @ se3_adjoint(translation(centre)) for centre in state.centres)
@@ -141,7 +139,7 @@ class CondyleTerm:
 
 
 def _features(incisor: Array) -> tuple[Array, Array]:
-    """Return 1, the coordinates of a point and their products (K,), and their slopes by the point (K, 3)."""
+    """Return the monomials (K,) up to degree two of a point, and their derivatives by it (K, 3)."""
     x, unit = incisor / _UNIT_MM, np.diag(1.0 / np.array(_UNIT_MM))
     i, j = np.triu_indices(3)
     products = x[i, None] * unit[j] + x[j, None] * unit[i]
@@ -150,12 +148,12 @@ def _features(incisor: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class BiteTerm:
-    """Push lower teeth down that lie above the closed bite of the scans.
+    """Penalise lower teeth above the closed bite of the scans.
 
     Attributes:
         points: of the lower teeth, in scan coordinates [mm], shape (N, 3).
         up: bite normal, scan coordinates, shape (3,).
-        noise_px3: variance of borders times the length over which they err alike.
+        noise_px3: variance of borders times their correlation length.
     """
 
     points: Array
@@ -163,7 +161,7 @@ class BiteTerm:
     noise_px3: float
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the squared heights above the closed bite at the state's poses, in units of the outline sums."""
+        """Add the squared heights above the closed bite at the solution's poses, in units of the outline sums."""
         skull = state.poses[0]
         up = skull[:3, :3] @ self.up
         for point in self.points:
@@ -171,7 +169,7 @@ class BiteTerm:
             height = float(up @ (here - closed))
             if height <= 0:
                 continue
-            # Both the point and the place it may not pass move with their arch.
+            # The point moves with the lower arch, its limit with the upper arch.
             moves = [up @ np.hstack([-hat(here - centre), np.eye(3)]) for centre in state.centres]
             slope = np.concatenate([-moves[0], moves[1]])
             trust = _BITE_DOUBT / (_BITE_DOUBT + (height / _ABOVE_MM) ** 2)

@@ -1,4 +1,4 @@
-"""Head and jaw of a known person in pictures that come one instant after the other."""
+"""Live tracking of head and jaw of a known person."""
 
 from __future__ import annotations
 
@@ -24,14 +24,13 @@ from jawusd.tracking.region.pace import BRIEF
 from jawusd.tracking.region.rig_tracker import RigTracker
 
 _FACES = 3_000
-# Coarser than for recorded pictures, where pictures that are left out cost more: on 100 frames of one take the incisal
-# point was 0.182 mm off with these, 0.178 with parallax of 2 px, 0.2 mm for settled steps and a last look at all poses.
+# Coarser than for recorded images, since dropped frames cost more accuracy than coarse steps.
 _SETTINGS = replace(TrackingConfig(), sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
-_WIDER = 1.5  # true over computed standard deviation, as where all frames are solved together
+_WIDER = 1.5  # ratio of true to computed standard deviation, as in the smoother
 
 
 class LiveTake:
-    """Follow head and jaw from instant to instant; `coordinates` are those of the poses."""
+    """Live tracker of head and jaw; `coordinates` convert its poses."""
 
     def __init__(
         self,
@@ -43,15 +42,15 @@ class LiveTake:
         fixed_head: bool = False,
         executor: Executor | None = None,
     ) -> None:
-        """Prepare.
+        """Prepare the scans.
 
         Args:
             jaw: the person's rig.
             scans: upper and lower teeth, prepared.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-            cameras: in the order of the pictures.
-            fixed_head: the cameras are worn: the head hardly moves before them.
-            executor: threads that match the contours of all cameras side by side.
+            cameras: in image order.
+            fixed_head: the cameras are head-mounted, so the head hardly moves relative to them.
+            executor: thread pool that matches the contours of all cameras in parallel.
         """
         self._scans, self._axes, self._cameras = [thinned(scan, _FACES) for scan in scans], axes, cameras
         self._head = STEADY if fixed_head else 1.0
@@ -60,7 +59,7 @@ class LiveTake:
         self._tracker: RigTracker | None = None
 
     def begin(self, cut: Cut, near: Pose) -> float:
-        """Learn the colours of an instant near a pose; return how much of the contour in sight fits, 0 .. 1."""
+        """Learn the colours of an instant near a pose; return the matched share of the visible contour, 0 .. 1."""
         colours = LearnedColours(self._scans, self._cameras, self._axes)
         self._tracker = RigTracker(self._instants, colours, head=self._head, pace=BRIEF)
         solution = self._tracker.begin(cut, near).solution
@@ -69,20 +68,20 @@ class LiveTake:
         return float((score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0)).min())
 
     def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
-        """Align the next instant, so many frames on.
+        """Align the next instant, `frames` frames later.
 
         Raises:
-            ValueError: nothing was begun.
+            ValueError: `begin` was not called.
         """
         if self._tracker is None:
             raise ValueError("step before begin")
         return self._tracker.step(cut, frames)
 
     def sigma_d(self, fit: FrameFit) -> Array:
-        """Return the standard deviations of d after the last step [mm], shape (3,).
+        """Return the standard deviations of d of the last step [mm], shape (3,).
 
         Raises:
-            ValueError: nothing was begun.
+            ValueError: `begin` was not called.
         """
         if self._tracker is None:
             raise ValueError("sigma before begin")

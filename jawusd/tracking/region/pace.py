@@ -1,4 +1,4 @@
-"""How much work a tracker of pictures puts into one instant."""
+"""Computational effort of the rig tracker per instant, for recorded and for live images."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ _Gates = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Pace:
-    """Say how many steps are taken, and when what is searched.
+    """Steps of an alignment, and conditions and sizes of searches.
 
     Attributes:
-        gates_px: residual gate of every step from the prediction.
-        next_px: the same after a frame that was left out.
-        far_px: the same after more of them.
-        wide_px: from other starts, and at the end of a search; None takes the gates of the prediction again.
-        doubted, searched: shares of the usual contour that fits, below which other starts are tried, and poses
-            searched, while hardly any frames were left out.
-        jaws, finalists, heads: poses of the jaw and of the head that a search tries, and jaws followed to the end.
+        gates_px: residual gate of every step from a prediction.
+        next_px: the same after one dropped frame.
+        far_px: the same after several dropped frames.
+        wide_px: gates from other starts and at the end of a search; None for those of the prediction.
+        doubted, searched: shares of the usual matched contour below which other starts are tried, and poses are
+            searched, as long as hardly any frames were dropped.
+        jaws, finalists, heads: jaw poses tried by a search, those aligned fully, and head poses tried.
         search_every: failed frames per search.
-        searches: failed frames after which teeth count as out of sight.
-        later_every: failed frames per search then.
-        in_turn: then search the jaw in one frame and the head in a later one, so that no frame waits long.
-        learn_every: frames after which colours are taken up.
+        searches: number of failed frames after which teeth count as out of sight.
+        later_every: failed frames per search from then on.
+        in_turn: from then on, search jaw and head in different frames, to limit the time per frame.
+        learn_every: frames per update of the colours.
     """
 
     gates_px: _Gates
@@ -42,7 +42,7 @@ class Pace:
     learn_every: int
 
 
-#: For recorded pictures.
+#: For recorded images.
 THOROUGH = Pace(
     gates_px=(6.0, 4.0, 3.0, 2.5, 2.0),
     next_px=(6.0, 4.0, 3.0, 2.5, 2.0),
@@ -59,7 +59,7 @@ THOROUGH = Pace(
     in_turn=False,
     learn_every=1,
 )
-#: For pictures that wait for nobody. Searches cost what passes meanwhile, so they begin later.
+#: For live images. Frames are dropped during a search, so searches start later.
 BRIEF = Pace(
     gates_px=(8.0, 3.0, 2.0),
     next_px=(16.0, 6.0, 2.5, 2.0),

@@ -1,4 +1,4 @@
-"""A performance from pictures alone: frame after frame both ways from the start, then all frames at once."""
+"""A performance solved from images without masks: frame by frame in both directions, then all frames jointly."""
 
 from __future__ import annotations
 
@@ -27,41 +27,34 @@ from jawusd.tracking.performance.unknowns import HabitPrior
 from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.rig_tracker import RigTracker
 
-#: Cuts the pictures of a range of frames by cameras, of the capture or with other focal lengths, at a size that suits
-#: teeth near a point of the world [mm], shape (3,).
+#: Crops the images of a range of frames for cameras, possibly with changed focal lengths, at a resolution suited to
+#: teeth near a world point [mm], shape (3,).
 Cuts = Callable[[Sequence[Camera], Array, range], Iterator[Cut]]
 Progress = Callable[[int, int], None]
 
-# Faces of the crowns until the last step, and there; distance of contour samples, motion that redraws scans [px], and
-# the step after which the gates in between are left out [mm].
+# Faces of the crowns before and in the last step; spacing of contour samples, and motion that triggers a redraw [px];
+# step below which intermediate gates are skipped [mm].
 _ROUGH_FACES, _FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 6_000, 20_000, 2.0, 2.0, 0.08
-# Frames that tell a fixed head and unknown focal lengths before all are solved, and how often focal lengths are.
+# Frames used to estimate a fixed head and unknown focal lengths in advance, and rounds for focal lengths.
 _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
-# How borders of colours err over a take, and over which length alike [px] apart from that: teeth darken towards their
-# free edges, where borders lie up to half a pixel inside; where the gum line is found was learned on the way. Chosen on
-# actor_a and six path-traced mouths, three cameras each, of which it left 0.075 to 0.15 mm at the incisal point and a
-# NEES of d of 0.44 to 2.4, median 0.91; with the habits of drawn masks 0.08 to 0.15 mm, and 0.12 on actor_a.
+# Prior on the offsets of colour borders over a take, and correlation length of the remaining errors [px]. Teeth darken
+# towards their free edges, where borders lie up to half a pixel inside; gum-line offsets are learned while tracking.
 _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
-# Variance of a single camera's poses over that of several cameras that tell as much [-]: borders that light or blur
-# moved have no other view against them. NEES of d over twelve solves of four persons by one camera, median: 2.1 without
-# it, 1.0 with it, and 0.2 to 11, since a frame in a wrong minimum says nothing of it.
-_ALONE = 2.0
-# Contour that fits over that of a pose without doubt, from which on another pose takes its place. Chosen on one camera
-# of the example, not on a population; with 1, slightly better poses could lead back through a whole take.
-_CLEARLY = 1.05
+_ALONE = 2.0  # inflation of the variance with a single camera, as no other view contradicts shifted borders [-]
+_CLEARLY = 1.05  # ratio of matched contour above which another pose replaces a trusted one
 
 
 @dataclass(frozen=True, eq=False)
 class PictureShot:
-    """Say what to solve.
+    """Input of a solve.
 
     Attributes:
-        cuts: cut the pictures.
-        cameras: in the order of the pictures.
+        cuts: crops the images.
+        cameras: in image order.
         frames: of the reference camera.
         fps: frames per second.
-        fixed_head: the cameras are worn: the head does not move before them.
-        free_focal: the focal lengths are guesses.
+        fixed_head: the cameras are head-mounted, so the head pose is constant.
+        free_focal: estimate the focal lengths.
     """
 
     cuts: Cuts
@@ -73,7 +66,7 @@ class PictureShot:
 
 
 class PictureTake:
-    """Follow a shot by the colours of its pictures."""
+    """Solver of a shot by the colours of its images."""
 
     def __init__(
         self,
@@ -83,14 +76,14 @@ class PictureTake:
         shot: PictureShot,
         config: TrackingConfig | None = None,
     ) -> None:
-        """Prepare.
+        """Prepare the scans.
 
         Args:
             jaw: the person's rig.
             scans: upper and lower teeth, prepared.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-            shot: pictures and frames.
-            config: the tracker's numbers.
+            shot: images and frames.
+            config: settings of the tracker.
         """
         self._axes, self._jaw, self._shot = axes, jaw, shot
         self._scans = [thinned(scan, _FACES) for scan in scans]
@@ -107,10 +100,10 @@ class PictureTake:
         )
 
     def begun(self, frame: int, near: Pose) -> tuple[Pose, float]:
-        """Return the pose on a frame near a guess, and how much of the contour in sight fits it, 0 .. 1.
+        """Return the pose in a frame near a guess, and the matched share of the visible contour, 0 .. 1.
 
         Raises:
-            CaptureError: a picture cannot be decoded.
+            CaptureError: an image cannot be decoded.
         """
         fit = self._tracker(self._shot.cameras, 1.0).begin(self._first_cut(self._shot.cameras, frame, near), near)
         solution = fit.solution
@@ -122,11 +115,11 @@ class PictureTake:
         """Solve head pose and jaw parameters of every frame.
 
         Args:
-            frame, start: where to begin.
-            progress: called with frames done and frames in all, once per frame.
+            frame, start: initial frame and pose.
+            progress: called after each frame with the number of frames done and the total.
 
         Raises:
-            CaptureError: a picture cannot be decoded.
+            CaptureError: an image cannot be decoded.
         """
         shot = self._shot
         cameras, start, factors = self._known_before(frame, start, progress)
@@ -139,7 +132,7 @@ class PictureTake:
         return performance_of(self._jaw, pivot, shot.frames, smoothed, names, shot.fps, free_focal=shot.free_focal)
 
     def _known_before(self, at: int, start: Pose, progress: Progress) -> tuple[Sequence[Camera], Pose, Array]:
-        """Return cameras, start, and true over given focal lengths (C,), from some frames where they are unknown."""
+        """Return cameras, start, and focal-length factors (C,), estimated from some frames if unknown."""
         shot = self._shot
         cameras, factors = shot.cameras, np.ones(len(shot.cameras))
         rounds = _FOCAL_ROUNDS if shot.free_focal else int(shot.fixed_head)
@@ -172,7 +165,7 @@ class PictureTake:
     def _follow(
         self, cameras: Sequence[Camera], start: tuple[int, Pose], frames: range, head: float, progress: Progress
     ) -> list[FrameFit]:
-        """Return the fits of frames, from one and its pose on both ways."""
+        """Return the fits of frames, tracked from an initial pose in both directions."""
         at, pose = start
         tracker = self._tracker(cameras, head)
         fits = {at: tracker.begin(self._first_cut(cameras, at, pose), pose)}
@@ -187,13 +180,13 @@ class PictureTake:
     def _turned(
         self, cameras: Sequence[Camera], one: RigTracker, fits: dict[int, FrameFit], frame: int, before: range
     ) -> Iterator[FrameFit]:
-        """Yield the fits of frames, followed from one against the way of a tracker."""
+        """Yield the fits of frames tracked from one frame against a tracker's direction."""
         turned = one.other_way(fits[frame])
         for cut in self._shot.cuts(cameras, self._centre(fits[frame].pose), before):
             yield turned.step(cut)
 
     def _smoothed(self, frames: range, fits: Sequence[FrameFit]) -> Smoothed:
-        """Return all frames refined together."""
+        """Refine all frames jointly."""
         shot = self._shot
         smoother = Smoother(
             self._instants,
@@ -210,7 +203,7 @@ class PictureTake:
         return smoother.run(fits)
 
     def _with_one_head(self, fits: Sequence[FrameFit]) -> list[FrameFit]:
-        """Return the fits with the same head, the median of those found."""
+        """Return the fits with one common head pose, the median of those found."""
         seen = [fit for fit in fits if fit.found.all()] or list(fits)
         first = seen[0].pose.head
         away = np.median([self.coordinates.head_steps(first, fit.pose.head) for fit in seen], axis=0)
@@ -219,16 +212,16 @@ class PictureTake:
 
 
 def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, range], Iterator[FrameFit]]) -> None:
-    """Follow the teeth against the way into frames in which they were not found, or doubtful; keep what fits better.
+    """Track backwards into frames in which the teeth were not found or doubtful; keep the better fits.
 
-    Teeth may be in sight for some frames before a search finds them, and a wrong pose is often left for the right one
-    only frames later.
+    Teeth may be visible for some frames before a search finds them, and a wrong pose is often corrected only some
+    frames later.
 
     Args:
-        fits: by frame; looked at again are those before one that is less doubtful than the last, until the teeth are
-            lost on the way back, or what is followed into one without doubt does not fit clearly better.
-        way: frames in the order in which they were followed.
-        back: yields the fits of frames in their order, followed from a frame that comes before them in it.
+        fits: by frame, updated in place. Backward tracking starts at each frame that is more trusted than its
+            predecessor, and ends when the teeth are lost or when a trusted frame is not fitted clearly better.
+        way: frames in tracking order.
+        back: yields the fits of a range of frames, tracked from a given frame.
     """
     for last, frame in pairwise(way):
         if _trust(fits[frame]) <= _trust(fits[last]):
@@ -242,7 +235,7 @@ def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, rang
 
 
 def _trust(fit: FrameFit) -> int:
-    """Return 0 for teeth that were not found, 1 for doubtful ones, 2 for others."""
+    """Return 0 for teeth that were not found, 1 for doubtful fits, 2 otherwise."""
     return int(fit.found.all()) * (1 if fit.doubtful else 2)
 
 
@@ -251,7 +244,7 @@ def _fitting_px(fit: FrameFit) -> float:
 
 
 def _zoomed(camera: Camera, factor: float) -> Camera:
-    """Return a camera with another focal length."""
+    """Return a camera with its focal length scaled."""
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= factor
     return replace(camera, K=K)

@@ -1,4 +1,4 @@
-"""Where a solve from pictures begins: at picks, or by search in rows of teeth that were found by colour alone."""
+"""The start of tracking by colour: from picks, or by search in rough masks of the arches found by colour."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from jawusd.tracking.performance.single_start import SingleStart
 
 
 class RowStart:
-    """Find both arches on a frame of two cameras or more.
+    """Search for both arches in a frame of two or more cameras.
 
-    Rough masks do, since borders of colours show then how well poses fit.
+    Rough masks are sufficient, since the fit of the poses is verified with colour borders.
 
     Attributes:
         axes: scan frame to (left, up, front) axes, shape (4, 4).
-        findings: what is doubtful about the scans.
+        findings: findings about the scans.
     """
 
     def __init__(
@@ -42,15 +42,15 @@ class RowStart:
         T_anatomical_skull: list[list[float]] | None,
         map_: Mapper = map,
     ) -> None:
-        """Prepare.
+        """Prepare the search.
 
         Args:
-            meshes, scans: upper and lower teeth in one frame, in occlusion [mm]; the same, prepared.
-            T_anatomical_skull: scan frame to (left, up, front) axes, shape (4, 4), None if it is not known.
-            map_: runs orientations.
+            meshes, scans: upper and lower teeth in one frame, in occlusion [mm]; the same after `prepare_scan`.
+            T_anatomical_skull: scan frame to (left, up, front) axes, shape (4, 4); None if unknown.
+            map_: map function that may run orientations in parallel.
 
         Raises:
-            TrackingError: the scans cannot be in occlusion.
+            TrackingError: the scans are not in occlusion.
         """
         self._meshes, self._map = meshes, map_
         self.solver = ContourSolver(scans, TrackingConfig())
@@ -61,10 +61,10 @@ class RowStart:
         return StartSearch(self._meshes, self.solver, self.axes, self._map)
 
     def picked(self, bootstrap: Bootstrap, cameras: Mapping[str, Camera]) -> Array:
-        """Return the poses that picks show, in two cameras or more: T_world_upper and T_world_lower, shape (2, 4, 4).
+        """Return the poses from picks in two or more cameras: T_world_upper and T_world_lower, shape (2, 4, 4).
 
         Raises:
-            TrackingError: the picks cannot be.
+            TrackingError: the picks are inconsistent.
         """
         table = zip(self._meshes, ARCH_NAMES, (bootstrap.upper, bootstrap.lower), strict=True)
         return np.stack([pose_from_picks(picks, mesh.vertices, cameras, name)[0] for mesh, name, picks in table])
@@ -72,11 +72,11 @@ class RowStart:
     def at(
         self, sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
     ) -> Array | None:
-        """Return the likeliest poses on a frame by rough masks, shape (2, 4, 4), None if there are none.
+        """Return the most likely poses in a frame with rough masks, shape (2, 4, 4), or None.
 
         Args:
-            sources: cameras with masks of that frame, two or more.
-            cameras, offsets: by camera name; reference frame minus own frame number.
+            sources: two or more cameras with masks of that frame.
+            cameras, offsets: by camera name; an offset is reference minus own frame number.
             frame: of the reference camera.
         """
         masked = masked_sources(sources, cameras, offsets, 2)
@@ -87,10 +87,10 @@ class RowStart:
 
 
 class PictureStart:
-    """Find head and jaw of a person whose rig is known on a frame of one camera or more.
+    """Search for head and jaw of a person with a known rig in a frame of one or more cameras.
 
     Attributes:
-        findings: what is doubtful about the scans.
+        findings: findings about the scans.
     """
 
     def __init__(
@@ -101,10 +101,10 @@ class PictureStart:
         T_anatomical_skull: list[list[float]] | None,
         map_: Mapper = map,
     ) -> None:
-        """Prepare; see `RowStart`.
+        """Prepare the search; arguments as for `RowStart`.
 
         Raises:
-            TrackingError: the scans cannot be in occlusion.
+            TrackingError: the scans are not in occlusion.
         """
         self._meshes, self._jaw, self._map = meshes, jaw, map_
         self._rows = RowStart(meshes, scans, T_anatomical_skull, map_)
@@ -116,21 +116,21 @@ class PictureStart:
         return SingleStart(self._meshes, self._rows.solver, self._jaw, self._rows.axes, self._map)
 
     def picked(self, bootstrap: Bootstrap, cameras: Mapping[str, Camera]) -> Pose:
-        """Return the pose that picks show, in two cameras or more.
+        """Return the pose from picks in two or more cameras.
 
         Raises:
-            TrackingError: the picks cannot be.
+            TrackingError: the picks are inconsistent.
         """
         return self._coordinates.pose_of(self._rows.picked(bootstrap, cameras))
 
     def at(
         self, sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
     ) -> Pose | None:
-        """Return the likeliest pose on a frame by rough masks of one camera or more, None if there is none.
+        """Return the most likely pose in a frame with rough masks of one or more cameras, or None.
 
         Args:
             sources: cameras with masks of that frame.
-            cameras, offsets: by camera name; reference frame minus own frame number.
+            cameras, offsets: by camera name; an offset is reference minus own frame number.
             frame: of the reference camera.
         """
         if len(sources) > 1:

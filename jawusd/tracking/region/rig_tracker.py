@@ -1,4 +1,4 @@
-"""Follow head and jaw of a person whose rig exists by the colours of the pictures, lost and found again."""
+"""Tracker of head and jaw of a person with a known rig by colour, with recovery after losses."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES
 from jawusd.tracking.region.pace import THOROUGH, Pace
 from jawusd.tracking.region.search import head_shifts, likeliest
 
-# Variance of the borders of colours times the length over which they err alike [px^3]: as for both arches alone.
+# Variance of colour borders times their correlation length [px^3].
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _LAST_GATES_PX = (2.0,)
-_TRIAL_GATES_PX = (8.0, 6.0)  # of the many poses that a search tries
-# Since the last step, up to which none was left out, and up to which its motion tells where the teeth are.
+_TRIAL_GATES_PX = (8.0, 6.0)  # for the many candidates of a search
+# Frames since the last step up to which no frame counts as dropped, and up to which motion is extrapolated.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
-_FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
-# Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
-# and one that was lost is not trusted again. The pace may doubt and search later while no frames are left out.
+_FIRST_ROUNDS = 3  # of refining the start, which may be off by a few tenths of a millimetre
+# Shares of the usual matched contour below which a pose is doubted, a search starts, an arch is given up, and a lost
+# arch is not accepted again. `Pace` overrides the first two as long as no frames are dropped.
 _DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
-_UNSURE_FRAMES = 3.0  # left out, after which an arch counts as lost
-_USUAL_FRAMES = 15  # over which the usual contour is measured; it is no less than a share of that of the first frame
-_LEAST_USUAL = 0.7
-_JAWS = 96  # poses of the jaw among which a search looks for those to try
+_UNSURE_FRAMES = 3.0  # frames since the last step after which an arch counts as lost
+_USUAL_FRAMES = 15  # window of the usual matched share
+_LEAST_USUAL = 0.7  # lower bound of the usual share, relative to the first frame
+_JAWS = 96  # jaw poses that a search ranks by colour
 
 
 class RigTracker:
-    """Follow head and jaw of a known person from picture to picture.
+    """Frame-by-frame tracker of head and jaw of a known person.
 
     Attributes:
-        expected: where they were expected in the last step.
+        expected: prior of the last step.
     """
 
     def __init__(
@@ -59,13 +59,13 @@ class RigTracker:
         pace: Pace = THOROUGH,
         whole: InstantSolver | None = None,
     ) -> None:
-        """Take what aligns instants and where the colours are kept; `begin` comes first.
+        """Configure the tracker; call `begin` first.
 
         Args:
-            head: how far the head moves, see `Prediction`.
-            free_focal: tell how outlines grow with focal lengths.
-            pace: how much work an instant is worth.
-            whole: aligns with more faces of the scans in the last step, if that is wanted.
+            head: factor on the head's standard deviations, see `Prediction`.
+            free_focal: compute derivatives by focal lengths.
+            pace: computational effort per instant.
+            whole: solver with more faces of the scans for the last step; default: none.
         """
         self._whole = whole
         self._instants, self._coordinates, self._colours = instants, instants.coordinates, colours
@@ -78,7 +78,7 @@ class RigTracker:
         self._failed = self._frame = 0
 
     def begin(self, cut: Cut, pose: Pose) -> FrameFit:
-        """Learn the colours of a first frame from a pose of a few tenths of a millimetre; return the better pose."""
+        """Learn the colours of a first frame from a pose accurate to some tenths of a millimetre; return its fit."""
         arches = self._coordinates.arches(pose)
         self._colours.begin(cut(arches), arches)
         sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
@@ -97,14 +97,14 @@ class RigTracker:
         return fit
 
     def other_way(self, begin: FrameFit) -> RigTracker:
-        """Return a tracker that goes on from the first frame with what is known now, and learns on its own."""
+        """Return an independent tracker that continues from the first frame with the current statistics."""
         out = copy(self)
         out._colours, out._usual = self._colours.copy(), self._usual.copy()
         out._motion = Prediction(self._coordinates, begin.pose, begin.found, head=self._head)
         return out
 
     def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
-        """Align the next frame, or one some frames on."""
+        """Align the next frame, `frames` frames later."""
         self.expected = expected = self._motion.expected(frames)
         look = self._look(cut, self._coordinates.arches(expected.pose))
         if not look.use.any():
@@ -129,7 +129,7 @@ class RigTracker:
         return replace(fit, doubtful=bool((share < _DOUBTED * usual).any()))
 
     def _remember(self, share: Array) -> None:
-        """Take the shares of contour that fit (2,) as an example of what is usual, but those that are doubtful."""
+        """Add the matched shares (2,) to the statistics, except doubtful ones."""
         usual = self._usual_share()
         self._usual.append(np.where(share >= _SEARCHED * usual, share, usual))
 
@@ -137,23 +137,23 @@ class RigTracker:
         return np.maximum(np.median(self._usual, axis=0), _LEAST_USUAL * self._first)
 
     def _look(self, cut: Cut, around: Array) -> _Look:
-        """Return the pictures around both arches at poses (2, 4, 4)."""
+        """Return the images cropped around both arches at poses (2, 4, 4)."""
         before = self._coordinates.arches(self._motion.last)
         return _Look(self._instants, self._colours, cut(around), before, self._whole)
 
     def _wide_look(self, found: Aligned, cut: Cut) -> _Look:
-        """Return the pictures around all that the jaw reaches from a pose of the head."""
+        """Return the images cropped around the full range of the jaw for a head pose."""
         return self._look(cut, np.stack([found.pose.head, found.pose.head @ self._widest]))
 
     def _best(self, expected: Expected, look: _Look, cut: Cut, frames: float, least: Array) -> tuple[Aligned, _Look]:
-        """Align from the prediction, and from other starts where that may have failed; then in more of the pictures.
+        """Align from the prediction; if that may have failed, from other starts, then by search in larger crops.
 
-        What is found far away is kept only if at least so much of the contour in sight fits there, shape (2,).
+        Results of a search are accepted only if the matched share reaches `least`, shape (2,).
         """
         pace, usual = self._pace, self._usual_share()
         in_turn, far = pace.in_turn and self._failed > pace.searches, frames > _STEADY_FRAMES
         gates = pace.gates_px if in_turn or frames <= _NEXT_FRAMES else pace.far_px if far else pace.next_px
-        # After frames that were left out no motion vouches for a pose that fits only half.
+        # After dropped frames, partial fits are not trusted, as motion does not support them.
         doubted, searched = (_DOUBTED, _SEARCHED) if far else (pace.doubted, pace.searched)
         found = look.align(expected.pose, expected, gates)
         if not (_share(found.solution) < doubted * usual).any():
@@ -176,7 +176,7 @@ class RigTracker:
         return far_away if (_share(far_away.solution) >= least).all() else found, look
 
     def _best_in_turn(self, found: Aligned, expected: Expected, look: _Look, cut: Cut) -> tuple[Aligned, _Look]:
-        """Search the jaw in one frame and the head in a later one: teeth out of sight hold up no pictures."""
+        """Search jaw and head in different frames, to limit the time per frame while teeth are out of sight."""
         turn = self._failed % self._pace.later_every
         if turn == 0:
             look = self._wide_look(found, cut)
@@ -186,7 +186,7 @@ class RigTracker:
         return found, look
 
     def _with_head_searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
-        """Try shifted poses of the head, which the jaw goes with."""
+        """Try shifted head poses with an unchanged jaw."""
         shifts = head_shifts(expected.pose.head, self._colours.axes)
         order = likeliest(list(shifts @ expected.pose.head), look.views, self._instants.solver.scans, 0)
         order = order[: self._pace.heads]
@@ -198,7 +198,7 @@ class RigTracker:
         return look.align(found.pose, Expected(found.pose, LARGEST_SIGMA**-2.0), gates)
 
     def _searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
-        """Try poses of the jaw all over its range, those first whose teeth lie where it looks like teeth."""
+        """Try jaw poses over the whole range, ranked by the colours at their teeth."""
         head, jaw = found.pose.head, self._coordinates.jaw
         places = [head @ jaw.pose(d) for d in self._jaws]
         order = likeliest(places, look.views, self._instants.solver.scans, 1, look.upper_crowns(found.pose))
@@ -215,7 +215,7 @@ class RigTracker:
 
 
 class _Look:
-    """Hold the pictures of one instant, drawn into by all attempts."""
+    """Images of one instant and the rendering shared by all alignments."""
 
     def __init__(
         self,
@@ -231,12 +231,12 @@ class _Look:
         self.use = present_masks(self.views)
 
     def align(self, start: Pose, expected: Expected, gates_px: Sequence[float]) -> Aligned:
-        """Return the likeliest pose near a start."""
+        """Return the most likely pose near a start."""
         weight = np.full(2, 1.0 / _BORDER_PX3)
         return self._instants.align(start, self.views, self.use, gates_px, expected, weight, self._rendering)
 
     def polished(self, found: Aligned, expected: Expected) -> Aligned:
-        """Return the alignment with all faces there are; hidden parts are as before."""
+        """Refine an alignment with all faces; visibility is not recomputed."""
         if self._whole is None:
             return found
         weight = np.full(2, 1.0 / _BORDER_PX3)
@@ -244,19 +244,19 @@ class _Look:
         return self._whole.align(found.pose, views, self.use, _LAST_GATES_PX, expected, weight, self._rendering)
 
     def upper_crowns(self, pose: Pose) -> list[Mask]:
-        """Return the pixels of each view that show upper crowns at a pose."""
+        """Return the pixels of each view that upper crowns cover at a pose."""
         self._instants.linearise(pose, self.views, self.use, self._rendering, self._instants.config.final_gate_px[1])
         return [labels[0] == CROWN for labels in self._rendering.labels]
 
     def learn(self, pose: Pose, rates: tuple[float, float]) -> None:
-        """Take up the colours beside the borders found at a pose, once."""
+        """Update the colours beside the borders matched at a pose."""
         if self._whole is None:
             self._counting, gate = self._colours.counting(self.views), self._instants.config.final_gate_px[1]
             self._instants.linearise(pose, self._counting, self.use, self._rendering, gate)
         self._colours.learn(self._counting, self._pictures, self._instants.coordinates.arches(pose), rates)
 
     def fit(self, found: Aligned, trusted: Mask, free_focal: bool) -> FrameFit:
-        """Return what is known of the frame, with the arches that are trusted, shape (2,)."""
+        """Return the fit of the frame with the trusted arches, shape (2,)."""
         use = self.use & trusted[:, None]
         unknown = np.full(use.shape, np.nan)
         if not free_focal or not trusted.any():
@@ -269,10 +269,10 @@ class _Look:
 
 
 def _share(solution: Solution) -> Array:
-    """Return how much of the contour in sight fits, per arch, shape (2,)."""
+    """Return the matched share of the visible contour, per arch, shape (2,)."""
     return np.asarray(score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0), np.float64)
 
 
 def _better(one: Aligned, other: Aligned) -> Aligned:
-    """Return the one with more contour that fits."""
+    """Return the alignment with more matched contour."""
     return other if score_px(other.solution).sum() > score_px(one.solution).sum() else one

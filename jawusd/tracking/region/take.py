@@ -1,4 +1,4 @@
-"""What colours show of cameras and scans: knocked cameras, wrong focal lengths, scans mirrored or of another size."""
+"""Tracks of a take followed by colour, and checks of its cameras, scans and footage."""
 
 from __future__ import annotations
 
@@ -29,25 +29,22 @@ from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings, mirror_findings
 from jawusd.tracking.sequence.time_checks import time_findings
 
-# Share of a camera's contour that fits over that of the camera with most, below which it sees the teeth elsewhere. It
-# was 0.65 and more in 8 takes of 7 mouths (false alarms: at most 31 %, 95 %), and 0.05 to 0.08 in 3 of these with a
-# camera turned by 0.6 degrees.
-_LEAST_SHARE = 0.3
+_LEAST_SHARE = 0.3  # matched share of the contour, relative to the best camera, below which a camera is reported
 # Standard deviation of the lower teeth beyond which a frame is uninformative [mm], and the shares of such frames above
 # which a take is doubtful, and unusable.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 _MOST = 0.6  # share of frames; a run of good frames this long suggests trimming the ends of the take
 
-#: How borders of colours lie beside the teeth's edges: up to half a pixel inside, as teeth darken towards them; where
-#: the gum line is found was learned on the way.
+#: Prior on the offsets of colour borders from the teeth's edges: up to half a pixel inside, as teeth darken towards
+#: them; gum-line offsets are learned while tracking.
 BORDERS = AnnotatorPrior(edge_px=0.3, gum_px=0.08, gum_mm=0.02, arch_px=0.25, arch_mm=0.01, camera_px=0.08, frames=5.0)
 FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)
 
 
 def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list[Finding]:
-    """Return a warning for each camera whose pictures fit the teeth far less than those of the others.
+    """Return a warning for each camera whose images fit the teeth far worse than those of the others.
 
-    Kind: "camera_rarely_used", with its share of the contour in sight that fits.
+    Kind: "camera_rarely_used", with the matched share of the visible contour.
     """
     shares = []
     for solution in solutions:
@@ -61,12 +58,12 @@ def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list
         Finding(
             "camera_rarely_used",
             "warning",
-            f"{share[c]:.0%} of the teeth's outlines fit its pictures, {share.max():.0%} those of the camera that sees "
-            f"them best; {_LEAST_SHARE:.0%} of that at least is usual. It adds little to the tracks.",
+            f"{share[c]:.0%} of the teeth's outlines match its images, compared with {share.max():.0%} for the best "
+            f"camera and at least {_LEAST_SHARE:.0%} of that usually. It contributes little to the tracks.",
             value=round(float(share[c]), 3),
             limit=round(float(_LEAST_SHARE * share.max()), 3),
             camera=name,
-            hint="Check that the video is this camera's, its calibration (was it knocked?) and its time offset.",
+            hint="Check its video, its calibration (the camera may have moved) and its time offset.",
         )
         for c, name in enumerate(names)
         if share[c] < _LEAST_SHARE * share.max()
@@ -80,7 +77,7 @@ def scan_findings(
     looks: Iterable[tuple[Array, Sequence[View]]],
     config: TrackingConfig,
 ) -> list[Finding]:
-    """Return what some frames show about the scans and of focal lengths; see `lens_findings` and `mirror_findings`.
+    """Return findings about scans and focal lengths from some frames; see `lens_findings` and `mirror_findings`.
 
     Args:
         left: unit vector in scan coordinates, shape (3,).
@@ -98,7 +95,7 @@ def scan_findings(
 
 
 def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return the longest run of frames, first and one past the last."""
+    """Return the longest run of good frames, end exclusive."""
     ends = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
     runs = ends.reshape(-1, 2)
     if len(runs) == 0:
@@ -108,7 +105,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def footage_doubts(tracks: Tracks) -> list[Finding]:
-    """Return a warning if the jaw is lost, or not known to a millimetre, in too many frames that colours alone showed.
+    """Return a warning if the jaw is lost or known to less than a millimetre in too many frames.
 
     Kind: "footage_doubtful" [%].
     """
@@ -117,32 +114,32 @@ def footage_doubts(tracks: Tracks) -> list[Finding]:
     share = float(bad.mean())
     if share <= _FEW:
         return []
-    judgement = "is not usable as it is" if share > _MANY else "is doubtful in parts"
+    judgement = "is not usable as it is" if share > _MANY else "is partly unreliable"
     message = (
-        f"the footage {judgement}: in {bad.sum()} of {len(bad)} frames the jaw is lost, or its teeth are not known to "
-        f"{_UNKNOWN_MM:g} mm; at most {_FEW:.0%} of the frames is usual"
+        f"the footage {judgement}: in {bad.sum()} of {len(bad)} frames the jaw is lost or its uncertainty exceeds "
+        f"{_UNKNOWN_MM:g} mm; usually at most {_FEW:.0%} of the frames are affected"
     )
     worst = int(np.argmax(np.where(np.isfinite(sigma_mm), sigma_mm, np.inf)))
-    hint = "Look at the overlay, light the mouth better, or draw masks (`jawusd segment`)."
+    hint = "Inspect the overlay, light the mouth better, or draw masks (`jawusd segment`)."
     first, last = _longest_run(~bad)
     if last - first >= _MOST * len(bad):
         kept = f"[{tracks.frames[first]}, {tracks.frames[last - 1] + 1}]"
-        hint = f"If the others are dark, as in light flashes, write frames = {kept} in capture.toml. {hint}"
+        hint = f"If the other frames are too dark or too bright, set frames = {kept} in capture.toml. {hint}"
     value, limit = round(100 * share, 1), 100 * _FEW
     return [Finding("footage_doubtful", "warning", message, value, limit, frame=int(tracks.frames[worst]), hint=hint)]
 
 
 @dataclass(frozen=True, eq=False)
 class TakeFacts:
-    """Say what is known of a take besides its frames.
+    """Description of a take apart from its frames.
 
     Attributes:
-        cameras: in their order.
+        cameras: in view order.
         scans: upper and lower.
         landmarks: mandible coordinates [mm], shape (5, 3).
         axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-        rest_frame: frame with the teeth together that the capture names, or None.
-        registers: whether the lower scan is moved to where the closed bite shows it.
+        rest_frame: frame with closed teeth named in the capture, or None.
+        registers: whether to register the lower scan by the closed bite of the take.
     """
 
     cameras: Sequence[Camera]
@@ -156,13 +153,13 @@ class TakeFacts:
 def tracks_of(
     followed: Mapping[int, RegionPose], take: TakeFacts, looks: Sequence[tuple[Array, Sequence[View]]] = ()
 ) -> Tracks:
-    """Return the tracks of frames; delays between cameras and where borders lie are estimated from all of them.
+    """Return the tracks of frames; delays between cameras and border offsets are estimated jointly.
 
     Args:
-        looks: poses and views of some of the frames, which sizes and focal lengths are estimated from.
+        looks: poses and views of some frames, for estimating scale and focal lengths.
 
     Raises:
-        TrackingError: the registration of the scans is to be corrected, and the mouth was not closed.
+        TrackingError: the registration of the scans is to be corrected, but the mouth was never closed.
     """
     config = FOR_COLOURS
     solved = [(frame, found, found.solution) for frame, found in followed.items() if found.solution is not None]

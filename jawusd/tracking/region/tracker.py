@@ -1,4 +1,4 @@
-"""Follow both arches by the colours of the pictures alone, frame after frame."""
+"""Frame-by-frame tracker of both arches by colour, without masks or a rig."""
 
 from __future__ import annotations
 
@@ -20,34 +20,33 @@ from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES
 from jawusd.tracking.region.search import Look, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 
-_FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
-# Of the usual share of contour that fits, below which poses are looked for farther away, a jaw is searched, what was
-# lost is not trusted again, and poses are given up. Wrong poses under closed lips had 0.25 at most, a jaw whose edges
-# front teeth and lips hide 0.28. The usual share is that of the last frames, but no less than the last number times
-# that of the first: lips that close slowly must not get to be usual.
+_FIRST_ROUNDS = 3  # of refining the start, which may be off by a few tenths of a millimetre
+# Shares of the usual matched contour below which wider gates are tried, a jaw is searched, a lost arch is not accepted
+# again, and an arch is given up. The usual share is the median over the last frames, but at least `_LEAST_USUAL` of
+# that of the first frame, so that slowly closing lips do not become usual.
 _DOUBTED, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = 0.8, 0.6, 0.5, 0.25, 0.7
-_USUAL_FRAMES = 15  # over which the usual contour is measured
-# A lost jaw is searched on so many frames each once the head is found, then on every so-many-th, as a lost head always.
+_USUAL_FRAMES = 15  # window of the usual matched share
+# A lost jaw is searched in the first `_EAGER` frames, then in every `_OFTEN`-th one, like a lost head.
 _EAGER, _OFTEN = 6, 4
-_RESTING = 4  # frames without looking farther away after that was of no use: closed lips stay closed for a while
-_WIDE_MM = 40.0  # how far open a jaw is expected at most that was out of sight
+_RESTING = 4  # frames without wide gates after these have failed, since lips stay closed for a while
+_WIDE_MM = 40.0  # largest expected opening of a jaw that was out of sight
 
 
 @dataclass(frozen=True, eq=False)
 class RegionPose:
-    """Hold where the teeth were found in a frame."""
+    """Poses of both arches in a frame."""
 
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4); predictions for arches not found
     found: Mask  # shape (2,)
     covariance: Array  # of their left twists about the world origin, NaN for arches not found, shape (2, 6, 6)
-    worth_px: float = 0.0  # contour of both arches that fits, closeness counted, less the strain of the condyles
-    solution: Solution | None = None  # the alignment; None of poses that were read from a file
-    usual: Array = field(default_factory=lambda: np.ones(2))  # contour in sight that fits over its usual share, (2,)
-    least: Array = field(default_factory=lambda: np.zeros(2))  # of that, below which an arch is not found, shape (2,)
+    worth_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
+    solution: Solution | None = None  # the alignment; None for poses read from a file
+    usual: Array = field(default_factory=lambda: np.ones(2))  # matched share relative to the usual one, shape (2,)
+    least: Array = field(default_factory=lambda: np.zeros(2))  # threshold on it for an arch to be found, shape (2,)
 
 
 class RegionTracker:
-    """Follow both arches through pictures of several cameras; colours are learned on the way."""
+    """Tracker of both arches in images of several cameras; colours are learned while tracking."""
 
     def __init__(
         self,
@@ -62,7 +61,7 @@ class RegionTracker:
 
         Args:
             scans: upper and lower, in one frame, in occlusion.
-            cameras: in the order of the pictures.
+            cameras: in image order.
             landmarks, axes: as in `CondyleMotion`.
         """
         self._search = PoseSearch(scans, landmarks, axes, config, executor)
@@ -70,7 +69,7 @@ class RegionTracker:
         self._first_share = np.zeros(2)
 
     def begin(self, cut: Cut, poses: Array) -> RegionPose:
-        """Learn the colours of a first frame from poses of a few tenths of a millimetre; return better poses."""
+        """Learn the colours of a first frame from poses accurate to some tenths of a millimetre, and refine them."""
         self._colours.begin(cut(poses), poses)
         for _ in range(_FIRST_ROUNDS):
             pictures = cut(poses)
@@ -87,20 +86,20 @@ class RegionTracker:
         """Return the views of an instant by the colours learned so far.
 
         Args:
-            pictures: one per camera.
+            pictures: one image per camera.
             poses: T_world_upper and T_world_lower there, shape (2, 4, 4).
         """
         return self._colours.views(pictures, poses)
 
     @property
     def first_fit(self) -> float:
-        """The share of the contour in sight that fits on the first frame, of the arch that fits worse, 0 .. 1."""
+        """Matched share of the visible contour in the first frame, of the worse arch, 0 .. 1."""
         return float(self._first_share.min())
 
     def follow(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:
-        """Yield poses frame after frame, away from the first one, whose poses are given.
+        """Yield the poses of consecutive frames in either direction from the first one, whose poses are given.
 
-        Every call starts from what is known after `begin`.
+        Every call starts from the statistics after `begin`.
         """
         known, self._colours = self._colours, self._colours.copy()
         try:
@@ -110,7 +109,7 @@ class RegionTracker:
 
 
 class _Instant:
-    """Look at the pictures of one instant."""
+    """Images of one instant and their alignment."""
 
     def __init__(
         self, search: PoseSearch, colours: LearnedColours, pictures: Sequence[Picture | None], before: Array
@@ -120,16 +119,16 @@ class _Instant:
         self._counting = colours.counting(self.look.views)
 
     def polished(self, solution: Solution, *, firm: bool = False) -> Solution:
-        """Return an alignment with all faces of the scans."""
+        """Refine an alignment with all faces of the scans."""
         return self._search.polished(solution, self._counting, self.look, firm=firm)
 
     def learn(self, poses: Array, rates: tuple[float, float]) -> None:
-        """Take up the colours beside the borders found on the way to the last alignment, near its poses."""
+        """Update the colours beside the borders matched in the refined alignment."""
         self._colours.learn(self._counting, self._pictures, poses, rates)
 
 
 class _Way:
-    """Follow the teeth in one direction of time."""
+    """Tracker in one temporal direction."""
 
     def __init__(self, search: PoseSearch, colours: LearnedColours, first_share: Array, poses: Array) -> None:
         self._search, self._colours, self._first_share, self._poses = search, colours, first_share, poses
@@ -139,7 +138,7 @@ class _Way:
         self._found, self._missed, self._absent, self._rest = np.ones(2, bool), 0, 0, 0
 
     def follow(self, cuts: Iterator[Cut]) -> Iterator[RegionPose]:
-        """Yield the poses of instant after instant."""
+        """Yield the poses of consecutive instants."""
         for cut in cuts:
             starts = self._motion.starts()
             head, wide = starts[0][0], self._search.condyles.placed(0.0, _WIDE_MM, 0.0)
@@ -168,7 +167,7 @@ class _Way:
             share = fitting_share(solution)
         missed = share[0] >= _SUSPECT * usual[0] and share[1] < _SUSPECT * usual[1]
         self._missed = self._missed + 1 if missed else 0
-        # A jaw that goes out of sight is searched ever less often, one that is lost eagerly at first.
+        # A jaw that disappears is searched at doubling intervals, a lost one in every frame at first.
         late = self._missed & (self._missed - 1) == 0
         if missed and (late if self._found[1] else self._missed <= _EAGER or self._missed % _OFTEN == 0):
             lost = not self._found[1]
@@ -176,7 +175,7 @@ class _Way:
         return solution, searched
 
     def _taken(self, instant: _Instant, rough: Solution, searched: bool, usual: Array, seen: bool) -> RegionPose:
-        """Judge a rough alignment, make it exact, and learn from it if it is good."""
+        """Refine a rough alignment, decide which arches are found, and learn if both are."""
         solution = instant.polished(rough, firm=searched)
         share, least = fitting_share(rough), np.where(self._found, _LOST, _AGAIN)
         found = (share >= least * usual) & (matched_px(solution) >= self._search.config.least_matched_px)

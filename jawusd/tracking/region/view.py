@@ -1,6 +1,6 @@
-"""What is known of contour samples from where they lie: the colours to expect beside them, and how far they moved.
+"""Edge search by colour in one camera's image: colour tables, motion blur and borders of contour samples.
 
-Every compiled function here releases the GIL and keeps no state.
+All compiled functions release the GIL and are stateless.
 """
 
 from __future__ import annotations
@@ -19,20 +19,19 @@ from jawusd.tracking.region.colours import BINS, KINDS, TABLES
 from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
 
-_AHEAD_PX = 2.0  # outside of a crown's silhouette, where it is looked whether gum lies behind
+_AHEAD_PX = 2.0  # distance outside a crown's silhouette at which gum is tested for
 
-_SHUTTER = 0.5  # share of a frame's time that it is exposed: unknown, usual for film
-# Motion during the exposure at which a border counts half in the last look [px]: what is measured of a ramp of light is
-# the less sure the longer it is, in variance as the square. Chosen on two path-traced mouths, two others were seen;
-# NEES of all four 0.74, 0.35, 0.77, 0.31, without it 1.54, 0.44, 1.04, 0.40. Looks before the last tell by the share
-# of the contour that fits whether teeth are lost, which fast ones are not.
+_SHUTTER = 0.5  # assumed exposure as a share of the frame time, typical of film
+# Motion during the exposure at which the weight of a border is halved [px]: the variance of an edge grows with the
+# square of its blur. Applied in the final alignment only, since earlier ones decide by the matched share of the contour
+# whether teeth are lost.
 _BLURRED_PX = 10.0
-_LEARNED_PX = (2, 7)  # distances from borders between which colours are learned
-# Of the place of the gum line: least weight of a border [-], farthest [px], fewest samples.
+_LEARNED_PX = (2, 7)  # range of distances from borders in which colours are learned
+# Estimate of the gum-line offset: minimum weight of a border [-], largest distance [px], minimum number of samples.
 _SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
-_CLEAR_RATIO = 1.0  # mean log ratio on both sides from which a border counts in full [-]
-_SHARPEN_PX = 5.0  # reach from which on borders are refined by colour
-_CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # of colours half way [8-bit steps], [px]
+_CLEAR_RATIO = 1.0  # mean log ratio on both sides from which a border has full weight [-]
+_SHARPEN_PX = 5.0  # search range up to which borders are refined by colour
+_CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # minimum contrast of refined borders [8-bit steps], largest refinement
 _CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
 
 
@@ -40,20 +39,20 @@ _CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
 def choose_tables(
     samples: Array, count: int, labels: NDArray[np.uint8], axes: Array, patches: Array, out: NDArray[np.int64]
 ) -> None:
-    """Write the table of log ratios for each sample: of the nearest patch, for a free edge or the gum line.
+    """Write the index of the log-ratio table of each sample: nearest patch, and free edge or gum line.
 
     Args:
         samples: shape (n, COLUMNS); the first `count` are silhouette.
-        labels: what is seen of the arch: CROWN, GUM or 0, shape (h, w).
+        labels: rendered labels of the arch: CROWN, GUM or 0, shape (h, w).
         axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-        patches: middles of the arch's patches, left and front [mm], shape (PATCHES, 2).
-        out: receives, shape (n,).
+        patches: centres of the arch's patches, left and front [mm], shape (PATCHES, 2).
+        out: result, shape (n,).
     """
     height, width = labels.shape
     for s in range(len(samples)):
         sample = samples[s]
         kind = 1
-        if s < count:  # crowns before their own gum look like the gum line
+        if s < count:  # a silhouette in front of its own gum looks like a gum line
             i = min(max(pixel_of(sample[U] + _AHEAD_PX * sample[NX]), 0), width - 1)
             j = min(max(pixel_of(sample[V] + _AHEAD_PX * sample[NY]), 0), height - 1)
             kind = 1 if labels[j, i] == GUM else 0
@@ -69,13 +68,13 @@ def choose_tables(
 
 @numba.njit(nogil=True, cache=True)
 def measure_blur(samples: Array, before: Array, shutter: float, out: Array) -> None:
-    """Write how far the samples move along their normals during the exposure [px], shape (n,).
+    """Write the motion of the samples along their normals during the exposure [px], shape (n,).
 
     Args:
         samples: shape (n, COLUMNS).
-        before: projection of the arch to this picture at the frame before, shape (3, 4).
-        shutter: share of a frame's time that it is exposed [-].
-        out: receives, shape (n,).
+        before: projection of the arch to this image in the previous frame, shape (3, 4).
+        shutter: exposure as a share of the frame time [-].
+        out: result, shape (n,).
     """
     for s in range(len(samples)):
         sample = samples[s]
@@ -88,11 +87,11 @@ def measure_blur(samples: Array, before: Array, shutter: float, out: Array) -> N
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Collect what the borders found in a picture teach."""
+    """Statistics collected beside the borders matched in an image."""
 
-    tooth: Array  # colours inside of borders, shape (2, TABLES, BINS)
+    tooth: Array  # colours inside borders, shape (2, TABLES, BINS)
     outside: Array  # colours outside, shape (2, TABLES, BINS)
-    gum_px: Array  # how far outside of the scans' gum line it was found [px], NaN where it was not, shape (2,)
+    gum_px: Array  # outward offset of the gum line from the scans' [px], NaN where not measured, shape (2,)
 
     @classmethod
     def zeros(cls) -> Counts:
@@ -102,18 +101,18 @@ class Counts:
 
 @dataclass(frozen=True, eq=False)
 class RegionView:
-    """Hold a part of an undistorted picture with the colours that tell teeth."""
+    """Part of an undistorted image with the colour model of teeth."""
 
     rgb: NDArray[np.uint8]  # shape (h, w, 3)
     bins: NDArray[np.uint16]  # colour bins, shape (h, w)
-    ratio: NDArray[np.float32]  # log ratios of tooth over anything else, shape (2, TABLES, BINS)
-    patches: Array  # middles of the patches of both arches, left and front [mm], shape (2, PATCHES, 2)
+    ratio: NDArray[np.float32]  # log ratios of tooth to background, shape (2, TABLES, BINS)
+    patches: Array  # centres of the patches of both arches, left and front [mm], shape (2, PATCHES, 2)
     axes: Array  # rotation from scan to anatomical axes, shape (3, 3)
-    before: Array  # projections of both arches to this picture at the frame before, shape (2, 3, 4)
-    counts: Counts | None = None  # collects what is found, in the last look at an instant
+    before: Array  # projections of both arches to this image in the previous frame, shape (2, 3, 4)
+    counts: Counts | None = None  # statistics to collect, in the final alignment of an instant
 
     def likeness(self, arch: int) -> NDArray[np.float32]:
-        """Return how much every pixel looks like teeth of an arch rather than anything else, shape (h, w)."""
+        """Return the mean log ratio of tooth to background per pixel, for an arch, shape (h, w)."""
         return np.asarray(self.ratio[arch].mean(0)[self.bins], np.float32)
 
     def search(
