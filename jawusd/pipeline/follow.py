@@ -133,7 +133,7 @@ def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, Regi
     """
     for frame, found in zip(back, again, strict=False):
         apart_mm = np.linalg.norm(_places(found, points) - _places(known[frame], points), axis=-1).mean()
-        better = found.worth_px > known[frame].worth_px or not known[frame].found.all()
+        better = found.objective_px > known[frame].objective_px or not known[frame].found.all()
         if apart_mm < _SAME_MM or not found.found.all() or not better:
             return
         known[frame] = found

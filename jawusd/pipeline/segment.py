@@ -165,7 +165,7 @@ class _Segmentation:
         Raises:
             TrackingError: the picks cannot be, or the teeth were not found.
         """
-        from jawusd.tracking.region.picture_start import RowStart
+        from jawusd.tracking.region.picture_start import ArchStart
 
         picks = self._capture.bootstrap
         frames = range(self._first, self._stop)
@@ -179,7 +179,7 @@ class _Segmentation:
             return self._start, self._guide[self._start].poses
         follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
         upper, lower = self._tracker.scans
-        rows = RowStart(self._meshes, (upper, lower), self._capture.anatomy.T_anatomical_skull, self._pool.map)
+        rows = ArchStart(self._meshes, (upper, lower), self._capture.anatomy.T_anatomical_skull, self._pool.map)
         capture, footage = self._capture, self._footage
         begin = searched_start(capture, self._offsets, footage, rows, follower, frames, self._progress)
         self._start = begin.frame

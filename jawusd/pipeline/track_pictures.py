@@ -19,7 +19,7 @@ from jawusd.pipeline.subject import subject_of_capture
 
 if TYPE_CHECKING:
     from jawusd.segmentation.picture import ColourFootage
-    from jawusd.tracking.region.picture_start import RowStart
+    from jawusd.tracking.region.picture_start import ArchStart
 
 FEWEST_VIDEOS = 2
 # Share of the contour in sight that fits colours, below which teeth are not where they are picked: of six path-traced
@@ -44,7 +44,7 @@ def track_videos(
     """
     from jawusd.segmentation.picture import ColourFootage
     from jawusd.tracking.contour.scan import prepare_scan
-    from jawusd.tracking.region.picture_start import RowStart
+    from jawusd.tracking.region.picture_start import ArchStart
     from jawusd.tracking.region.take import TakeFacts, footage_doubts, tracks_of
 
     cameras, videos = open_footage(capture)
@@ -61,7 +61,7 @@ def track_videos(
     teeth = meshes["upper_teeth"], meshes["lower_teeth"]
     scans = prepare_scan(teeth[0], "upper"), prepare_scan(teeth[1], "lower")
     with ThreadPoolExecutor(jobs) as pool:
-        rows = RowStart(teeth, scans, capture.anatomy.T_anatomical_skull, pool.map)
+        rows = ArchStart(teeth, scans, capture.anatomy.T_anatomical_skull, pool.map)
         follower = Follower(footage, cameras, scans, subject, pool)
         picks = capture.bootstrap
         if picks is None:
@@ -84,7 +84,7 @@ def track_videos(
     return tracks
 
 
-def _picked_start(rows: RowStart, follower: Follower, picks: Bootstrap, frames: range) -> Begin[Array]:
+def _picked_start(rows: ArchStart, follower: Follower, picks: Bootstrap, frames: range) -> Begin[Array]:
     """Return where the teeth are picked.
 
     Raises:
@@ -102,7 +102,7 @@ def searched_start(
     capture: Capture,
     offsets: Mapping[str, int],
     footage: ColourFootage,
-    rows: RowStart,
+    rows: ArchStart,
     follower: Follower,
     frames: range,
     progress: Progress,

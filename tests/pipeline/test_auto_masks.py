@@ -125,12 +125,12 @@ def test_masks_without_their_guide_are_told(tmp_path):
         take_up_guide(capture, tracks, LANDMARKS)
 
 
-def _followed(frames, mm, worth_px=900.0):
+def _followed(frames, mm, objective_px=900.0):
     """Return what was followed: the jaw moved by so many mm along x on each frame."""
     covariance = np.tile(np.eye(6), (2, 1, 1))
     return {
         int(frame): RegionPose(
-            np.stack([np.eye(4), make_transform(np.eye(3), [x, 0.0, 0.0])]), np.ones(2, bool), covariance, worth_px
+            np.stack([np.eye(4), make_transform(np.eye(3), [x, 0.0, 0.0])]), np.ones(2, bool), covariance, objective_px
         )
         for frame, x in zip(frames, mm, strict=True)
     }

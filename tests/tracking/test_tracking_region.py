@@ -24,7 +24,7 @@ from jawusd.tracking.region import performance, rig_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import _light, search_borders, sharpen
-from jawusd.tracking.region.pace import THOROUGH
+from jawusd.tracking.region.effort import THOROUGH
 from jawusd.tracking.region.performance import follow_back
 from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.view import Counts, RegionView
@@ -276,7 +276,7 @@ def test_what_a_search_finds_is_kept_only_if_enough_of_it_fits(monkeypatch, fits
     near, far = SimpleNamespace(pose="near", solution=[0.3, 0.05]), SimpleNamespace(pose="far", solution=fits)
     look = SimpleNamespace(align=lambda *_: near)
     tracker = RigTracker.__new__(RigTracker)
-    tracker._pace, tracker._failed, tracker._head = THOROUGH, 0, 0.1
+    tracker._effort, tracker._failed, tracker._head = THOROUGH, 0, 0.1
     tracker._motion, tracker._usual_share = SimpleNamespace(last=None), lambda: np.array([0.4, 0.4])
     monkeypatch.setattr(rig_tracker, "_better", lambda one, other: one)
     tracker._wide_look, tracker._searched = (lambda *_: look), (lambda *_: far)

@@ -20,7 +20,7 @@ from jawusd.tracking.performance.coordinates import JAW, Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.motion import STEADY
 from jawusd.tracking.region.appearance import CORRELATION_PX, Cut, LearnedColours
-from jawusd.tracking.region.pace import BRIEF
+from jawusd.tracking.region.effort import FAST
 from jawusd.tracking.region.rig_tracker import RigTracker
 
 _FACES = 3_000
@@ -61,7 +61,7 @@ class LiveTake:
     def begin(self, cut: Cut, near: Pose) -> float:
         """Learn the colours of an instant near a pose; return the matched share of the visible contour, 0 .. 1."""
         colours = LearnedColours(self._scans, self._cameras, self._axes)
-        self._tracker = RigTracker(self._instants, colours, head=self._head, pace=BRIEF)
+        self._tracker = RigTracker(self._instants, colours, head=self._head, effort=FAST)
         solution = self._tracker.begin(cut, near).solution
         if solution is None:
             return 0.0

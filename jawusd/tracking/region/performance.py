@@ -169,7 +169,7 @@ class PictureTake:
         at, pose = start
         tracker = self._tracker(cameras, head)
         fits = {at: tracker.begin(self._first_cut(cameras, at, pose), pose)}
-        back = tracker.other_way(fits[at])
+        back = tracker.reversed_from(fits[at])
         for way, one in ((range(at + 1, frames.stop), tracker), (range(at - 1, frames.start - 1, -1), back)):
             for frame, cut in zip(way, self._shot.cuts(cameras, self._centre(pose), way), strict=True):
                 fits[frame] = one.step(cut)
@@ -181,7 +181,7 @@ class PictureTake:
         self, cameras: Sequence[Camera], one: RigTracker, fits: dict[int, FrameFit], frame: int, before: range
     ) -> Iterator[FrameFit]:
         """Yield the fits of frames tracked from one frame against a tracker's direction."""
-        turned = one.other_way(fits[frame])
+        turned = one.reversed_from(fits[frame])
         for cut in self._shot.cuts(cameras, self._centre(fits[frame].pose), before):
             yield turned.step(cut)
 

@@ -25,7 +25,7 @@ from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.single_start import SingleStart
 
 
-class RowStart:
+class ArchStart:
     """Search for both arches in a frame of two or more cameras.
 
     Rough masks are sufficient, since the fit of the poses is verified with colour borders.
@@ -101,13 +101,13 @@ class PictureStart:
         T_anatomical_skull: list[list[float]] | None,
         map_: Mapper = map,
     ) -> None:
-        """Prepare the search; arguments as for `RowStart`.
+        """Prepare the search; arguments as for `ArchStart`.
 
         Raises:
             TrackingError: the scans are not in occlusion.
         """
         self._meshes, self._jaw, self._map = meshes, jaw, map_
-        self._rows = RowStart(meshes, scans, T_anatomical_skull, map_)
+        self._rows = ArchStart(meshes, scans, T_anatomical_skull, map_)
         self._coordinates = Coordinates(jaw, scans)
         self.findings = self._rows.findings
 

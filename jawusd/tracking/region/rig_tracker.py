@@ -22,8 +22,8 @@ from jawusd.tracking.performance.motion import Prediction
 from jawusd.tracking.performance.single_start import spread_out
 from jawusd.tracking.performance.views import growth_of
 from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
-from jawusd.tracking.region.pace import THOROUGH, Pace
-from jawusd.tracking.region.search import head_shifts, likeliest
+from jawusd.tracking.region.effort import THOROUGH, Effort
+from jawusd.tracking.region.search import head_shifts, rank_by_colour
 
 # Variance of colour borders times their correlation length [px^3].
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
@@ -34,7 +34,7 @@ _TRIAL_GATES_PX = (8.0, 6.0)  # for the many candidates of a search
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
 _FIRST_ROUNDS = 3  # of refining the start, which may be off by a few tenths of a millimetre
 # Shares of the usual matched contour below which a pose is doubted, a search starts, an arch is given up, and a lost
-# arch is not accepted again. `Pace` overrides the first two as long as no frames are dropped.
+# arch is not accepted again. `Effort` overrides the first two as long as no frames are dropped.
 _DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
 _UNSURE_FRAMES = 3.0  # frames since the last step after which an arch counts as lost
 _USUAL_FRAMES = 15  # window of the usual matched share
@@ -56,7 +56,7 @@ class RigTracker:
         *,
         head: float = 1.0,
         free_focal: bool = False,
-        pace: Pace = THOROUGH,
+        effort: Effort = THOROUGH,
         whole: InstantSolver | None = None,
     ) -> None:
         """Configure the tracker; call `begin` first.
@@ -64,12 +64,12 @@ class RigTracker:
         Args:
             head: factor on the head's standard deviations, see `Prediction`.
             free_focal: compute derivatives by focal lengths.
-            pace: computational effort per instant.
+            effort: computational effort per instant.
             whole: solver with more faces of the scans for the last step; default: none.
         """
         self._whole = whole
         self._instants, self._coordinates, self._colours = instants, instants.coordinates, colours
-        self._head, self._free_focal, self._pace = head, free_focal, pace
+        self._head, self._free_focal, self._effort = head, free_focal, effort
         self._jaws = spread_out(instants.coordinates.jaw, _JAWS)
         places = instants.coordinates.jaw.pose(self._jaws)
         self._widest = places[np.argmax(np.linalg.norm(places[:, :3, 3], axis=1))]
@@ -84,7 +84,7 @@ class RigTracker:
         sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
         for _ in range(_FIRST_ROUNDS):
             arches = self._coordinates.arches(pose)
-            look = _Look(self._instants, self._colours, cut(arches), arches, self._whole)
+            look = _InstantImages(self._instants, self._colours, cut(arches), arches, self._whole)
             rough = look.align(pose, Expected(pose, sigma**-2.0), _FIRST_GATES_PX)
             found = look.polished(rough, Expected(pose, sigma**-2.0))
             pose = found.pose
@@ -96,7 +96,7 @@ class RigTracker:
         self._usual.append(self._first)
         return fit
 
-    def other_way(self, begin: FrameFit) -> RigTracker:
+    def reversed_from(self, begin: FrameFit) -> RigTracker:
         """Return an independent tracker that continues from the first frame with the current statistics."""
         out = copy(self)
         out._colours, out._usual = self._colours.copy(), self._usual.copy()
@@ -121,7 +121,7 @@ class RigTracker:
         self._frame += 1
         if trusted.all():
             self._failed = 0
-            if self._frame % self._pace.learn_every == 0:
+            if self._frame % self._effort.learn_every == 0:
                 look.learn(found.pose, RATES)
             self._remember(share)
         self._motion.take(found.pose, trusted)
@@ -136,37 +136,39 @@ class RigTracker:
     def _usual_share(self) -> Array:
         return np.maximum(np.median(self._usual, axis=0), _LEAST_USUAL * self._first)
 
-    def _look(self, cut: Cut, around: Array) -> _Look:
+    def _look(self, cut: Cut, around: Array) -> _InstantImages:
         """Return the images cropped around both arches at poses (2, 4, 4)."""
         before = self._coordinates.arches(self._motion.last)
-        return _Look(self._instants, self._colours, cut(around), before, self._whole)
+        return _InstantImages(self._instants, self._colours, cut(around), before, self._whole)
 
-    def _wide_look(self, found: Aligned, cut: Cut) -> _Look:
+    def _wide_look(self, found: Aligned, cut: Cut) -> _InstantImages:
         """Return the images cropped around the full range of the jaw for a head pose."""
         return self._look(cut, np.stack([found.pose.head, found.pose.head @ self._widest]))
 
-    def _best(self, expected: Expected, look: _Look, cut: Cut, frames: float, least: Array) -> tuple[Aligned, _Look]:
+    def _best(
+        self, expected: Expected, look: _InstantImages, cut: Cut, frames: float, least: Array
+    ) -> tuple[Aligned, _InstantImages]:
         """Align from the prediction; if that may have failed, from other starts, then by search in larger crops.
 
         Results of a search are accepted only if the matched share reaches `least`, shape (2,).
         """
-        pace, usual = self._pace, self._usual_share()
-        in_turn, far = pace.in_turn and self._failed > pace.searches, frames > _STEADY_FRAMES
-        gates = pace.gates_px if in_turn or frames <= _NEXT_FRAMES else pace.far_px if far else pace.next_px
+        effort, usual = self._effort, self._usual_share()
+        in_turn, far = effort.in_turn and self._failed > effort.searches, frames > _STEADY_FRAMES
+        gates = effort.gates_px if in_turn or frames <= _NEXT_FRAMES else effort.far_px if far else effort.next_px
         # After dropped frames, partial fits are not trusted, as motion does not support them.
-        doubted, searched = (_DOUBTED, _SEARCHED) if far else (pace.doubted, pace.searched)
+        doubted, searched = (_DOUBTED, _SEARCHED) if far else (effort.doubted, effort.searched)
         found = look.align(expected.pose, expected, gates)
         if not (_share(found.solution) < doubted * usual).any():
             return found, look
         if not in_turn:
-            for start in (self._motion.last,) if pace.wide_px is None else (expected.pose, self._motion.last):
-                found = _better(found, look.align(start, expected, pace.wide_px or gates))
+            for start in (self._motion.last,) if effort.wide_px is None else (expected.pose, self._motion.last):
+                found = _better(found, look.align(start, expected, effort.wide_px or gates))
         if not (_share(found.solution) < searched * usual).any():
             return found, look
         self._failed += 1
         if in_turn:
             return self._best_in_turn(found, expected, look, cut)
-        if (self._failed - 1) % (pace.search_every if self._failed <= pace.searches else pace.later_every):
+        if (self._failed - 1) % (effort.search_every if self._failed <= effort.searches else effort.later_every):
             return found, look
         look = self._wide_look(found, cut)
         found = look.align(found.pose, expected, gates)
@@ -175,46 +177,48 @@ class RigTracker:
         far_away = self._searched(found, expected, look)
         return far_away if (_share(far_away.solution) >= least).all() else found, look
 
-    def _best_in_turn(self, found: Aligned, expected: Expected, look: _Look, cut: Cut) -> tuple[Aligned, _Look]:
+    def _best_in_turn(
+        self, found: Aligned, expected: Expected, look: _InstantImages, cut: Cut
+    ) -> tuple[Aligned, _InstantImages]:
         """Search jaw and head in different frames, to limit the time per frame while teeth are out of sight."""
-        turn = self._failed % self._pace.later_every
+        turn = self._failed % self._effort.later_every
         if turn == 0:
             look = self._wide_look(found, cut)
             return self._searched(found, expected, look), look
-        if turn == self._pace.later_every // 2 and self._head == 1.0:
+        if turn == self._effort.later_every // 2 and self._head == 1.0:
             return self._with_head_searched(found, expected, look), look
         return found, look
 
-    def _with_head_searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
+    def _with_head_searched(self, found: Aligned, expected: Expected, look: _InstantImages) -> Aligned:
         """Try shifted head poses with an unchanged jaw."""
         shifts = head_shifts(expected.pose.head, self._colours.axes)
-        order = likeliest(list(shifts @ expected.pose.head), look.views, self._instants.solver.scans, 0)
-        order = order[: self._pace.heads]
+        order = rank_by_colour(list(shifts @ expected.pose.head), look.views, self._instants.solver.scans, 0)
+        order = order[: self._effort.heads]
         for head in (shifts[k] @ expected.pose.head for k in order):
             start = replace(expected.pose, head=head)
             around = Expected(start, LARGEST_SIGMA**-2.0)
             found = _better(found, look.align(start, around, _TRIAL_GATES_PX))
-        gates = self._pace.wide_px or self._pace.gates_px
+        gates = self._effort.wide_px or self._effort.gates_px
         return look.align(found.pose, Expected(found.pose, LARGEST_SIGMA**-2.0), gates)
 
-    def _searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
+    def _searched(self, found: Aligned, expected: Expected, look: _InstantImages) -> Aligned:
         """Try jaw poses over the whole range, ranked by the colours at their teeth."""
         head, jaw = found.pose.head, self._coordinates.jaw
         places = [head @ jaw.pose(d) for d in self._jaws]
-        order = likeliest(places, look.views, self._instants.solver.scans, 1, look.upper_crowns(found.pose))
+        order = rank_by_colour(places, look.views, self._instants.solver.scans, 1, look.upper_crowns(found.pose))
         brief, loose = [], expected.precision.copy()
         loose[JAW] = LARGEST_SIGMA[JAW] ** -2.0
-        for k in order[: self._pace.jaws]:
+        for k in order[: self._effort.jaws]:
             start = replace(found.pose, d=self._jaws[k])
             brief.append(look.align(start, Expected(start, loose), _TRIAL_GATES_PX))
         brief.sort(key=lambda trial: -float(score_px(trial.solution).sum()))
-        for trial in brief[: self._pace.finalists]:
+        for trial in brief[: self._effort.finalists]:
             around = Expected(trial.pose, loose)
-            found = _better(found, look.align(trial.pose, around, self._pace.wide_px or self._pace.gates_px))
+            found = _better(found, look.align(trial.pose, around, self._effort.wide_px or self._effort.gates_px))
         return found
 
 
-class _Look:
+class _InstantImages:
     """Images of one instant and the rendering shared by all alignments."""
 
     def __init__(

@@ -78,7 +78,7 @@ def starts_everywhere(condyles: CondyleMotion) -> list[Array]:
     return [condyles.placed(*place) for place in _PLACES_MM]
 
 
-def likeliest(
+def rank_by_colour(
     places: Sequence[Array], views: Sequence[View], scans: Sequence[Scan], arch: int, taken: Sequence[Mask] = ()
 ) -> list[int]:
     """Return the indices of poses T_world_arch (4, 4), ranked by how much the pixels at their crowns look like teeth.
@@ -103,7 +103,7 @@ def likeliest(
     return [int(k) for k in np.argsort(-worth, kind="stable")]
 
 
-class Look(NamedTuple):
+class InstantViews(NamedTuple):
     """Views of an instant, and the rendering shared by its alignments."""
 
     views: Sequence[View]
@@ -133,7 +133,7 @@ class PoseSearch:
         self._loose, self._firm = (CondyleTerm(self.condyles, noise) for noise in (_LOOSE_PX3, _FIRM_PX3))
         self._bite, self._axes = BiteTerm(landmarks[:3], axes[1], _BORDER_PX3), axes
 
-    def near(self, start: Array, look: Look, *, firm: bool = False) -> Solution:
+    def near(self, start: Array, look: InstantViews, *, firm: bool = False) -> Solution:
         """Align from a start accurate to some tenths of a millimetre, T_world_upper and T_world_lower (2, 4, 4).
 
         Args:
@@ -141,7 +141,7 @@ class PoseSearch:
         """
         return self._align(start, look, _FAR_GATES_PX, firm)
 
-    def best(self, starts: list[Array], look: Look, last: Array) -> Solution:
+    def best(self, starts: list[Array], look: InstantViews, last: Array) -> Solution:
         """Align from the prediction and, if the motion is fast, from other starts.
 
         Args:
@@ -155,7 +155,7 @@ class PoseSearch:
                 solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
         return solution
 
-    def from_farther(self, solution: Solution, start: Array, last: Array, look: Look) -> Solution:
+    def from_farther(self, solution: Solution, start: Array, last: Array, look: InstantViews) -> Solution:
         """Align with wide gates and from the poses of the previous frame; return the best solution."""
         solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
         return self._better(solution, self._align(last, look, _NEAR_GATES_PX))
@@ -165,7 +165,7 @@ class PoseSearch:
         solution: Solution,
         predicted: Array,
         last: Array,
-        look: Look,
+        look: InstantViews,
         motion: MotionPredictor,
         everywhere: bool,
     ) -> Solution:
@@ -176,41 +176,41 @@ class PoseSearch:
         if everywhere:
             jaws += starts_everywhere(self.condyles)
         head = solution.poses[0]
-        order = likeliest([head @ jaw for jaw in jaws], look.views, self._thin.scans, 1)[:_HOPEFUL]
+        order = rank_by_colour([head @ jaw for jaw in jaws], look.views, self._thin.scans, 1)[:_HOPEFUL]
         pairs = (np.stack([head, head @ jaws[k]]) for k in order)
         brief = [self._align(pair, look, _TRIAL_GATES_PX, True) for pair in pairs]
-        brief.sort(key=lambda trial: -self.worth_px(trial))
+        brief.sort(key=lambda trial: -self.objective_px(trial))
         for trial in brief[:_FINALISTS]:
             solution = self._better(solution, self.near(trial.poses, look, firm=True))
         return solution
 
-    def with_head_searched(self, solution: Solution, predicted: Array, look: Look) -> Solution:
+    def with_head_searched(self, solution: Solution, predicted: Array, look: InstantViews) -> Solution:
         """Try shifted head poses with an unchanged jaw."""
         shifts = head_shifts(predicted[0], self._axes)
-        order = likeliest(list(shifts @ predicted[0]), look.views, self._thin.scans, 0)[: _HOPEFUL // 2]
+        order = rank_by_colour(list(shifts @ predicted[0]), look.views, self._thin.scans, 0)[: _HOPEFUL // 2]
         brief = [self._align(shifts[k] @ predicted, look, _TRIAL_GATES_PX, True) for k in order]
         brief.sort(key=lambda trial: -float(score_px(trial)[0].sum()))
         best = [self.near(trial.poses, look, firm=True) for trial in brief[:_FINALISTS]]
         return max((solution, *best), key=lambda trial: float(score_px(trial)[0].sum()))
 
-    def look(self, views: Sequence[View]) -> Look:
+    def look(self, views: Sequence[View]) -> InstantViews:
         """Return the views of an instant with a shared rendering."""
-        return Look(views, self._thin.rendering(views))
+        return InstantViews(views, self._thin.rendering(views))
 
-    def polished(self, solution: Solution, views: Sequence[View], look: Look, *, firm: bool) -> Solution:
+    def polished(self, solution: Solution, views: Sequence[View], look: InstantViews, *, firm: bool) -> Solution:
         """Refine an alignment with all faces of the scans; visibility is not recomputed."""
         terms = (self._firm if firm else self._loose, self._bite)
         return self.solver.solve(solution.poses, views, _LAST_GATES_PX, None, terms, rendering=look.rendering)
 
-    def worth_px(self, solution: Solution) -> float:
+    def objective_px(self, solution: Solution) -> float:
         """Return the objective: matched contour minus a penalty for implausible condyles [px]."""
         return float(score_px(solution).sum()) - _STRAIN_PX * self.condyles.strain(relative_pose(*solution.poses))
 
     def _better(self, one: Solution, other: Solution) -> Solution:
         """Return the solution with the higher objective."""
-        return other if self.worth_px(other) > self.worth_px(one) else one
+        return other if self.objective_px(other) > self.objective_px(one) else one
 
-    def _align(self, start: Array, look: Look, gates_px: Sequence[float], firm: bool = False) -> Solution:
+    def _align(self, start: Array, look: InstantViews, gates_px: Sequence[float], firm: bool = False) -> Solution:
         terms = (self._firm if firm else self._loose, self._bite)
         return self._thin.solve(start, look.views, gates_px, None, terms, rendering=look.rendering)
 

@@ -17,7 +17,7 @@ from jawusd.tracking.contour.quality import matched_px, relative_covariance, res
 from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
-from jawusd.tracking.region.search import Look, PoseSearch, fitting_share
+from jawusd.tracking.region.search import InstantViews, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 
 _FIRST_ROUNDS = 3  # of refining the start, which may be off by a few tenths of a millimetre
@@ -39,7 +39,7 @@ class RegionPose:
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4); predictions for arches not found
     found: Mask  # shape (2,)
     covariance: Array  # of their left twists about the world origin, NaN for arches not found, shape (2, 6, 6)
-    worth_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
+    objective_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
     solution: Solution | None = None  # the alignment; None for poses read from a file
     usual: Array = field(default_factory=lambda: np.ones(2))  # matched share relative to the usual one, shape (2,)
     least: Array = field(default_factory=lambda: np.zeros(2))  # threshold on it for an arch to be found, shape (2,)
@@ -79,8 +79,8 @@ class RegionTracker:
             poses = solution.poses
             instant.learn(poses, FIRST_RATES)
         self._first_share = fitting_share(rough)
-        worth_px = self._search.worth_px(solution)
-        return RegionPose(poses, np.ones(2, bool), _covariance(solution), worth_px, solution)
+        objective_px = self._search.objective_px(solution)
+        return RegionPose(poses, np.ones(2, bool), _covariance(solution), objective_px, solution)
 
     def views(self, pictures: Sequence[Picture | None], poses: Array) -> list[View]:
         """Return the views of an instant by the colours learned so far.
@@ -103,7 +103,7 @@ class RegionTracker:
         """
         known, self._colours = self._colours, self._colours.copy()
         try:
-            yield from _Way(self._search, self._colours, self._first_share, poses).follow(cuts)
+            yield from _DirectionTracker(self._search, self._colours, self._first_share, poses).follow(cuts)
         finally:
             self._colours = known
 
@@ -127,7 +127,7 @@ class _Instant:
         self._colours.learn(self._counting, self._pictures, poses, rates)
 
 
-class _Way:
+class _DirectionTracker:
     """Tracker in one temporal direction."""
 
     def __init__(self, search: PoseSearch, colours: LearnedColours, first_share: Array, poses: Array) -> None:
@@ -149,7 +149,7 @@ class _Way:
             rough, searched = self._located(starts, instant.look, usual)
             yield self._taken(instant, rough, searched, usual, any(picture is not None for picture in pictures))
 
-    def _located(self, starts: list[Array], look: Look, usual: Array) -> tuple[Solution, bool]:
+    def _located(self, starts: list[Array], look: InstantViews, usual: Array) -> tuple[Solution, bool]:
         """Return a rough alignment, and whether it came from a search."""
         search, searched = self._search, False
         solution = search.best(starts, look, self._poses)
@@ -187,8 +187,8 @@ class _Way:
             self._usual.append(share)
         self._motion.update(poses, found, np.full(2, seen))
         self._poses, self._found = poses, found
-        worth_px = self._search.worth_px(solution)
-        return RegionPose(poses, found, covariance, worth_px, solution, share / usual, least)
+        objective_px = self._search.objective_px(solution)
+        return RegionPose(poses, found, covariance, objective_px, solution, share / usual, least)
 
 
 def _covariance(solution: Solution) -> Array:

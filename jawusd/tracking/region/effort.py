@@ -8,7 +8,7 @@ _Gates = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Pace:
+class Effort:
     """Steps of an alignment, and conditions and sizes of searches.
 
     Attributes:
@@ -43,7 +43,7 @@ class Pace:
 
 
 #: For recorded images.
-THOROUGH = Pace(
+THOROUGH = Effort(
     gates_px=(6.0, 4.0, 3.0, 2.5, 2.0),
     next_px=(6.0, 4.0, 3.0, 2.5, 2.0),
     far_px=(6.0, 4.0, 3.0, 2.5, 2.0),
@@ -60,7 +60,7 @@ THOROUGH = Pace(
     learn_every=1,
 )
 #: For live images. Frames are dropped during a search, so searches start later.
-BRIEF = Pace(
+FAST = Effort(
     gates_px=(8.0, 3.0, 2.0),
     next_px=(16.0, 6.0, 2.5, 2.0),
     far_px=(24.0, 14.0, 8.0, 4.0, 2.0),
