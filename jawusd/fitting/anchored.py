@@ -63,7 +63,7 @@ class CondylarGuidance:
     centres: Array  # kinematic centres at rest [mm], shape (2, 3)
     slopes: Array  # polynomial coefficients of the height over the slide, shape (2, 4) [mm]
     slide_range: Array  # captured slides [mm], shape (2, 2)
-    shift: Array  # coefficients of the sideways movement of the middle [mm], shape (5,)
+    shift: Array  # coefficients of the sideways movement of the condyles' midpoint [mm], shape (5,)
     misfit_mm: float  # rms residual of the three equations over the captured poses
 
     @classmethod

@@ -195,7 +195,7 @@ class RasterCounter:
         cull: bool = False,
         threads: int = 1,
     ) -> None:
-        """Take the scan.
+        """Store the used part of the scan.
 
         Args:
             vertices: scan coordinates [mm], shape (V, 3).

@@ -141,7 +141,8 @@ def test_one_video_is_not_enough(offsets):
 
 
 @pytest.mark.parametrize(
-    ("lost", "unsure", "words"), [(0, 0, None), (0, 1, "in parts"), (2, 0, "in parts"), (1, 2, "not usable")]
+    ("lost", "unsure", "words"),
+    [(0, 0, None), (0, 1, "partly unreliable"), (2, 0, "partly unreliable"), (1, 2, "not usable")],
 )
 def test_frames_that_tell_little_make_footage_doubtful(tracked, lost, unsure, words):
     sigma = np.full((12, 5), 0.3)

@@ -97,7 +97,8 @@ class Smoother:
         motion = measured_motion(self._coordinates, [fit.pose for fit in fits], good, self._fps)
         total = self._rounds * len(fits)
         if self._unknowns.fixed_head and self._views is not None:
-            fits = self._with_one_head(fits)
+            fits = with_one_head(self._coordinates, fits)
+            fits = [self._matched(fit, frame, state) for fit, frame in zip(fits, self._frames, strict=True)]
         if self._unknowns.free_focal and self._views is not None:
             fits = [self._matched(fit, frame, state) for fit, frame in zip(fits, self._frames, strict=True)]
         for round_ in range(self._rounds + 1):
@@ -118,17 +119,6 @@ class Smoother:
         if self._unknowns.free_focal:
             sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
         return Smoothed(fits, covariance, state, sigma)
-
-    def _with_one_head(self, fits: list[FrameFit]) -> list[FrameFit]:
-        """Return the fits with one common head pose, the median of those found."""
-        seen = [fit for fit in fits if fit.found.all()] or fits
-        first = seen[0].pose.head
-        away = np.median([self._coordinates.head_steps(first, fit.pose.head) for fit in seen], axis=0)
-        head = self._coordinates.turned(first, away)
-        return [
-            self._matched(replace(fit, pose=replace(fit.pose, head=head)), frame, TakeState.unknown(self._cameras))
-            for fit, frame in zip(fits, self._frames, strict=True)
-        ]
 
     def _system(
         self, fits: Sequence[FrameFit], state: TakeState, weight: Array, motion: Motion, *, bounded: bool = True
@@ -197,6 +187,15 @@ class Smoother:
         out = response @ (self._wider * shared) @ np.swapaxes(response, 1, 2)
         out[:, JAW, JAW] += self._wider * found.own
         return np.asarray(out, np.float64), found.shared
+
+
+def with_one_head(coordinates: Coordinates, fits: Sequence[FrameFit]) -> list[FrameFit]:
+    """Return the fits with one common head pose, the median of those found."""
+    seen = [fit for fit in fits if fit.found.all()] or fits
+    first = seen[0].pose.head
+    away = np.median([coordinates.head_steps(first, fit.pose.head) for fit in seen], axis=0)
+    head = coordinates.turned(first, away)
+    return [replace(fit, pose=replace(fit.pose, head=head)) for fit in fits]
 
 
 def outline_variance(fits: Sequence[FrameFit], config: TrackingConfig, length_px: float | None = None) -> Array:

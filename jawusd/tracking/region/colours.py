@@ -114,7 +114,7 @@ def _write_ratios(
     Args:
         local_tooth, local_outside: histograms by table, empty where nothing was learned, shape (T, B).
         tooth: of all teeth, shape (B,).
-        outside: background beside borders of each kind, shape (KINDS, B).
+        outside: histogram of the background next to borders of each kind, shape (KINDS, B).
         lips: of skin and lips, shape (B,).
         out: result, shape (T, B).
     """

@@ -12,7 +12,7 @@ from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.geometry import Camera
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.quality import residual_px, score_px
+from jawusd.tracking.contour.quality import residual_px
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.performance.attempts import FrameFit
@@ -22,6 +22,7 @@ from jawusd.tracking.performance.motion import STEADY
 from jawusd.tracking.region.appearance import CORRELATION_PX, Cut, LearnedColours
 from jawusd.tracking.region.effort import FAST
 from jawusd.tracking.region.rig_tracker import RigTracker
+from jawusd.tracking.region.search import fitting_share
 
 _FACES = 3_000
 # Coarser than for recorded images, since dropped frames cost more accuracy than coarse steps.
@@ -65,7 +66,7 @@ class LiveTake:
         solution = self._tracker.begin(cut, near).solution
         if solution is None:
             return 0.0
-        return float((score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0)).min())
+        return float(fitting_share(solution).min())
 
     def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
         """Align the next instant, `frames` frames later.

@@ -22,10 +22,11 @@ from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.motion import KNOWN, STEADY
 from jawusd.tracking.performance.results import performance_of
-from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother
+from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother, with_one_head
 from jawusd.tracking.performance.unknowns import HabitPrior
 from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.rig_tracker import RigTracker
+from jawusd.tracking.region.search import fitting_share
 
 #: Crops the images of a range of frames for cameras, possibly with changed focal lengths, at a resolution suited to
 #: teeth near a world point [mm], shape (3,).
@@ -109,7 +110,7 @@ class PictureTake:
         solution = fit.solution
         if solution is None or not fit.found.all():
             return fit.pose, 0.0
-        return fit.pose, float((score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0)).min())
+        return fit.pose, float(fitting_share(solution).min())
 
     def solve(self, frame: int, start: Pose, progress: Progress = lambda done, total: None) -> Performance:
         """Solve head pose and jaw parameters of every frame.
@@ -142,7 +143,7 @@ class PictureTake:
             head = STEADY if shot.fixed_head and round_ == 0 else KNOWN if shot.fixed_head else 1.0
             fits = self._follow(cameras, (at, start), some, head, progress)
             if head == STEADY:
-                fits = self._with_one_head(fits)
+                fits = with_one_head(self.coordinates, fits)
             elif shot.free_focal:
                 smoothed = self._smoothed(some, fits)
                 fits, growth = smoothed.fits, np.exp(smoothed.state.log_focal)
@@ -201,14 +202,6 @@ class PictureTake:
             wider=WIDER * (_ALONE if len(shot.cameras) == 1 else 1.0),
         )
         return smoother.run(fits)
-
-    def _with_one_head(self, fits: Sequence[FrameFit]) -> list[FrameFit]:
-        """Return the fits with one common head pose, the median of those found."""
-        seen = [fit for fit in fits if fit.found.all()] or list(fits)
-        first = seen[0].pose.head
-        away = np.median([self.coordinates.head_steps(first, fit.pose.head) for fit in seen], axis=0)
-        head = self.coordinates.turned(first, away)
-        return [replace(fit, pose=replace(fit.pose, head=head)) for fit in fits]
 
 
 def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, range], Iterator[FrameFit]]) -> None:

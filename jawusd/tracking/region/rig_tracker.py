@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, score_px
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.solver import Matched
@@ -23,7 +22,7 @@ from jawusd.tracking.performance.single_start import spread_out
 from jawusd.tracking.performance.views import growth_of
 from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
 from jawusd.tracking.region.effort import THOROUGH, Effort
-from jawusd.tracking.region.search import head_shifts, rank_by_colour
+from jawusd.tracking.region.search import fitting_share, head_shifts, rank_by_colour
 
 # Variance of colour borders times their correlation length [px^3].
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
@@ -32,7 +31,7 @@ _LAST_GATES_PX = (2.0,)
 _TRIAL_GATES_PX = (8.0, 6.0)  # for the many candidates of a search
 # Frames since the last step up to which no frame counts as dropped, and up to which motion is extrapolated.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
-_FIRST_ROUNDS = 3  # of refining the start, which may be off by a few tenths of a millimetre
+_FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of a millimetre
 # Shares of the usual matched contour below which a pose is doubted, a search starts, an arch is given up, and a lost
 # arch is not accepted again. `Effort` overrides the first two as long as no frames are dropped.
 _DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
@@ -92,7 +91,7 @@ class RigTracker:
         self.expected = Expected(pose, sigma**-2.0)
         fit = look.fit(found, np.ones(2, bool), self._free_focal)
         self._motion = Prediction(self._coordinates, pose, fit.found, head=self._head)
-        self._first = _share(rough.solution)
+        self._first = fitting_share(rough.solution)
         self._usual.append(self._first)
         return fit
 
@@ -114,7 +113,7 @@ class RigTracker:
         usual = self._usual_share()
         least = np.where(unsure, _AGAIN, _LOST) * usual
         rough, look = self._best(expected, look, cut, frames, least)
-        share, found = _share(rough.solution), look.polished(rough, expected)
+        share, found = fitting_share(rough.solution), look.polished(rough, expected)
         trusted = (share >= least) & (matched_px(found.solution) >= self._least_px)
         if not trusted.any():
             found = replace(found, pose=expected.pose)
@@ -158,12 +157,12 @@ class RigTracker:
         # After dropped frames, partial fits are not trusted, as motion does not support them.
         doubted, searched = (_DOUBTED, _SEARCHED) if far else (effort.doubted, effort.searched)
         found = look.align(expected.pose, expected, gates)
-        if not (_share(found.solution) < doubted * usual).any():
+        if not (fitting_share(found.solution) < doubted * usual).any():
             return found, look
         if not in_turn:
             for start in (self._motion.last,) if effort.wide_px is None else (expected.pose, self._motion.last):
                 found = _better(found, look.align(start, expected, effort.wide_px or gates))
-        if not (_share(found.solution) < searched * usual).any():
+        if not (fitting_share(found.solution) < searched * usual).any():
             return found, look
         self._failed += 1
         if in_turn:
@@ -172,10 +171,10 @@ class RigTracker:
             return found, look
         look = self._wide_look(found, cut)
         found = look.align(found.pose, expected, gates)
-        if self._head == 1.0 and _share(found.solution)[0] < _SEARCHED * usual[0]:
+        if self._head == 1.0 and fitting_share(found.solution)[0] < _SEARCHED * usual[0]:
             found = self._with_head_searched(found, expected, look)
         far_away = self._searched(found, expected, look)
-        return far_away if (_share(far_away.solution) >= least).all() else found, look
+        return far_away if (fitting_share(far_away.solution) >= least).all() else found, look
 
     def _best_in_turn(
         self, found: Aligned, expected: Expected, look: _InstantImages, cut: Cut
@@ -270,11 +269,6 @@ class _InstantImages:
         solution = instants.linearise(found.pose, self.views, use, self._rendering, gate, True, matched)
         growth = growth_of(matched, solution.poses, solution.centres, self.views)
         return FrameFit(found.pose, solution, use, use, unknown, growth)
-
-
-def _share(solution: Solution) -> Array:
-    """Return the matched share of the visible contour, per arch, shape (2,)."""
-    return np.asarray(score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0), np.float64)
 
 
 def _better(one: Aligned, other: Aligned) -> Aligned:

@@ -20,7 +20,7 @@ from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES
 from jawusd.tracking.region.search import InstantViews, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 
-_FIRST_ROUNDS = 3  # of refining the start, which may be off by a few tenths of a millimetre
+_FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of a millimetre
 # Shares of the usual matched contour below which wider gates are tried, a jaw is searched, a lost arch is not accepted
 # again, and an arch is given up. The usual share is the median over the last frames, but at least `_LEAST_USUAL` of
 # that of the first frame, so that slowly closing lips do not become usual.
