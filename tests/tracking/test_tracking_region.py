@@ -272,7 +272,7 @@ def test_a_jaw_that_is_lost_slowly_does_not_get_usual():
 @pytest.mark.parametrize(("fits", "kept"), [([0.3, 0.12], "near"), ([0.3, 0.2], "far"), ([0.12, 0.3], "near")])
 def test_what_a_search_finds_is_kept_only_if_enough_of_it_fits(monkeypatch, fits, kept):
     """A closed mouth fits hardly anywhere; the pose that fits best of all then lies anywhere."""
-    monkeypatch.setattr(rig_tracker, "_share", np.asarray)
+    monkeypatch.setattr(rig_tracker, "fitting_share", np.asarray)
     near, far = SimpleNamespace(pose="near", solution=[0.3, 0.05]), SimpleNamespace(pose="far", solution=fits)
     look = SimpleNamespace(align=lambda *_: near)
     tracker = RigTracker.__new__(RigTracker)
