@@ -1,4 +1,4 @@
-"""The models for comparison: PCA, the best sum of curves, and the paper's networks."""
+"""Alternative models: PCA, the best sum of curves, and the paper's networks."""
 
 from dataclasses import replace
 
@@ -184,7 +184,7 @@ def test_paper_model_counts_the_constant_once(published):
     parts = [part.value(found.net, t[:, i])[0] for i, part in enumerate(found.parts)]
     constant = found.net.decode(np.zeros((1, 5)))
     np.testing.assert_allclose(found.value(t), sum(parts) - 2 * constant, atol=1e-12)
-    # a group left at its zero code must add nothing: only Phi1 remains
+    # a group at its zero code must contribute nothing: only Phi1 remains
     single = fits[False].network_sum
     if all(len(part.group) == 1 for part in single.parts):
         alone = np.array([[0.1, 0.0, 0.0]])

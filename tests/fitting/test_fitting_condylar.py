@@ -1,4 +1,4 @@
-"""What the condyles' paths say of poses nobody captured."""
+"""Extrapolation beyond the captured poses by the condylar paths."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ CONDYLES = np.array([[50.0, 40.0, -90.0], [-50.0, 40.0, -90.0]])
 
 
 def hinge_and_slide(opening_rad, slides_mm):
-    """Return motions of a jaw that turns about its condyles, which slide down a bent eminence side by side."""
+    """Return motions of a jaw that rotates about its condyles, which slide down a curved eminence together."""
     forward = np.asarray(slides_mm, dtype=float)
     down = -0.5 * forward - 0.02 * forward**2
     R = so3_exp(np.stack([opening_rad, 0 * forward, 0 * forward], axis=-1))

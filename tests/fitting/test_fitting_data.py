@@ -1,4 +1,4 @@
-"""What becomes training data, and how mistakes in it are named."""
+"""Selection of training data, and detection of mistakes in it."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def tracks_of(T, covariance=None):
         frames=np.arange(100, 100 + count),
         T_world_upper=np.broadcast_to(np.eye(4), T.shape).copy(),
         T_world_lower=T.copy(),
-        T_upper_lower=np.full_like(T, np.nan),  # must not be looked at
+        T_upper_lower=np.full_like(T, np.nan),  # must be ignored
         raw_T_world_upper=np.broadcast_to(np.eye(4), T.shape).copy(),
         raw_T_world_lower=T.copy(),
         raw_T_upper_lower=T.copy(),
@@ -146,7 +146,7 @@ def test_mistaken_frames_are_recognised(person, take):
     assert codes(person, take, turned([0, np.pi, 0])) == ["front_back_flip"]
     assert codes(person, take, turned([0, 0, np.pi])) == ["left_right_flip"]
     assert codes(person, take, lambda A, lm: (A, lm[[0, 2, 1, 4, 3]])) == ["left_right_flip"]
-    exchanged = [0, 2, 1, 4, 3]  # in a frame that was found from the landmarks, which turns over with them
+    exchanged = [0, 2, 1, 4, 3]  # in a frame derived from the landmarks, which flips with them
     assert codes(person, take, lambda A, lm: (landmark_frame(lm), lm)) == []
     assert codes(person, take, lambda A, lm: (landmark_frame(lm[exchanged]), lm[exchanged])) == ["left_right_flip"]
     assert codes(person, take, turned([np.pi, 0, 0])) == ["front_back_flip"]

@@ -1,4 +1,4 @@
-"""The glide surface: a hull of the contact, its factors, and a model whose d1 counts from tooth contact."""
+"""The glide surface: envelope of the contact, low-rank factors, and a model whose d1 starts at tooth contact."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_a_surface_of_limited_slopes_lies_on_or_above_the_contact():
     assert (found >= down - 1e-12).all()
     assert np.abs(np.diff(found, axis=0)).max() <= 0.5 * 1.0 + 1e-9
     assert np.abs(np.diff(found, axis=1)).max() <= 0.5 * 0.7 + 1e-9
-    # the least such surface: every point of it is held up by one of the contact
+    # the lowest such surface: every point is supported by a contact point
     away = np.abs(D2[:, None, None, None] - D2[:, None]) * 1.0 + np.abs(D3[:, None, None] - D3) * 0.7
     np.testing.assert_allclose(found, (down - away).max(axis=(2, 3)), atol=1e-9)
 
@@ -45,7 +45,7 @@ def test_factors_give_the_surface_at_its_knots():
 
 
 class FlatTeeth:
-    """Teeth that touch wherever a point of the mandible is less than it was below a plane, rising with d3."""
+    """Teeth that touch where a mandible point rises above a plane that is inclined along d3."""
 
     closed_mm = 0.3
 
@@ -73,7 +73,7 @@ def test_d1_counts_from_contact_and_poses_stay():
     at = new.model.gauge.displacement(np.column_stack([np.zeros(50), side]))
     far = np.hypot(*side.T) > 2.5
     np.testing.assert_allclose((at[:, 1] + 0.4 * at[:, 2])[far], 0.0, atol=0.1)
-    # the bound begins there, and holds the closed bite
+    # the bound starts there, and contains the closed bite
     assert new.margin([0.0, 0.0, 0.0]) >= 0
     assert new.margin([-0.2, 0.0, 0.3]) < 0
     assert found.arrays["d_range"][0, 0] == pytest.approx(-0.05)

@@ -1,4 +1,4 @@
-"""The default model on synthetic persons whose joints share nothing with its form."""
+"""The default model on synthetic persons whose joints are independent of its form."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def rig(model):
 
 
 def largest_error(person, rig, T):
-    """Return the largest mandible-point distance of poses and their encoded twins [mm]."""
+    """Return the largest mandible-point distance between poses and their encoded versions [mm]."""
     points = np.c_[person.mandible_points, np.ones(len(person.mandible_points))]
     difference = (rig.pose(rig.encode(T)[0]) - T) @ points.T
     return np.linalg.norm(difference[:, :3], axis=1).max(1)
@@ -207,7 +207,7 @@ def test_model_survives_the_file(tmp_path, model):
 
 
 def test_a_fit_does_not_depend_on_the_threads_of_linear_algebra(person, take):
-    """With two threads it ended 5 micrometres elsewhere; the number that the process has is left as it was."""
+    """Two threads would change the result by 5 micrometres; the thread count of the process is restored."""
     T = take[:400]
     with threadpool_limits(limits=1, user_api="blas"):
         alone = fit(person, T)

@@ -168,7 +168,7 @@ def test_gauge_is_found_again_from_its_own_displacements():
     path, gauge = example_gauge()
     rng = np.random.default_rng(13)
     d = np.stack([rng.exponential(6.0, 3000).clip(0, 40), rng.uniform(-9, 9, 3000), rng.normal(0, 1.5, 3000)], axis=1)
-    d[::3, 0] = 0.0  # gliding with the teeth together
+    d[::3, 0] = 0.0  # gliding with closed teeth
     found = fit_gauge(gauge.displacement(d), np.ones(3000), path, np.ones(3, bool))
     slides = np.array([[0.0, 7, 0], [0, -7, 0], [0, 0, 6.0], [10, 6, 0]])
     np.testing.assert_allclose(found.gauge.displacement(slides), gauge.displacement(slides), atol=0.45)
@@ -281,7 +281,7 @@ def test_tolerance_grows_with_what_a_left_out_exercise_adds():
     rng = np.random.default_rng(21)
     alike = envelope(rng, 1000)
     farther = alike.copy()
-    block = np.arange(1000) // 50 % 5 == 4  # frames that are left out together
+    block = np.arange(1000) // 50 % 5 == 4  # frames held out together
     farther[block, 1:] = [0.0, 2.0] + 1.3 * (alike[block, 1:] - [0.0, 2.0])
     (_, small), (_, large) = fit_slice_hull(alike), fit_slice_hull(farther)
     assert 0.0 <= small < large <= 1.0

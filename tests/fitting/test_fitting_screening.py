@@ -1,4 +1,4 @@
-"""Tracking failures of centimetres are found before a spline bends to them."""
+"""Screening of tracking failures of centimetres before a spline is fitted."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def poses(person):
 
 
 def knocked(poses, count, rad, mm):
-    """Return the poses with some thrown off in random directions, and which."""
+    """Return the poses with some displaced in random directions, and which ones."""
     rng = np.random.default_rng(3)
     rows = np.sort(rng.choice(len(poses), count, replace=False))
     out = poses.copy()

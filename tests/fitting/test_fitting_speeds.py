@@ -1,4 +1,4 @@
-"""The speeds of the take behind a model."""
+"""Speeds of the take that a model was fitted to."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def test_gaps_and_frames_left_out_are_no_motion():
     d = np.stack([10 + 8 * np.sin(5 * times), 3 * np.cos(3 * times), np.sin(4 * times)], axis=1)
     expected = Speeds.of_take(d, FPS)
     keep = np.ones(600, dtype=bool)
-    keep[200:260] = False  # a gap: the jaw is elsewhere afterwards
+    keep[200:260] = False  # a gap, after which the jaw has moved
     trained = np.ones(600, dtype=bool)
     trained[400] = False
     d[400] += 30.0  # an outlier

@@ -1,4 +1,4 @@
-"""The paper's experiments: every measure against brute force or known geometry, and the whole on a synthetic person."""
+"""The paper's experiments: measures against brute force or known geometry, and a full run on a synthetic person."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def data(poses, anatomy):
 
 @pytest.fixture(scope="module")
 def quick():
-    """Train the networks for a tenth of their time, and draw a fifth of the random poses."""
+    """Train the networks for a tenth of the usual time, and draw a fifth of the random poses."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthesis, "POSES", 200)
         patch.setattr(synthesis, "_BATCH", 800)
@@ -93,7 +93,7 @@ def test_random_parameters_fill_each_bound_and_nothing_else():
         assert shapely.contains_xy(shape, drawn[POLYGONS][:, 0], drawn[POLYGONS][:, axis]).all()
         assert not shapely.contains_xy(shape, drawn[BOX][:, 0], drawn[BOX][:, axis]).all()
     assert (bounds.slices.signed_distance(drawn[SLICES]) <= 0).all()
-    # Uniform: the box is not filled from the middle or the edge alone.
+    # Uniform, neither concentrated in the middle nor at the edge.
     assert np.abs(drawn[BOX].mean(0) - bounds.box.mean(1)).max() < 0.05 * np.ptp(bounds.box, axis=1).max()
 
 
@@ -129,7 +129,7 @@ def test_paths_are_measured_against_the_captured_condyles():
     d = np.zeros((200, 3))
     d[:100, 1] = 5.0  # the nearer half was captured while the jaw was sideways
     up, up_from, down, down_from = path_distances(paths, captured, d)
-    # Beside a point the line lies up to 0.75 mm higher.
+    # Next to a point the line lies up to 0.75 mm higher.
     assert 1.2 < up.values_mm.mean() < 1.6 and down.values_mm.max() == 0.0
     assert up_from.values_mm.max() > 5.0 and np.isclose(up_from.values_mm.min(), np.sqrt(2), atol=0.05)
     assert len(down_from.values_mm) == len(up_from.values_mm) == 100
@@ -235,7 +235,7 @@ def test_frames_a_prior_helped_with_are_never_used(poses, anatomy):
 
 
 def _tracks(poses, aided, extra):
-    """Tracks with these raw poses; what this version adds to tracks is filled in by `vars` of an empty one."""
+    """Tracks with these raw poses; all other fields are those of empty tracks."""
     covariance = np.tile(np.eye(6) * 1e-6, (FRAMES, 1, 1))
     values = {
         "frames": np.arange(FRAMES), "T_upper_lower": poses, "raw_T_upper_lower": poses, "prior_aided": aided,

@@ -1,4 +1,4 @@
-"""Pixel counts: the CPU's against numpy on unpacked pictures, OpenGL's against the CPU's, and what fails without GL."""
+"""Pixel counts: CPU against numpy on unpacked images, OpenGL against CPU, and errors without OpenGL."""
 
 import importlib
 import sys
@@ -16,7 +16,7 @@ gl = importlib.import_module("jawusd.paper.gl")
 
 SIZE = (200, 130)
 VIEWS = 3
-EDGE_TIES_PX = 4  # pixels whose centre lies on a side to rounding, out of some 6000
+EDGE_TIES_PX = 4  # pixels whose centre lies on an edge to rounding, out of about 6000
 
 
 def torus(rings: int = 60, sides: int = 30) -> tuple[np.ndarray, np.ndarray]:
@@ -58,7 +58,7 @@ def drawn(faces: np.ndarray, matrix: np.ndarray, pose: np.ndarray) -> np.ndarray
 
 
 def screens() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return matrices, masks drawn at another pose, and free places larger than the masks."""
+    """Return matrices, masks drawn at another pose, and free areas larger than the masks."""
     P = matrices()
     masks = np.stack([drawn(FACES, m, some_poses(1, seed=9)[0]) for m in P])
     free = masks.copy()
@@ -118,7 +118,7 @@ def test_opengl_agrees_with_the_cpu(context, cull) -> None:
         assert np.abs(found - expected).max() <= EDGE_TIES_PX
         assert expected.max() > 100 * EDGE_TIES_PX
         assert context.error is not None  # clears it: making a framebuffer, moderngl binds the one released before
-        # A drawing counts the same alone and in a batch.
+        # Counts are the same for single poses and batches.
         np.testing.assert_array_equal(np.concatenate([counter.counts(pose[None]) for pose in poses]), found)
     assert context.error == "GL_NO_ERROR"
 

@@ -45,7 +45,7 @@ def plate() -> Mesh:
 
 
 def plate_view(mask: np.ndarray, other: np.ndarray | None = None) -> View:
-    """Look at the plate from 100 mm, 1 px/mm; pixel (31.5, 31.5) is its middle, so that no centre lies on a side."""
+    """View the plate from 100 mm at 1 px/mm, centred at (31.5, 31.5), so that no pixel centre lies on an edge."""
     matrix = np.array([[100.0, 0, 31.5, 3150], [0, 100, 31.5, 3150], [0, 0, 1, 100]])
     masks = np.stack([mask, np.zeros_like(mask) if other is None else other]).astype(np.uint8) * 255
     return View(matrix, np.array([0, 0, -100.0]), masks, np.array([True, True]))
@@ -57,7 +57,7 @@ def box(rows: slice, columns: slice) -> np.ndarray:
     return out
 
 
-PLATE = box(slice(20, 44), slice(12, 52))  # where the plate is seen; its green part are rows 36 to 43
+PLATE = box(slice(20, 44), slice(12, 52))  # image of the plate; rows 36 to 43 are green
 
 
 def shifted(x_mm: float, y_mm: float) -> np.ndarray:
@@ -75,8 +75,8 @@ def energy_of(views, poses, row=0, other_row_hides=False):
 def test_the_energy_is_white_pixels_plus_lambda_times_dark_green_ones() -> None:
     poses = [np.eye(4), shifted(5, 0), shifted(0, -3), shifted(0, 2)]
     values, bare = energy_of([plate_view(PLATE)], poses)
-    # Right: 5 columns of mask bare, 5 columns of 8 green rows outside. Up: 3 bare rows, all green inside.
-    # Down: 2 bare rows on top, 2 green rows outside below.
+    # Right: 5 columns of the mask uncovered, 5 columns of 8 green rows outside. Up: 3 rows uncovered, all green inside.
+    # Down: 2 rows uncovered at the top, 2 green rows outside at the bottom.
     expected_bare = [0, 5 * 24, 3 * 40, 2 * 40]
     expected_green = [0, 5 * 8, 0, 2 * 40]
     np.testing.assert_array_equal(np.ravel(bare), expected_bare)
@@ -119,7 +119,7 @@ def test_red_and_green_are_taken_by_majority_and_grey_is_left_out() -> None:
     scan = paper_scan(Mesh(mesh.vertices, mesh.faces, colors), "upper")
     middle = np.sort(mesh.vertices[scan.plain_faces][..., 1])[:, 1]
     assert middle.min() >= -8 and mesh.vertices[scan.plain_faces][..., 1].min() == -9
-    assert len(scan.plain_faces) == 2 * 40 * 12 + 40  # of the squares with two grey corners one triangle each
+    assert len(scan.plain_faces) == 2 * 40 * 12 + 40  # and one triangle per square with two grey corners
     assert len(scan.boundary_faces) == 2 * 40 * 8 and mesh.vertices[scan.boundary_faces][..., 1].min() == 4
     assert not scan.cull  # a plate has no inside
 
@@ -155,7 +155,7 @@ def test_golden_section_finds_the_minimum_of_the_interval(place, expected) -> No
     assert length == pytest.approx(expected, abs=1e-3) and length == pytest.approx(reference, abs=2e-3)
     assert value == pytest.approx((length - place) ** 2)
     assert min(asked) > 0 and max(asked) < 2
-    # Every look after the first two shortens the interval by the golden ratio.
+    # Every evaluation after the first two shortens the interval by the golden ratio.
     assert len(asked) == 2 + int(np.ceil(np.log(1e-3 / 2) / np.log((np.sqrt(5) - 1) / 2)))
 
 
@@ -215,7 +215,7 @@ def test_rotation_and_translation_mean_what_equation_6_says(block) -> None:
 def test_the_dense_look_leaves_a_minimum_that_descent_cannot() -> None:
     better = np.array([1, -1, 1, 0, 1, -1]) * np.repeat([PaperConfig.dense_rad, PaperConfig.dense_mm], 3)
 
-    def energy(poses):  # a hole in flat land
+    def energy(poses):  # flat except for one minimum
         return np.array([0.0 if np.allclose(pose, pose_at(better), atol=1e-9) else 10.0 for pose in poses])
 
     found = solve_paper(energy, START, CENTRE, PaperConfig())
@@ -241,7 +241,7 @@ CAMERAS = make_cameras()
 POSES = jaw_poses(3 * FRAMES)[::3]
 ROWS = ("upper", "lower")
 OFFSETS = {camera.name: 0 for camera in CAMERAS}
-# No dense look: these tests are about bookkeeping.
+# No dense search: these tests are about bookkeeping.
 QUICK = PaperConfig(most_rounds=2, dense_samples=1)
 
 
@@ -259,7 +259,7 @@ def masks_folder(tmp_path_factory):
 
 
 def take(folder, **change) -> Capture:
-    """Describe the take; it starts in its middle frame, with slightly wrong picks."""
+    """A take that starts in its middle frame, with slightly wrong picks."""
     rng = np.random.default_rng(1)
     start = 1
     picks = {row: [] for row in ROWS}

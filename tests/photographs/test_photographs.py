@@ -1,4 +1,4 @@
-"""Photographs of closed teeth: lines, lens, contact, and the bite of scans in frames of their own."""
+"""Photographs of closed teeth: lines, lens, contact, and the bite of scans in arbitrary frames."""
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ def mouth():
 @pytest.fixture(scope="module")
 def rows(mouth):
     scans = [prepare_scan(mesh, name) for mesh, name in zip(mouth.meshes, ("upper", "lower"))]
-    # of both sides that either row may stand on, the true ones
+    # of the possible vertical directions of both arches, the true ones
     usual = min(
         typical_bites(scans),
         key=lambda one: (
@@ -34,7 +34,7 @@ def rows(mouth):
 def test_lines_are_found_to_a_fraction_of_a_pixel():
     picture = np.zeros((400, 500), np.uint8)
     cv2.circle(picture, (250 * 16 + 5, 200 * 16 + 11), 120 * 16, 255, 3, cv2.LINE_AA, 4)
-    picture[20, 20:40] = 255  # a slip of the pen
+    picture[20, 20:40] = 255  # a stray stroke
     lines = read_lines(picture, "circle")
     away = lines.pixels - [250 + 5 / 16, 200 + 11 / 16]
     radius = np.linalg.norm(away, axis=1)
@@ -92,7 +92,7 @@ def test_contact_holds_teeth_together(mouth, rows):
 
 
 def aligned(mouth, rows, contact, names, seed=0, last=6):
-    """Return photographs begun a few degrees and millimetres off, with a focal length 20 % off."""
+    """Return photographs with starts a few degrees and millimetres off, and a focal length 20 % off."""
     rng = np.random.default_rng(seed)
     photos = []
     for name in names:
@@ -123,13 +123,13 @@ def test_one_photograph_tells_the_bite_across_its_line_of_sight(mouth, rows):
     bite, _ = aligned(mouth, rows, contact, ["left"], seed=2, last=20)
     away = transform_point(bite.T_upper_lower, mouth.incisor) - transform_point(mouth.T_upper_lower, mouth.incisor)
     across = bite.photos[0].pose.T_cam_upper[:2, :3] @ away
-    # The rows touch elsewhere, too, if one of them is moved along the line of sight.
+    # The arches also touch elsewhere if one of them moves along the line of sight.
     assert np.linalg.norm(across) < 0.6 and np.linalg.norm(away) < 2.5
 
 
 @pytest.fixture
 def small_search(monkeypatch):
-    """Search few directions, from small pictures."""
+    """Search few directions, in small images."""
     search_little(monkeypatch)
 
 

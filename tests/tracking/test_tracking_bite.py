@@ -1,4 +1,4 @@
-"""Lower teeth are kept from passing through the upper ones, and only from that."""
+"""The bite prior keeps lower teeth from penetrating the upper ones, and has no other effect."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ TERM = BiteTerm(POINTS, UP, 50.0)
 
 
 def state(lift_mm):
-    """Return a head somewhere in the world whose lower teeth lie above the closed bite by so much."""
+    """Return a head with a random pose whose lower teeth lie above the closed bite by some height."""
     head = np.eye(4)
     head[:3, :3], head[:3, 3] = Rotation.from_rotvec([0.3, -0.4, 0.2]).as_matrix(), [10.0, -20.0, 300.0]
     jaw = np.eye(4)
@@ -25,7 +25,7 @@ def state(lift_mm):
 
 
 def cost(poses):
-    """Return half the weighted sum of squares by which points lie above the closed bite, its trust held fixed."""
+    """Return half the weighted sum of squared heights above the closed bite, with fixed weights."""
     here = (poses[1, :3, :3] @ POINTS.T).T + poses[1, :3, 3]
     closed = (poses[0, :3, :3] @ POINTS.T).T + poses[0, :3, 3]
     return np.maximum((here - closed) @ (poses[0, :3, :3] @ UP), 0.0)

@@ -1,4 +1,4 @@
-"""Poses of a take weighed against the motion of its condyles, on joints of no polynomials."""
+"""Fusion of a take's poses with its condylar motion, on joints that are not polynomial."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ FRAMES = 150
 
 
 class Take:
-    """A take whose arches are off by turns about the teeth, as colours leave them."""
+    """A take whose arches have rotational errors about the teeth, as in tracking by colour."""
 
     def __init__(self, seed, upper=0.3, turn_deg=0.8):
         person, rng = Person(seed), np.random.default_rng(seed)

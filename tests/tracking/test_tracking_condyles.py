@@ -1,4 +1,4 @@
-"""Where condyles go with the incisal point, learned from motions of a synthetic joint that has no polynomials."""
+"""Condylar motion as a function of the incisal point, learned from a synthetic joint that is not polynomial."""
 
 from dataclasses import replace
 
@@ -60,9 +60,9 @@ def test_without_frames_both_sides_are_expected_alike():
     motion, _ = taught(Person(4), [])
     right_ahead, left_ahead = (motion.expected(np.array([x, -12.0, -3.0]))[0].reshape(2, 3) for x in (6.0, -6.0))
     assert right_ahead == pytest.approx(left_ahead[::-1] * [-1, 1, 1])
-    assert right_ahead[1, 2] > right_ahead[0, 2] + 3.0  # the right condyle goes ahead if the jaw goes to the left
+    assert right_ahead[1, 2] > right_ahead[0, 2] + 3.0  # the right condyle advances if the jaw moves to the left
     closed, wide = (np.sqrt(motion.expected(np.array([0.0, y, y / 3]))[2]) for y in (0.0, -30.0))
-    assert closed == pytest.approx(np.sqrt(np.tile([1.09, 1.64, 1.25], 2)))  # of the bite, and of no polynomial
+    assert closed == pytest.approx(np.sqrt(np.tile([1.09, 1.64, 1.25], 2)))  # uncertainty of the bite alone
     assert (wide > closed).all() and wide.max() < 6.0
 
 
@@ -117,7 +117,7 @@ def test_the_term_brings_condyles_back():
     before = motion.strain(relative_pose(*now))
     for _ in range(8):
         equations = NormalEquations()
-        equations.add_joint(np.diag([1e4] * 6 + [1e-2] * 6), np.zeros(12))  # a head that is well seen
+        equations.add_joint(np.diag([1e4] * 6 + [1e-2] * 6), np.zeros(12))  # a clearly visible head
         CondyleTerm(motion, 54.0).accumulate(state(now), equations)
         step = equations.solve()
         now = np.stack([motion_about(state(now).centres[r], step[r]) @ now[r] for r in (0, 1)])

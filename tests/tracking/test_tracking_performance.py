@@ -1,4 +1,4 @@
-"""Performances of a known jaw: unknowns, a take with lips closed over some frames, one and several cameras."""
+"""Performances of a known jaw: unknowns, a take with lips closed in some frames, one and several cameras."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def folder(jaw, truth, tmp_path_factory):
-    """The masks of the take; none on the hidden frames."""
+    """The masks of the take; none in the hidden frames."""
     return write_masks(tmp_path_factory.mktemp("shot"), jaw, truth, small_take.CAMERAS)
 
 
@@ -133,7 +133,7 @@ def test_a_performance_is_found_and_carried_through_closed_lips(jaw, scans, trut
 
 @pytest.mark.parametrize("cameras", [1, 3])
 def test_the_bound_pulls_a_jaw_inside_but_makes_it_no_surer(jaw, scans, truth, cameras):
-    """Nothing is seen of a jaw some millimetres to the side of its bound."""
+    """The jaw is invisible and some millimetres outside its bound."""
     instants = InstantSolver(ContourSolver(scans, TrackingConfig()), Coordinates(jaw, scans))
     none = np.zeros((2, cameras), bool)
 
@@ -182,7 +182,7 @@ def test_a_wrong_focal_length_is_found(jaw, scans, truth, folder):
 
 
 def test_a_worn_camera_sees_one_head(jaw, scans, truth, tmp_path):
-    """The head of the first frame in all frames."""
+    """Motion with the head of the first frame in all frames."""
     still = (truth[0], np.repeat(truth[1][:1], COUNT, axis=0))
     write_masks(tmp_path, jaw, still, small_take.CAMERAS[:1])
     found = solved(jaw, scans, still, tmp_path, small_take.CAMERAS[:1], fixed_head=True)

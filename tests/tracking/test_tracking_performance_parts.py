@@ -55,7 +55,7 @@ def test_the_take_is_solved_as_the_dense_system_is(frames, shared):
 
 
 def test_motion_is_told_from_the_noise_of_the_poses(jaw):
-    """Of smooth motion under noise as large as its second differences."""
+    """Smooth motion under noise as large as its second differences."""
     from jawusd.tracking.performance.coordinates import Coordinates
 
     class Arch:
@@ -72,12 +72,12 @@ def test_motion_is_told_from_the_noise_of_the_poses(jaw):
     good = np.ones(len(t), bool)
     wanted, found = (measured_motion(coordinates, poses, good, 24.0).bend for poses in (true, shaken))
     np.testing.assert_allclose(np.sqrt(found[3:]), np.sqrt(wanted[3:]), rtol=0.5)
-    none = measured_motion(coordinates, shaken, ~good, 24.0)  # nothing seen: as the take behind the rig moved
+    none = measured_motion(coordinates, shaken, ~good, 24.0)  # nothing seen: variances of the rig's own take
     assert (none.bend > 0).all() and (none.step > 0).all()
 
 
 def inside_by(bias_px, jaw, frames, habits):
-    """Return the bias of free edges told by borders on random normals that all lie so far off."""
+    """Return the estimated bias of free edges from borders on random normals with a common offset."""
     from types import SimpleNamespace
 
     from jawusd.tracking.performance.coordinates import Coordinates
@@ -104,7 +104,7 @@ def inside_by(bias_px, jaw, frames, habits):
 
 
 def test_borders_of_colours_may_lie_inside_farther_than_drawn_ones(jaw):
-    """Light moves borders by more than a hand's habits; both are told from many frames alike."""
+    """Lighting shifts borders by more than an annotator does; many frames reveal both equally."""
     np.testing.assert_allclose(inside_by(-0.5, jaw, 40, HabitPrior((0.4, 0.08, 0.02), 5.0)), -0.5, atol=0.1)
     assert (inside_by(-0.5, jaw, 40, DRAWN) > -0.3).all()
 
@@ -137,7 +137,7 @@ def performance(jaw):
 
 
 def test_covariances_are_those_of_the_moved_poses(jaw, performance):
-    """By Monte Carlo over the nine unknowns."""
+    """Compare with Monte Carlo over the nine unknowns."""
     tracks, p, k = tracks_of(performance, jaw), performance, 2
     rng, to = np.random.default_rng(0), make_transform(np.eye(3), p.pivot)
     steps = rng.multivariate_normal(np.zeros(9), p.covariance[k] * 1e-4, size=20_000)

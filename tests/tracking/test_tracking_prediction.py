@@ -1,4 +1,4 @@
-"""Where head and jaw are expected, frame after frame and after frames that were left out."""
+"""Predictions of head and jaw, for consecutive frames and after dropped frames."""
 
 from types import SimpleNamespace
 
@@ -21,7 +21,7 @@ def coordinates():
 
 
 def following(coordinates, step_mm, frames=4, head=1.0):
-    """Return the prediction after frames in which the jaw opened evenly, and the last pose."""
+    """Return the prediction after frames of uniform opening, and the last pose."""
     pose = Pose(np.eye(4), np.zeros(3))
     motion = Prediction(coordinates, pose, BOTH, head=head)
     for k in range(1, frames + 1):
@@ -32,7 +32,7 @@ def following(coordinates, step_mm, frames=4, head=1.0):
 
 
 def test_a_motion_goes_on_and_dies_away(coordinates):
-    """After long gaps it has gone no farther than a damped motion ever does: 0.8 / (1 - 0.8) steps."""
+    """After long gaps, the extrapolation reaches the limit of a damped motion: 0.8 / (1 - 0.8) steps."""
     motion, last = following(coordinates, 0.5)
     one = motion.expected().pose.d[0] - last.d[0]
     assert 0.25 < one < 0.5

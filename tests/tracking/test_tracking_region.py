@@ -1,4 +1,4 @@
-"""Borders of teeth found in colours, against pictures whose borders are known by construction."""
+"""Tooth borders by colour in images with known borders, and the trackers that use them."""
 
 import weakref
 from collections import deque
@@ -36,7 +36,7 @@ LIMITS = (8.0, 0.4, 0.7)
 
 
 def disc(seed=0, noise=4.0, radius=RADIUS):
-    """Return a disc of tooth in lips, (h, w, 3), every pixel mixed by the area that the disc covers."""
+    """Return an anti-aliased tooth-coloured disc on lip colour, (h, w, 3)."""
     y, x = np.mgrid[0:SIZE, 0:SIZE]
     share = np.clip(radius - np.hypot(x - MIDDLE, y - MIDDLE) + 0.5, 0, 1)[..., None]
     picture = share * TOOTH + (1 - share) * LIP + np.random.default_rng(seed).normal(0, noise, (SIZE, SIZE, 3))
@@ -65,7 +65,7 @@ def searched(picture, share, samples, reach=LIMITS[0], other_depth=None):
     bins = colour_bins(picture)
     inside, outside = share > 0.99, share < 0.01
     colours = CameraColours(bins, Areas(inside, outside, np.zeros_like(inside), np.zeros_like(inside)))
-    y, x = np.mgrid[0:SIZE, 0:SIZE]  # the crown as drawn where it is thought to be
+    y, x = np.mgrid[0:SIZE, 0:SIZE]  # the crown rendered at its assumed position
     radius = np.hypot(samples[0, U] - MIDDLE, samples[0, V] - MIDDLE)
     own = (np.hypot(x - MIDDLE, y - MIDDLE) <= radius).astype(np.uint8) * CROWN
     other = np.zeros((SIZE, SIZE), np.uint8)
@@ -90,7 +90,7 @@ def test_borders_are_found_from_either_side(off):
 
 
 def weights_after(motion_px, counts):
-    """Return the weights of a disc's borders that moves to the right from frame to frame, and their normals."""
+    """Return the border weights of a disc that moves to the right, and the normals."""
     picture, share = disc()
     samples = samples_at(RADIUS)
     samples[:, X], samples[:, Y] = samples[:, U], samples[:, V]
@@ -112,7 +112,7 @@ def test_borders_that_move_count_less_in_the_last_look():
     assert along.sum() > 10 and across.sum() > 1
     assert (fast[along] < 0.3 * rest[along]).all()
     np.testing.assert_allclose(fast[across], rest[across], rtol=0.02)
-    earlier, _ = weights_after(40.0, None)  # which tells whether teeth are lost
+    earlier, _ = weights_after(40.0, None)  # before the final alignment, which decides whether teeth are lost
     assert (earlier[along] > 0.9 * rest[along]).all()
 
 
@@ -150,7 +150,7 @@ def test_crowns_before_crowns_end_at_the_dark_line():
     own[:, :69], other[:, 69:] = CROWN, CROWN
     distances, weights = np.full(1, np.nan), np.zeros(1)
     search_creases(samples, picture, own, other, 5.0, 25.0, 0.5, distances, weights)
-    # Half as dark as the line is sqrt(2 ln 2) = 1.18 px before its middle.
+    # Half the darkness of the line is reached sqrt(2 ln 2) = 1.18 px before its centre.
     assert weights[0] == 0.5 and distances[0] == pytest.approx(2.0 - 1.18, abs=0.3)
 
 
@@ -159,7 +159,7 @@ def test_colours_follow_what_borders_show():
     areas = Areas(share > 0.99, share < 0.01, np.zeros_like(share, bool), np.zeros_like(share, bool))
     colours = CameraColours(colour_bins(picture), areas)
     blue = int(colour_bins(np.full((1, 1, 3), (30, 60, 200), np.uint8))[0, 0])
-    assert colours.ratio[1, 4, blue] < 0  # never seen
+    assert colours.ratio[1, 4, blue] < 0  # unseen colour
     tooth, outside = np.zeros((2, TABLES, BINS)), np.zeros((2, TABLES, BINS))
     tooth[1, 4, blue] = 1000.0  # lower arch, patch 2
     outside[1, :, int(colour_bins(LIP[None, None].astype(np.uint8))[0, 0])] = 1000.0
@@ -184,7 +184,7 @@ def test_the_example_is_followed_by_its_colours(tmp_path):
     follower = Follower(footage, cameras, prepared(teeth), subject)
     assert follower.begun(start, picked)[1] > 0.3
     guide = follower.run(chosen, lambda *step: done.append(step))
-    assert 1 <= footage.most <= 2  # or long takes fill the memory
+    assert 1 <= footage.most <= 2  # otherwise long takes exhaust the memory
     assert sorted(guide) == list(chosen) and done[-1] == ("follow", len(chosen), len(chosen))
     for frame, found in guide.items():
         true = poses[list(frames).index(frame)]
@@ -199,7 +199,7 @@ def test_the_example_is_followed_by_its_colours(tmp_path):
 
 
 class Counted(ColourFootage):
-    """Count the instants whose pictures are held when the next one is asked for, going forwards."""
+    """Count the instants whose images are in memory when the next one is requested, going forwards."""
 
     most = 0
 
@@ -214,7 +214,7 @@ class Counted(ColourFootage):
 
 
 class Covered(ColourFootage):
-    """Show other frames in place of some, and what lips would hide in none: all skin."""
+    """Replace some frames by others, or by uniform skin, as under closed lips."""
 
     SHOWN: ClassVar = {22: None, 23: 48, 24: 49}
 
@@ -232,7 +232,7 @@ def fit_of(by, found, px, doubtful=False):
 
 @pytest.mark.parametrize("step", [1, -1])
 def test_teeth_are_followed_back_from_where_they_were_found(monkeypatch, step):
-    """Lost from the 3rd frame on, in sight again from the 5th, found at the 8th; lost to the end from the 9th on."""
+    """Lost from the 3rd frame, visible again from the 5th, found in the 8th; lost from the 9th to the end."""
     monkeypatch.setattr(performance, "score_px", np.asarray)
     way = range(30, 30 + 10 * step, step)
     fits = {at: fit_of("first", k < 3 or k == 8, 9.0) for k, at in enumerate(way)}
@@ -250,7 +250,7 @@ def test_teeth_are_followed_back_from_where_they_were_found(monkeypatch, step):
 
 
 def test_a_wrong_pose_is_replaced_up_to_where_the_right_one_fits_hardly_better(monkeypatch):
-    """From frame 2 on wrong, but doubtful only in 3, where it fits better all the same, and 5; right from 6 on."""
+    """Wrong from frame 2, but doubtful only in 3, where it fits better anyway, and in 5; correct from frame 6."""
     monkeypatch.setattr(performance, "score_px", np.asarray)
     fits = {k: fit_of("first", True, 7.0 if k == 3 else 5.0, k in (3, 5)) for k in range(8)}
     follow_back(fits, range(8), lambda frame, before: (fit_of("back", True, 6.0 if at > 1 else 5.2) for at in before))
@@ -258,7 +258,7 @@ def test_a_wrong_pose_is_replaced_up_to_where_the_right_one_fits_hardly_better(m
 
 
 def test_a_jaw_that_is_lost_slowly_does_not_get_usual():
-    """A wrong pose that fits ever less was followed for six frames, up to 8 mm off."""
+    """A pose that drifts away fits less and less, which must not lower the usual share."""
     tracker = RigTracker.__new__(RigTracker)
     tracker._usual, tracker._first = deque([np.array([0.5, 0.4])] * 3, maxlen=15), np.array([0.5, 0.3])
     for share in np.linspace(0.2, 0.14, 30):
@@ -271,7 +271,7 @@ def test_a_jaw_that_is_lost_slowly_does_not_get_usual():
 
 @pytest.mark.parametrize(("fits", "kept"), [([0.3, 0.12], "near"), ([0.3, 0.2], "far"), ([0.12, 0.3], "near")])
 def test_what_a_search_finds_is_kept_only_if_enough_of_it_fits(monkeypatch, fits, kept):
-    """A closed mouth fits hardly anywhere; the pose that fits best of all then lies anywhere."""
+    """With a closed mouth hardly anything fits, so the best pose of a search is arbitrary."""
     monkeypatch.setattr(rig_tracker, "fitting_share", np.asarray)
     near, far = SimpleNamespace(pose="near", solution=[0.3, 0.05]), SimpleNamespace(pose="far", solution=fits)
     look = SimpleNamespace(align=lambda *_: near)
