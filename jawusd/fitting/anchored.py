@@ -214,7 +214,7 @@ class _Chart:
 def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bool) -> tuple[AnchoredModel, float]:
     """Fit f to the best rotations of the frames with their incisal points fixed at u.
 
-    The smoothing is chosen anew by every call, since trimming outliers permits a less stiff f.
+    The smoothing is chosen in every call, since f may be less stiff once outliers are trimmed.
     """
     rotation = data.metric.best_rotation(data.motion, data.incisor, u + data.incisor)[kept]
     omega, q, weights = so3_log(rotation), chart.of(u[kept]), data.weights[kept]

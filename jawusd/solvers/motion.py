@@ -147,8 +147,7 @@ def _nested(like: object, leaves: Iterator[Tensor]) -> object:
     if not isinstance(like, tuple | list):
         return next(leaves)
     parts = [_nested(each, leaves) for each in like]
-    # a named tuple takes its fields as arguments, which mypy cannot infer from `type(like)`
-    return type(like)(*parts) if hasattr(like, "_fields") else parts  # type: ignore[arg-type]
+    return type(like)(*parts) if hasattr(like, "_fields") else parts  # type: ignore[arg-type]  # a NamedTuple's fields
 
 
 def jaw_pose_from_axis_angle(

@@ -88,7 +88,7 @@ def rank_by_colour(
         taken: by view, pixels (h, w) of the other arch, which are ignored; empty if unknown.
     """
     points = scans[arch].crown_vertices(_POINTS)
-    worth = np.zeros(len(places))
+    scores = np.zeros(len(places))
     for c, view in enumerate(views):
         if not isinstance(view.edges, RegionView):
             continue
@@ -99,8 +99,8 @@ def rank_by_colour(
             h = transform_points(pose, points) @ view.matrix[:, :3].T + view.matrix[:, 3]
             x, y = np.rint(h[:, :2] / h[:, 2:]).astype(int).T
             inside = (x >= 0) & (y >= 0) & (x < like.shape[1]) & (y < like.shape[0])
-            worth[k] += float(like[y[inside], x[inside]].sum())
-    return [int(k) for k in np.argsort(-worth, kind="stable")]
+            scores[k] += float(like[y[inside], x[inside]].sum())
+    return [int(k) for k in np.argsort(-scores, kind="stable")]
 
 
 class InstantViews(NamedTuple):
