@@ -154,7 +154,7 @@ def test_frames_that_tell_little_make_footage_doubtful(tracked, lost, unsure, wo
         return
     frames = tracked[1].frames
     assert words in found[0].message and f"{lost + unsure} of 12" in found[0].message
-    assert f"write frames = [{frames[unsure]}, {frames[11 - lost] + 1}]" in found[0].hint
+    assert f"set frames = [{frames[unsure]}, {frames[11 - lost] + 1}]" in found[0].hint
 
 
 def test_footage_doubtful_all_over_has_no_part_to_keep(tracked):
