@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take, upgraded_model
 from jawusd.formats.atomic import write_npz_atomic
-from jawusd.formats.text import ModelHeader, check_header
+from jawusd.formats.notes import ModelMeta, check_notes
 
 FAMILY, VERSION = "jawusd-model", 2
 _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_trained")
@@ -33,6 +34,11 @@ class JawModel:
     trained: Mask  # the frame took part in the fit, shape (F,)
     # kind, method, actor, error tables, warnings, configuration, versions, hashes
     meta: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def notes(self) -> ModelMeta:
+        """Those values of `meta` that have a schema."""
+        return cast(ModelMeta, self.meta)
 
 
 def save_model(path: str | os.PathLike[str], model: JawModel) -> None:
@@ -60,7 +66,7 @@ def load_model(path: str | os.PathLike[str]) -> JawModel:
         UnitsError: other units or twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
-    check_header(meta, ModelHeader, path)
+    check_notes(meta, ModelMeta, path)
     arrays = upgraded_model(arrays, path)
     frames = take(arrays, "captured_frames", (None,), path)
     count = len(frames)

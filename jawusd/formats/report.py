@@ -9,6 +9,7 @@ from jawusd.formats.experiments import Experiments
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
+from jawusd.formats.notes import SyncNotes
 from jawusd.formats.tracks import Tracks
 
 
@@ -74,7 +75,7 @@ class ReportData:
     actor: str
     tracks: Tracks
     model: JawModel
-    sync: Mapping[str, object]  # result of the sync stage: `offsets`, `method` and its confidence
+    sync: SyncNotes
     cameras: tuple[CameraFacts, ...]  # empty where the capture is not at hand
     inferred: tuple[str, ...]  # what was derived instead of being given
     seconds: Mapping[str, float]  # per stage [s]

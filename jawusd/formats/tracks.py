@@ -11,76 +11,17 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import TypedDict
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FormatError
 from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.formats.atomic import write_npz_atomic
+from jawusd.formats.notes import TracksMeta, check_notes
 from jawusd.formats.performance import SolvedJaw, take_solved
-from jawusd.formats.text import TracksHeader, check_header
 from jawusd.geometry import LANDMARKS, rigidity_defect
 
 FAMILY, VERSION = "jawusd-tracks", 1
 _APART_S = 0.5  # neighbours show the same trouble
-
-
-class CameraCorrections(TypedDict):
-    """Camera poses as a take corrects them; tables by camera name."""
-
-    corrected: bool
-    pivot_mm: list[float]
-    turns_deg: dict[str, list[float]]
-    turns_sigma_deg: dict[str, list[float]]
-    moves_mm: dict[str, list[float]]
-    moves_sigma_mm: dict[str, list[float]]
-    T_cam_world: dict[str, list[list[float]]]
-
-
-class Registration(TypedDict):
-    """Say how far the lower scan is from where the closed bite of the take shows it, in skull (scan) axes.
-
-    `T` (4, 4) maps the lower scan as it was given to where it belongs; shift and turn are of the same motion about the
-    middle of the lower crowns. Standard deviations follow.
-    """
-
-    frames: list[int]  # with the teeth together
-    named: bool  # whether the capture names such a frame
-    applied: bool  # whether poses and lower scan are those of the corrected registration
-    shift_mm: list[float]
-    turn_deg: list[float]
-    shift_sigma_mm: list[float]
-    turn_sigma_deg: list[float]
-    T: list[list[float]]
-
-
-class TracksMeta(TypedDict, total=False):
-    """Configuration, and what was estimated over a whole take; tables by camera name, pairs are (upper, lower)."""
-
-    tracking: dict[str, object]
-    correlation_px: float
-    delays_frames: dict[str, float]
-    delays_sigma_frames: dict[str, float]
-    outline_bias_px: dict[str, list[float]]  # by camera: how far the masks of both arches reach over free edges
-    outline_bias_sigma_px: dict[str, list[float]]
-    gum_bias_px: dict[str, list[float]]  # by camera: the same at the gum line
-    gum_bias_sigma_px: dict[str, list[float]]
-    gum_line_mm: list[float]  # how far the drawn gum line lies from the scans' towards the gum, along the surface
-    gum_line_sigma_mm: list[float]
-    registration: Registration
-    steady_error: list[list[list[float]]]  # of both arches S (4, 4): the masks showed T_world_arch @ S
-    extrinsics: CameraCorrections
-    focal: dict[str, list[float]]  # by camera: focal length over the calibrated one, and its standard deviation
-    start: dict[str, object]
-    painted: list[bool]
-    solver: str
-    backend: str
-    evaluations_per_row_and_frame: float
-    calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
-    fps: float  # frames per second of a performance
-    prior_spread_mm: float  # width of the model's prior that all final poses were weighed with, where they were
-    tolerance_mm: float  # how far outside the bound the rig allows poses of a performance
-    findings: list[dict[str, str | float | int]]  # `Finding.as_json` of everything doubtful about the take
 
 
 class TrackStatus(IntEnum):
@@ -269,7 +210,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
     limit = meta.pop("margin_limit_mm", None)  # of older files: the smallest margin, which is below zero
     if isinstance(limit, float):
         meta["tolerance_mm"] = -limit
-    check_header(meta, TracksHeader, path)
+    check_notes(meta, TracksMeta, path)
     names = meta.get("camera_names")
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
         raise FormatError('"meta" has no list "camera_names".', path=path)

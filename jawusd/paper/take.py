@@ -14,7 +14,8 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks, TracksMeta
+from jawusd.formats.notes import TracksMeta
+from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks
 from jawusd.geometry import LANDMARKS, Camera, relative_pose, transform_point
 from jawusd.paper.energy import PaperEnergy, PaperScan, PixelCounter, RasterCounter, paper_scan
 from jawusd.paper.solver import PaperConfig, solve_paper

@@ -17,6 +17,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.experiments import Experiments, save_table
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import JawModel, load_model
+from jawusd.formats.notes import SyncNotes
 from jawusd.formats.report import CameraFacts, Origin, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.cameras import load_cameras
@@ -38,7 +39,6 @@ from jawusd.pipeline.state import (
     no_progress,
 )
 from jawusd.pipeline.subject import Subject, subject_of_build
-from jawusd.report.headers import SyncHeader
 from jawusd.report.verdicts import BuildVerdict
 
 T = TypeVar("T")
@@ -136,7 +136,7 @@ def _without_pictures(
         actor=subject.name,
         tracks=tracks,
         model=model,
-        sync=facts.state.result("sync", SyncHeader) or {},
+        sync=facts.state.result("sync", SyncNotes) or {},
         cameras=attempt("cameras", left_out, lambda: _cameras(facts)) or (),
         inferred=tuple(fit_summary(model).get("inferred", ())),
         seconds={name: record.seconds for name, record in facts.state.stages.items() if name != "report"},
@@ -274,7 +274,7 @@ def recorded_offsets(state: BuildState) -> dict[str, int]:
     Raises:
         FormatError: build.json is damaged.
     """
-    return (state.result("sync", SyncHeader) or {}).get("offsets", {})
+    return (state.result("sync", SyncNotes) or {}).get("offsets", {})
 
 
 def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:

@@ -6,7 +6,7 @@ import math
 import os
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired
+from typing import TYPE_CHECKING, NotRequired, cast
 
 import numpy as np
 from typing_extensions import TypedDict
@@ -14,14 +14,14 @@ from typing_extensions import TypedDict
 from jawusd.base.errors import TrackingError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
-from jawusd.formats.finding import Finding, FoundJson
+from jawusd.formats.finding import Finding
 from jawusd.formats.model import JawModel
+from jawusd.formats.notes import TakeNotes
 from jawusd.formats.tracks import (
     LOST,
     PARTIAL,
     RECOVERED,
     LostReason,
-    Registration,
     Tracks,
     TrackStatus,
     save_tracks,
@@ -29,7 +29,7 @@ from jawusd.formats.tracks import (
 )
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.cameras import Size, load_cameras, rescaled_cameras
+from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.meshes import load_labelled, load_meshes, registered_meshes
 from jawusd.pipeline.overlay import write_overlay
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 _LISTED_FRAMES = 20
 
 
-class TrackSummary(TypedDict):
+class TrackSummary(TakeNotes):
     """Hold what a person should know of tracks; numbers of frames, unless the name says otherwise."""
 
     frames: int
@@ -55,16 +55,9 @@ class TrackSummary(TypedDict):
     recovered: int
     without_a_camera: int
     prior_aided: int
-    prior_spread_mm: NotRequired[float]  # width of the model's prior that all final poses were weighed with
-    calibration_rescaled_px: dict[str, tuple[Size, Size]]  # sizes calibrated and recorded, by camera
     sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if not known
     coverage_error_percent: float | None  # share of the masks used that is left uncovered, None without any
     frames_used: NotRequired[dict[str, int]]  # frames that a camera took part in, by camera
-    outline_bias_px: NotRequired[dict[str, list[float]]]  # how far outlines reach over free edges, by camera and arch
-    gum_bias_px: NotRequired[dict[str, list[float]]]  # the same at the gum line
-    gum_line_mm: NotRequired[list[float]]  # of both arches, towards the gum along the surface
-    registration: NotRequired[Registration]  # of the lower scan, from frames with the teeth together
-    findings: NotRequired[list[FoundJson]]  # what is doubtful about the take: `Finding.as_json`
 
 
 class ArchSummary(TypedDict):
@@ -180,7 +173,8 @@ def first_pass(
                 tracks = widen_strained(tracks, landmarks, subject.T_anatomical_skull[:3, :3])
             findings = [*findings, *doubts]
     tracks.meta["findings"] = [*tracks.meta.get("findings", []), *(finding.as_json() for finding in findings)]
-    tracks.meta["calibration_rescaled_px"] = rescaled_cameras(capture)
+    rescaled = rescaled_cameras(capture)
+    tracks.meta["calibration_rescaled_px"] = {name: [list(was), list(now)] for name, (was, now) in rescaled.items()}
     return tracks
 
 
@@ -232,7 +226,7 @@ def track_summary(tracks: Tracks) -> TrackSummary:
     sigma = np.median(tracks.sigma_mm[tracked], axis=0) if tracked.any() else np.full(len(LANDMARKS), np.nan)
     coverage = used_coverage(tracks)
     coverage = coverage[np.isfinite(coverage)]
-    summary = TrackSummary(
+    counted = TrackSummary(
         frames=len(tracks.frames),
         tracked=int(tracked.sum()),
         lost=[int(frame) for frame in lost],
@@ -240,20 +234,12 @@ def track_summary(tracks: Tracks) -> TrackSummary:
         recovered=int((tracks.status == RECOVERED).any(1).sum()),
         without_a_camera=int((tracks.status == PARTIAL).any(1).sum()),
         prior_aided=int(tracks.prior_aided.sum()),
-        calibration_rescaled_px=tracks.meta.get("calibration_rescaled_px", {}),
         sigma_mm={name: _rounded(value) for name, value in zip(LANDMARKS, sigma.tolist(), strict=True)},
         coverage_error_percent=_rounded(100 * float(coverage.mean())) if coverage.size else None,
         frames_used=dict(zip(tracks.camera_names, tracks.masks_used.any(1).sum(0).tolist(), strict=True)),
-        findings=tracks.meta.get("findings", []),
     )
-    if "outline_bias_px" in tracks.meta:
-        summary["outline_bias_px"] = tracks.meta["outline_bias_px"]
-        summary["gum_bias_px"], summary["gum_line_mm"] = tracks.meta["gum_bias_px"], tracks.meta["gum_line_mm"]
-    if "prior_spread_mm" in tracks.meta:
-        summary["prior_spread_mm"] = tracks.meta["prior_spread_mm"]
-    if "registration" in tracks.meta:
-        summary["registration"] = tracks.meta["registration"]
-    return summary
+    notes = {name: value for name, value in tracks.meta.items() if name in TakeNotes.__annotations__}
+    return cast(TrackSummary, {"calibration_rescaled_px": {}, "findings": [], **notes, **counted})
 
 
 def lost_reasons(tracks: Tracks) -> dict[str, dict[str, int]]:

@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Mapping
 from importlib import resources
+from typing import cast
 
 import jinja2
 import numpy as np
@@ -18,10 +19,10 @@ from jawusd.base.errors import shown
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import DEEP, TOUCHING
+from jawusd.formats.notes import TracksMeta
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.figures import human_ranges, model_figure, tracking_figure
-from jawusd.report.headers import TracksHeader, model_header, sync_header, tracks_header
 from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
 from jawusd.report.verdicts import MARKS, WORDS, BuildVerdict, judge, overall, summary
@@ -122,7 +123,7 @@ def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict
         "holdout": ("held out", "poses of parts of the take that were held out of the fit, one part at a time"),
         "trimmed": ("outliers", "poses excluded from the fit as outliers"),
     }
-    tables = model_header(data).get("errors", {})
+    tables = data.model.notes.get("errors", {})
     return [
         (*names[key], [(place, tables[key][place]) for place in _PLACES if place in tables[key]])
         for key in names
@@ -132,7 +133,7 @@ def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict
 
 def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
     """Return (reason, count, frames as text) of frames that were lost, regularised, or excluded from the fit."""
-    tracks, meta = data.tracks, model_header(data)
+    tracks, meta = data.tracks, data.model.notes
     lists = {"lost by the tracker": tracks.frames[np.any(tracks.status == LOST, axis=1)]}
     for arch, name in enumerate(("upper", "lower")):
         for reason in list(LostReason)[1:]:
@@ -165,13 +166,13 @@ def _findings(data: ReportData) -> list[str]:
 
 def _start(data: ReportData) -> str:
     """Return how tracking was initialised."""
-    start = tracks_header(data).get("start", {})
+    start = data.tracks.meta.get("start", {})
     if not start:
         return "not recorded"
     text = f"by {start.get('by')}, on frame {start.get('frame')}"
     left_out = [
         f"{arch}: {', '.join(map(str, numbers))}"
-        for arch, numbers in start.get("picks_left_out", {}).items()
+        for arch, numbers in cast(dict[str, list[int]], start.get("picks_left_out", {})).items()
         if numbers
     ]
     if left_out:
@@ -181,7 +182,7 @@ def _start(data: ReportData) -> str:
 
 def _cameras(data: ReportData) -> list[dict[str, str]]:
     """Return a table row per camera: footage, masks, and corrections of the calibration."""
-    meta, offsets = tracks_header(data), sync_header(data).get("offsets", {})
+    meta, offsets = data.tracks.meta, data.sync.get("offsets", {})
     known = {camera.name: camera for camera in data.cameras}
     extrinsics = meta.get("extrinsics", {})
     rows = []
@@ -212,7 +213,7 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
     return rows
 
 
-def _drawn(meta: TracksHeader, camera: str) -> str:
+def _drawn(meta: TracksMeta, camera: str) -> str:
     """Return the offset of the mask outlines from the teeth in a camera, upper and lower arch."""
     edges, gum = meta.get("outline_bias_px", {}).get(camera), meta.get("gum_bias_px", {}).get(camera)
     if edges is None or gum is None:
@@ -222,7 +223,7 @@ def _drawn(meta: TracksHeader, camera: str) -> str:
 
 def _bite(data: ReportData) -> str:
     """Return what the take shows about the annotated gum line and about the closed bite."""
-    meta, said = tracks_header(data), []
+    meta, said = data.tracks.meta, []
     if "gum_line_mm" in meta:
         upper, lower = meta["gum_line_mm"]
         said.append(

@@ -13,7 +13,6 @@ from jawusd.evaluator.motions import motions_of_poses
 from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import transform_points
-from jawusd.report.headers import model_header
 
 #: Names of the states of a frame.
 STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "regularised by the model")
@@ -49,7 +48,7 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
         "frames": _text(tracks.frames[rows].astype("<i4")),
         "state": _text(_states(tracks)[rows]),
         "states": list(STATES),
-        "fps": float(model_header(data).get("fps") or _DEFAULT_FPS) / step,
+        "fps": float(data.model.notes.get("fps") or _DEFAULT_FPS) / step,
         "centre": (0.5 * (low + high)).round(2).tolist(),
         "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
         "traced": landmarks[[0, 3, 4]].round(3).tolist(),

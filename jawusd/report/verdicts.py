@@ -13,7 +13,6 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks, used_coverage
-from jawusd.report.headers import model_header, sync_header, tracks_header
 
 #: Grades, best first; "open" means that there is nothing to judge.
 GOOD, LOOK, BAD, OPEN = "good", "look", "bad", "open"
@@ -136,7 +135,7 @@ def _verdict(stage: str, checks: list[Check]) -> Verdict:
 
 
 def _sync(data: ReportData) -> Verdict:
-    delays, sync = tracks_header(data).get("delays_frames", {}), sync_header(data)
+    delays, sync = data.tracks.meta.get("delays_frames", {}), data.sync
     rest = max((abs(float(value)) for value in delays.values()), default=np.nan)
     if len(data.tracks.camera_names) == 1:
         return Verdict("sync", "A single camera needs no synchronisation.", (), GOOD)
@@ -187,7 +186,7 @@ def _track(tracks: Tracks) -> Verdict:
 
 
 def _fit(data: ReportData) -> Verdict:
-    meta = model_header(data)
+    meta = data.model.notes
     errors = meta.get("errors", {})
     table = errors.get("holdout") or errors.get("train") or {}
     kind = "poses held out of the fit" if errors.get("holdout") else "poses of the fit"
@@ -221,7 +220,7 @@ def _fit(data: ReportData) -> Verdict:
 
 
 def _bounds(data: ReportData) -> Verdict:
-    model, meta = data.model, model_header(data)
+    model, meta = data.model, data.model.notes
     rig = JawRig(model.arrays, model.meta)
     used = model.trained & np.all(np.isfinite(model.d), axis=1)
     verdicts = rig.validate_parameters(model.d[used], tolerance_mm=None)

@@ -9,8 +9,9 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
+from jawusd.formats.notes import Registration, TracksMeta
 from jawusd.formats.performance import Performance, SolvedJaw, SolveState
-from jawusd.formats.tracks import LOST, TRACKED, Registration, Tracks, TracksMeta
+from jawusd.formats.tracks import LOST, TRACKED, Tracks
 from jawusd.geometry import LANDMARKS, hat, make_transform, se3_adjoint, se3_left_jacobian
 from jawusd.tracking.contour.quality import landmark_sigmas, matched_px, residual_px
 from jawusd.tracking.performance.coordinates import HEAD, JAW

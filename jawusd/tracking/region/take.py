@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.formats.finding import Finding
-from jawusd.formats.tracks import LOST, TRACKED, LostReason, Tracks, TracksMeta
+from jawusd.formats.notes import TracksMeta
+from jawusd.formats.tracks import LOST, TRACKED, LostReason, Tracks
 from jawusd.geometry import Camera
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.formats.finding import Finding, Severity
-from jawusd.formats.tracks import LOST, Registration
+from jawusd.formats.notes import Registration
+from jawusd.formats.tracks import LOST
 from jawusd.geometry import relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames

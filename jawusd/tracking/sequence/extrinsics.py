@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.formats.tracks import CameraCorrections, TracksMeta
+from jawusd.formats.notes import CameraCorrections, TracksMeta
 from jawusd.geometry import Camera, se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.contour.equations import motion_about, translation
 from jawusd.tracking.contour.views import View

@@ -8,7 +8,8 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
-from jawusd.formats.tracks import Tracks, TracksMeta
+from jawusd.formats.notes import TracksMeta
+from jawusd.formats.tracks import Tracks
 from jawusd.geometry import (
     make_transform,
     mandible_metric,

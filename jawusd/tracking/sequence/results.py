@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.formats.tracks import LOST, Tracks, TracksMeta
+from jawusd.formats.notes import TracksMeta
+from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import relative_pose, se3_adjoint
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, translation

@@ -12,7 +12,8 @@ from jawusd.base.arrays import Array
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks, TracksMeta
+from jawusd.formats.notes import TracksMeta
+from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera
 from jawusd.tracking.config import FOR_TAKES, TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, PackedRecords, whole_frames
