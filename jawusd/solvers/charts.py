@@ -30,7 +30,7 @@ from jawusd.evaluator.models import AdditiveModel
 from jawusd.evaluator.operations import triple
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED
 from jawusd.solvers.motion import OPERATIONS, MotionModule
-from jawusd.solvers.solution import capturing, finished, inverse
+from jawusd.solvers.solution import applied, attached, capturing, finished, inverse
 
 _STEPS_CAPTURED = 7  # of the inverse gauge in a captured graph; 5 suffice for anatomical parameters
 _GAUGE_NUMBERS = 26  # count of numbers in `GaugeNumbers`
@@ -68,6 +68,9 @@ class Chart(Protocol):
 
     def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return d (n, 3) [mm] of x, and dd/dx (n, 3, 3)."""
+
+    def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
+        """Return what `decoded` found at x, with its first and second derivatives by x."""
 
 
 class AnchoredMotion(MotionModule):
@@ -113,6 +116,13 @@ class AnchoredMotion(MotionModule):
         one, zero = torch.ones_like(x_1), torch.zeros_like(x_1)
         rows = ((x_1, one, zero), (y_1, y_2, y_3), (z_1, z_2, one))
         return d, inverse(torch.stack([torch.stack(row, dim=1) for row in rows], dim=1))
+
+    def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
+        """Return d with its derivatives by u: a step of Newton's method adds the second ones."""
+        d = attached(d, by_x, x)
+        u, _ = displacement(self._anchored_numbers().gauge, d[:, 0], d[:, 1], d[:, 2], TENSORS)
+        error = torch.stack(u, dim=1) - x
+        return d - applied(by_x, error - error.detach())
 
     def _anchored_numbers(self) -> AnchoredNumbers:
         found = cast("AnchoredNumbers", self.numbers())
@@ -165,6 +175,10 @@ class AdditiveMotion(MotionModule):
     def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return x, which is d, and the identity."""
         return x, torch.eye(3, dtype=x.dtype, device=x.device).expand(x.shape[0], 3, 3)
+
+    def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
+        """Return x, which is d."""
+        return x
 
 
 def chart_of(kind: str, arrays: Mapping[str, Array]) -> AnchoredMotion | AdditiveMotion:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from jawusd.evaluator.nearest import ITERATIONS, MAX_DAMPING, MIN_DAMPING, MIN_STIFFNESS, START_DAMPING
 from jawusd.solvers.charts import Chart
-from jawusd.solvers.solution import applied, capturing, finished, inverse
+from jawusd.solvers.solution import applied, attached, capturing, finished, inverse, solved
 
 # x (n, 3), targets (n, 3, m) -> residuals (n, 3 m) and their derivatives by x (n, 3 m, 3)
 Residual = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -19,8 +19,12 @@ _NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # off the model, Gauss-Newton conv
 _MIN_CURVATURE = 1e-9  # relative; keeps encodings differentiable where a parameter hardly moves the landmarks
 
 
-def nearest(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def encoded(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     """Return the parameters whose motion moves vectors nearest to their targets.
+
+    First and second derivatives by the targets are exact, to the accuracy of the search. With its result x0, and the
+    inverse Hessian H and Jacobian J there as constants, ``x1 = x0 + H J^T (target - target0)`` is right to first order;
+    one step ``x2 = x1 - H grad(x1, target)`` makes it right to second order.
 
     Args:
         chart: The model.
@@ -29,10 +33,25 @@ def nearest(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[T
         u: Displacements (n, 3) [mm] of the incisal point, where the search starts.
 
     Returns:
-        d (n, 3) [mm]; the images of the vectors (n, 3 m) [mm]; and the derivative (n, 3, 3 m) of d by the targets, from
-        the implicit function theorem on ``grad |image(x) - target|^2 = 0``.
+        d (n, 3) [mm], and the residuals (n, 3 m) [mm]: images of the vectors minus targets. Second derivatives of their
+        sum of squares are exact, those of single residuals are not.
     """
+    residual = _residual_of(chart, vectors)
+    width = target.shape[1:]
 
+    def search(rows: Tensor) -> tuple[Tensor, ...]:
+        return _nearest(chart, residual, rows[:, 3:].unflatten(1, width), rows[:, :3])
+
+    flat = target.flatten(1)
+    x, H_inverse, by_target, d, by_x = solved(search, torch.cat([u, flat], dim=1))
+    x = attached(x, by_target, flat)
+    r, J = residual(x, target)
+    gradient = applied(J.transpose(1, 2), r)
+    x = x - applied(H_inverse, gradient - gradient.detach())
+    return chart.attached(d, by_x, x), r
+
+
+def _residual_of(chart: Chart, vectors: Tensor) -> Residual:
     def residual(x: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         R, t, S = chart.derivative(x)
         image = R @ vectors[:3] + t[:, :, None] * vectors[3]
@@ -41,6 +60,11 @@ def nearest(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[T
         J = turned + S[:, 3:, None] * vectors[3][:, None]
         return (image - target).flatten(1), J.flatten(1, 2)
 
+    return residual
+
+
+def _nearest(chart: Chart, residual: Residual, target: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+    """Return x (n, 3), the inverse Hessian (n, 3, 3), dx / dtarget (n, 3, 3 m), d (n, 3) [mm] and dd / dx (n, 3, 3)."""
     x, r, J = _descended(residual, chart.start(u), target)
     H = _curvature(residual, x, target)
     g = applied(J.transpose(1, 2), r)
@@ -55,8 +79,8 @@ def nearest(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[T
         x, r = torch.where(better[:, None], x - step, x), torch.where(better[:, None], r_trial, r)
         J, g = torch.where(better[:, None, None], J_trial, J), torch.where(better[:, None], g_trial, g)
         H = _curvature(residual, x, target)
-    d, by_x = chart.decoded(x)
-    return d, r + target.flatten(1), by_x @ inverse(H) @ J.transpose(1, 2)
+    H_inverse = inverse(H)
+    return x, H_inverse, H_inverse @ J.transpose(1, 2), *chart.decoded(x)
 
 
 def _tolerance_mm(x: Tensor) -> float:

@@ -15,9 +15,10 @@ from jawusd.evaluator.encoding import landmark_vectors
 from jawusd.evaluator.speeds import Speeds
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.solvers.charts import chart_of
-from jawusd.solvers.encoding import nearest
+from jawusd.solvers.encoding import encoded
 from jawusd.solvers.hull import Hull
 from jawusd.solvers.interior import Interior
+from jawusd.solvers.precision import check_precision, full_precision
 from jawusd.solvers.solution import attached, solved
 
 _CORNERS = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
@@ -73,6 +74,7 @@ class TemporalPrior(nn.Module):
         for name, covariance in (("velocity", speeds.velocity), ("acceleration", speeds.acceleration)):
             self.register_buffer(name, torch.linalg.inv(torch.tensor(covariance)))
 
+    @full_precision
     def forward(self, d: Tensor, fps: float) -> Tensor:
         """Return the prior (...) of d (..., F, 3) [mm] at a rate [1/s]; about 3 for motion like that of the take.
 
@@ -80,12 +82,11 @@ class TemporalPrior(nn.Module):
 
         Raises:
             ValueError: fewer than three frames.
-            TypeError: a dtype other than the prior's.
+            TypeError: a dtype other than the prior's, or coarser than float32.
         """
         if d.ndim < 2 or d.shape[-1] != 3 or d.shape[-2] < 3:
             raise ValueError(f"the shape of d must end in (F, 3) with three frames or more, got {tuple(d.shape)}")
-        if d.dtype != self.velocity.dtype:
-            raise TypeError(f"d is {d.dtype}, the prior computes in {self.velocity.dtype}. Convert one of them.")
+        check_precision("d", d.dtype, self.velocity.dtype)
         velocity = (d[..., 1:, :] - d[..., :-1, :]) * fps
         acceleration = (velocity[..., 1:, :] - velocity[..., :-1, :]) * fps
         lengths = [
@@ -102,7 +103,10 @@ class JawLayer(nn.Module):
     `state_dict` saves them, and `load_state_dict` accepts only the state of the same rig. Every function works under
     `torch.func`, `torch.compile(fullgraph=True)`, `torch.export` and its ONNX exporter, for any batch shape.
 
-    `encode`, `project` and `inside` have first derivatives only.
+    `encode`, `loss` and `residuals` have first and second derivatives, `project` and `inside` first ones only.
+
+    All functions compute in the precision of the layer: autocast and TensorFloat-32 are off within them. A captured
+    graph multiplies with the precision that the program has set for matrices.
 
     ``layer.temporal(d, fps)`` is a prior on motion between frames, see `TemporalPrior`; None if the rig has no
     speeds.
@@ -147,11 +151,13 @@ class JawLayer(nn.Module):
         self.register_buffer("rig_hash", torch.tensor(list(bytes.fromhex(rig.model_hash)), dtype=torch.uint8))
         self.register_load_state_dict_pre_hook(_reject_other_rigs)
 
+    @full_precision
     def forward(self, d: Tensor) -> Tensor:
         """Return the poses T_skull_mandible, shape (..., 4, 4), for jaw parameters d (..., 3) [mm]."""
         rows = self._rows(d, (3,), "d")
         return (self.from_anatomical @ self.motion(rows) @ self.closed).reshape(*d.shape[:-1], 4, 4)
 
+    @full_precision
     def margin(self, d: Tensor) -> Tensor:
         """Return the signed distance (...) of d (..., 3) to the bound [mm], positive inside."""
         return self.bound.margin(self._rows(d, (3,), "d")).reshape(d.shape[:-1])
@@ -160,6 +166,7 @@ class JawLayer(nn.Module):
         """Return the squared distance (...) by which d (..., 3) lies outside the bound [mm^2]; zero inside."""
         return torch.relu(-self.margin(d)).square()
 
+    @full_precision
     def clearance(self, d: Tensor, of: Meeting = "teeth") -> Tensor:
         """Return the clearance (...) [mm] of teeth or condyles at d (..., 3) [mm], as `JawRig.clearance` does.
 
@@ -174,6 +181,7 @@ class JawLayer(nn.Module):
             raise EvaluatorError(f"the rig of this JawLayer has no clearance of the {of}.")
         return cast("Tensor", field(self._rows(d, (3,), "d"))).reshape(d.shape[:-1])
 
+    @full_precision
     def project(self, d: Tensor) -> Tensor:
         """Return the nearest jaw parameters (..., 3) [mm] with margin >= 0 to d (..., 3) [mm], as `JawRig.project`.
 
@@ -183,6 +191,7 @@ class JawLayer(nn.Module):
         x, by_d = solved(self.bound.nearest, rows)
         return attached(x, by_d, rows).reshape(d.shape)
 
+    @full_precision
     def inside(self, z: Tensor) -> Tensor:
         """Return valid jaw parameters (..., 3) [mm] for any vectors z (..., 3): a smooth bijection.
 
@@ -192,15 +201,17 @@ class JawLayer(nn.Module):
         d, by_z = solved(lambda z: self.interior.mapped(self.bound, z), rows)
         return attached(d, by_z, rows).reshape(z.shape)
 
+    @full_precision
     def unconstrained(self, d: Tensor) -> Tensor:
         """Return the z (..., 3) with ``inside(z) = d`` for jaw parameters d (..., 3) [mm]; NaN outside the bound."""
         return self.interior.unconstrained(self.bound, self._rows(d, (3,), "d")).reshape(d.shape)
 
+    @full_precision
     def encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nearest jaw parameters and their landmark distance, as `JawRig.encode`.
 
-        The derivatives by the pose are exact, from the implicit function theorem on ``grad_d |pose(d) - T|^2 = 0``,
-        including second derivatives of the model.
+        First and second derivatives by the pose are exact, from the implicit function theorem on
+        ``grad_d |pose(d) - T|^2 = 0``, including second derivatives of the model.
 
         Args:
             T_skull_mandible: Poses, shape (..., 4, 4).
@@ -209,7 +220,8 @@ class JawLayer(nn.Module):
             d [mm], shape (..., 3), and residual_mm, shape (...). The distance has a kink at zero, where
             its gradient is set to zero.
         """
-        d, squared = self._encode(T_skull_mandible)
+        d, residuals = self._encode(T_skull_mandible)
+        squared = residuals.square().sum(dim=-1)
         on_model = squared == 0
         distance = torch.sqrt(torch.where(on_model, torch.ones_like(squared), squared))
         return d, torch.where(on_model, torch.zeros_like(squared), distance)
@@ -220,36 +232,34 @@ class JawLayer(nn.Module):
         It is zero for every pose of this person's jaw and grows with the distance to the model and to the bound. It
         replaces the usual regularisation towards the closed mouth. Shape (...), smooth everywhere.
         """
-        d, squared = self._encode(T_skull_mandible)
-        return squared + self.penalty(d)
+        return self.residuals(T_skull_mandible).square().sum(dim=-1)
+
+    @full_precision
+    def residuals(self, T_skull_mandible: Tensor, sigma_mm: float = 1.0) -> Tensor:
+        """Return the prior of `loss` as residuals for least-squares solvers, shape (..., 13).
+
+        Twelve are coordinates of the landmarks' offset from the nearest pose of the model, the last is the distance
+        outside the bound; all are divided by ``sigma_mm``. With 1, the sum of their squares is `loss`, and twice
+        ``J^T J`` is its Gauss-Newton Hessian.
+        """
+        d, residuals = self._encode(T_skull_mandible)
+        outside = torch.relu(-self.margin(d))
+        return torch.cat([residuals, outside[..., None]], dim=-1) / sigma_mm
 
     def _encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nearest d [mm], shape (..., 3), and the squared residual [mm^2], which is smooth at zero."""
+        """Return the nearest d [mm], shape (..., 3), and the residuals (..., 12) [mm]."""
         T = self._rows(T_skull_mandible, (4, 4), "T_skull_mandible")
-        d, image, by_target = solved(self._nearest, T)
-        target = self._images(T)
-        # d minimises the squared residual, so to first order a change of d does not change it
-        squared = (image - target).square().sum(dim=1)
-        batch = T_skull_mandible.shape[:-2]
-        return attached(d, by_target, target).reshape(*batch, 3), squared.reshape(batch)
-
-    def _nearest(self, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         moved = (self.to_anatomical @ T @ self.incisor)[:, :3] - (self.closed @ self.incisor)[:3]
-        target = self._images(T).unflatten(1, (3, 4))
-        return nearest(self.motion, self.vectors_at_rest, target, moved)
-
-    def _images(self, T: Tensor) -> Tensor:
-        """Return the images (n, 12) of the four vectors that represent the landmarks, see `evaluator.encoding`."""
-        return (self.to_anatomical @ T @ self.vectors)[:, :3].flatten(1)
+        # images of the four vectors that represent the landmarks, see `evaluator.encoding`
+        target = (self.to_anatomical @ T @ self.vectors)[:, :3]
+        d, residuals = encoded(self.motion, self.vectors_at_rest, target, moved)
+        batch = T_skull_mandible.shape[:-2]
+        return d.reshape(*batch, 3), residuals.reshape(*batch, 12)
 
     def _rows(self, values: Tensor, tail: tuple[int, ...], name: str) -> Tensor:
         if values.shape[max(values.ndim - len(tail), 0) :] != tail:
             raise ValueError(f"the shape of {name} must end in {tail}, got {tuple(values.shape)}")
-        if values.dtype != self.closed.dtype:
-            raise TypeError(
-                f"{name} is {values.dtype}, the layer computes in {self.closed.dtype}. "
-                f"Convert one of them: layer.to({values.dtype}) or {name}.to({self.closed.dtype})."
-            )
+        check_precision(name, values.dtype, self.closed.dtype)
         return values.reshape(-1, *tail)
 
 

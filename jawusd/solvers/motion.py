@@ -16,6 +16,7 @@ from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.formula import MODELS, Numbers, RigidMotion, anchored_motion
 from jawusd.evaluator.operations import Rows, polynomial, triple
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, Triple, angle_quotients, angle_series
+from jawusd.solvers.precision import check_precision, full_precision
 
 _TINY = 1e-30  # keeps the derivative of sqrt at zero finite
 
@@ -150,6 +151,7 @@ def _nested(like: object, leaves: Iterator[Tensor]) -> object:
     return type(like)(*parts) if hasattr(like, "_fields") else parts  # type: ignore[arg-type]  # a NamedTuple's fields
 
 
+@full_precision
 def jaw_pose_from_axis_angle(
     axis_angle: Tensor,
     translation: Tensor | None,
@@ -175,7 +177,11 @@ def jaw_pose_from_axis_angle(
 
     Returns:
         T_skull_mandible [mm], shape (..., 4, 4).
+
+    Raises:
+        TypeError: a number type coarser than float32.
     """
+    check_precision("axis_angle", axis_angle.dtype)
     batch = axis_angle.shape[:-1]
     omega = axis_angle.reshape(-1, 3)
     moved = torch.zeros_like(omega) if translation is None else translation.reshape(-1, 3) * unit_mm

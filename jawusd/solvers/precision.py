@@ -1,0 +1,60 @@
+"""Number types of the torch functions: float32 or float64, whatever the program around them has switched on.
+
+Poses are hundreds of millimetres from the origin: bfloat16 has steps of 1 mm there, TensorFloat-32 of 0.1 mm.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from contextlib import nullcontext
+from typing import ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from jawusd.solvers.solution import capturing
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_ALLOWED = (torch.float32, torch.float64)
+
+
+def full_precision(function: Callable[P, R]) -> Callable[P, R]:
+    """Run a function of tensors without autocast, and outside captured graphs without TensorFloat-32."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **named: P.kwargs) -> R:
+        device = next(each for each in args if isinstance(each, Tensor)).device.type
+        with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
+            products = "highest" if capturing() else torch.get_float32_matmul_precision()
+            if products == "highest":
+                return function(*args, **named)
+            torch.set_float32_matmul_precision("highest")
+            try:
+                return function(*args, **named)
+            finally:
+                torch.set_float32_matmul_precision(products)
+
+    return wrapped
+
+
+def check_precision(name: str, found: torch.dtype, own: torch.dtype | None = None) -> None:
+    """Check the number type of an argument, and that of the layer that it is passed to, if to any.
+
+    Raises:
+        TypeError: they differ, or are coarser than float32.
+    """
+    if own is not None and own not in _ALLOWED:
+        raise TypeError(
+            f"the layer was converted to {own}, too coarse for poses; it computes in float32 or float64. "
+            "Convert it back with layer.float() after converting the module that holds it."
+        )
+    if found not in _ALLOWED:
+        raise TypeError(f"{name} is {found}, allowed are float32 and float64. Convert it: {name}.float().")
+    if own is not None and found != own:
+        raise TypeError(
+            f"{name} is {found}, the layer computes in {own}. "
+            f"Convert one of them: layer.to({found}) or {name}.to({own})."
+        )
