@@ -18,6 +18,7 @@ pytestmark = [
 ]
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
 LAYERS = {kind: JawLayer(rig) for kind, rig in RIGS.items()}
+cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 SCALES = torch.tensor([0.01] * 3 + [1.0] * 3, dtype=torch.float64)
 
 
@@ -39,23 +40,25 @@ def moved(T):
     return pose
 
 
-def test_mixed_precision_of_the_program_changes_no_pose(pair):
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=cuda)])
+def test_mixed_precision_of_the_program_changes_no_pose(pair, device):
     rig, layer = pair
-    single = copy.deepcopy(layer).float()
-    d = torch.tensor(np.random.default_rng(0).uniform(*rig.d_range.T, (50, 3)), dtype=torch.float32)
+    single = copy.deepcopy(layer).float().to(device)
+    d = torch.tensor(np.random.default_rng(0).uniform(*rig.d_range.T, (50, 3)), dtype=torch.float32, device=device)
     T, expected = single(d), single.loss(single(d))
     before = torch.get_float32_matmul_precision()
     try:
         for precision in ("highest", "medium"):
             torch.set_float32_matmul_precision(precision)
             for dtype in (torch.bfloat16, torch.float16):
-                with torch.autocast("cpu", dtype=dtype):
+                with torch.autocast(device, dtype=dtype):
                     torch.testing.assert_close(single(d), T, rtol=0, atol=0)
                     torch.testing.assert_close(single.loss(T), expected, rtol=0, atol=0)
                     moving = single.encode(T)[0]
             assert moving.dtype == torch.float32 and torch.get_float32_matmul_precision() == precision
     finally:
         torch.set_float32_matmul_precision(before)
+    np.testing.assert_allclose(T.cpu(), rig.pose(d.cpu().double().numpy()), atol=1e-2)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
