@@ -132,7 +132,7 @@ class TrackingConfig:
     settled_share: float = 0.2
 
     def gates_after(self, gates_px: tuple[float, ...], moved_mm: float) -> tuple[float, ...]:
-        """Return the remaining gates after a step with the first gate moved the arches by `moved_mm`."""
+        """Return the remaining gates, given that the step with the first gate moved the arches by `moved_mm`."""
         rest = gates_px[1:]
         if rest and gates_px[0] == rest[-1]:
             return () if moved_mm < self.converged_mm else rest

@@ -1,4 +1,4 @@
-"""First poses from picks."""
+"""Initial poses from picks."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_noisy_picks_start_within_the_basin():
 
 @pytest.mark.parametrize("bad", [0, 2])
 @pytest.mark.parametrize("count", [4, 6])
-def test_one_wrong_pick_is_left_out_and_named(count, bad):
+def test_one_wrong_pick_is_rejected_and_reported(count, bad):
     picks = _picks(count, 0.3)
     vertex = (picks[bad].vertex + len(MESH.vertices) // 2) % len(MESH.vertices)
     picks[bad] = Pick(vertex=vertex, views=picks[bad].views)
@@ -58,7 +58,7 @@ def test_one_wrong_pick_is_left_out_and_named(count, bad):
     assert vertex_error_mm(MESH, pose, POSE) < 0.5
 
 
-def test_one_wrong_pixel_is_left_out():
+def test_one_wrong_pixel_is_rejected():
     picks = _picks(5, 0.2)
     picks[1] = _moved(picks[1], 60.0)
     pose, wrong = pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
@@ -66,7 +66,7 @@ def test_one_wrong_pixel_is_left_out():
     assert vertex_error_mm(MESH, pose, POSE) < 0.4
 
 
-def test_three_contradicting_picks_are_refused_with_their_misses():
+def test_three_contradicting_picks_are_an_error_with_their_residuals():
     picks = _picks(3)
     picks[0] = _moved(picks[0], 90.0)
     with pytest.raises(
@@ -153,7 +153,7 @@ def test_exchanged_cameras_are_named():
             pose_from_picks(wrong, MESH.vertices, CAMERAS, "upper")
 
 
-def test_views_that_do_not_meet_accuse_the_calibration():
+def test_views_that_do_not_meet_report_the_calibration():
     picks = []
     for pick in _picks(5):
         first, *rest = pick.views

@@ -1,4 +1,4 @@
-"""What the closed bite tells about the scans' registration and the steady error of a take."""
+"""The registration error of scans and the constant error of a take, from closed-bite frames."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ from jawusd.tracking.sequence.closed_bite import (
 POINT = np.array([3.0, -4.0, 20.0])
 REST = RestFrames((0, 1, 2, 3), True, POINT, POINT + (0, -5, 0), False)
 FRAMES = np.arange(12)
-SIGMA = np.r_[np.full(3, 0.002), np.full(3, 0.04)]  # of a pose about the point [rad, mm]
+SIGMA = np.r_[np.full(3, 0.002), np.full(3, 0.04)]  # sigma of a pose about the point [rad, mm]
 
 
 def _take(registration=None, steady=((0,) * 6, (0,) * 6), seed=0):
@@ -49,7 +49,7 @@ def _parts(covariance):
     return 0.3 * covariance, 0.7 * covariance
 
 
-def test_a_good_registration_takes_the_steady_error_out():
+def test_with_a_good_registration_the_constant_error_is_removed():
     steady = (0, 0, 0, 0, 0.05, 0), (0, 0, 0, 0, -0.05, 0)
     poses, covariance = _take(steady=steady)
     bite = closed_bite(FRAMES, poses, *_parts(covariance), REST)
@@ -89,7 +89,7 @@ def test_a_bad_registration_is_measured_and_corrected(mm, degrees):
 
 
 def test_what_remains_is_the_conditional_covariance():
-    """Draw steady errors, registration and noise by scipy; what a linear regression leaves of them must remain."""
+    """Sample constant errors, registration and noise; the residual covariance of a linear regression must match."""
     poses, covariance = _take()
     bite = closed_bite(FRAMES, poses, *_parts(covariance), REST)
     upper, lower, both = bite.spread
@@ -107,7 +107,7 @@ def test_what_remains_is_the_conditional_covariance():
         assert np.cov(left.T) / np.outer(scale, scale) == pytest.approx(remaining / np.outer(scale, scale), abs=0.01)
 
 
-def test_covariances_shrink_by_what_the_closed_bite_tells():
+def test_the_closed_bite_reduces_covariances():
     poses, covariance = _take()
     bite = closed_bite(FRAMES, poses, *_parts(covariance), REST)
     A = se3_adjoint(translation(POINT))
@@ -132,7 +132,7 @@ def _records(poses):
     return {k: FrameRecord(Solution(p, *nothing), status, used, np.zeros((2, 2))) for k, p in enumerate(poses)}
 
 
-def test_rest_frames_are_those_around_the_named_one_and_else_the_most_closed():
+def test_rest_frames_are_those_around_the_named_one_or_the_most_closed():
     poses, _ = _take()
     up, probes = np.array([0.0, 1.0, 0.0]), POINT + np.random.default_rng(2).normal(size=(30, 3)) * 10
     assert rest_frames(_records(poses), 1, up, POINT, probes) == (0, 1, 2, 3)
@@ -141,12 +141,12 @@ def test_rest_frames_are_those_around_the_named_one_and_else_the_most_closed():
 
 
 @pytest.mark.parametrize(("named", "words"), [(True, "rest_frame is not tracked"), (False, "no frame shows")])
-def test_a_take_without_a_closed_bite_says_so(named, words):
+def test_a_take_without_a_closed_bite_has_a_note(named, words):
     found = registration_unknown(RestFrames((), named, POINT, POINT, False))
     assert found.kind == "registration_unknown" and found.severity == "note" and words in found.message
 
 
-def test_without_rest_frames_nothing_is_said():
+def test_without_rest_frames_there_is_no_result():
     poses, covariance = _take()
     poses[:3] = np.nan
     assert closed_bite(FRAMES, poses, *_parts(covariance), REST) is None

@@ -1,4 +1,4 @@
-"""Pictures of a scan that has moved are those of a drawing warped, as long as the camera sees nearly the same of it."""
+"""Drawings of a scan are warped to small motions of the scan."""
 
 from dataclasses import replace
 
@@ -39,14 +39,14 @@ def drawn_at(pose):
 
 
 def shown_at(pose):
-    """Return the same from a drawing at POSE, and by how much it has turned."""
+    """Return the same warped from a drawing at POSE, and its rotation."""
     labels, depth = pictures()
     turned = Drawing(SCANS[0], *seen(POSE), SHAPE).show(seen(pose)[0], labels, depth)
     return labels, depth, turned
 
 
 def moved(sideways_mm=0.0, roll_rad=0.0, turn_rad=0.0, away_mm=0.0):
-    """Return POSE moved across the picture and away, rolled about the line of sight, turned about the vertical."""
+    """Return POSE moved across the picture and away, rolled, and rotated about the vertical."""
     across, down, line = CAMERA.T_cam_world[:3, :3]
     place = transform_point(POSE, SCANS[0].centre)
     step = se3_exp(np.r_[roll_rad * line + turn_rad * down, 0, 0, 0])
@@ -58,7 +58,7 @@ def test_at_its_own_pose_a_drawing_is_shown_as_drawn():
     labels, depth, turned = shown_at(POSE)
     expected = drawn_at(POSE)
     assert (labels == expected[0]).all() and turned == 0.0
-    np.testing.assert_allclose(depth, expected[1], rtol=1e-5)  # pixels count from elsewhere, in single precision
+    np.testing.assert_allclose(depth, expected[1], rtol=1e-5)  # another pixel origin, in single precision
     assert (labels == CROWN).sum() > 500
 
 
@@ -71,7 +71,7 @@ def test_at_its_own_pose_a_drawing_is_shown_as_drawn():
         moved(sideways_mm=-3.0, roll_rad=-0.05, turn_rad=0.01),
     ],
 )
-def test_a_warped_drawing_is_as_one_drawn_there(pose):
+def test_a_warped_drawing_equals_a_new_one(pose):
     labels, depth, turned = shown_at(pose)
     anew, depth_anew = drawn_at(pose)
     before, _ = drawn_at(POSE)
@@ -92,7 +92,7 @@ def test_a_warped_drawing_is_as_one_drawn_there(pose):
     assert np.quantile(np.abs(kept[:, INVERSE_DEPTH] / fresh[nearest, INVERSE_DEPTH] - 1.0), 0.9) < 0.005
 
 
-def test_what_another_look_shows_is_drawn_anew():
+def test_another_viewpoint_is_drawn_again():
     drawing = Drawing(SCANS[0], *seen(POSE), SHAPE)
 
     def shows(pose, shape=SHAPE):
@@ -113,7 +113,7 @@ def test_contours_end_at_the_window():
     assert 0 < count < len(part) < len(whole) and part[:, U].max() < middle - 1
 
 
-def test_pictures_of_one_instant_serve_the_next():
+def test_drawings_are_reused_at_the_next_instant():
     view = View(CAMERA.projection_matrix(), CAMERA.centre_world(), np.zeros((2, *SHAPE), np.uint8), np.ones(2, bool))
     solver = ContourSolver(SCANS, TrackingConfig())
     poses = np.stack([POSE, jaw_poses(3)[2][1]])
@@ -126,7 +126,7 @@ def test_pictures_of_one_instant_serve_the_next():
     assert [key for key in known if solver.drawings._kept[key] is not known[key]] == [next(iter(known))]
 
 
-def test_drawings_of_cameras_long_gone_are_forgotten():
+def test_drawings_of_removed_cameras_are_dropped():
     drawings = Drawings(SCANS, PARALLAX_PX)
     for k in range(70):
         camera = CAMERA.centre_world() + [1e-3 * k, 0, 0]
@@ -136,8 +136,8 @@ def test_drawings_of_cameras_long_gone_are_forgotten():
     assert not drawings._kept
 
 
-def test_the_next_alignment_is_the_same_without_what_was_drawn_before():
-    """Warped pictures change poses by less than a hundredth of a millimetre."""
+def test_the_next_alignment_is_the_same_without_cached_drawings():
+    """Warping changes poses by less than 0.01 mm."""
     config, cameras, found = TrackingConfig(), make_cameras(), []
     for parallax_px in (0.0, config.parallax_px):
         solver = ContourSolver(SCANS, replace(config, parallax_px=parallax_px))
@@ -154,7 +154,7 @@ def test_the_next_alignment_is_the_same_without_what_was_drawn_before():
         assert vertex_error_mm(MESHES[r], found[1][1][r], found[0][1][r]) < 0.01
 
 
-def test_contours_are_found_where_threads_draw(monkeypatch):
+def test_contours_are_sampled_while_threads_draw(monkeypatch):
     view = View(CAMERA.projection_matrix(), CAMERA.centre_world(), np.zeros((2, *SHAPE), np.uint8), np.ones(2, bool))
     solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(3)[2]
     rendering = solver.rendering([view])

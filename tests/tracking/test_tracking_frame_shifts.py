@@ -1,4 +1,4 @@
-"""Dropped frames and late cameras, told from which of its neighbouring masks fits."""
+"""Dropped frames and late cameras, found by the neighbouring masks that fit best."""
 
 import numpy as np
 import pytest
@@ -9,26 +9,26 @@ FRAMES = np.arange(40, 52)
 
 
 def _shifts(*shown: tuple[int, ...]) -> FrameShifts:
-    """Return shifts of cameras whose masks fit best at the given one, per frame and camera."""
+    """Return shifts with the best fit at the given shift of every frame and camera."""
     fit = np.full((len(FRAMES), len(shown), len(SHIFTS)), -0.2)
     for c, best in enumerate(shown):
         fit[np.arange(len(FRAMES)), c, [SHIFTS.index(shift) for shift in best]] = 0.4
     return FrameShifts(FRAMES, fit)
 
 
-def test_a_step_is_found_where_it_is():
+def test_a_step_is_located():
     found = _shifts((0,) * 12, (0,) * 7 + (-1,) * 5).clearest()
     assert found == (1, 1, 47)  # it shows the instant after
 
 
 def test_the_camera_that_steps_most_clearly_is_named():
     shifts = _shifts((0,) * 7 + (1,) * 5, (0,) * 7 + (-1,) * 5)
-    shifts.fit[7:, 0, 0] = 0.25  # as poses follow one camera, the other seems to step too
+    shifts.fit[7:, 0, 0] = 0.25  # the poses follow one camera, so the other seems to step too
     assert shifts.clearest().camera == 1
 
 
 @pytest.mark.parametrize("wrong", [(3,), (3, 8), (10, 11)])
-def test_single_wrong_masks_are_no_step(wrong):
+def test_single_wrong_masks_are_not_a_step(wrong):
     best = np.zeros(12, int)
     best[list(wrong)] = -1
     assert _shifts((0,) * 12, tuple(best.tolist())).clearest() is None
@@ -40,17 +40,17 @@ def test_two_wrong_masks_do_not_hide_a_step():
     assert _shifts((0,) * 12, tuple(best.tolist())).clearest().frames == -1
 
 
-def test_a_camera_late_from_the_start_makes_no_step():
+def test_a_camera_late_from_the_start_is_not_a_step():
     shifts = _shifts((0,) * 12, (-1,) * 12)
     assert shifts.clearest() == (1, 1, None)
-    shifts.fit[:5, 0, 0] = 0.6  # poses follow it at times
+    shifts.fit[:5, 0, 0] = 0.6  # the poses follow it sometimes
     assert shifts.clearest() == (1, 1, None)
     assert _shifts((0,) * 12, (0,) * 12).clearest() is None
 
 
-def test_masks_that_fit_at_no_instant_are_no_shift():
+def test_masks_that_never_fit_are_not_a_shift():
     shifts = _shifts((0,) * 12, (0,) * 7 + (-1,) * 5)
-    shifts.fit[:] -= 0.7  # a wrong lens, say
+    shifts.fit[:] -= 0.7  # a wrong lens, for example
     assert shifts.clearest() is None
     assert shifts.is_timely(0)
 
@@ -63,7 +63,7 @@ def test_a_step_that_lost_the_jaw_is_found_where_its_camera_fits_better_than_the
     assert (shifts.clearest() == (1, 1, 47)) == found
 
 
-def test_a_jaw_at_rest_tells_nothing():
+def test_a_jaw_at_rest_gives_no_evidence():
     still = FrameShifts(FRAMES, np.random.default_rng(0).normal(0.4, 0.01, (12, 3, 3)))
     assert still.clearest() is None
     unseen = FrameShifts(FRAMES, np.full((12, 3, 3), np.nan))

@@ -1,4 +1,4 @@
-"""Single instants: escalation, and the reason why an arch is lost."""
+"""Tracking of single frames: escalation, and reasons for lost arches."""
 
 import re
 from collections import deque
@@ -53,8 +53,8 @@ def test_good_prediction_is_tracked(tracker):
     assert max(_errors(record)) < 0.05
 
 
-def test_a_mask_that_stays_uncovered_from_the_first_frame_on_is_left_out(tracker):
-    """A knocked camera: its masks, never covered, are no worse than usual, and alone would lose every frame."""
+def test_a_mask_that_is_never_covered_is_excluded(tracker):
+    """Masks of a knocked camera are never covered, so they are not unusual, but would lose every frame."""
     views = _views(1)
     masks = views[0].masks.copy()
     for row in masks:
@@ -73,18 +73,18 @@ def test_jaw_far_from_its_prediction_is_found(tracker):
     away = POSES[1].copy()
     away[1] = make_transform(np.eye(3), [1.0, 9.0, 1.0]) @ away[1] @ se3_exp([-0.08, 0, 0, 0, 0, 0])
     record = tracker.track([away], _views(1), [])
-    # The upper row may count as recovered too: the misplaced jaw had hidden parts of it.
+    # The upper arch may count as recovered too, since the misplaced jaw had hidden parts of it.
     assert record.status[1] in (RECOVERED, PARTIAL) and record.status[0] != LOST
     assert max(_errors(record)) < 0.1
 
 
-def test_a_second_start_helps_before_anything_dearer(tracker):
+def test_a_second_start_is_tried_before_costlier_attempts(tracker):
     bad = disturbed(POSES[1], 6.0, 0.15, np.random.default_rng(1))
     record = tracker.track([bad, POSES[1]], _views(1), None)
     assert (record.status != LOST).all() and max(_errors(record)) < 0.1
 
 
-def test_masks_of_nothing_lose_both_rows(tracker):
+def test_empty_masks_lose_both_arches(tracker):
     rng = np.random.default_rng(2)
     views = [View(v.matrix, v.eye, np.zeros_like(v.masks), v.present) for v in _views(1)]
     for view in views:
@@ -94,14 +94,14 @@ def test_masks_of_nothing_lose_both_rows(tracker):
     assert tracker.track([POSES[1]], views, []).status.tolist() == [LOST, LOST]
 
 
-def test_absent_masks_lose_only_their_row(tracker):
+def test_missing_masks_lose_only_their_arch(tracker):
     views = [View(v.matrix, v.eye, v.masks, np.array([True, False])) for v in _views(1)]
     record = tracker.track([POSES[1]], views, [])
     assert record.status.tolist() == [TRACKED, LOST] and np.isnan(record.coverage[1]).all()
 
 
-def test_a_mask_that_draws_the_pose_away_is_left_out_in_the_end(tracker):
-    """Start where only the spoiled mask is: all masks look wrong there, and the one that is so shows only later."""
+def test_a_mask_that_biases_the_pose_is_finally_excluded(tracker):
+    """Start at the wrong mask: all masks look wrong there, and the wrong one is found only later."""
     views, far = _views(1), _views(2)
     moved = np.roll(views[2].masks[0], (30, 45), axis=(0, 1))
     spoiled = np.stack([moved, views[2].masks[1]])
@@ -114,7 +114,7 @@ def test_a_mask_that_draws_the_pose_away_is_left_out_in_the_end(tracker):
 
 
 def test_one_mask_does_not_outvote_two(tracker):
-    """Start where the spoiled mask says: it fits there to the pixel, and the two good ones do not."""
+    """Start where the wrong mask fits exactly, and the two correct ones do not."""
     views = _views(1)
     away = POSES[1].copy()
     away[0] = make_transform(np.eye(3), [3.0, 2.5, 1.0]) @ away[0]
@@ -143,7 +143,7 @@ def test_one_mask_does_not_outvote_two(tracker):
         (LostReason.UNCERTAIN, {"lost_sigma_mm": 0.001}, r"expected error of the crowns 0\.\d\d mm, at most 0\.00 mm"),
     ],
 )
-def test_every_check_names_its_figure_and_its_limit(tracker, reason, limits, words):
+def test_every_check_reports_its_value_and_limit(tracker, reason, limits, words):
     strict = FrameTracker(ContourSolver(SCANS, CONFIG), replace(CONFIG, **limits), tracker.history)
     record = strict.align_once(POSES[1], _views(1), 0.0)
     assert record.status.tolist() == [LOST, LOST] and {loss.reason for loss in record.losses} == {reason}
@@ -161,7 +161,7 @@ def test_one_mask_is_too_few_for_an_arch(tracker):
     assert str(LostReason.FEW_MASKS) == "few masks" and str(LOST) == "lost"
 
 
-def test_medians_of_what_is_known_are_those_of_numpy():
+def test_medians_equal_those_of_numpy():
     rng = np.random.default_rng(5)
     for count in (1, 2, 7, 24):
         for missing in (0.0, 0.3, 0.9, 1.0):

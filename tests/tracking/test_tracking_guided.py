@@ -1,4 +1,4 @@
-"""Tracking through masks that are made around poses given by colours."""
+"""Tracking with masks made around poses found by colour."""
 
 import numpy as np
 from bumpy_teeth import arch, make_cameras, render_masks, vertex_error_mm
@@ -28,7 +28,7 @@ def see(frame, poses, turn):
     return [View(c.projection_matrix(), c.centre_world(), m, present) for c, m in zip(CAMERAS, masks, strict=True)]
 
 
-def test_masks_take_out_the_error_of_the_guide_and_lost_rows_keep_its_poses():
+def test_masks_correct_the_guide_and_lost_arches_keep_its_poses():
     guide = {frame: np.stack([GUIDE_ERROR, GUIDE_ERROR]) @ pose_at(frame) for frame in range(FRAMES)}
     tracker = GuidedTracker(*MESHES, see, 2)
     past = [FrameSummary.of(tracker.begin(0, guide[0]))]

@@ -1,4 +1,4 @@
-"""Masks as any program writes them track alike, and unused cameras are named."""
+"""Masks in every supported encoding track alike, and unused cameras are reported."""
 
 from pathlib import Path
 
@@ -24,12 +24,12 @@ def drawn(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def expected(drawn) -> Tracks:
-    """Track the masks of black and white once; nobody may change what comes back."""
+    """Tracks of black-and-white masks; read-only."""
     return track(make_capture(drawn, COUNT))
 
 
 def rewritten(drawn: Path, folder: Path, change, cameras=("cam0", "cam1", "cam2")) -> Path:
-    """Write the masks of a take anew; `change` gives the picture of a mask of 0 and 255, and may write it itself."""
+    """Rewrite the masks of a take; `change` converts a mask of 0 and 255, and may write it itself."""
     for camera in OFFSETS:
         for row in ROWS:
             (folder / camera / row).mkdir(parents=True)
@@ -65,7 +65,7 @@ KINDS = {
 }
 
 
-USUAL = ("zero_one", "sixteen", "inverted", "palette")  # one of each way to be read; the others are slow
+USUAL = ("zero_one", "sixteen", "inverted", "palette")  # one for each reader; the others are slow
 
 
 @pytest.mark.parametrize("kind", [k if k in USUAL else pytest.param(k, marks=pytest.mark.slow) for k in KINDS])
@@ -78,7 +78,7 @@ def test_every_kind_of_mask_tracks_like_black_and_white(drawn, expected, tmp_pat
     assert kinds == (set() if usual else {"mask_levels"})
 
 
-def test_soft_edges_stay_where_they_are(drawn, expected, tmp_path):
+def test_soft_edges_are_not_shifted(drawn, expected, tmp_path):
     soft = rewritten(drawn, tmp_path, lambda m: cv2.GaussianBlur(m, (0, 0), 1.0) // 2)
     found = errors_mm(track(make_capture(soft, COUNT))).mean(0)
     assert (found < errors_mm(expected).mean(0) + 0.02).all()
@@ -112,21 +112,21 @@ def findings(tracks, kind: str) -> list[Finding]:
     return [Finding.from_json(found) for found in tracks.meta["findings"] if found["kind"] == kind]
 
 
-def test_a_black_camera_is_left_out_and_named(drawn, tmp_path):
+def test_a_black_camera_is_excluded_and_reported(drawn, tmp_path):
     tracks = track(make_capture(rewritten(drawn, tmp_path, lambda m: 0 * m, ["cam1"]), COUNT))
     assert tracks.camera_names == ("cam0", "cam2") and tracks.tracked().all()
     (found,) = findings(tracks, "masks_black")
     assert found.camera == "cam1" and "all black: it is not used" in found.message
 
 
-def test_a_camera_without_masks_is_named(drawn):
+def test_a_camera_without_masks_is_reported(drawn):
     cameras = [source(drawn, "cam0"), {"name": "cam1", "video": "cam1.mp4"}, source(drawn, "cam2")]
     tracks = track(make_capture(drawn, COUNT, cameras=cameras))
     assert tracks.camera_names == ("cam0", "cam2")
     assert [found.camera for found in findings(tracks, "camera_without_masks")] == ["cam1"]
 
 
-def test_a_camera_whose_masks_are_of_other_frames_is_named(drawn, tmp_path):
+def test_a_camera_whose_masks_are_of_other_frames_is_reported(drawn, tmp_path):
     folder = rewritten(drawn, tmp_path, lambda m: m)
     for row in ROWS:
         for k in range(COUNT):
@@ -137,7 +137,7 @@ def test_a_camera_whose_masks_are_of_other_frames_is_named(drawn, tmp_path):
     assert found.camera == "cam1" and found.message.startswith(f"used in 0 of {COUNT} frames: it has no masks")
 
 
-def test_a_camera_whose_masks_never_fit_is_named(drawn, tmp_path):
+def test_a_camera_whose_masks_never_fit_is_reported(drawn, tmp_path):
     folder = rewritten(drawn, tmp_path, lambda m: np.roll(m, 60, axis=1), ["cam2"])
     tracks = track(make_capture(folder, COUNT))
     (found,) = findings(tracks, "camera_not_used")
@@ -145,7 +145,7 @@ def test_a_camera_whose_masks_never_fit_is_named(drawn, tmp_path):
     assert (errors_mm(tracks).mean(0) < 0.05).all()
 
 
-def test_one_picture_unlike_the_others_is_left_out_and_named(drawn, tmp_path):
+def test_one_picture_unlike_the_others_is_excluded_and_reported(drawn, tmp_path):
     folder = rewritten(drawn, tmp_path, lambda m: m)
     odd = png(folder, "cam1", "upper", 2)
     cv2.imwrite(str(odd), cv2.imread(str(odd), cv2.IMREAD_GRAYSCALE) // 255 * 100)
@@ -169,7 +169,7 @@ def test_black_masks_everywhere_and_masks_of_three_levels_are_refused(drawn, tmp
     assert CAMERAS[1].name == "cam1" and FIRST
 
 
-def test_a_camera_that_draws_the_first_frame_astray_is_left_out(drawn, tmp_path):
+def test_a_camera_that_biases_the_first_frame_is_excluded(drawn, tmp_path):
     folder = rewritten(drawn, tmp_path, lambda m: np.roll(m, 25, axis=0), ["cam1"])
     tracks = track(make_capture(folder, COUNT, away_mm=1.5))
     assert [found.camera for found in findings(tracks, "camera_not_used")] == ["cam1"]

@@ -21,7 +21,7 @@ COUNT = 24
 SPREAD_MM = 0.1
 HIDDEN = (10, 11)
 LIP_MM = (
-    3.8  # height of the lower lip over the lower incisal point, as seen at the front: edges of crowns stay in sight
+    3.8  # height of the lower lip over the lower incisal point: crown edges stay visible
 )
 
 
@@ -40,7 +40,7 @@ def truth(jaw):
 
 
 def terms(prior, poses, centres):
-    """Return the precision and the right side that a prior adds."""
+    """Return the precision and right side added by a prior."""
     equations = NormalEquations()
     prior.accumulate(
         Solution(
@@ -109,7 +109,7 @@ def small_log(T):
 
 @pytest.fixture(scope="module")
 def take(jaw, truth, tmp_path_factory):
-    """A take on whose middle frames all but a sliver of the lower teeth is hidden."""
+    """A take whose middle frames hide nearly all of the lower teeth."""
     folder = tmp_path_factory.mktemp("aided")
     rng = np.random.default_rng(0)
     for camera in small_take.CAMERAS:
@@ -200,15 +200,15 @@ def test_lost_frames_come_back_marked_and_raw_poses_stay(take, jaw, truth):
 
 
 @pytest.mark.slow
-def test_a_model_of_another_jaw_helps_nobody(take, jaw, truth):
-    """Its poses do not fit the masks or the model, so the first pass stays."""
+def test_a_model_of_another_jaw_changes_nothing(take, jaw, truth):
+    """Its poses fit neither masks nor model, so the first pass is kept."""
     arrays = {**jaw.arrays, "residual_limit_mm": np.array(1e-6)}
     aided = aid(take, JawRig(arrays, jaw.meta))
     assert not aided.prior_aided.any()
 
 
 @pytest.mark.slow
-def test_without_hard_frames_nothing_is_done(take, jaw):
+def test_without_hard_frames_tracks_are_unchanged(take, jaw):
     first = take[1]
     easy = replace(first, status=np.ones_like(first.status), sigma_mm=np.full_like(first.sigma_mm, 0.1))
     assert aid(take, jaw, easy) is easy

@@ -1,4 +1,4 @@
-"""Final poses of colours are the likeliest by what was measured and by the model."""
+"""Final poses from colours are the most likely ones given measurement and model."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from jawusd.geometry import se3_exp, se3_inverse, se3_log, transform_points
 from jawusd.tracking.sequence.kinematic_prior import KinematicPrior, weigh_with_model
 
 COUNT = 60
-OFF_MM = 0.1  # of the true motion from the model
+OFF_MM = 0.1  # distance of the true motion from the model
 
 
 @pytest.fixture(scope="module")
@@ -24,10 +24,10 @@ def truth():
 
 
 def measured(truth, sigma_mm, arm_mm):
-    """Return tracks that measured poses about the incisal point, turns being known by an arm of so many mm."""
+    """Return tracks with errors about the incisal point; rotation errors have a lever arm in mm."""
     rng, point = np.random.default_rng(5), example_rig().landmarks[0]
     about = np.eye(6)
-    about[3:, :3] = -np.cross(np.eye(3), point).T  # a turn about the incisal point moves the origin
+    about[3:, :3] = -np.cross(np.eye(3), point).T  # a rotation about the incisal point moves the origin
     root = about @ np.diag([sigma_mm / arm_mm] * 3 + [sigma_mm] * 3)
     poses = se3_exp(rng.normal(size=(COUNT, 6)) @ root.T) @ truth
     poses[2] = np.nan
@@ -48,7 +48,7 @@ def off_mm(poses, truth):
     return np.linalg.norm(away, axis=-1).mean(0)
 
 
-def test_condyles_come_nearer_and_the_incisal_point_stays(truth):
+def test_condyles_improve_and_the_incisal_point_stays(truth):
     tracks = measured(truth, 0.1, 10.0)
     weighed = weigh_with_model(tracks, example_rig())
     before, after = off_mm(tracks.T_upper_lower, truth), off_mm(weighed.T_upper_lower, truth)
@@ -66,7 +66,7 @@ def test_poses_measured_well_stay(truth):
     assert np.nanmax(np.abs(weighed.T_upper_lower - tracks.T_upper_lower)) < 0.002
 
 
-def test_the_likeliest_pose_is_found(truth):
+def test_the_most_likely_pose_is_found(truth):
     tracks, rig = measured(truth, 0.1, 10.0), example_rig()
     weighed = weigh_with_model(tracks, rig)
     prior = KinematicPrior(rig, weighed.meta["prior_spread_mm"])
@@ -83,7 +83,7 @@ def test_the_likeliest_pose_is_found(truth):
     assert cost(found * scale) < cost(np.zeros(6)) - 0.5 and cost(found * scale) < best.fun + 0.01
 
 
-def test_too_few_poses_tell_nothing_of_a_model(truth):
+def test_too_few_poses_leave_tracks_unchanged(truth):
     tracks = measured(truth, 0.1, 10.0)
     few = tracks.T_upper_lower.copy()
     few[10:] = np.nan

@@ -1,4 +1,4 @@
-"""Delays between cameras, masks drawn too wide, and cameras that were moved after their calibration."""
+"""Delays between cameras, wide masks, and cameras that moved after their calibration."""
 
 from dataclasses import replace
 
@@ -45,16 +45,16 @@ def test_delays_are_found_to_a_fiftieth_of_a_frame(late):
 
 
 @pytest.mark.slow
-def test_taking_delays_out_improves_the_poses(late):
+def test_correcting_delays_improves_the_poses(late):
     tracks, without = late
-    inner = slice(1, -1)  # at the ends nothing tells the velocity
+    inner = slice(1, -1)  # the velocity is unknown at the ends
     better, worse = errors_mm(tracks, raw=True)[inner], errors_mm(without, raw=True)[inner]
     assert better.mean() < 0.6 * worse.mean()
     assert better.max() < 0.06
 
 
 @pytest.mark.slow
-def test_masks_drawn_too_wide_are_noticed_and_made_up_for(tmp_path):
+def test_masks_drawn_too_wide_are_found_and_corrected(tmp_path):
     capture = make_capture(write_masks(tmp_path / "wide", 8, grown_px=1.0), 8)
     tracks, without = track(capture), track(capture, config=WITHOUT)
     assert np.mean(list(tracks.meta["outline_bias_px"].values()), axis=0) == pytest.approx([1.0, 1.0], abs=0.25)
@@ -62,15 +62,15 @@ def test_masks_drawn_too_wide_are_noticed_and_made_up_for(tmp_path):
 
 
 @pytest.mark.slow
-def test_nothing_is_found_where_nothing_is(takes):
+def test_a_correct_take_has_no_nuisances(takes):
     tracks, *_ = takes
     assert np.abs(list(tracks.meta["delays_frames"].values())).max() < 0.03
     assert np.abs(list(tracks.meta["outline_bias_px"].values())).max() < 0.1
 
 
 @pytest.mark.slow
-def test_scans_without_gum_tell_less_of_how_masks_were_drawn(tmp_path, monkeypatch):
-    """The same take, with all that is measured on it, leaves more unknown of both arches."""
+def test_scans_without_gum_have_larger_uncertainties(tmp_path, monkeypatch):
+    """The same take and measurements give larger uncertainties of both arches."""
     capture = make_capture(write_masks(tmp_path / "crowns", 6), 6)
     crowns = [Mesh(m.vertices, m.faces[crown_face_mask(m)], m.colors) for m in MESHES]
 
@@ -84,7 +84,7 @@ def test_scans_without_gum_tell_less_of_how_masks_were_drawn(tmp_path, monkeypat
 
 
 def _nuisances(**values):
-    """Return nuisances of two cameras, all zero and well known but for those given."""
+    """Return nuisances of two cameras, zero with small sigmas except for those given."""
     none = {
         "delays": np.zeros(2),
         "habits": np.zeros((2, 2, 3)),
@@ -136,18 +136,18 @@ def _landmarks_mm(tracks, truth):
 
 @pytest.fixture(scope="module")
 def takes(clean_take):
-    """The same masks with the true cameras, with knocked ones, and with these taken as they are."""
+    """The same masks with true cameras, knocked cameras, and knocked cameras without correction."""
     capture, good = clean_take
     return good, _track_knocked(capture), _track_knocked(capture, config=WITHOUT)
 
 
 @pytest.mark.slow
-def test_knocked_cameras_are_put_right(takes):
+def test_knocked_cameras_are_corrected(takes):
     good, corrected, without = takes
     assert corrected.meta["extrinsics"]["corrected"] and not without.meta["extrinsics"]["corrected"]
     assert _landmarks_mm(corrected, good) < 0.3 * _landmarks_mm(without, good)
     assert (corrected.status == 1).all()
-    # What the cameras were off by must not pass for something else.
+    # Camera errors must not be attributed to anything else.
     assert np.abs(list(corrected.meta["delays_frames"].values())).max() < 0.03
     assert np.abs(list(corrected.meta["outline_bias_px"].values())).max() < 0.15
 
@@ -168,13 +168,13 @@ def test_corrected_cameras_see_the_teeth_where_the_true_ones_do(takes):
             for c, true in zip(cameras, CAMERAS)
         )
 
-    assert misses(then) < 0.25  # px; outlines are good to 0.3
+    assert misses(then) < 0.25  # px; outlines are accurate to 0.3
     assert misses(KNOCKED) > 4 * misses(then)
 
 
 @pytest.mark.slow
 def test_corrections_fit_their_uncertainty(takes):
-    """Compare with the knocks themselves, but for the motion of the world that brings the two sets closest."""
+    """Compare with the true knocks, up to the best common motion of the world."""
     report = takes[1].meta["extrinsics"]
     pivot = np.eye(4)
     pivot[:3, 3] = report["pivot_mm"]
@@ -207,8 +207,8 @@ def test_true_cameras_are_left_alone(takes):
     assert corrected_cameras(CAMERAS, {})[1].T_cam_world.tolist() == CAMERAS[1].T_cam_world.tolist()
 
 
-def test_what_is_known_of_a_camera_is_said_about_the_teeth():
-    """Draw knocks of a camera about itself; about the teeth they scatter as the precision says."""
+def test_the_camera_prior_is_transferred_to_the_teeth():
+    """Sample knocks of a camera about its centre; their covariance about the teeth must match the precision."""
     pivot = np.array([3.0, -5.0, 2.0])
     extrinsics = Extrinsics.calibrated(CAMERAS, pivot)
     precision = extrinsics.precision(0.002, 0.5)[1]
@@ -223,7 +223,7 @@ def test_what_is_known_of_a_camera_is_said_about_the_teeth():
 
 
 def _records(count, lost=()):
-    """Return records of a jaw that turns and moves evenly, some of them lost and far away."""
+    """Return records of a jaw in uniform motion, some of them lost and far away."""
     step = np.array([0.01, 0.02, -0.01, 0.4, -0.6, 0.2])
     start = se3_exp([0.2, -0.1, 0.3, 5.0, -12.0, 3.0])
     records = {}
@@ -245,7 +245,7 @@ def _records(count, lost=()):
     return records, step
 
 
-def test_a_lost_row_is_bridged_by_even_motion():
+def test_a_lost_arch_is_interpolated_linearly():
     records, step = _records(12, lost=(4, 5, 6))
     pose, _ = bridge(records, 5, 1)
     assert pose == pytest.approx(records[5].solution.poses[0], abs=1e-6)
@@ -267,8 +267,8 @@ def test_delays_follow_an_accelerating_jaw_to_the_ends_of_the_take():
             assert moved[c, 1] == pytest.approx(se3_exp((k * delay + 0.5 * delay**2) * push), abs=1e-9)
 
 
-def test_what_a_parabola_misses_is_known():
-    """A jaw that moves along a cubic: error = truth against the parabola, at the ends and amid the take."""
+def test_the_error_of_the_parabola_is_known():
+    """For a cubic motion, the error of the parabola is known, at the ends and within the take."""
     records, _ = _records(6)
     push = np.array([0.0004, 0, 0, 0, -0.05, 0.01])
     for k, record in records.items():
@@ -289,8 +289,8 @@ def test_long_gaps_and_ends_are_not_bridged():
 
 
 @pytest.mark.slow
-def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(late_capture):
-    """Call a row lost without reason, as a late camera may: aligned again with the delay taken out it comes back."""
+def test_frames_lost_to_a_late_camera_are_recovered_once_the_delay_is_known(late_capture):
+    """Mark an arch as lost, as a late camera may cause: it is recovered after the delay is corrected."""
     original = FrameTracker.track
 
     def distrustful(self, starts, views, pose_history, reach_px=0.0):
@@ -308,8 +308,8 @@ def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(late_capture):
 
 
 @pytest.mark.parametrize("coefficients", [0, 4, 5, 8])
-def test_a_focal_length_that_was_found_bends_pictures_pixel_by_pixel_as_before(coefficients):
-    """A longer lens shows a point where the calibrated one shows it spread by the factor, as OpenCV draws it."""
+def test_a_corrected_focal_length_keeps_distortion_per_pixel(coefficients):
+    """A longer lens shows a point where the calibrated one shows it scaled, according to OpenCV."""
     rng = np.random.default_rng(coefficients)
     lens = rng.normal(size=coefficients) * 0.05
     camera = Camera("a", (640, 480), np.array([[700.0, 0, 330], [0, 690, 250], [0, 0, 1]]), lens, np.eye(4))

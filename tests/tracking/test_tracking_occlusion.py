@@ -1,4 +1,4 @@
-"""What cannot be a bite is refused with its cause, what is doubtful is said, and no bite of a person is refused."""
+"""Impossible bites are errors, unusual ones are warnings, and no valid bite is rejected."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def bite():
 
 
 def placed(mesh, move_mm=(0, 0, 0), turn_deg=(0, 0, 0), scale=1.0):
-    """Return the mesh turned about its middle, scaled and moved."""
+    """Return the mesh rotated about its centre, scaled and moved."""
     middle = mesh.vertices.mean(0)
     turn = se3_exp([*np.deg2rad(turn_deg), 0, 0, 0])[:3, :3]
     return Mesh((mesh.vertices - middle) @ turn.T * scale + middle + move_mm, mesh.faces, mesh.colors)
@@ -50,7 +50,7 @@ def kinds(upper, lower, axes=None):
 
 
 def bites(upper, lower):
-    """Yield bites that persons have, by name."""
+    """Yield valid bites by name."""
     molars = lambda v: v[:, 2] < -24  # noqa: E731
     yield "usual", upper, lower
     yield "open in front", upper, placed(lower, (0, -0.3, 0), (0.4, 0, 0))
@@ -77,7 +77,7 @@ def test_bites_of_persons_are_accepted_in_any_frame(bite):
 
 
 def test_deep_bite_that_leaves_the_middles_at_one_height_is_accepted(bite):
-    """The mean heights of two valid arches may be as close as a millimetre: what counts is where the crowns meet."""
+    """The mean heights of two valid arches may differ by only 1 mm: only the contact of the crowns matters."""
     upper, lower = bite
     shallow = lambda v: v[:, 1] > v[:, 1].min() + 4.5  # noqa: E731
     short = without(upper, lambda v: shallow(v) & (v[:, 2] < -10))
@@ -97,7 +97,7 @@ def test_deep_bite_that_leaves_the_middles_at_one_height_is_accepted(bite):
         ("scans_size", r"the lower arch is 12\d mm wide", {"scale": 2.0}),
     ],
 )
-def test_what_is_no_bite_is_refused_with_its_cause(bite, kind, message, change):
+def test_impossible_bites_are_errors_with_their_cause(bite, kind, message, change):
     scans = prepare_scan(bite[0], "upper"), prepare_scan(placed(bite[1], **change), "lower")
     for axes in (None, np.eye(4)):
         assert [f.kind for f in occlusion_findings(scans, axes)[1]] == [kind]
@@ -123,17 +123,17 @@ def test_upper_scan_upside_down_and_the_same_file_twice_are_refused(bite):
         ("scan_size", {"scale": 1.36}),
     ],
 )
-def test_doubtful_bites_are_said_with_a_figure(bite, kind, change):
+def test_unusual_bites_are_warnings_with_a_value(bite, kind, change):
     found = {f.kind: f for f in findings(bite[0], placed(bite[1], **change))}
     assert kind in found
     assert found[kind].severity == "warning" and found[kind].value is not None and found[kind].limit is not None
 
 
-def test_exchanged_files_are_said(bite):
+def test_exchanged_files_are_reported(bite):
     assert "underbite" in kinds(bite[1], bite[0])
 
 
-def test_given_axes_that_do_not_fit_are_said(bite):
+def test_given_axes_that_do_not_fit_are_reported(bite):
     up_and_down = np.diag([1.0, -1.0, -1.0, 1.0])
     assert kinds(*bite, up_and_down) == ["anatomical_axes_off"]
     assert kinds(*bite, np.eye(4)) == []

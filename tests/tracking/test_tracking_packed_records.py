@@ -1,4 +1,4 @@
-"""Packed records hold what was put in."""
+"""Packed records round-trip."""
 
 import errno
 
@@ -17,7 +17,7 @@ FRAMES = 4
 
 @pytest.fixture(scope="module")
 def records(tmp_path_factory):
-    """Return the records of a take as the tracker made them, before they were packed."""
+    """Return the records of a take before packing."""
     made = {}
 
     class Kept(PackedRecords):
@@ -31,7 +31,7 @@ def records(tmp_path_factory):
     return made
 
 
-def test_what_is_looked_up_is_what_was_set(records):
+def test_records_round_trip(records):
     packed = PackedRecords()
     packed.update(records)
     assert list(packed) == list(records) and len(packed) == FRAMES
@@ -53,7 +53,7 @@ def test_what_is_looked_up_is_what_was_set(records):
                 np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-30)
 
 
-def test_a_record_that_is_set_again_takes_the_place_of_the_one_looked_up(records):
+def test_a_replaced_record_is_not_served_from_the_cache(records):
     packed = PackedRecords()
     packed.update(records)
     first, second = sorted(packed)[:2]
@@ -67,7 +67,7 @@ def test_a_record_that_is_set_again_takes_the_place_of_the_one_looked_up(records
     assert list(packed.kept([second])) == [second]
 
 
-def test_long_takes_are_kept_in_a_file_and_read_back_alike(records, monkeypatch):
+def test_long_takes_are_stored_in_a_file_and_read_back(records, monkeypatch):
     monkeypatch.setattr(frame_record, "_IN_MEMORY", 1000)
     packed = PackedRecords()
     for frame in range(40 * FRAMES):

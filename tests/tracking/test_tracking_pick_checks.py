@@ -1,4 +1,4 @@
-"""Picks and masks that contradict one another are told, and the mistake that explains them by its name."""
+"""Contradicting picks and masks are reported with the mistake that explains them."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ NOTHING = (np.empty((0, 2)), np.empty((0, 2)))
 
 
 def picks(count=6, wrong=None, cameras=CAMERAS[:2]):
-    """Return picks of vertices of the crowns in two cameras, one arch's first of another vertex."""
+    """Return picks of crown vertices in two cameras, the first of one arch on a wrong vertex."""
     rng = np.random.default_rng(1)
     arches = {}
     for scan, vertices, pose in zip(SCANS, VERTICES, POSES, strict=True):
@@ -39,7 +39,7 @@ def picks(count=6, wrong=None, cameras=CAMERAS[:2]):
 
 
 def pixels(cameras=CAMERAS):
-    """Return some recorded pixels of both arches in every camera."""
+    """Return some mask pixels of both arches in every camera."""
     rng = np.random.default_rng(0)
     crowns = [transform_points(pose, scan.crown_vertices()) for pose, scan in zip(POSES, SCANS, strict=True)]
     return {c.name: tuple(c.project(points[rng.choice(len(points), 300)]) for points in crowns) for c in cameras}
@@ -63,14 +63,14 @@ def test_masks_where_the_picks_place_the_scans_are_accepted():
     assert not found()
 
 
-def test_missing_masks_are_no_contradiction():
+def test_missing_masks_are_not_a_contradiction():
     seen = pixels()
     seen["cam1"] = (np.empty((0, 2)), seen["cam1"][1])
     del seen["cam2"]
     assert not found(GIVEN, seen)
 
 
-def test_arches_exchanged_in_one_camera_or_in_all_are_told():
+def test_arches_exchanged_in_one_camera_or_all_are_reported():
     seen = pixels()
     one = {name: pair[::-1] if name == "cam1" else pair for name, pair in seen.items()}
     (finding,) = found(GIVEN, one)
@@ -79,10 +79,10 @@ def test_arches_exchanged_in_one_camera_or_in_all_are_told():
     assert finding.kind == "masks_arches_exchanged" and "in every camera" in finding.message
 
 
-def test_exchanged_scans_are_told():
+def test_exchanged_scans_are_reported():
     turned = replace(GIVEN, vertices=GIVEN.vertices[::-1], crowns=GIVEN.crowns[::-1])
     assert only(turned) == ("scans_exchanged", "error")
-    # Picks whose vertices the other scan does not have are not tried on it.
+    # The exchange of scans is not tried if picked vertices do not exist on the other scan.
     wrong = {**TABLE, "cam0": TABLE["cam1"], "cam1": TABLE["cam0"]}
     last = max(pick.vertex for pick in GIVEN.picks[1])
     assert max(pick.vertex for pick in GIVEN.picks[0]) > last
@@ -90,7 +90,7 @@ def test_exchanged_scans_are_told():
     assert only(short) == ("calibrations_exchanged", "error")
 
 
-def test_exchanged_masks_of_cameras_are_told():
+def test_exchanged_masks_of_cameras_are_reported():
     seen = pixels()
     (finding,) = found(GIVEN, {**seen, "cam0": seen["cam1"], "cam1": seen["cam0"]})
     assert finding.kind == "masks_cameras_exchanged" and "cam0 and cam1" in finding.message
@@ -104,7 +104,7 @@ def test_masks_elsewhere_are_a_warning_and_the_best_guess_counts():
     assert finding.value == pytest.approx(0.0) and not found(GIVEN, away, seen)
 
 
-def test_exchanged_calibrations_are_told_from_exchanged_picks():
+def test_exchanged_calibrations_are_distinguished_from_exchanged_picks():
     wrong = {**TABLE, "cam0": TABLE["cam1"], "cam1": TABLE["cam0"]}
     assert only(replace(GIVEN, cameras=wrong)) == ("calibrations_exchanged", "error")
     other = tuple(
@@ -119,19 +119,19 @@ def test_exchanged_calibrations_are_told_from_exchanged_picks():
     assert only(replace(GIVEN, picks=other))[0] in ("picks_views_exchanged", "picks_cameras_exchanged")
 
 
-def test_mirrored_scans_are_told_from_exchanged_arches():
+def test_mirrored_scans_are_distinguished_from_exchanged_arches():
     flip = np.array([-1.0, 1.0, 1.0])
     mirrored = [tuple(own * flip for own in both) for both in (GIVEN.vertices, GIVEN.crowns)]
     assert only(replace(GIVEN, vertices=mirrored[0], crowns=mirrored[1])) == ("scans_mirrored", "error")
 
 
 @pytest.mark.parametrize(("size", "severity"), [(1.3, "error"), (0.75, "error")])
-def test_scans_of_another_size_are_told(size, severity):
+def test_scans_of_another_size_are_reported(size, severity):
     larger = [tuple(size * own for own in both) for both in (GIVEN.vertices, GIVEN.crowns)]
     assert only(replace(GIVEN, vertices=larger[0], crowns=larger[1])) == ("scan_size", severity)
 
 
-def test_pictures_shifted_or_scaled_against_their_calibration_are_told():
+def test_pictures_shifted_or_scaled_against_their_calibration_are_reported():
     camera = TABLE["cam1"]
     off = shifted(camera, np.array([0.03 * camera.size_px[0], 0.0]))
     (finding,) = found(replace(GIVEN, cameras={**TABLE, "cam1": off}))
@@ -140,20 +140,20 @@ def test_pictures_shifted_or_scaled_against_their_calibration_are_told():
     assert "focal length" in finding.message and "cam1" in finding.message
 
 
-def test_a_wrong_pick_is_left_out_and_no_mistake_is_made_up_for_it():
+def test_a_wrong_pick_is_rejected_without_another_mistake():
     wrong = replace(GIVEN, picks=picks(wrong="upper"))
     (finding,) = found(wrong)
     assert (finding.kind, finding.severity) == ("pick_wrong", "warning") and "pick 1" in finding.message
 
 
-def test_contradictions_without_a_single_cause_are_refused_as_such():
+def test_contradictions_without_a_single_cause_are_an_error():
     turned = tuple([p.model_copy(update={"vertex": q.vertex}) for p, q in zip(own, own[::-1])] for own in GIVEN.picks)
     with pytest.raises(TrackingError, match="contradict one another"):
         found(replace(GIVEN, picks=turned))
 
 
-def test_no_focal_length_is_fitted_to_picks_without_sense():
-    """Of scans in inches, five times the focal length would come nearer; of worse ones, one that overflows."""
+def test_no_focal_length_is_fitted_to_random_picks():
+    """For scans in inches, five times the focal length would fit better; worse ones would overflow."""
     inches = tuple(vertices / 25.4 for vertices in VERTICES)
     camera = fitted_camera(GIVEN.picks, inches, TABLE, "cam0", True)
     assert camera.K[0, 0] <= 2 * TABLE["cam0"].K[0, 0] * (1 + 1e-9)

@@ -61,7 +61,7 @@ def test_landmark_sigmas_do_not_pair_poses_with_landmarks():
 
 @pytest.fixture(scope="module")
 def noisy_fits():
-    """Align frames whose outlines are off by 0.4 px, errors together over some 10 px; solutions and truths."""
+    """Solutions and true poses for outline errors of 0.4 px, correlated over about 10 px."""
     rng = np.random.default_rng(6)
     solver, out = ContourSolver(SCANS, CONFIG), []
     for poses in jaw_poses(12):
@@ -95,7 +95,7 @@ def test_sigma_of_the_crowns_follows_the_information(noisy_fits):
     sigma = crown_sigma_mm(SCANS[0], solution, 0, CONFIG)
     assert 0.005 < sigma < 0.1
     for sums in (*solution.silhouette, *solution.gingival_margin):
-        sums[0, 1:] = 0  # one view left: depth is nearly free
+        sums[0, 1:] = 0  # with one view, depth is nearly unconstrained
     assert crown_sigma_mm(SCANS[0], solution, 0, CONFIG) > 3 * sigma
     for sums in (*solution.silhouette, *solution.gingival_margin):
         sums[0] = 0
@@ -133,7 +133,7 @@ def test_motions_about_a_point_are_motions_there_carried_to_it():
         np.testing.assert_allclose(twist_between(start, there @ start, centre), twist, atol=1e-10)
 
 
-def test_what_is_usual_follows_every_frame():
+def test_medians_are_updated_every_frame():
     history, medians = History(5, 3), []
     for k in (4.0, 8.0, 6.0, 10.0):
         view, arch = np.full((2, 3), k), np.full(2, k)
@@ -144,7 +144,7 @@ def test_what_is_usual_follows_every_frame():
     assert medians == [[4, 4, 4], [6, 6, 6], [6, 6, 6], [8, 7, 7]]
 
 
-def test_prediction_goes_on_and_starts_offer_to_stop():
+def test_prediction_keeps_velocity_and_starts_include_rest():
     step = se3_exp([0.01, 0, 0.02, 1.0, -2.0, 0.5])
     poses = jaw_poses(1)[0]
     motion = _motion(poses)
@@ -157,7 +157,7 @@ def test_prediction_goes_on_and_starts_offer_to_stop():
     assert motion.miss_mm() == pytest.approx(np.linalg.norm((step @ poses - poses)[0] @ [10, 0, 0, 1]), rel=0.3)
 
 
-def test_lost_jaw_is_carried_by_the_head():
+def test_a_lost_jaw_moves_with_the_head():
     poses = jaw_poses(1)[0]
     motion = _motion(poses)
     head = se3_exp([0, 0.05, 0, 3.0, 0, 0])
@@ -166,7 +166,7 @@ def test_lost_jaw_is_carried_by_the_head():
     assert se3_inverse(motion.predict()[0]) @ motion.predict()[1] == pytest.approx(relative, abs=1e-9)
 
 
-def test_gallery_keeps_unlike_jaw_poses_relative_to_the_head():
+def test_history_keeps_distinct_jaw_poses_relative_to_the_head():
     poses = jaw_poses(1)[0]
     motion = _motion(poses)
     for k in range(30):
@@ -188,7 +188,7 @@ def test_searches_become_rarer_while_lost():
     assert due[:5] == [True, True, True, False, True] and sum(due) < 10
 
 
-def test_searches_in_vain_use_up_what_a_take_allows():
+def test_failed_searches_exhaust_the_budget():
     searches = SearchAllowance(384)
     for frame in range(searches.most):
         assert searches.allows(frame)
@@ -199,7 +199,7 @@ def test_searches_in_vain_use_up_what_a_take_allows():
     assert searches.allows(21) and searches.fruitless == 20
 
 
-def test_searches_stay_due_while_there_is_nothing_to_see():
+def test_searches_stay_due_while_nothing_is_visible():
     motion = _motion(jaw_poses(1)[0])
     for _ in range(7):
         motion.update(motion.predict(), UPPER, UPPER)
@@ -250,7 +250,7 @@ def test_views_keep_the_geometry_of_the_camera(tmp_path):
     for view, camera in zip(views, CAMERAS):
         h = view.matrix @ np.append(poses[0][:3, 3], 1.0)
         inside = render_masks(MESHES, poses, camera).any(0)
-        assert view.masks.shape[1:] < inside.shape  # cut to the teeth, and smaller
+        assert view.masks.shape[1:] < inside.shape  # cropped to the teeth, and smaller
         scale = 4.0 / (1250 / 200)
         centre = np.argwhere(view.masks[0] > 127).mean(0)[::-1] - h[:2] / h[2]
         full = np.argwhere(render_masks(MESHES, poses, camera, (7.5, -16.0))[0] > 127).mean(0)[::-1]
@@ -271,6 +271,6 @@ def test_gates_open_with_the_reach():
     assert CONFIG.gates_from(99.0) == CONFIG.wide_gates_px
 
 
-def test_scans_of_the_example_are_what_tests_take_them_for():
+def test_scans_of_the_example_meet_the_assumptions_of_tests():
     assert arch(True).faces.shape == MESHES[0].faces.shape
     assert all(s.painted and len(s.gingival_margin) > 100 for s in SCANS)

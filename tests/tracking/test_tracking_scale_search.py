@@ -1,4 +1,4 @@
-"""The size of the teeth as cameras see them, told by masks alone: cameras moved apart by known factors."""
+"""The world scale estimated from masks, for camera distances scaled by known factors."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def capture(tmp_path_factory):
 
 
 def farther_apart(factor):
-    """Return the cameras as squares given that much too large would make them."""
+    """Return the cameras as calibrated with a wrong square size."""
     cameras = []
     for camera in CAMERAS:
         T = camera.T_cam_world.copy()
@@ -37,7 +37,7 @@ def test_the_size_is_that_of_the_world(capture, factor):
 
 
 @pytest.mark.slow
-def test_masks_of_something_else_tell_no_size(capture, monkeypatch):
+def test_masks_of_something_else_give_no_size(capture, monkeypatch):
     monkeypatch.setattr("jawusd.tracking.initialization.scale_search._STARTS", (1.0,))
     turned = [replace(m, vertices=m.vertices * [0.6, 1.0, 1.3]) for m in MESHES]
     with pytest.raises(TrackingError, match=r"do not fit the masks of frames \d+, \d+ at any size from 0\.5 to 2"):
@@ -47,7 +47,7 @@ def test_masks_of_something_else_tell_no_size(capture, monkeypatch):
 
 
 def test_a_climb_without_an_end_counts_as_no_fit(capture, monkeypatch):
-    """Let every size fit better than the one before: the climb ends after so many sizes and is not believed."""
+    """If every size fits better than the one before, the climb stops at its limit and is rejected."""
     sizes = []
 
     def better(self, frame, size, poses, size_of_poses):

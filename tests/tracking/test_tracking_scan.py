@@ -48,7 +48,7 @@ def test_crown_gum_line_of_ball_and_plate_is_a_circle():
 
 def test_crown_gum_line_agrees_with_a_brute_force_search():
     rng = np.random.default_rng(5)
-    # No two triangles share a corner: whether those that touch count as crossing is up to rounding.
+    # No two triangles share a corner, since rounding decides whether touching triangles intersect.
     vertices = rng.normal(size=(165, 3)) * 3
     crown, gum = np.split(np.arange(165, dtype=np.int32).reshape(-1, 3), [25])
     segments, directions = crown_gum_segments(vertices, crown, gum)
@@ -111,7 +111,7 @@ def test_triangle_soup_is_welded():
     assert not scan.painted and len(scan.gum_faces) == 0
 
 
-def test_colours_that_are_no_labels_leave_the_whole_scan_crown():
+def test_colours_that_are_not_labels_count_as_crown():
     mesh = arch(True)
     ivory = np.tile([230, 215, 190], (len(mesh.vertices), 1)).astype(np.uint8)
     scan = prepare_scan(Mesh(mesh.vertices, mesh.faces, ivory), "upper")
@@ -135,7 +135,7 @@ def test_scan_with_too_few_faces_is_refused():
 
 @pytest.fixture(scope="module")
 def dense():
-    """A row of teeth with faces as small as intra-oral scanners make them, of the same shape."""
+    """The same arch with faces as small as those of intra-oral scanners."""
     mesh = arch(True)
     vertices, faces, colors = np.asarray(mesh.vertices), np.asarray(mesh.faces), np.asarray(mesh.colors, float)
     for _ in range(3):
@@ -156,7 +156,7 @@ def test_dense_scans_are_thinned_without_changing_shape_or_centre(dense):
     assert thin.thin is None and prepare_scan(arch(True), "upper").thin is None
 
 
-def test_a_dense_scan_lands_where_the_plain_one_does(dense):
+def test_a_dense_scan_aligns_like_the_plain_one(dense):
     config, poses, camera = TrackingConfig(), jaw_poses(2), make_cameras()
     meshes = (arch(True), arch(False))
     plain = [prepare_scan(mesh, name) for mesh, name in zip(meshes, ("upper", "lower"))]

@@ -1,4 +1,4 @@
-"""Which frame a search starts from, and which of what it finds is believed."""
+"""The start frame chosen by the search, and which results are accepted."""
 
 import re
 
@@ -32,7 +32,7 @@ def footage(tmp_path_factory):
 
 
 def _misplaced(poses, turn_rad=0.5):
-    """Return the poses with the upper row turned into a wrong minimum, which from 0.35 rad covers most of its masks."""
+    """Return the poses with the upper arch in a wrong minimum, which covers most of its masks from 0.35 rad on."""
     middle = make_transform(np.eye(3), [0, 0, -11])
     out = poses.copy()
     out[0] = poses[0] @ middle @ se3_exp([0, turn_rad, 0, 0, 0, 0]) @ se3_inverse(middle)
@@ -40,7 +40,7 @@ def _misplaced(poses, turn_rad=0.5):
 
 
 class _FoundBefore:
-    """Answer searches with fits and poses that were made up."""
+    """A stub search with given fits and poses."""
 
     def __init__(self, fits, misplaced=(), mirrored_fit=None):
         self.solver = ContourSolver(SCANS, TrackingConfig())
@@ -76,12 +76,12 @@ def _searched(footage, search):
     return take_start.search_start(search, footage)
 
 
-def test_first_frame_that_fits_only_clear_is_taken(footage):
+def test_first_frame_with_a_clear_fit_is_used(footage):
     search = _FoundBefore([0.1, 0.5, 0.9])
     assert _searched(footage, search).frame == search.asked[1] and len(search.asked) == 2
 
 
-def test_without_one_the_frame_that_fits_best_is_taken(footage):
+def test_without_a_clear_fit_the_best_frame_is_used(footage):
     search = _FoundBefore([0.1, 0.15, 0.25, 0.2, 0.1])
     start = _searched(footage, search)
     assert start.frame == search.asked[2] and len(search.asked) == 5 and start.notes["fit"] == 0.25
@@ -90,7 +90,7 @@ def test_without_one_the_frame_that_fits_best_is_taken(footage):
 @pytest.mark.parametrize(
     ("fit", "mirrored_fit", "refused"), [(0.07, 0.5, True), (0.07, 0.25, False), (0.2, 0.5, False)]
 )
-def test_a_start_in_doubt_is_refused_if_a_mistake_undone_leaves_none(footage, fit, mirrored_fit, refused):
+def test_a_poor_start_is_an_error_if_undoing_a_mistake_gives_a_clear_one(footage, fit, mirrored_fit, refused):
     search = _FoundBefore([fit] * 5, mirrored_fit=mirrored_fit)
     if refused:
         with pytest.raises(TrackingError, match="mirrored: left and right are exchanged"):
@@ -106,10 +106,10 @@ def test_wrong_minimum_that_covers_the_masks_is_refused(footage):
         with pytest.raises(TrackingError, match="upper teeth do not fit their masks") as refusal:
             first_record(solver, solver.config, _misplaced(poses), masks.at(FIRST), FIRST)
     share, fit = re.findall(r"(-?[\d.]+)%? (?:of the visible|\(at least 0.03)", str(refusal.value))
-    assert float(share) > 15 and float(fit) < 0  # the first alone would not tell
+    assert float(share) > 15 and float(fit) < 0  # the first alone is not conclusive
 
 
-def test_wrong_minimum_is_left_without_the_mask_that_it_does_not_cover(footage):
+def test_a_wrong_minimum_is_escaped_by_excluding_the_uncovered_mask(footage):
     solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(FRAMES)[0]
     with footage.views(poses[0, :3, 3], 7.2) as masks:
         record = first_record(solver, solver.config, _misplaced(poses, 0.35), masks.at(FIRST), FIRST)
@@ -118,14 +118,14 @@ def test_wrong_minimum_is_left_without_the_mask_that_it_does_not_cover(footage):
         assert vertex_error_mm(MESHES[r], record.solution.poses[r], poses[r]) < 0.05
 
 
-def test_frame_with_wrong_poses_is_passed_over(footage):
+def test_a_frame_with_wrong_poses_is_skipped(footage):
     search = _FoundBefore([0.2] * 5, misplaced=(0, 1))
     start = _searched(footage, search)
     assert start.frame == search.asked[2]
     assert list(start.notes["failed"]) == [str(f) for f in search.asked[:2]]
 
 
-def test_poor_poses_accuse_no_masks(footage, monkeypatch):
+def test_poor_poses_are_not_evidence_against_masks(footage, monkeypatch):
     def accuse(footage, solver, poses, frame):
         return possible_mixups(footage.sources)[0] if frame == search.asked[0] else None
 

@@ -1,4 +1,4 @@
-"""A whole small take, from PNG masks and picks to tracks, and what goes wrong with takes."""
+"""A small take, from PNG masks and picks to tracks, and its possible errors."""
 
 import re
 import shutil
@@ -39,7 +39,7 @@ def pictures(tmp_path_factory):
 
 @pytest.fixture
 def take(pictures, tmp_path):
-    """Copy the masks, to be spoiled at will."""
+    """Copy the masks, for tests that modify them."""
     return shutil.copytree(pictures, tmp_path / "take")
 
 
@@ -87,7 +87,7 @@ def test_frame_range_may_be_left_to_the_masks(pictures):
     assert tracks.frames.tolist() == list(range(5, 5 + FRAMES)) and (tracks.status == 1).all()
 
 
-def test_missing_mask_is_made_up_for_by_the_other_cameras(take):
+def test_a_missing_mask_is_compensated_by_the_other_cameras(take):
     png(take, "cam1", "lower", 6).unlink()
     tracks = track(_capture(take))
     assert tracks.status[6].tolist() == [1, 3]
@@ -96,7 +96,7 @@ def test_missing_mask_is_made_up_for_by_the_other_cameras(take):
 
 
 @pytest.mark.parametrize("kind", ["blob", "other row", "shifted"])
-def test_spoiled_mask_is_left_out(take, kind):
+def test_a_wrong_mask_is_excluded(take, kind):
     path = png(take, "cam2", "upper", 7)
     mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if kind == "blob":
@@ -126,8 +126,8 @@ def test_hidden_teeth_are_lost_and_found_again(take):
 
 
 @pytest.mark.slow
-def test_masks_exchanged_now_and_then_are_not_searched_for_ever(take, monkeypatch):
-    """Exchange the rows' masks on three frames apart from one another, each of which would be searched both ways."""
+def test_masks_exchanged_now_and_then_exhaust_the_search_budget(take, monkeypatch):
+    """Exchange the arches' masks on three separate frames, each of which would be searched in both directions."""
     for k in (5, 7, 9):
         for camera in CAMERAS:
             upper, lower = (png(take, camera.name, row, k) for row in ROWS)
@@ -184,7 +184,7 @@ def test_exchanged_masks_are_named(pictures):
 
 
 @pytest.mark.slow
-def test_picks_far_from_the_masks_are_named_and_made_up_for(pictures):
+def test_picks_far_from_the_masks_are_reported_and_corrected(pictures):
     tracks = track(_capture(pictures, away_mm=12.0))
     assert "picks_off" in {found["kind"] for found in tracks.meta["findings"]}
     assert errors_mm(tracks).max() < 0.1
@@ -196,7 +196,7 @@ def test_bootstrap_frame_must_lie_in_the_range(pictures):
 
 
 @pytest.mark.slow
-def test_a_picked_frame_without_two_masks_of_each_row_gives_way_to_another(take):
+def test_a_picked_frame_without_two_masks_of_each_row_is_replaced_by_another(take):
     for camera in CAMERAS[1:]:
         png(take, camera.name, "upper", START).unlink()
     tracks = track(_capture(take))

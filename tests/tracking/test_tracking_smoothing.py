@@ -21,7 +21,7 @@ def _distance(a, b):
     return np.linalg.norm((a - b)[:, :3, 3], axis=1)
 
 
-def test_noise_shrinks_on_even_motion():
+def test_noise_is_reduced_for_uniform_motion():
     truth, measured, covariance = _motion(200, np.random.default_rng(0), 1.0)
     smooth = smooth_poses(np.arange(200), measured, covariance, np.zeros(3))
     assert rigidity_defect(smooth).max() < 1e-12
@@ -54,12 +54,12 @@ def test_gaps_and_short_runs_stay_as_they_are():
     assert np.isnan(smooth[[4, 9]]).all() and np.isfinite(np.delete(smooth, [4, 9], 0)).all()
     assert (smooth[:4] == measured[:4]).all() and (smooth[5:9] == measured[5:9]).all()
     assert (smooth[10:] != measured[10:]).any((1, 2)).all()
-    # A jump between runs is no motion: each is smoothed alone.
+    # A jump between runs is not motion: each run is smoothed separately.
     alone = smooth_poses(frames[20:], measured[20:], covariance[20:], np.zeros(3))
     assert np.allclose(alone, smooth[20:])
 
 
-def test_the_result_minimises_what_it_says():
+def test_the_result_minimises_the_objective():
     rng = np.random.default_rng(4)
     _, measured, covariance = _motion(7, rng, 1.0)
     centre = np.array([3.0, -5.0, 200.0])

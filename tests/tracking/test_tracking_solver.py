@@ -79,7 +79,7 @@ def test_samples_lie_on_the_outline_of_the_rendered_crowns():
     assert (labels[outside[:, 1], outside[:, 0]] == GUM).mean() > 0.1
 
 
-def test_samples_of_a_rough_scan_do_not_lie_inside_of_its_outline():
+def test_samples_of_a_rough_scan_are_not_inside_its_outline():
     rng, mesh, off, length = np.random.default_rng(5), MESHES[0], [], []
     rough = replace(mesh, vertices=mesh.vertices + 0.04 * rng.normal(size=mesh.vertices.shape))
     scan = prepare_scan(rough, "upper")
@@ -95,7 +95,7 @@ def test_samples_of_a_rough_scan_do_not_lie_inside_of_its_outline():
     off, length = np.concatenate(off), np.concatenate(length)
     found = np.isfinite(off)
     assert found.sum() > 1000
-    assert abs(np.average(off[found], weights=length[found])) < 0.02  # 0.06 with all that is within a pixel of it
+    assert abs(np.average(off[found], weights=length[found])) < 0.02  # 0.06 with all samples within a pixel of it
 
 
 def test_contours_move_with_a_scan_until_it_is_drawn_again():
@@ -128,11 +128,11 @@ def test_edge_search_on_soft_straight_edges():
         search_edges(rows, mask, np.zeros_like(mask), nothing, 5.0, 0.4, 0.7, out)
         errors.append(out[:3] - (edge - rows[:3, U]))
         assert np.isposinf(out[3]) and np.isnan(out[4])
-    # Linear interpolation of area averages is off by up to an eighth of a pixel, both ways alike.
+    # Linear interpolation of area averages is off by up to an eighth of a pixel, symmetrically.
     assert np.abs(errors).max() < 0.125 and np.abs(np.mean(errors)) < 0.02
 
 
-def test_edges_across_the_contour_and_hidden_samples_are_left_out():
+def test_edges_across_the_contour_and_hidden_samples_are_ignored():
     mask = np.tile((np.arange(60) < 30).astype(np.uint8) * 255, (40, 1))
     rows = np.zeros((2, COLUMNS))
     rows[:, U], rows[:, V], rows[:, INVERSE_DEPTH] = 29.0, 20.0, 0.005
@@ -147,7 +147,7 @@ def test_edges_across_the_contour_and_hidden_samples_are_left_out():
     assert np.isnan(out[0])
     search_edges(rows[1:], mask, none, behind, 5.0, 0.4, 0.7, out)
     assert np.isfinite(out[0])
-    # The other row's mask begins at the edge, but nothing says that row lies behind: the edge may be its own.
+    # The other arch's mask begins at the edge, but that arch may not be behind: the edge may be its own.
     other = np.where(mask > 0, 0, 255).astype(np.uint8)
     search_edges(rows[1:], mask, other, nothing, 5.0, 0.4, 0.7, out)
     assert np.isnan(out[0])
@@ -192,7 +192,7 @@ def test_normal_equations_agree_with_finite_differences():
     assert np.abs(precision - J.T @ (J * weight[:, None])).max() / scale.max() ** 2 < 1e-6
     assert (np.abs(gradient - J.T @ (weight * distances)) / scale < 1e-6).all()
     habits = samples[:, HABITS]
-    assert np.ptp(habits, axis=0).min() > 0.5  # free edges and gum line are both in sight
+    assert np.ptp(habits, axis=0).min() > 0.5  # free edges and gum line are both visible
     assert np.abs(habit_slope - habits.T @ (J * weight[:, None])).max() / scale.max() < 1e-5
     assert np.allclose(habit_distance, habits.T @ (weight * distances))
     assert np.allclose(habit_weight, habits.T @ (habits * weight[:, None]))
@@ -211,7 +211,7 @@ def test_solver_finds_exact_masks_to_a_hundredth_of_a_millimetre(k):
         assert rigidity_defect(solution.poses[r]) < 1e-12
 
 
-def test_solver_holds_with_noise_and_lips():
+def test_solver_is_robust_to_noise_and_lips():
     rng = np.random.default_rng(2)
     views = _views(1, lips_mm=(6.5, -14.0), noise_px=0.4, rng=rng)
     start = disturbed(POSES[1], 0.7, 0.012, rng)
@@ -244,7 +244,7 @@ def test_threads_do_not_change_the_result():
     assert all((a == b).all() for a, b in zip(alone.outline, together.outline))
 
 
-def test_masks_left_out_do_not_count():
+def test_excluded_masks_have_no_effect():
     views = _views(6)
     broken = [*views[:2], View(views[2].matrix, views[2].eye, np.roll(views[2].masks, 9, axis=2), views[2].present)]
     use = np.array([[True, True, False]] * 2)
@@ -254,7 +254,7 @@ def test_masks_left_out_do_not_count():
     assert not b.outline.precision[:, 2].any() and b.outline.precision[:, :2].any()
 
 
-def test_silhouette_and_gingival_margin_are_terms_of_their_own():
+def test_silhouette_and_gingival_margin_are_separate_terms():
     solution = ContourSolver(SCANS, CONFIG).solve(POSES[2], _views(2), ())
     equations, parts = NormalEquations(), []
     for term in (SilhouetteTerm(), GingivalMarginTerm()):
@@ -270,7 +270,7 @@ def test_silhouette_and_gingival_margin_are_terms_of_their_own():
     assert not without.gingival_margin.precision.any()
 
 
-def test_a_row_without_masks_stays_where_it_was():
+def test_an_arch_without_masks_stays_in_place():
     views = [
         View(v.matrix, v.eye, v.masks * np.array([1, 0], np.uint8)[:, None, None], np.array([True, False]))
         for v in _views(3)

@@ -1,4 +1,4 @@
-"""Starts without picks, from poor picks, and from footage or scans that were mixed up."""
+"""Starts without picks, from poor picks, and from exchanged masks or scans."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -60,7 +60,7 @@ def pictures(tmp_path_factory):
 
 @pytest.fixture
 def short_search(monkeypatch):
-    """Search few orientations, on one frame."""
+    """A search over few orientations, on one frame."""
     turns = np.radians([-18.0, 0.0, 18.0])
     monkeypatch.setattr(start_search, "_GRID", Grid(turns, turns, turns, (10.0, 8.0, 12.0)))
     monkeypatch.setattr(take_start, "FRAMES_TRIED", 1)
@@ -121,7 +121,7 @@ def test_two_cameras_are_enough(pictures, short_search):
     assert max(_error_mm(start, r) for r in (0, 1)) < 0.2
 
 
-def test_masks_of_something_else_are_refused_with_what_was_tried(tmp_path, short_search, monkeypatch):
+def test_masks_of_something_else_are_an_error_that_lists_what_was_tried(tmp_path, short_search, monkeypatch):
     monkeypatch.setattr(take_start, "raise_cause", lambda *arguments: "No mistake explains it.")
     folder = write_masks(tmp_path / "take", FRAMES)
     for k, path in enumerate(sorted(folder.rglob("*.png"))):
@@ -133,7 +133,7 @@ def test_masks_of_something_else_are_refused_with_what_was_tried(tmp_path, short
         _start(_capture(folder, bootstrap=None))
 
 
-def test_where_teeth_are_not_found_it_is_said_what_is_doubtful_about_the_scans(pictures, monkeypatch):
+def test_if_teeth_are_not_found_warnings_about_the_scans_are_quoted(pictures, monkeypatch):
     def fail(*arguments):
         raise TrackingError("the teeth are not found", frame=7, hint="Give picks.")
 
@@ -145,7 +145,7 @@ def test_where_teeth_are_not_found_it_is_said_what_is_doubtful_about_the_scans(p
         _start(_capture(pictures, bootstrap=None), (MESHES[0], lower))
 
 
-def test_where_picked_teeth_do_not_fit_it_is_said_what_is_doubtful_about_the_scans(pictures, monkeypatch):
+def test_if_picked_teeth_do_not_fit_warnings_about_the_scans_are_quoted(pictures, monkeypatch):
     def fail(*arguments):
         raise TrackingError("the teeth do not fit", frame=7, hint="Check the picks.")
 
@@ -188,7 +188,7 @@ def test_exchanged_rows_of_all_cameras_are_named(pictures, short_search, picked)
         _start(_capture(pictures, cameras=_rows_exchanged(pictures, list(TABLE)), **change))
 
 
-def test_wrong_pick_is_left_out_and_noted(pictures):
+def test_a_wrong_pick_is_rejected_and_noted(pictures):
     capture = _capture(pictures)
     picks = list(capture.bootstrap.upper)
     picks[1] = picks[1].model_copy(update={"vertex": (picks[1].vertex + 700) % len(MESHES[0].vertices)})
@@ -198,7 +198,7 @@ def test_wrong_pick_is_left_out_and_noted(pictures):
     assert _error_mm(start, 0) < 1.0
 
 
-def test_picks_close_together_are_helped_by_the_masks(pictures):
+def test_picks_close_together_are_refined_by_the_masks(pictures):
     capture = _capture(pictures)
     rng = np.random.default_rng(0)
     poses = jaw_poses(START + 1)[START]
@@ -219,7 +219,7 @@ def test_picks_close_together_are_helped_by_the_masks(pictures):
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_picks_that_fit_outlive_a_search_that_does_not(pictures, monkeypatch, fails):
+def test_picks_that_fit_are_kept_if_the_search_fails(pictures, monkeypatch, fails):
     misplaced = jaw_poses(START + 1)[START].copy()
     misplaced[1, :3, 3] += [0.0, 0.0, -40.0]
 
@@ -252,7 +252,7 @@ def test_survey_finds_the_rows(pictures):
     for k, frame in enumerate(survey.frames):
         for r in (0, 1):
             pose = jaw_poses(FRAMES)[frame - FIRST, r]
-            # Lips and gum hide a part, and every camera sees another side of the arch.
+            # Lips and gum hide parts, and every camera sees another side of the arch.
             assert np.linalg.norm(survey.places()[k, r] - transform_point(pose, SCANS[r].centre)) < 12.0
 
 
@@ -263,7 +263,7 @@ def test_all_shifts_at_once_agree_with_drawing_each(pictures):
     centre = transform_point(pose, SCANS[1].centre)
     with footage.views(centre, 2.0) as masks:
         view = masks.at(FIRST + 2)[1]
-    scan = coarse_scan(Mesh(MESHES[1].vertices, MESHES[1].faces), "lower")  # without gum silhouettes say all
+    scan = coarse_scan(Mesh(MESHES[1].vertices, MESHES[1].faces), "lower")  # without gum, silhouettes are complete
     shifts = np.random.default_rng(0).uniform(-8, 8, (12, 3))
     found = Screen(view, 1, 2.0, shifts, centre).objectives(scan, pose[None])[0]
     template = np.pad(_template(view.masks[1], view.masks[0], 2.0), 60)
@@ -279,7 +279,7 @@ def test_all_shifts_at_once_agree_with_drawing_each(pictures):
         assert worth == pytest.approx(template[unpack_bits(bits, template.shape[1])].sum(), rel=0.02, abs=3.0)
 
 
-def test_the_best_of_turns_and_shifts_undoes_what_was_done_to_the_guess(pictures):
+def test_the_best_rotation_and_shift_correct_the_guess(pictures):
     capture = _capture(pictures)
     footage = Footage(masked_sources(capture.cameras, TABLE, OFFSETS), TABLE, OFFSETS, capture.frames)
     pose, scan = jaw_poses(3)[2, 1], coarse_scan(MESHES[1], "lower")
@@ -300,7 +300,7 @@ def _footage(folder):
     return Footage(masked_sources(capture.cameras, TABLE, OFFSETS), TABLE, OFFSETS, capture.frames)
 
 
-def test_picks_far_off_are_helped_by_a_search_everywhere(pictures, short_search):
+def test_picks_far_off_are_replaced_by_a_global_search(pictures, short_search):
     footage, truth = _footage(pictures), jaw_poses(FRAMES)[START]
     search = StartSearch(MESHES, ContourSolver(SCANS, TrackingConfig()), np.eye(4))
     off = make_transform(np.eye(3), [14.0, 0, -14.0]) @ truth
@@ -309,9 +309,9 @@ def test_picks_far_off_are_helped_by_a_search_everywhere(pictures, short_search)
     assert max(vertex_error_mm(MESHES[r], found.poses[r], truth[r]) for r in (0, 1)) < 0.1 and found.fit > 0.3
 
 
-def test_frames_tried_lie_apart():
+def test_frames_tried_are_spread_out():
     areas = np.full((9, 2, 3), 100.0)
-    areas[3:6] += 50.0  # the best ones side by side
+    areas[3:6] += 50.0  # the best ones are neighbours
     areas[4, :, 1:] += 50.0
     areas[8, 0] = [100.0, 0.0, 0.0]
     survey = MaskSurvey(np.arange(9) * 10, np.zeros((9, 2, 3, 2)), areas, np.zeros((3, 3, 4)), np.zeros((3, 3)))
@@ -329,7 +329,7 @@ def test_search_is_the_same_in_threads(pictures, short_search):
     assert (both[0].poses == both[1].poses).all() and both[0].objective_px == both[1].objective_px
 
 
-def test_a_row_found_a_tooth_aside_is_found_from_the_other_one(pictures, monkeypatch):
+def test_an_arch_shifted_by_a_tooth_is_corrected_by_the_other_one(pictures, monkeypatch):
     capture = _capture(pictures)
     solver = ContourSolver(SCANS, TrackingConfig())
     axes, _ = check_occlusion(SCANS, capture.anatomy.T_anatomical_skull)

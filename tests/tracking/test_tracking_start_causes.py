@@ -1,4 +1,4 @@
-"""Which mistake explains that no start is found, and which seems to but does not."""
+"""Mistakes that explain a failed start, and mistakes that only seem to."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ TABLE = {camera.name: camera for camera in CAMERAS}
 
 @pytest.mark.parametrize(("without", "accused"), [(np.nan, False), (0.02, True)])
 def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, without, accused):
-    """The masks of camera 1 lie off; an exchange that takes them away leaves only good ones, and is no explanation."""
+    """The masks of camera 1 are wrong; an exchange that removes them leaves correct ones, which proves nothing."""
     sources = [
         CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
         for name in ("cam0", "cam1", "cam2")
@@ -54,7 +54,7 @@ def test_a_scan_that_fits_nowhere_while_the_other_does_is_named(fits, named):
 
 
 class _Searches:
-    """Answer searches with a fit per search."""
+    """A stub that returns a given fit for each search."""
 
     def __init__(self, fits=()):
         self.fits, self.count = dict(fits), 0
@@ -82,7 +82,7 @@ def _refused(searches, monkeypatch, fits=None, accused=(), only_clear=False):
     return start_causes.raise_cause(searches, footage, [3, 6, 8], fits or {}, set(accused), only_clear)
 
 
-def test_the_search_for_a_mistake_ends_and_says_what_was_tried(monkeypatch):
+def test_the_search_for_a_mistake_is_bounded_and_reports_what_was_tried(monkeypatch):
     searches = _Searches()
     monkeypatch.setattr(start_causes, "MOST_PICTURES", 20)
     words = _refused(searches, monkeypatch)
@@ -121,7 +121,7 @@ def test_of_mistakes_that_are_not_all_tried_only_a_clear_fit_counts(monkeypatch)
         _refused(_Searches({5: 0.5}), monkeypatch)
 
 
-def test_sizes_are_tried_first_where_the_scans_are_of_no_usual_size(monkeypatch):
+def test_sizes_are_tried_first_for_scans_of_unusual_size(monkeypatch):
     with pytest.raises(TrackingError, match="the scans are about 5% too small"):
         _refused(_Searches({1: 0.2}), monkeypatch, accused=[start_causes.SIZE_HINT])
     with pytest.raises(TrackingError, match="the scans are mirrored"):

@@ -1,4 +1,4 @@
-"""Faults of calibration and synchronisation that only a tracked take shows."""
+"""Errors of calibration and synchronisation found in a tracked take."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -24,14 +24,14 @@ def _kinds(tracks):
     return {(found["kind"], found.get("camera")) for found in tracks.meta["findings"]}
 
 
-def test_a_good_take_is_not_doubted(clean_take):
+def test_a_good_take_has_no_findings(clean_take):
     timely = {"camera_late", "frame_dropped", "camera_moved", "focal_length", "scan_size", "lens_distortion"}
     timely |= {"scans_mirrored"}
     assert not timely & {kind for kind, _ in _kinds(clean_take[1])}
 
 
 @pytest.mark.slow
-def test_a_camera_a_frame_late_is_named_and_made_up_for(tmp_path):
+def test_a_camera_a_frame_late_is_reported_and_corrected(tmp_path):
     late = make_capture(write_masks(tmp_path / "late", FRAMES, delays=(0.0, 1.0, 0.0)), FRAMES)
     tracks = track(late)
     assert ("camera_late", "cam1") in _kinds(tracks)
@@ -41,7 +41,7 @@ def test_a_camera_a_frame_late_is_named_and_made_up_for(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_frame_dropped_in_mid_take_is_named(tmp_path):
+def test_a_frame_dropped_within_a_take_is_reported(tmp_path):
     folder = write_masks(tmp_path / "take", FRAMES + 1)
     for row in ("upper", "lower"):
         files = sorted((folder / "cam1" / row).glob("*.png"))
@@ -82,13 +82,13 @@ def test_mirrored_scans_are_named(capture):
 
 
 def lens_kinds(bend):
-    """Return what is found where the first of three cameras shows side teeth so much larger."""
+    """Return the findings if the first of three cameras magnifies side teeth."""
     bends, none, small = np.array([bend, 0.0, 0.0]), np.zeros(3), np.full(3, 1e-4)
     return _lens_kinds(Magnification(none, small, bends, small, *_masks_and_motion(none), 0.5))
 
 
 def _masks_and_motion(clear):
-    """Return the fields of masks drawn rightly, and of cameras that seem to have moved so clearly, shape (3,)."""
+    """Return fields for correct masks, and cameras with the given significance of motion, shape (3,)."""
     return np.zeros((3, 2)), np.full((3, 2), 0.1), np.full(3, 0.005), np.full(3, 2.0), np.array(clear, float)
 
 
@@ -106,7 +106,7 @@ def _lens_kinds(found, limits=OF_MASKS):
     ],
 )
 def test_a_knocked_camera_is_named_and_its_lens_is_not(clear, named):
-    small, bend = np.full(3, 1e-4), np.array([0.0, 0.007, 0.0])  # pictures of another place seem to be bent
+    small, bend = np.full(3, 1e-4), np.array([0.0, 0.007, 0.0])  # pictures of another position seem distorted
     found = Magnification(np.zeros(3), small, bend, small, *_masks_and_motion(clear), 0.5)
     bent = [] if named == "cam1" else [("lens_distortion", "cam1")]
     assert sorted(_lens_kinds(found)) == sorted(bent + ([("camera_moved", named)] if named else []))
@@ -128,15 +128,15 @@ def test_masks_drawn_wider_in_one_camera_are_named(bias_px, bend, kinds):
     assert _lens_kinds(found) == [(kind, "cam1") for kind in kinds]
 
 
-def test_only_what_a_lens_can_do_is_put_down_to_it():
-    """Masks that end in the shadow of the cheeks make side teeth smaller than any lens does."""
+def test_distortion_beyond_any_lens_is_reported_as_side_teeth():
+    """Masks that end in the shadow of the cheeks shrink side teeth more than any lens."""
     assert lens_kinds(0.005) == lens_kinds(-0.005) == [("lens_distortion", "cam0")]
     assert lens_kinds(-0.03) == lens_kinds(0.03) == [("side_teeth", "cam0")]
     assert lens_kinds(-0.001) == []
 
 
 def _fits(share, rough_px, frames=5):
-    """Return records of frames in which both arches fit such shares of their contour [-] with such residuals [px]."""
+    """Return records with given matched shares [-] and residuals [px] of both arches."""
     share, rough = np.array(share)[:, None] * np.ones(3), np.array(rough_px)[:, None] * np.ones(3)
     none, weight = OutlineSums.zeros(3), np.full((2, 3), 100.0)
     edges = none._replace(score_px=500 * share, weight=weight, square=100 * 0.828 * rough**2)
@@ -147,14 +147,14 @@ def _fits(share, rough_px, frames=5):
 @pytest.mark.parametrize(
     ("share", "rough_px", "named"),
     [
-        ((0.72, 0.09), (0.58, 1.23), "lower"),  # the lower scan of somebody else
+        ((0.72, 0.09), (0.58, 1.23), "lower"),  # another person's lower scan
         ((0.09, 0.72), (1.23, 0.58), "upper"),
         ((0.55, 0.30), (0.57, 0.56), None),  # lips over the lower teeth
-        ((0.72, 0.09), (0.58, 0.60), None),  # hardly to be seen
+        ((0.72, 0.09), (0.58, 0.60), None),  # barely visible
         ((0.48, 0.56), (0.29, 0.47), None),
     ],
 )
-def test_a_scan_that_fits_hardly_anything_is_named(share, rough_px, named):
+def test_a_scan_that_barely_fits_is_reported(share, rough_px, named):
     found = misfit_findings(_fits(share, rough_px))
     assert [(f.kind, f.message.split(" scan")[0]) for f in found] == (
         [] if named is None else [("scan_misfit", f"the {named}")]

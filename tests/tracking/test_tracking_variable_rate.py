@@ -1,4 +1,4 @@
-"""A camera that dropped pictures: its masks are taken at the time they show, in tracking and in segmentation."""
+"""A camera that dropped frames: masks are assigned by time, in tracking and in segmentation."""
 
 from fractions import Fraction
 
@@ -20,7 +20,7 @@ def own_frames(camera: str) -> list[int]:
 
 
 def film(path, camera) -> None:
-    """Write a clip whose pictures tell their own frame by their brightness."""
+    """Write a clip whose frame numbers are encoded as brightness."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(1000))
         stream.width, stream.height, stream.pix_fmt = *camera.size_px, "yuv420p"
@@ -36,7 +36,7 @@ def film(path, camera) -> None:
 
 @pytest.fixture(scope="module")
 def take(tmp_path_factory):
-    """The small take with clips, its masks numbered by their pictures."""
+    """The small take with clips, and masks numbered by picture."""
     folder = write_masks(tmp_path_factory.mktemp("variable"), COUNT)
     for camera in CAMERAS:
         film(folder / f"{camera.name}.mp4", camera)
@@ -56,19 +56,19 @@ def capture(folder, with_clips):
 
 
 @pytest.mark.slow
-def test_masks_are_taken_at_their_time(take):
+def test_masks_are_assigned_by_time(take):
     tracks = track(capture(take, with_clips=True))
     assert tracks.tracked().all() and errors_mm(tracks, raw=True).max() < 0.25
     used = np.isfinite(tracks.coverage_error).all(1)
     for c, camera in enumerate(CAMERAS):
         gone = [FIRST + k for k in range(COUNT) if FIRST + k - OFFSETS[camera.name] in DROPPED.get(camera.name, ())]
         assert tracks.frames[~used[:, c]].tolist() == gone
-    # Counted by pictures alone, two cameras would show other instants.
+    # Counted by picture number, two cameras would show other instants.
     by_count = errors_mm(track(capture(take, with_clips=False)), raw=True)
     assert np.nanmean(by_count) > 3 * errors_mm(tracks, raw=True).mean()
 
 
-def test_footage_is_taken_at_its_time(take):
+def test_footage_is_read_by_time(take):
     videos = {camera.name: Video(take / f"{camera.name}.mp4") for camera in CAMERAS}
     footage = ColourFootage(videos, OFFSETS)
     for frames in (range(FIRST, FIRST + COUNT), range(FIRST + COUNT - 1, FIRST - 1, -1)):

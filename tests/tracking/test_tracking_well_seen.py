@@ -1,4 +1,4 @@
-"""First frames that were aligned wrongly are found by tracking back to them from frames that show the teeth well."""
+"""Wrong first frames are corrected by tracking back from well-seen frames."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,13 +14,13 @@ from jawusd.tracking.sequence import passes
 from jawusd.tracking.sequence.passes import Passes, mark_poorly_seen_lost, nearest_well_seen
 
 FRAMES = 10
-OFF_MM = 2.5  # farther than the gates, so that a contour near by is taken for the teeth's
+OFF_MM = 2.5  # beyond the gates, so that a nearby contour is matched instead
 WRONG = range(FIRST + START - 1, FIRST + START + 2)
 
 
 @pytest.fixture(scope="module")
 def records(tmp_path_factory):
-    """Return the records of a take whose frames are all right, and its capture."""
+    """Return the records of a correct take, and its capture."""
     capture = make_capture(write_masks(tmp_path_factory.mktemp("take"), FRAMES), FRAMES)
     kept = {}
 
@@ -81,7 +81,7 @@ def centres(records):
 
 
 def seen(share, rough_px):
-    """Return the record of a frame in which such a share of the lower contour fits [-], so roughly [px]."""
+    """Return a record with a given matched share [-] and residual [px] of the lower arch."""
     share, rough = (np.array([usual, lower])[:, None] * np.ones(3) for usual, lower in ((0.6, share), (0.6, rough_px)))
     none, weight = OutlineSums.zeros(3), np.full((2, 3), 100.0)
     edges = none._replace(score_px=500 * share, weight=weight, square=100 * 0.828 * rough**2)
@@ -93,7 +93,7 @@ def seen(share, rough_px):
     ("share", "rough_px", "given_up"),
     [(0.12, 1.1, True), (0.12, 0.7, False), (0.5, 1.1, False), (0.5, 0.6, False)],
 )
-def test_an_arch_that_fits_far_less_and_far_more_roughly_than_usual_is_given_up(share, rough_px, given_up):
+def test_an_arch_that_fits_far_less_and_far_more_roughly_than_usual_is_lost(share, rough_px, given_up):
     known = {frame: seen(0.5, 0.6) for frame in range(10)} | {4: seen(share, rough_px)}
     mark_poorly_seen_lost(known)
     lost = {frame: (record.status == LOST).tolist() for frame, record in known.items()}
@@ -103,15 +103,15 @@ def test_an_arch_that_fits_far_less_and_far_more_roughly_than_usual_is_given_up(
         assert known[4].losses[1].value == pytest.approx(share / 0.5)
 
 
-def test_a_few_frames_do_not_tell_what_is_usual():
+def test_few_frames_give_no_reference():
     known = {frame: seen(0.5, 0.6) for frame in range(4)} | {4: seen(0.12, 1.1)}
     mark_poorly_seen_lost(known)
     assert (known[4].status == TRACKED).all()
 
 
-def test_a_take_gives_up_what_is_poorly_seen(records, monkeypatch):
+def test_poorly_seen_frames_of_a_take_are_lost(records, monkeypatch):
     _, capture = records
-    monkeypatch.setattr(passes, "_POOR_SHARE", 2.0)  # so that every frame counts as one
+    monkeypatch.setattr(passes, "_POOR_SHARE", 2.0)  # so that every frame counts as poorly seen
     monkeypatch.setattr(passes, "_POOR_RESIDUAL", 0.0)
     tracks = track(capture)
     assert (tracks.status == LOST).all() and (tracks.lost_reason == LostReason.LOW_SCORE).all()

@@ -54,7 +54,7 @@ class ContourSolver:
     def __init__(self, scans: Sequence[Scan], config: TrackingConfig, executor: Executor | None = None) -> None:
         self.scans = tuple(scans)
         self.config = config
-        self.map: Mapper = Sharing(executor) if executor else map
+        self.map: Mapper = ParallelMap(executor) if executor else map
         arms = np.array([[(scan.radius_mm / 2) ** 2] * 3 + [1.0] * 3 for scan in self.scans])
         self._start_strength = config.typical_noise_px3 / config.prediction_mm**2 * arms
         limits = (config.sample_step_px, config.depth_tolerance_mm)
@@ -182,7 +182,7 @@ class ContourSolver:
             r, c = task
             return self._match(moved[task], views[c], r, rendering, c, gate + 1.0)
 
-        # Masks are looked up in less time than a thread takes to begin; colours are not.
+        # Matching masks takes less time than waking a thread; matching colours does not.
         mapper = map if all(view.edges is None for view in views) else self.map
         matches = dict(zip(tasks, mapper(match, tasks), strict=True))
         centres = np.stack([transform_point(poses[r], self.scans[r].centre) for r in ARCHES])
@@ -254,7 +254,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
-class Sharing:
+class ParallelMap:
     """A parallel `map` for short tasks that wakes one thread per core instead of one per item.
 
     The calling thread works too. Tasks of the tracker take about a millisecond, waking a thread a tenth of that.

@@ -24,7 +24,7 @@ from jawusd.tracking.initialization.pick_causes import Mistake, Setting, possibl
 
 _CLOSE_MM = 1.0  # mask pixels this near to a projected crown point count as covered
 _ON = 0.85  # share of a camera's masks on the scans from which the masks count as correctly placed
-# Misfit as given from which a mistake is looked for; exceeded by 1 of 60 valid persons.
+# Misfit of the given inputs above which mistakes are tested; exceeded by 1 of 60 valid persons.
 _SUSPECT_MISFIT = 1.7
 # Share of the given misfit that may remain for a mistake to be believed. The second holds for mistakes that tracking
 # corrects, which are only warnings, if rejected picks then fit.
@@ -32,7 +32,7 @@ _PROOF, _PROOF_BY_PICKS = 0.5, 0.75
 _OFF, _MISS_MM = 0.05, 0.3  # share of masks off the scans, and rms pick error [mm], that add the same misfit
 _UNSEEN = 0.25  # assumed share off the scans of a camera without masks at this instant: it may show something else
 _SURE = 1.0  # misfit below which an exchange is accepted without testing mistakes of single cameras
-_ALIKE = 0.15  # extra misfit up to which other mistakes are named beside the likeliest one
+_ALIKE = 0.15  # extra misfit up to which other mistakes are reported besides the most likely one
 _MOST_TRIED = 400  # mistakes: all of 15 cameras; the 6,000 of 64 cameras would take most of an hour
 _FEWEST = 3  # picks on an arch
 

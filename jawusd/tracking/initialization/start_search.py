@@ -39,7 +39,7 @@ _NEAR_GRID = Grid(
     reach_mm=(6.0, 6.0, 6.0),
 )
 # Openings of the jaw that are tried relative to an arch found alone [mm], and position of the hinge axis above and
-# behind the front teeth [mm]: arches look alike when shifted by a tooth, but a jaw cannot shift so.
+# behind the front teeth [mm]: arches look alike when shifted by a tooth, but a jaw cannot be.
 _OPENINGS_MM, _CONDYLES_MM = (0.0, 6.0, 14.0, 24.0, 36.0), (40.0, -90.0)
 _WIDEST_JAW_RAD = 0.8  # largest rotation between the arches of a jaw
 _FARTHEST_JAW_MM = 75.0  # largest distance between the front teeth of the arches
