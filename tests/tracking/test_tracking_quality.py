@@ -24,7 +24,7 @@ from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, working_size
 from jawusd.tracking.initialization.pose_search import shift_to_masks
-from jawusd.tracking.sequence.history import History, MotionPredictor, SearchAllowance
+from jawusd.tracking.sequence.history import History, MotionPredictor, SearchBudget
 
 CONFIG = TrackingConfig()
 SCANS = tuple(prepare_scan(m, n) for m, n in zip(MESHES, ("upper", "lower")))
@@ -189,7 +189,7 @@ def test_searches_become_rarer_while_lost():
 
 
 def test_failed_searches_exhaust_the_budget():
-    searches = SearchAllowance(384)
+    searches = SearchBudget(384)
     for frame in range(searches.most):
         assert searches.allows(frame)
         searches.note(frame, found=False)

@@ -9,7 +9,7 @@ from small_take import CAMERAS, MESHES, OFFSETS, make_capture, write_masks
 from jawusd.base.errors import TrackingError
 from jawusd.tracking.initialization import scale_search
 from jawusd.tracking.initialization.scale_search import seen_size
-from jawusd.tracking.initialization.start_search import Found, StartSearch
+from jawusd.tracking.initialization.start_search import SearchResult, StartSearch
 
 COUNT = 3
 
@@ -56,7 +56,7 @@ def test_a_climb_without_an_end_counts_as_no_fit(capture, monkeypatch):
 
     monkeypatch.setattr(scale_search._Sizes, "_fitted", better)
     monkeypatch.setattr(scale_search, "_MOST_SIZES", 20)
-    monkeypatch.setattr(StartSearch, "at", lambda *_: Found(np.stack([np.eye(4)] * 2), 1.0, np.ones(2)))
+    monkeypatch.setattr(StartSearch, "at", lambda *_: SearchResult(np.stack([np.eye(4)] * 2), 1.0, np.ones(2)))
     with pytest.raises(TrackingError, match=r"at any size from 0\.5 to 2"):
         seen_size(capture, CAMERAS, OFFSETS, MESHES)
     assert 2 * 5 * 20 < len(sizes) <= 2 * 5 * 21  # frames, starts, and the first size of each climb

@@ -16,8 +16,8 @@ from jawusd.tracking.contour.views import masked_sources
 from jawusd.tracking.initialization import start as take_start
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.initialization.start_causes import possible_mixups
-from jawusd.tracking.initialization.start_search import Found
+from jawusd.tracking.initialization.start_causes import possible_exchanges
+from jawusd.tracking.initialization.start_search import SearchResult
 
 FRAMES = 5
 TABLE = {camera.name: camera for camera in CAMERAS}
@@ -68,7 +68,7 @@ class _FoundBefore:
             poses = _misplaced(poses)
         fit = self.fits[len(self.asked)]
         self.asked.append(frame)
-        return Found(poses, 1000.0 * fit, np.full(2, fit))
+        return SearchResult(poses, 1000.0 * fit, np.full(2, fit))
 
 
 def _searched(footage, search):
@@ -127,9 +127,9 @@ def test_a_frame_with_wrong_poses_is_skipped(footage):
 
 def test_poor_poses_are_not_evidence_against_masks(footage, monkeypatch):
     def accuse(footage, solver, poses, frame):
-        return possible_mixups(footage.sources)[0] if frame == search.asked[0] else None
+        return possible_exchanges(footage.sources)[0] if frame == search.asked[0] else None
 
-    monkeypatch.setattr(take_start, "likely_mixup", accuse)
+    monkeypatch.setattr(take_start, "likely_exchange", accuse)
     search = _FoundBefore([0.1, 0.5])
     assert _searched(footage, search).frame == search.asked[1]
     search = _FoundBefore([0.5])

@@ -36,7 +36,7 @@ from jawusd.tracking.initialization import start_search
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
 from jawusd.tracking.initialization.pose_search import (
     Grid,
-    Screen,
+    ShiftCorrelation,
     _template,
     coarse_scan,
     hinge_at_front,
@@ -44,7 +44,7 @@ from jawusd.tracking.initialization.pose_search import (
 )
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
-from jawusd.tracking.initialization.start_search import Found, StartSearch
+from jawusd.tracking.initialization.start_search import SearchResult, StartSearch
 from jawusd.tracking.sequence.passes import Passes
 
 FRAMES = 5
@@ -226,11 +226,11 @@ def test_picks_that_fit_are_kept_if_the_search_fails(pictures, monkeypatch, fail
     def search(*_):
         if fails:
             raise TrackingError("no pair of poses")
-        return Found(misplaced, -300.0, np.full(2, -0.2))
+        return SearchResult(misplaced, -300.0, np.full(2, -0.2))
 
     monkeypatch.setattr(take_start, "_SURE_MM", 0.0)
-    monkeypatch.setattr(take_start, "search_around", search)
-    monkeypatch.setattr(take_start, "around_without_a_camera", lambda *_: None)
+    monkeypatch.setattr(take_start, "search_near", search)
+    monkeypatch.setattr(take_start, "fit_without_a_camera", lambda *_: None)
     start = _start(_capture(pictures))
     assert start.notes["by"] == "picks" and not [f for f in start.findings if f.kind == "picks_off"]
     assert max(_error_mm(start, r) for r in (0, 1)) < 1.0
@@ -265,7 +265,7 @@ def test_all_shifts_at_once_agree_with_drawing_each(pictures):
         view = masks.at(FIRST + 2)[1]
     scan = coarse_scan(Mesh(MESHES[1].vertices, MESHES[1].faces), "lower")  # without gum, silhouettes are complete
     shifts = np.random.default_rng(0).uniform(-8, 8, (12, 3))
-    found = Screen(view, 1, 2.0, shifts, centre).objectives(scan, pose[None])[0]
+    found = ShiftCorrelation(view, 1, 2.0, shifts, centre).objectives(scan, pose[None])[0]
     template = np.pad(_template(view.masks[1], view.masks[0], 2.0), 60)
     h = view.matrix @ np.append(centre, 1)
     slope = (view.matrix[:2, :3] - (h[:2] / h[2])[:, None] * view.matrix[2, :3]) / h[2]
@@ -305,7 +305,7 @@ def test_picks_far_off_are_replaced_by_a_global_search(pictures, short_search):
     search = StartSearch(MESHES, ContourSolver(SCANS, TrackingConfig()), np.eye(4))
     off = make_transform(np.eye(3), [14.0, 0, -14.0]) @ truth
     assert search.near(footage, FIRST + START, off).fit < 0.1
-    found = take_start.search_around(search, footage, FIRST + START, off)
+    found = take_start.search_near(search, footage, FIRST + START, off)
     assert max(vertex_error_mm(MESHES[r], found.poses[r], truth[r]) for r in (0, 1)) < 0.1 and found.fit > 0.3
 
 

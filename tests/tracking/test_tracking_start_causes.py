@@ -9,13 +9,13 @@ from jawusd.formats.capture_parts import CameraSource, Masks
 from jawusd.tracking.initialization import start_causes
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_causes import raise_for_unmatched_arch
-from jawusd.tracking.initialization.start_search import Found
+from jawusd.tracking.initialization.start_search import SearchResult
 
 TABLE = {camera.name: camera for camera in CAMERAS}
 
 
-@pytest.mark.parametrize(("without", "accused"), [(np.nan, False), (0.02, True)])
-def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, without, accused):
+@pytest.mark.parametrize(("without", "suspected"), [(np.nan, False), (0.02, True)])
+def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, without, suspected):
     """The masks of camera 1 are wrong; an exchange that removes them leaves correct ones, which proves nothing."""
     sources = [
         CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
@@ -28,9 +28,9 @@ def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, w
 
     monkeypatch.setattr(start_causes, "_uncovered_shares", shares)
     footage = Footage(sources, TABLE, OFFSETS, (0, 10))
-    found = start_causes.likely_mixup(footage, None, np.stack([np.eye(4)] * 2), 3)
-    assert (found is not None) == accused
-    assert not accused or "cam1 and cam2 are exchanged" in found.finding
+    found = start_causes.likely_exchange(footage, None, np.stack([np.eye(4)] * 2), 3)
+    assert (found is not None) == suspected
+    assert not suspected or "cam1 and cam2 are exchanged" in found.finding
 
 
 @pytest.mark.parametrize(
@@ -69,17 +69,17 @@ class _Searches:
         self.count += 1
         if self.count not in self.fits:
             raise TrackingError("nothing found")
-        return Found(np.stack([np.eye(4)] * 2), 1000.0, np.full(2, self.fits[self.count]))
+        return SearchResult(np.stack([np.eye(4)] * 2), 1000.0, np.full(2, self.fits[self.count]))
 
 
-def _refused(searches, monkeypatch, fits=None, accused=(), only_clear=False):
+def _refused(searches, monkeypatch, fits=None, suspected=(), only_clear=False):
     monkeypatch.setattr(start_causes, "aligned", lambda search, footage, poses, frame: poses)
     sources = [
         CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
         for name in ("cam0", "cam1", "cam2")
     ]
     footage = Footage(sources, TABLE, OFFSETS, (0, 10))
-    return start_causes.raise_cause(searches, footage, [3, 6, 8], fits or {}, set(accused), only_clear)
+    return start_causes.raise_cause(searches, footage, [3, 6, 8], fits or {}, set(suspected), only_clear)
 
 
 def test_the_search_for_a_mistake_is_bounded_and_reports_what_was_tried(monkeypatch):
@@ -123,7 +123,7 @@ def test_of_mistakes_that_are_not_all_tried_only_a_clear_fit_counts(monkeypatch)
 
 def test_sizes_are_tried_first_for_scans_of_unusual_size(monkeypatch):
     with pytest.raises(TrackingError, match="the scans are about 5% too small"):
-        _refused(_Searches({1: 0.2}), monkeypatch, accused=[start_causes.SIZE_HINT])
+        _refused(_Searches({1: 0.2}), monkeypatch, suspected=[start_causes.SIZE_HINT])
     with pytest.raises(TrackingError, match="the scans are mirrored"):
         _refused(_Searches({1: 0.2}), monkeypatch)
 

@@ -76,7 +76,7 @@ def coarse_scan(mesh: Mesh, name: str) -> Scan:
     return prepare_scan(Mesh(mesh.vertices[chosen], faces.astype(np.int32), colors), name)
 
 
-class Screen:
+class ShiftCorrelation:
     """Correlates the drawn arch with its mask in one picture, for all shifts at once."""
 
     def __init__(self, view: View, arch: int, px_per_mm: float, shifts: Array, at: Array) -> None:
@@ -133,11 +133,13 @@ def search_arch(
         map_: distributes the orientations among threads.
     """
     shifts = grid.shifts() @ base[:3, :3].T
-    screens = [Screen(view, arch, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[arch]]
+    correlations = [
+        ShiftCorrelation(view, arch, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[arch]
+    ]
 
     def best_translations(turns: Array) -> list[Candidate]:
         poses = base @ make_transform(turns, np.zeros(3)) @ hinge
-        objectives = np.sum([screen.objectives(scan, poses) for screen in screens], axis=0)
+        objectives = np.sum([correlation.objectives(scan, poses) for correlation in correlations], axis=0)
         best = objectives.argmax(axis=1)
         poses[:, :3, 3] += shifts[best]
         return [Candidate(float(row[k]), pose) for row, k, pose in zip(objectives, best, poses, strict=True)]

@@ -27,10 +27,10 @@ from jawusd.tracking.initialization.start_causes import (
     SIZE_HINT,
     aligned,
     all_arches_exchanged,
-    likely_mixup,
+    likely_exchange,
     raise_cause,
 )
-from jawusd.tracking.initialization.start_search import Found, StartSearch
+from jawusd.tracking.initialization.start_search import SearchResult, StartSearch
 
 #: Frames surveyed: two seconds of reading, covering every exercise of a usual take.
 SURVEYED = 24
@@ -69,24 +69,24 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
     frames = footage.survey(None, SURVEYED).promising(most).tolist()
     failed: dict[int, str] = {}
     suspected = set(suspects)
-    best: tuple[int, Found] | None = None
+    best: tuple[int, SearchResult] | None = None
     fits: dict[int, Array] = {}
     for frame in frames:
         try:
             found = search.at(footage, frame)
             fits[frame] = found.fits
             # If most masks are correct, so are the poses, and they reveal the wrong masks. Poor poses prove nothing.
-            mixup = likely_mixup(footage, search.solver, found.poses, frame)
-            if mixup is None:
+            exchange = likely_exchange(footage, search.solver, found.poses, frame)
+            if exchange is None:
                 found = replace(found, poses=aligned(search, footage, found.poses, frame))
         except TrackingError as error:
             failed[frame] = error.message
             continue
-        if mixup is not None:
+        if exchange is not None:
             if found.fit >= CLEAR_FIT:
-                raise mixup.error(frame)
-            failed[frame] = mixup.finding
-            suspected.add(mixup.hint)
+                raise exchange.error(frame)
+            failed[frame] = exchange.finding
+            suspected.add(exchange.hint)
             continue
         if best is None or found.fit > best[1].fit:
             best = frame, found
@@ -108,7 +108,7 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
     return Start(frame, found.poses, {**notes, "failed": {str(f): m for f, m in failed.items()}})
 
 
-def search_around(search: StartSearch, footage: Footage, frame: int, poses: Array) -> Found:
+def search_near(search: StartSearch, footage: Footage, frame: int, poses: Array) -> SearchResult:
     """Search near given poses, and everywhere if none of them fits clearly.
 
     Raises:
@@ -124,9 +124,9 @@ def search_around(search: StartSearch, footage: Footage, frame: int, poses: Arra
     return max(near, anywhere, key=lambda found: found.objective_px)
 
 
-def around_without_a_camera(
-    search: StartSearch, footage: Footage, frame: int, poses: Array, found: Found
-) -> tuple[str, Found] | None:
+def fit_without_a_camera(
+    search: StartSearch, footage: Footage, frame: int, poses: Array, found: SearchResult
+) -> tuple[str, SearchResult] | None:
     """Return a camera whose masks contradict the others, and the poses without it; None if all masks agree.
 
     A camera is excluded only if the others then fit clearly.
@@ -150,19 +150,19 @@ def around_without_a_camera(
     return max(better, key=lambda one: one[1].fit, default=None)
 
 
-def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Found) -> None:
+def _check_upright(search: StartSearch, footage: Footage, frame: int, found: SearchResult) -> None:
     """Reject masks that fit better with the arches exchanged: an upside-down upper arch resembles a lower one."""
-    mixup = all_arches_exchanged(footage.sources)
+    exchange = all_arches_exchanged(footage.sources)
     try:
-        other = search.at(replace(footage, sources=mixup.sources), frame)
+        other = search.at(replace(footage, sources=exchange.sources), frame)
     except TrackingError:
         return
     if other.objective_px > found.objective_px:
         raise TrackingError(
-            f"{mixup.finding}: {other.objective_px:.0f} px of contour match after exchanging them, "
+            f"{exchange.finding}: {other.objective_px:.0f} px of contour match after exchanging them, "
             f"{found.objective_px:.0f} px as given",
             frame=frame,
-            hint=mixup.hint,
+            hint=exchange.hint,
         )
 
 
@@ -196,7 +196,7 @@ def find_start(
     footage = Footage(masked_sources(capture.cameras, cameras, offsets), cameras, offsets, capture.frames)
     T_anatomical_scan, findings = check_occlusion(solver.scans, capture.anatomy.T_anatomical_skull)
     search = StartSearch(meshes, solver, T_anatomical_scan, map_)
-    with quoting(findings):
+    with quote_findings(findings):
         if capture.bootstrap is not None:
             start = _picked(capture.bootstrap, capture.frames, footage, meshes, search)
         else:
@@ -206,7 +206,7 @@ def find_start(
 
 
 @contextlib.contextmanager
-def quoting(findings: Sequence[Finding]) -> Iterator[None]:
+def quote_findings(findings: Sequence[Finding]) -> Iterator[None]:
     """Append findings to the hint of a TrackingError raised inside the context, since they may be its cause.
 
     Raises:
@@ -240,17 +240,17 @@ def _picked(
     notes: dict[str, object] = {"by": "picks", "frame": bootstrap.frame}
     notes |= {"picks_left_out": left_out, "picks_sigma_mm": sigma_mm}
     start = Start(bootstrap.frame, np.stack(poses), notes)
-    if (mixup := likely_mixup(footage, search.solver, start.poses, start.frame)) is not None:
-        raise mixup.error(start.frame)
+    if (exchange := likely_exchange(footage, search.solver, start.poses, start.frame)) is not None:
+        raise exchange.error(start.frame)
     if not footage.has_masks(start.frame):
         return _elsewhere(search, footage, start, "the frame of the picks lacks masks of both arches in two cameras")
     if max(sigma_mm.values()) <= _SURE_MM and _fits(search, footage, start):
         return start
     try:
-        found = search_around(search, footage, start.frame, start.poses)
+        found = search_near(search, footage, start.frame, start.poses)
     except TrackingError:
         return start if _fits(search, footage, start) else _elsewhere(search, footage, start)
-    if (without := around_without_a_camera(search, footage, start.frame, start.poses, found)) is not None:
+    if (without := fit_without_a_camera(search, footage, start.frame, start.poses, found)) is not None:
         notes["camera_left_out"], found = without
     searched = {"by": "picks, then search", "worth_px": found.objective_px, "fit": found.fit}
     near = Start(start.frame, found.poses, notes | searched, _picks_off(search, start, found.poses, sigma_mm))

@@ -26,7 +26,7 @@ _ODD_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Mixup:
+class MaskExchange:
     """A possible exchange of masks."""
 
     finding: str  # description of the exchange
@@ -38,21 +38,21 @@ class Mixup:
         return TrackingError(self.finding, frame=frame, hint=self.hint)
 
 
-def all_arches_exchanged(sources: Sequence[CameraSource]) -> Mixup:
+def all_arches_exchanged(sources: Sequence[CameraSource]) -> MaskExchange:
     """Return the exchange of arches in all cameras; exchanged scan files look the same."""
-    return Mixup(
+    return MaskExchange(
         "the masks of the upper and lower teeth are exchanged in every camera",
         "Exchange masks.upper and masks.lower, or upper_teeth and lower_teeth in [scans].",
         _with_masks(sources, {k: _masks(s).exchanged for k, s in enumerate(sources)}),
     )
 
 
-def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
+def possible_exchanges(sources: Sequence[CameraSource]) -> list[MaskExchange]:
     """Return every exchange of arches in one camera or all, and of masks between two cameras."""
     out = []
     for k, source in enumerate(sources):
         out.append(
-            Mixup(
+            MaskExchange(
                 f"the masks of the upper and lower teeth are exchanged in camera {source.name}",
                 f"Exchange masks.upper and masks.lower of camera {source.name}.",
                 _with_masks(sources, {k: _masks(source).exchanged}),
@@ -62,7 +62,7 @@ def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
     for a, b in combinations(range(len(sources)), 2):
         first, second = sources[a].name, sources[b].name
         out.append(
-            Mixup(
+            MaskExchange(
                 f"the masks of cameras {first} and {second} are exchanged",
                 f"Exchange the masks of cameras {first} and {second}, or their entries in the calibration.",
                 _with_masks(sources, {a: _masks(sources[b]), b: _masks(sources[a])}),
@@ -71,7 +71,7 @@ def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
     return out
 
 
-def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Mixup | None:
+def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> MaskExchange | None:
     """Return the exchange that best explains masks off their scans, with its evidence; None if none does.
 
     `poses` are T_world_upper and T_world_lower of the frame, accurate to about 1 mm, shape (2, 4, 4).
@@ -79,25 +79,25 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: i
     given = _uncovered_shares(footage, solver, poses, frame)
     if not (given >= _ODD_SHARE).any():
         return None
-    found: list[tuple[float, float, Mixup]] = []
-    for mixup in possible_mixups(footage.sources):
-        if _sizes_differ(footage, mixup.sources):
+    found: list[tuple[float, float, MaskExchange]] = []
+    for exchange in possible_exchanges(footage.sources):
+        if _sizes_differ(footage, exchange.sources):
             continue
         try:
-            shares = _uncovered_shares(replace(footage, sources=mixup.sources), solver, poses, frame)
+            shares = _uncovered_shares(replace(footage, sources=exchange.sources), solver, poses, frame)
         except CaptureError:
             continue  # mask videos with another length than the clips of those cameras
         # If an exchange leaves a camera without masks on this frame, that is not evidence.
         both = np.isfinite(given) & np.isfinite(shares)
         if (given[both] >= _ODD_SHARE).any():
-            found.append((float(shares[both].mean()), float(given[both].mean()), mixup))
+            found.append((float(shares[both].mean()), float(given[both].mean()), exchange))
     if not found:
         return None
-    share, before, mixup = min(found, key=lambda f: f[0] / f[1])
+    share, before, exchange = min(found, key=lambda f: f[0] / f[1])
     if share >= _PROOF * before:
         return None
     evidence = f"{before:.0%} of the masks lie off their scans, {share:.0%} after exchanging them"
-    return replace(mixup, finding=f"{mixup.finding}: {evidence}")
+    return replace(exchange, finding=f"{exchange.finding}: {evidence}")
 
 
 def _uncovered_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
@@ -277,8 +277,8 @@ def _exchanges(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
     """Yield exchanges of masks and of calibrations."""
     if len(footage.sources) > _MOST_CAMERAS:
         return
-    for mixup in possible_mixups(footage.sources):
-        yield _Cause(mixup.finding, mixup.hint, search, replace(footage, sources=mixup.sources))
+    for exchange in possible_exchanges(footage.sources):
+        yield _Cause(exchange.finding, exchange.hint, search, replace(footage, sources=exchange.sources))
     for a, b in combinations([source.name for source in footage.sources], 2):
         if footage.offsets[a] != footage.offsets[b]:  # otherwise identical to an exchange of masks
             cameras = {**footage.cameras, a: footage.cameras[b], b: footage.cameras[a]}

@@ -46,7 +46,7 @@ _FARTHEST_JAW_MM = 75.0  # largest distance between the front teeth of the arche
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """The result of a search on a frame."""
 
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
@@ -103,7 +103,7 @@ class StartSearch:
         solver = ContourSolver((scans[0], scans[1]), self._config)
         return StartSearch(meshes, solver, T_anatomical_scan, self._map)
 
-    def at(self, footage: Footage, frame: int) -> Found:
+    def at(self, footage: Footage, frame: int) -> SearchResult:
         """Return the best poses on a frame.
 
         Raises:
@@ -118,7 +118,7 @@ class StartSearch:
         finalists = [self._searched(r, views, bases[r], _GRID) for r in ARCHES]
         return self._settled(finalists, views, footage, frame)
 
-    def near(self, footage: Footage, frame: int, poses: Array) -> Found:
+    def near(self, footage: Footage, frame: int, poses: Array) -> SearchResult:
         """Return the best poses on a frame near given ones, T_world_upper and T_world_lower, shape (2, 4, 4).
 
         Raises:
@@ -139,7 +139,7 @@ class StartSearch:
 
     def _settled(
         self, finalists: Sequence[Sequence[Array]], views: Sequence[View], footage: Footage, frame: int
-    ) -> Found:
+    ) -> SearchResult:
         """Return the best pair of finalists, refined at working resolution."""
         pairs = self._refined_pairs(finalists, views)
         if not pairs:
@@ -150,7 +150,7 @@ class StartSearch:
         objective = [self._objective(self.solver, s, views).sum() for s in ends]
         best = int(np.argmax(objective))
         fits = arch_fit(self.solver.scans, ends[best], views, self._config.uncovered_price)
-        return Found(ends[best].poses, float(objective[best]), fits)
+        return SearchResult(ends[best].poses, float(objective[best]), fits)
 
     def _distinct(self, found: Sequence[Candidate], r: int) -> list[Array]:
         """Return the best poses that are distinct from one another."""

@@ -25,7 +25,14 @@ from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.initialization.pose_search import Candidate, Grid, Screen, coarse_scan, hinge_at_front, search_arch
+from jawusd.tracking.initialization.pose_search import (
+    Candidate,
+    Grid,
+    ShiftCorrelation,
+    coarse_scan,
+    hinge_at_front,
+    search_arch,
+)
 from jawusd.tracking.initialization.start_search import guessed_axes
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameFit, Instant
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
@@ -180,10 +187,10 @@ class SingleStart:
     def _with_jaws(self, views: Sequence[View], head: Candidate) -> list[tuple[float, Pose]]:
         """Return the two most promising jaws for a head, with the objective of both arches."""
         place = transform_point(head.pose, self._coarse[1].centre)
-        screen = Screen(views[0], 1, _PX_PER_MM, _SHIFTS @ head.pose[:3, :3].T, place)
+        correlation = ShiftCorrelation(views[0], 1, _PX_PER_MM, _SHIFTS @ head.pose[:3, :3].T, place)
         poses = head.pose @ self._jaw.pose(self._jaws)
         prices = np.array([self._outside_price(1, pose, views[0]) for pose in poses])
-        scores = screen.objectives(self._coarse[1], poses).max(axis=1) - prices
+        scores = correlation.objectives(self._coarse[1], poses).max(axis=1) - prices
         return [(head.objective + scores[k], Pose(head.pose, self._jaws[k])) for k in np.argsort(scores)[::-1][:2]]
 
     def _outside_price(self, arch: int, pose: Array, view: View) -> float:

@@ -80,7 +80,7 @@ class Extrinsics:
         }
 
 
-def lever(pivot: Array, centre: Array) -> Array:
+def twist_transfer(pivot: Array, centre: Array) -> Array:
     """Return the matrix that converts a twist about a pivot to one about a centre, shape (6, 6)."""
     return se3_adjoint(translation(pivot - centre))
 

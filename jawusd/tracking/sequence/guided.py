@@ -28,7 +28,7 @@ from jawusd.tracking.sequence.history import History
 
 #: Makes the views of a frame of the reference camera. Arguments: the frame, expected T_world_upper and T_world_lower,
 #: shape (2, 4, 4), and the round, which is 0 for poses not yet aligned with masks.
-See = Callable[[int, Array, int], Sequence[View]]
+MakeViews = Callable[[int, Array, int], Sequence[View]]
 
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round removes most of the remaining error
 
@@ -40,7 +40,7 @@ class GuidedTracker:
         self,
         upper: Mesh,
         lower: Mesh,
-        see: See,
+        see: MakeViews,
         rounds: int,
         config: TrackingConfig | None = None,
         executor: Executor | None = None,

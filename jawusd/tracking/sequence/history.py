@@ -108,7 +108,7 @@ class MotionPredictor:
         return [np.stack([p[0], head @ se3_inverse(p[0]) @ p[1]]) for p in self._seen]
 
 
-class SearchAllowance:
+class SearchBudget:
     """A budget of failed multi-start searches in a take.
 
     A search takes as long as tracking ten to fifty frames, and wrong masks would trigger failing searches on every such

@@ -13,7 +13,7 @@ from jawusd.tracking.contour.equations import Solution, motion_about
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.delays import interpolation_errors, velocity_twist
-from jawusd.tracking.sequence.extrinsics import Extrinsics, lever
+from jawusd.tracking.sequence.extrinsics import Extrinsics, twist_transfer
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +276,7 @@ def _reduced(
     The response is the twist about the arch's centre per unit of the unknowns, shape (6, U).
     """
     outline, size = solution.outline, layout.size
-    to_centre = lever(pivot, solution.centres[arch])
+    to_centre = twist_transfer(pivot, solution.centres[arch])
     S, r, B = np.zeros((size, size)), np.zeros(size), np.zeros((6, size))
     for c in range(layout.cameras):
         H, g = outline.precision[arch, c], outline.gradient[arch, c]

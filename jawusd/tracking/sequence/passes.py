@@ -17,7 +17,7 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
-from jawusd.tracking.sequence.history import History, MotionPredictor, SearchAllowance
+from jawusd.tracking.sequence.history import History, MotionPredictor, SearchBudget
 
 Progress = Callable[[int, int], None]
 
@@ -44,7 +44,7 @@ class Passes:
         self._progress = progress or (lambda done, total: None)
         self._probes = probe_points(solver.scans)
         self.records = PackedRecords()
-        self.searches = SearchAllowance(stop - first)
+        self.searches = SearchBudget(stop - first)
 
     def track_from(self, frame: int, poses: Array) -> None:
         """Track all frames in both directions from the given one, then back to it, and into the gaps.

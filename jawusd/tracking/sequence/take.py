@@ -21,7 +21,7 @@ from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
 from jawusd.tracking.initialization.magnification import measure_magnification
-from jawusd.tracking.initialization.start import find_start, quoting
+from jawusd.tracking.initialization.start import find_start, quote_findings
 from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.delays import BRIDGE_FRAMES, bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
@@ -81,7 +81,7 @@ def track_capture(
         with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
             first, stop = capture.frames or masks.frames
             take = _Take(solver, config, masks, first, stop, progress)
-            with quoting(start.findings):
+            with quote_findings(start.findings):
                 take.track_from(start.frame, start.poses)
             point = np.mean([scan.centre for scan in scans], axis=0)
             named, up = capture.motion.rest_frame, start.T_anatomical_scan[1, :3]

@@ -20,7 +20,7 @@ from jawusd.tracking.contour.scan import ARCH_NAMES, Scan, mirrored
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.initialization.magnification import Instant, Magnification
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.history import SearchAllowance
+from jawusd.tracking.sequence.history import SearchBudget
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
     return out
 
 
-def search_findings(searches: SearchAllowance, records: Mapping[int, FrameRecord]) -> list[Finding]:
+def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) -> list[Finding]:
     """Return a warning if the search budget was exhausted, so that frames stay lost without a search.
 
     Kind: "searches_left_out" [frames].
