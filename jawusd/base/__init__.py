@@ -1,4 +1,4 @@
-"""What every other layer stands on: exceptions, version, safe arrays from files, paths, the schema's place.
+"""The foundation of all layers: exceptions, version, safe readers of npz and tables, input paths, the schema's path.
 
-Imports the standard library and numpy alone.
+May import only the standard library and numpy.
 """

@@ -1,4 +1,4 @@
-"""The array types that annotations name; shapes, frames and units stand in the docstrings."""
+"""Array types for annotations; docstrings give shapes, frames and units."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,7 @@
 """The exceptions of jawusd: one tree, one exit code per family.
 
     JawusdError                     exit 1, never raised itself
-      FormatError          exit 3   a file is not what its reader expects
+      FormatError          exit 3   a file does not follow its format
         VersionError                written by a newer jawusd
         UnitsError                  lengths or angles in another unit
       MissingDependencyError exit 4 an optional package is not installed
@@ -12,11 +12,11 @@
       FittingError         exit 7
       RigError             exit 8
       EvaluatorError       exit 9
-      OutputError          exit 10  the output cannot be written, or must not be
+      OutputError          exit 10  the output cannot be written, or would overwrite something
       ClusterError         exit 11  the workers of a cluster cannot be used
-      ResourceError        exit 12  memory or processor time did not suffice, or a library crashed
+      ResourceError        exit 12  out of memory or processor time, or a library crashed
 
-A message says where (file, frame, camera), what was found, what is allowed with its unit, and what to do.
+A message states where (file, frame, camera), what was found, what is allowed with its unit, and what to do.
 """
 
 from __future__ import annotations
@@ -57,16 +57,16 @@ _EXTRA_OF_PACKAGE = {
 }
 
 
-# Control characters, marks that turn the direction of text, invisible ones, and bytes of names that are no text.
+# Control characters, direction marks, invisible characters, and undecodable bytes of file names.
 _HIDDEN = re.compile(
     "[\x00-\x1f\x7f-\x9f\u00ad\u061c\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
     "\ud800-\udfff\U000e0000-\U000e0fff]"
 )
-_LISTED = "\n  "  # before each of several findings in one message
+_LISTED = "\n  "  # separates several findings in one message
 
 
 def shown(text: object) -> str:
-    """Return what a file says as one line that can be printed: what would control a terminal is written as escapes."""
+    """Return text from a file as one printable line; control characters are escaped."""
     return _HIDDEN.sub(_escape, str(text))
 
 
@@ -78,12 +78,12 @@ def _escape(found: re.Match[str]) -> str:
 
 
 class JawusdError(Exception):
-    """Carry one clear sentence for the person at the keyboard; as text, see `shown`, it can be printed.
+    """Base class of all errors: one clear sentence for the user, safe to print (see `shown`).
 
     Args:
         message: what was found and what is allowed, with units.
-        path, camera, frame: where, each printed before the message.
-        hint: what to do about it, printed after it.
+        path, camera, frame: the place, printed before the message.
+        hint: what to do, printed after the message.
     """
 
     exit_code = 1
@@ -118,90 +118,90 @@ class JawusdError(Exception):
         return f"{where}{self.statement()}{advice}"
 
     def __reduce__(self) -> tuple[Callable[[str], JawusdError], tuple[str]]:
-        # Exceptions cross process boundaries; keyword arguments are lost by the default protocol.
+        # Exceptions cross process boundaries; the default protocol loses keyword arguments.
         kind = partial(type(self), path=self.path, camera=self.camera, frame=self.frame, hint=self.hint)
         return kind, (self.message,)
 
 
 class FormatError(JawusdError):
-    """Report a file that does not follow its format."""
+    """A file does not follow its format."""
 
     exit_code = 3
 
 
 class VersionError(FormatError):
-    """Report a file written by a newer version of jawusd."""
+    """A file was written by a newer version of jawusd."""
 
 
 class UnitsError(FormatError):
-    """Report lengths or angles in a unit the format does not allow."""
+    """Lengths or angles are in a unit that the format does not allow."""
 
 
 class MissingDependencyError(JawusdError):
-    """Report an optional package that is needed here and not installed."""
+    """A required optional package is not installed."""
 
     exit_code = 4
 
 
 class CaptureError(JawusdError):
-    """Report a capture that cannot be used."""
+    """A capture cannot be used."""
 
     exit_code = 5
 
 
 class CalibrationError(CaptureError):
-    """Report cameras whose calibration is missing or wrong."""
+    """The calibration of cameras is missing or wrong."""
 
 
 class SyncError(CaptureError):
-    """Report cameras that could not be aligned in time."""
+    """Cameras could not be synchronised."""
 
 
 class TrackingError(JawusdError):
-    """Report teeth that could not be tracked."""
+    """Teeth could not be tracked."""
 
     exit_code = 6
 
 
 class FittingError(JawusdError):
-    """Report poses that no jaw model can be fitted to."""
+    """No jaw model can be fitted to the poses."""
 
     exit_code = 7
 
 
 class RigError(JawusdError):
-    """Report a rig that cannot be written or read."""
+    """A rig cannot be written or read."""
 
     exit_code = 8
 
 
 class EvaluatorError(JawusdError):
-    """Report a model that cannot be evaluated."""
+    """A model cannot be evaluated."""
 
     exit_code = 9
 
 
 class OutputError(JawusdError):
-    """Report an output that cannot, or must not, be written."""
+    """An output cannot, or must not, be written."""
 
     exit_code = 10
 
 
 class ClusterError(JawusdError):
-    """Report a cluster that does not answer, or whose workers cannot build."""
+    """A cluster does not answer, or its workers cannot build."""
 
     exit_code = 11
 
 
 class ResourceError(JawusdError):
-    """Report that memory or processor time did not suffice, or that a library crashed."""
+    """Memory or processor time ran out, or a library crashed."""
 
     exit_code = 12
 
 
 @contextlib.contextmanager
 def naming_file(path: str | PathLike[str]) -> Iterator[None]:
-    """Name a file in the errors of stages that know only its content."""
+    """Add a file's path to errors that have none."""
     try:
         yield
     except JawusdError as error:
@@ -212,13 +212,13 @@ def naming_file(path: str | PathLike[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def explain_missing_packages(extra: str | None = None) -> Iterator[None]:
-    """Say which extra to install when a package is missing; use it in a `with` statement or as a decorator.
+    """Name the extra to install when a package is missing; a context manager and decorator.
 
     Args:
-        extra: the extra that everything inside belongs to; by default it is looked up by the missing package.
+        extra: the extra of all packages used inside; by default it is looked up by the missing package.
 
     Raises:
-        MissingDependencyError: in place of the ModuleNotFoundError.
+        MissingDependencyError: instead of the ModuleNotFoundError.
     """
     try:
         yield
@@ -233,7 +233,7 @@ def explain_missing_packages(extra: str | None = None) -> Iterator[None]:
 
 
 def _importing_module(error: ModuleNotFoundError) -> str:
-    """Return the innermost module of jawusd on the way to an import error."""
+    """Return the innermost jawusd module in the traceback of an import error."""
     found, step = "jawusd", error.__traceback__
     while step is not None:
         name = str(step.tb_frame.f_globals.get("__name__"))

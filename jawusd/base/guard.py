@@ -1,7 +1,7 @@
-"""Run the program in a child process with limits, so that the death of a native library becomes one message.
+"""Run the program in a child process with resource limits, and report crashes of native libraries as one message.
 
-OpenUSD, FFmpeg, OpenCV and others parse what a file holds, and may crash or use all memory over a damaged one. The
-parent does nothing but wait: it passes signals and the exit code on.
+OpenUSD, FFmpeg, OpenCV and other libraries may crash or exhaust memory on a damaged file. The parent only waits for the
+child, and forwards signals and the exit code.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ except ImportError:  # on Windows, which has no such limits
 #: Environment variable: how much memory [GB] a command may use; 0 for no limit.
 SETTING = "JAWUSD_MEMORY_GB"
 
-_SHARE, _LEAST_GB = 0.75, 4.0  # of the machine's memory; ordinary builds take less than the least
-_LEAST_SPACE_GB = 1.5  # 1.3 GB with OpenUSD's libraries
-_CHILD = "_JAWUSD_CHILD"  # marks the child where processes cannot fork
-_SI_KERNEL = 0x80  # of Linux's siginfo.h: a terminal sent the signal, to the child as well
-_PR_SET_PDEATHSIG = 1  # of Linux's prctl.h
+_SHARE, _LEAST_GB = 0.75, 4.0  # share of the machine's memory; lower bound, which ordinary builds stay below
+_LEAST_SPACE_GB = 1.5  # OpenUSD's libraries take 1.3 GB of address space
+_CHILD = "_JAWUSD_CHILD"  # environment variable that marks the child where processes cannot fork
+_SI_KERNEL = 0x80  # from Linux's siginfo.h: sent by a terminal, to the child as well
+_PR_SET_PDEATHSIG = 1  # from Linux's prctl.h
 _PASSED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGTSTP", "SIGCONT")
 _KEYS = ("SIGINT", "SIGQUIT", "SIGTSTP")
 _CRASHES = ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGILL", "SIGFPE", "SIGSYS", "SIGTRAP")
 
-_in_hand: mmap.mmap | None = None
+_current: mmap.mmap | None = None
 
 
 def begin() -> None:
-    """Go on in a child process with limits; the parent waits for it and ends as it does.
+    """Continue in a child process with limits; the parent waits for it and exits with its status.
 
-    Call it before anything heavy is imported and before any thread starts.
+    Call this before heavy imports and before any thread starts.
     """
-    global _in_hand
+    global _current
     try:
         limit = memory_limit()
         _check_space()
@@ -55,11 +55,11 @@ def begin() -> None:
         return
     if not hasattr(os, "fork"):
         _leave_by_subprocess()
-    _in_hand = mmap.mmap(-1, mmap.PAGESIZE)
+    _current = mmap.mmap(-1, mmap.PAGESIZE)
     passed = {getattr(signal, name) for name in _PASSED}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {*passed, signal.SIGCHLD})
     parent = os.getpid()
-    gc.freeze()  # collections would copy what parent and child share
+    gc.freeze()  # a collection would copy the pages that parent and child share
     child = os.fork()
     if child:
         _leave_as(_wait(child, passed))
@@ -69,10 +69,10 @@ def begin() -> None:
 
 
 def memory_limit() -> int:
-    """Return how much memory a command may use [bytes]; 0 for no limit.
+    """Return how much memory a command may use [bytes]; 0 means no limit.
 
     Raises:
-        ResourceError: The environment variable is no number.
+        ResourceError: The environment variable is not a number.
     """
     named = os.environ.get(SETTING)
     if not named:
@@ -80,11 +80,11 @@ def memory_limit() -> int:
     with contextlib.suppress(ValueError):
         if 0 <= (limit := float(named)) < 1e6:
             return int(limit * 1e9)
-    raise ResourceError(f"{SETTING} is {named!r}, allowed is a number of GB, 0 for no limit.")
+    raise ResourceError(f"{SETTING} is {named!r}, allowed is a number of GB from 0 to 1e6; 0 means no limit.")
 
 
 def machine_memory() -> int:
-    """Return the memory of the machine, or of the container this runs in [bytes]; 0 where the system does not say."""
+    """Return the memory of the machine or container [bytes]; 0 if unknown."""
     try:
         found = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # Windows has no sysconf
@@ -96,21 +96,21 @@ def machine_memory() -> int:
 
 
 def _check_space() -> None:
-    """Refuse less address space than OpenUSD's libraries need: others report what they lack as damage of files."""
+    """Refuse too little address space for OpenUSD's libraries, which would be reported as damaged files later."""
     space = -1 if resource is None else resource.getrlimit(resource.RLIMIT_AS)[0]  # -1: no limit
     if 0 <= space < _LEAST_SPACE_GB * 1e9:
         found = (
-            f"address space is limited to {space / 1e9:.2g} GB (ulimit -v), at least {_LEAST_SPACE_GB:g} GB are needed."
+            f"address space is limited to {space / 1e9:.2g} GB (ulimit -v), at least {_LEAST_SPACE_GB:g} GB is needed."
         )
         raise ResourceError(found)
 
 
 def limit_process(memory: int, cpu_s: int | None = None) -> None:
-    """Limit this process and those that it starts.
+    """Limit this process and its children.
 
     Args:
-        memory: [bytes], 0 for no limit. It counts what a process can write to and shares with no other: address space
-            that CUDA, numba and threads only reserve is free.
+        memory: [bytes], 0 for no limit. Counts private writable memory, not address space that CUDA, numba and threads
+            only reserve.
         cpu_s: Processor time [s].
     """
     if resource is None:
@@ -129,39 +129,39 @@ def _lower(kind: int, most: int) -> None:
 
 
 def out_of_memory(path: str | PathLike[str] | None = None) -> ResourceError:
-    """Return the error for a lack of memory over a file, that in hand by default, with the limit."""
+    """Return the out-of-memory error for a file, by default the current one, with the limit."""
     limits = []
     if resource is not None:
         found = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_DATA, resource.RLIMIT_AS))
         limits = [limit for limit in found if limit != resource.RLIM_INFINITY]
     allowed = f", {min(limits) / 1e9:.2g} GB" if limits else ""
     return ResourceError(
-        f"needs more memory than jawusd may use here{allowed}.", path=path or file_in_hand(), hint=_MORE
+        f"needs more memory than jawusd may use here{allowed}.", path=path or current_file(), hint=_MORE
     )
 
 
-_MORE = f"Set {SETTING} (and ulimit -v) to allow more, or use a smaller input."
+_MORE = f"Raise the limit with {SETTING} (and ulimit -v), or use a smaller input."
 
 
-def take_in_hand(path: str | PathLike[str]) -> None:
-    """Note the file that is read next, for the message if it ends the program."""
-    if _in_hand is not None:
+def note_input(path: str | PathLike[str]) -> None:
+    """Record the file that is read next, for the message if the program crashes."""
+    if _current is not None:
         name = os.fsencode(os.path.abspath(path))[: mmap.PAGESIZE - 1]
-        _in_hand[:] = name.ljust(mmap.PAGESIZE, b"\0")
+        _current[:] = name.ljust(mmap.PAGESIZE, b"\0")
 
 
-def file_in_hand() -> str:
-    """Return the file that was noted last, else the command line."""
+def current_file() -> str:
+    """Return the last recorded file, or the command line if there is none."""
     import shlex
 
-    noted = bytes(_in_hand).rstrip(b"\0") if _in_hand is not None else b""
+    noted = bytes(_current).rstrip(b"\0") if _current is not None else b""
     return os.fsdecode(noted) if noted else shlex.join(["jawusd", *sys.argv[1:]])
 
 
 @contextlib.contextmanager
 def most_cpu(seconds: int) -> Iterator[None]:
-    """Let the child end where the work inside takes more processor time [s]; without a guard, do nothing."""
-    if resource is None or _in_hand is None:
+    """Limit the processor time [s] of the work inside; do nothing outside the guarded child."""
+    if resource is None or _current is None:
         yield
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_CPU)
@@ -173,7 +173,7 @@ def most_cpu(seconds: int) -> Iterator[None]:
 
 
 def _die_with(parent: int) -> None:
-    """Let the system end this process when its parent ends, where it can (Linux)."""
+    """Make the system kill this process when its parent ends (Linux only)."""
     if sys.platform == "linux":
         import ctypes
 
@@ -183,7 +183,7 @@ def _die_with(parent: int) -> None:
 
 
 def _wait(child: int, passed: set[signal.Signals]) -> int:
-    """Pass signals on until a child ends; return its wait status."""
+    """Forward signals until the child ends; return its wait status."""
     while True:
         number, is_from_terminal = _next_signal({*passed, signal.SIGCHLD})
         if number != signal.SIGCHLD:
@@ -211,7 +211,7 @@ def _next_signal(awaited: set[signal.Signals]) -> tuple[int, bool]:
 
 
 def _leave_as(status: int) -> NoReturn:
-    """End this process as its child did: with its exit code, by its signal, or with a message where it crashed."""
+    """End this process like its child: with its exit code, by its signal, or with a message if it crashed."""
     if os.WIFEXITED(status):
         os._exit(os.WEXITSTATUS(status))
     number = signal.Signals(os.WTERMSIG(status))
@@ -225,13 +225,13 @@ def _leave_as(status: int) -> NoReturn:
 
 def _death(name: str) -> ResourceError:
     if name == "SIGXCPU":
-        found, hint = "takes too much processor time to read: it is damaged, or was made to.", ""
+        found, hint = "takes too much processor time to read: the file is damaged or malicious.", ""
     elif name == "SIGKILL":
-        found, hint = "the program was killed while it used this, by the system for lack of memory or by a user.", _MORE
+        found, hint = "the program was killed while using this, by the system (out of memory) or by a user.", _MORE
     else:
-        found = f"a library crashed while it used this ({name}): a file is damaged, or memory did not suffice."
-        hint = "The option -v says where in the program, before the command."
-    return ResourceError(found, path=file_in_hand(), hint=hint or None)
+        found = f"a library crashed while using this ({name}): the file is damaged, or memory ran out."
+        hint = "Run `jawusd -v COMMAND` to see where."
+    return ResourceError(found, path=current_file(), hint=hint or None)
 
 
 def _leave_with(error: ResourceError) -> NoReturn:
@@ -241,12 +241,12 @@ def _leave_with(error: ResourceError) -> NoReturn:
 
 
 def _leave_by_subprocess() -> NoReturn:
-    """Run the program in a second Python and end as it does, where processes cannot fork."""
+    """Run the program in a second Python process and exit with its status, where processes cannot fork."""
     import subprocess
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the console sends it to both
     line = [sys.executable, "-m", "jawusd", *sys.argv[1:]]
     code = subprocess.run(line, env={**os.environ, _CHILD: "1"}, check=False).returncode
-    if code < 0 or code >= 0xC0000000:  # codes of Windows for exceptions that nobody caught
+    if code < 0 or code >= 0xC0000000:  # Windows exit codes of uncaught exceptions
         _leave_with(_death(f"{code & 0xFFFFFFFF:#x}"))
     os._exit(code)

@@ -9,75 +9,74 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from jawusd.base.errors import FormatError, JawusdError
-from jawusd.base.guard import take_in_hand
+from jawusd.base.guard import note_input
 
 _LFS = b"version https://git-lfs"
-#: Environment variable that allows folders in every run, separated as in PATH.
+#: Environment variable with folders that are allowed in every run, separated as in PATH.
 SETTING = "JAWUSD_ALLOW"
 
 _given: ContextVar[tuple[Path, ...]] = ContextVar("allowed_folders", default=())
 
 
 def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatError) -> None:
-    """Check that something to read is a file, and note that it is read. What is missing is left to its reader.
+    """Check that an input is a regular file, and record it as the current one. Missing files are left to the reader.
 
-    Pipes that nobody writes to would be waited for, and devices read, for ever.
-
-    Pipes without a name are allowed: shells hand over what another program writes in that way.
+    Reading an idle pipe would block, and reading a device may never end. Anonymous pipes are allowed: shells use them
+    for process substitution.
 
     Raises:
-        JawusdError: of the given class; it is a folder, a named pipe, a device or a socket.
+        JawusdError: of the given class; the path is a folder, a named pipe, a device or a socket.
     """
-    take_in_hand(path)
-    there = Path(os.path.realpath(path))  # of a pipe without a name "pipe:[1234]", which does not exist
+    note_input(path)
+    there = Path(os.path.realpath(path))  # "pipe:[1234]" for an anonymous pipe, which does not exist
     try:
         wrong = there.exists() and not there.is_file()
-    except OSError:  # of a name that is too long: its reader says so
+    except OSError:  # the name is too long; the reader reports it
         return
     if wrong:
-        raise error("is not a file.", path=path)
+        raise error("is not a regular file.", path=path, hint="Name a file, not a folder, pipe or device.")
 
 
 def why_unreadable(path: str | os.PathLike[str]) -> tuple[str, str] | None:
-    """Return why a file of any kind cannot be read, and what to do; None if neither length nor beginning says it."""
+    """Return why a file cannot be read, and what to do, if it is empty or a Git LFS pointer; otherwise None."""
     with open(path, "rb") as file:
         beginning = file.read(len(_LFS))
     if not beginning:
         return "the file is empty.", "Copy it again."
     if beginning == _LFS:
-        return "is a pointer of Git LFS, not the file itself.", "Fetch it: git lfs pull."
+        return "is a Git LFS pointer, not the file itself.", "Fetch it: git lfs pull."
     return None
 
 
 def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
-    """Check that OpenUSD can follow a path: it allows UTF-8 without line breaks and other control characters.
+    """Check that OpenUSD can open a path: it needs UTF-8 without control characters.
 
     Raises:
-        JawusdError: of the given class; it cannot.
+        JawusdError: of the given class; OpenUSD cannot open it.
     """
     if any(unicodedata.category(letter) == "Cc" for letter in os.path.abspath(path)):
         raise error(
-            "a line break or another control character is in the path; OpenUSD cannot follow it.",
+            "the path contains a line break or another control character; OpenUSD cannot open it.",
             path=path,
-            hint="Rename the folder, or name another one.",
+            hint="Rename the folder, or use another one.",
         )
     try:
         os.path.abspath(path).encode()
-    except UnicodeEncodeError:  # Python stands for such bytes by lone surrogates
+    except UnicodeEncodeError:  # Python represents such bytes as lone surrogates
         raise error(
-            "the path is not UTF-8, or holds letters that this locale lacks; OpenUSD cannot follow it.",
+            "the path is not UTF-8, or has characters that this locale lacks; OpenUSD cannot open it.",
             path=path,
-            hint="Rename the folder; where its name is UTF-8, set PYTHONUTF8=1.",
+            hint="Rename the folder; if its name is UTF-8, set PYTHONUTF8=1.",
         ) from None
 
 
 def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
-    """Allow folders, and those below them, instead of any allowed before; those of the setting stay allowed."""
+    """Allow stages to reference files in folders and their subfolders; replaces earlier calls, not the setting."""
     _given.set(tuple(Path(folder).resolve() for folder in folders))
 
 
 def allowed_folders() -> list[Path]:
-    """Return the folders that are allowed, links resolved."""
+    """Return the allowed folders, links resolved."""
     named = [Path(folder).resolve() for folder in os.environ.get(SETTING, "").split(os.pathsep) if folder]
     return [*_given.get(), *named]
 

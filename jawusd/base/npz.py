@@ -1,4 +1,4 @@
-"""Read npz files that hold plain arrays and a JSON string `meta`, guarded against damaged and hostile files."""
+"""Read npz files of plain arrays and a JSON string `meta`; safe against damaged and hostile files."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from jawusd.base.inputs import check_input
 UNITS = {"length": "mm", "angle": "rad"}
 TWIST_ORDER = ["omega", "v"]
 
-NamedArrays = dict[str, Array]  # of whatever type the file has; `take` checks those that are used
+NamedArrays = dict[str, Array]  # of any dtype; `take` checks the arrays that are used
 JsonObject = dict[str, object]
 
-# Ten times what 20,000 frames take; guards against archives that unpack to fill the memory.
+# Ten times the size of 20,000 frames; guards against zip bombs.
 _MAX_ARRAY_BYTES = 512 << 20
-#: What zipfile and numpy raise for damaged members, beside OSError: their decoders' own errors, missing methods and
-# passwords (RuntimeError), headers that declare more than there is (MemoryError) or nest too deeply; headers that are
-# no Python literal numpy takes apart with Python's tokenizer, which raises errors of its own.
+#: Exceptions of zipfile and numpy for damaged members, besides OSError: decoder errors, unsupported methods and
+# passwords (RuntimeError), headers that declare too much data (MemoryError) or nest too deeply, and errors of Python's
+# tokenizer, with which numpy parses headers that are not Python literals.
 DAMAGED = (
     ValueError, EOFError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError,
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError, SyntaxError,
@@ -36,7 +36,7 @@ DAMAGED = (
 
 
 def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[NamedArrays, JsonObject]:
-    """Read the arrays and the meta data of a jawusd npz file and check format, version and units.
+    """Read the arrays and metadata of a jawusd npz file, and check format, version and units.
 
     Args:
         family: Format name without version, e.g. ``"jawusd-tracks"``.
@@ -54,14 +54,14 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
         with zipfile.ZipFile(path) as archive:
             total = sum(member.file_size for member in archive.infolist())
         if total > _MAX_ARRAY_BYTES:
-            raise FormatError(f"unpacks to {total / 1e9:.1f} GB; at most 0.5 GB are read.", path=path)
+            raise FormatError(f"unpacks to {total / 1e9:.1f} GB, the limit is 0.5 GB.", path=path)
         with np.load(path, allow_pickle=False) as archive:
             for name in archive.files:
                 arrays[name] = archive[name]
                 if not isinstance(arrays[name], np.ndarray):
-                    raise FormatError(f'"{name}" is no array.', path=path)
+                    raise FormatError(f'"{name}" is not an array.', path=path)
     except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path) from error
+        raise FormatError("there is no such file.", path=path, hint="Check the path.") from error
     except (OSError, *DAMAGED) as error:
         raise FormatError(f"is not a readable npz file ({error!s:.200}).", path=path) from error
     if "meta" not in arrays:
@@ -95,7 +95,7 @@ def check_format(found: object, family: str, version: int, path: str | os.PathLi
 
 
 def check_units(meta: Mapping[str, object], path: str | os.PathLike[str]) -> None:
-    """Check the units and the twist order written in a file's meta data.
+    """Check the units and the twist order in a file's metadata.
 
     Raises:
         UnitsError: they differ from mm, rad and (omega, v), or are missing.
@@ -107,12 +107,12 @@ def check_units(meta: Mapping[str, object], path: str | os.PathLike[str]) -> Non
 
 
 def upgraded_model(arrays: NamedArrays, path: object) -> NamedArrays:
-    """Return the arrays of a model of any version under their present names.
+    """Return the arrays of a model of any version under their current names.
 
-    Version 1 held the tolerance of measured poses as the smallest margin of a valid pose, "margin_limit_mm".
+    Version 1 stored the tolerance of measured poses as the smallest margin of a valid pose, "margin_limit_mm".
 
     Raises:
-        FormatError: that margin is no number.
+        FormatError: that margin is not a number.
     """
     known = dict(arrays)
     if "margin_limit_mm" in known:
@@ -125,7 +125,7 @@ def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: ob
     """Return one of the arrays of `read_npz` after checking its shape and finiteness.
 
     Args:
-        shape: Required shape, None where any length goes.
+        shape: Required shape, None for any length.
         finite: Refuse NaN and infinity.
 
     Raises:

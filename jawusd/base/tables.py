@@ -1,13 +1,13 @@
-"""Read text and tables as editors, spreadsheets and other programs of any locale write them.
+"""Read text and tables of any encoding and locale, as written by editors, spreadsheets and other programs.
 
-One place decides for all readers:
+All readers share these rules:
 
-* the encoding: UTF-8, or UTF-16 and UTF-32 as the byte order mark or the first bytes say;
-* the ends of lines: LF, CRLF, CR;
-* the separator: tab, semicolon or comma, the first that splits header and first row alike, or the header; a line
-  `sep=;` names it;
-* the decimal sign: a point, or a comma in tables whose numbers have no points. Thousands separators are not read, and
-  `1,234` alone, which may be either, is refused.
+* encoding: UTF-8, or UTF-16 and UTF-32 by the byte order mark or the first bytes;
+* line ends: LF, CRLF, CR;
+* separator: tab, semicolon or comma, the first that splits header and first row into equally many cells, or that splits
+  the header; a line `sep=;` overrides this;
+* decimal sign: a point, or a comma if no number of the table has a point. Thousands separators are not supported, and
+  the ambiguous `1,234` is refused.
 
 Blank lines, comments and blank columns at the end are skipped.
 """
@@ -29,31 +29,31 @@ from jawusd.base.errors import FormatError
 from jawusd.base.inputs import check_input
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}
-_AS_UTF8 = "Save it as UTF-8: editors ask for the encoding under Save As."
+_AS_UTF8 = "Save it as UTF-8: editors offer the encoding under Save As."
 _NAMED_SEPARATOR = re.compile(r'"?sep=(.)"?[ \t]*\n', re.IGNORECASE)
 _COMMA_NUMBER = re.compile(r"[+-]?\d*,\d*(e[+-]?\d+)?", re.IGNORECASE)
 _MAYBE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 
 
 def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
-    """Return what a text file holds, lines ended by LF alone.
+    """Return the content of a text file, with LF line ends.
 
     Args:
         path: the file.
-        most_bytes: the largest size that is read.
-        encoding: of files that neither a byte order mark nor null bytes tell to be UTF-16 or UTF-32.
+        most_bytes: the largest accepted size.
+        encoding: used unless a byte order mark or null bytes indicate UTF-16 or UTF-32.
 
     Raises:
-        FormatError: missing, no file, too large or no text in this encoding.
+        FormatError: missing, not a regular file, too large, or not text in this encoding.
     """
     check_input(path)
     try:
         size = path.stat().st_size
         if size > most_bytes:
-            raise FormatError(f"is {size} bytes, at most {most_bytes} are read.", path=path)
+            raise FormatError(f"is {size} bytes, at most {most_bytes} are allowed.", path=path)
         data = path.read_bytes()
     except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path) from error
+        raise FormatError("there is no such file.", path=path, hint="Check the path.") from error
     except OSError as error:
         raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
     found = json.detect_encoding(data)
@@ -66,11 +66,11 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
 
 def _not_text(path: Path, error: UnicodeDecodeError, encoding: str) -> FormatError:
     if not encoding.startswith("utf-8"):
-        words = f"begins as {encoding.upper()} text and holds bytes that are none."
+        words = f"begins as {encoding.upper()} text but has bytes that are invalid in it."
         return FormatError(words, path=path, hint=_AS_UTF8)
     line, byte = error.object[: error.start].count(b"\n") + 1, error.object[error.start]
     return FormatError(
-        f"is not UTF-8 text: line {line} holds the byte 0x{byte:02x}, as an accented letter in another encoding.",
+        f"is not UTF-8 text: line {line} has the byte 0x{byte:02x}, probably an accented letter in another encoding.",
         path=path,
         hint=_AS_UTF8,
     )
@@ -78,13 +78,13 @@ def _not_text(path: Path, error: UnicodeDecodeError, encoding: str) -> FormatErr
 
 @dataclass(frozen=True)
 class TextTable:
-    """Hold a table below a header, cells as text.
+    """A table with a header, cells as text.
 
     Attributes:
         path: the file, for messages.
-        header: names of the columns, blank ones at the end left out.
-        rows: cells, as many as the header names.
-        places: where each row stands, as "line 3".
+        header: column names, without blank ones at the end.
+        rows: cells, one per column.
+        places: place of each row in the file, such as "line 3".
     """
 
     path: Path
@@ -93,21 +93,21 @@ class TextTable:
     places: list[str]
 
     def numbers(self, columns: Sequence[int], rows: Sequence[int] | None = None) -> Array:
-        """Return columns as numbers, shape (rows, columns), `nan` and `inf` as they stand.
+        """Return columns as numbers, shape (rows, columns); `nan` and `inf` are kept.
 
         Args:
             columns: indices in the header.
             rows: indices of rows, None for all.
 
         Raises:
-            FormatError: a cell that is no number, or numbers whose decimal sign cannot be told.
+            FormatError: a cell is not a number, or the decimal sign is ambiguous.
         """
         chosen = range(len(self.rows)) if rows is None else rows
         cells = [[self.rows[i][k] for k in columns] for i in chosen]
         return to_numbers(cells, lambda i, j: self.named(chosen[i], columns[j]), self.path).reshape(-1, len(columns))
 
     def named(self, row: int, column: int) -> str:
-        """Return how messages name a cell."""
+        """Return the name of a cell for messages."""
         return f'{self.places[row]}, column "{self.header[column]}"'
 
 
@@ -116,12 +116,12 @@ def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool
 
     Args:
         path: the file.
-        most_bytes: the largest size that is read.
-        comment: what lines that are skipped begin with.
-        short_rows: rows may end early; the caller checks them with `check_width`.
+        most_bytes: the largest accepted size.
+        comment: prefix of lines to skip.
+        short_rows: allow rows to end early; the caller checks them with `check_width`.
 
     Raises:
-        FormatError: no text, no table, or a row with more or fewer cells than the header.
+        FormatError: not text, not a table, or a row with more or fewer cells than the header.
     """
     found, separator = split_rows(read_text(path, most_bytes), path, comment)
     if not found:
@@ -144,28 +144,28 @@ def check_width(table: TextTable, index: int, separator: str = "") -> None:
     """Check that a row has as many cells as the header.
 
     Raises:
-        FormatError: it has not.
+        FormatError: the row has more or fewer cells.
     """
     found, wanted = len(table.rows[index]), len(table.header)
     if found != wanted:
         more = separator == "," and found > wanted
         raise FormatError(
-            f"{table.places[index]} has {found} values, the header names {wanted}.",
+            f"{table.places[index]} has {found} values, the header has {wanted} columns.",
             path=table.path,
-            hint="Commas separate the columns here: write decimals with points." if more else None,
+            hint="Commas separate the columns here: write decimals with points." if more else "Correct that line.",
         )
 
 
 def split_rows(
     text: str, path: Path, comment: str = "#", blank_rows: bool = False
 ) -> tuple[list[tuple[int, list[str]]], str]:
-    """Return the rows of a table with their line numbers, and what separates the cells.
+    """Return the rows of a table with their line numbers, and the separator.
 
     Args:
-        text: of the file.
+        text: the content of the file.
         path: the file, for messages.
-        comment: what lines that are skipped begin with.
-        blank_rows: rows of several blank cells count, but at the end.
+        comment: prefix of lines to skip.
+        blank_rows: keep rows of several blank cells, except at the end.
 
     Raises:
         FormatError: quotes that do not match.
@@ -188,7 +188,7 @@ def _is_filled(row: Sequence[str]) -> bool:
 
 
 def _separator(text: str, comment: str) -> str:
-    """Return what separates the cells of the first line that is split, see the module."""
+    """Return the separator, found from the first line that any separator splits and the line after it."""
     lines = (line for line in io.StringIO(text) if line.strip() and not line.lstrip().startswith(comment))
     first = next((line for line in lines if any(sign in line for sign in SEPARATORS)), "")
     second = next(lines, "")
@@ -199,15 +199,15 @@ def _separator(text: str, comment: str) -> str:
 
 
 def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str], path: Path) -> Array:
-    """Return cells as numbers, shape as theirs, `nan` and `inf` as they stand.
+    """Return cells as numbers of the same shape; `nan` and `inf` are kept.
 
     Args:
-        cells: rows of the same length.
-        named: what row and column are called in messages.
+        cells: rows of equal length.
+        named: returns the name of a cell for messages, given row and column.
         path: the file, for messages.
 
     Raises:
-        FormatError: a cell that is no number, or numbers whose decimal sign cannot be told.
+        FormatError: a cell is not a number, or the decimal sign is ambiguous.
     """
     if any("," in cell for row in cells for cell in row):
         cells = _with_points(cells, named, path)
@@ -230,7 +230,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _with_points(cells: Sequence[Sequence[str]], named: Callable[[int, int], str], path: Path) -> list[list[str]]:
-    """Return cells with decimal points for commas."""
+    """Return the cells with decimal commas replaced by points."""
     flat = [(i, j, cell.strip()) for i, row in enumerate(cells) for j, cell in enumerate(row)]
     commas = [place for place in flat if "," in place[2]]
     point = next((place for place in flat if "." in place[2] and _is_number(place[2].replace(",", ""))), None)
@@ -238,16 +238,15 @@ def _with_points(cells: Sequence[Sequence[str]], named: Callable[[int, int], str
     if point is not None:
         raise FormatError(
             f'{named(i, j)} is "{cell}" and {named(*point[:2])} is "{point[2]}": commas and points cannot both be '
-            "decimal signs, and thousands separators are not read.",
+            "decimal signs, and thousands separators are not allowed.",
             path=path,
-            hint="Write all decimals with points, and no thousands separators.",
+            hint="Write all decimals with points, without thousands separators.",
         )
     if all(_MAYBE_THOUSANDS.fullmatch(cell) for _, _, cell in commas):
         raise FormatError(
-            f'{named(i, j)}: "{cell}" may be {cell.replace(",", ".")} or {cell.replace(",", "")}, and no other number '
-            "of the table tells which.",
+            f'{named(i, j)}: "{cell}" is ambiguous, {cell.replace(",", ".")} or {cell.replace(",", "")}.',
             path=path,
-            hint="Write decimals with points, and no thousands separators.",
+            hint="Write decimals with points, without thousands separators.",
         )
     return [
         [cell.replace(",", ".") if _COMMA_NUMBER.fullmatch(cell.strip()) else cell for cell in row] for row in cells

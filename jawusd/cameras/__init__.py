@@ -1,4 +1,4 @@
-"""Calibrated cameras of this and other programs: a module for each file format, listed in `files`.
+"""Calibrated cameras from jawusd and other programs: one module per file format, registered by `files`.
 
-Imports `formats`, `geometry` and `base`; knows nothing of captures' footage.
+May import `formats`, `geometry` and `base`; does not read footage.
 """

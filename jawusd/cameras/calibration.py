@@ -1,8 +1,8 @@
-"""Camera calibration: the TOML of aniposelib, lengths in mm; Pose2Sim and Caliscope write the same keys, in metres.
+"""Camera calibration: aniposelib TOML, lengths in mm; Pose2Sim and Caliscope use the same keys, in metres.
 
-Each table `[cam_0]`, `[cam_1]`, ... holds name, size, matrix, distortions, rotation (Rodrigues vector) and
-translation; the last two take world to camera coordinates. Pose2Sim calls the tables after its cameras, Caliscope puts
-them below `[cameras]`, by port.
+Each table `[cam_0]`, `[cam_1]`, ... has name, size, matrix, distortions, rotation (Rodrigues vector) and translation;
+the last two map world to camera coordinates. Pose2Sim names the tables after its cameras, Caliscope nests them in
+`[cameras]`, by port.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import read_toml
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp, so3_log
 
-# Entries of R R^T - I; a rotation written with 6 digits stays below it.
+# Largest entry of R R^T - I; met by rotations written with 6 digits.
 _ROTATION_TOLERANCE = 1e-4
 _CAMERA_TABLE = re.compile(r"^cam_\d+$")
 
@@ -29,7 +29,7 @@ def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
     """Read the cameras of a calibration file.
 
     Raises:
-        CalibrationError: a value is missing, of the wrong shape or not finite, or a rotation is not one.
+        CalibrationError: a value is missing, has the wrong shape, is not finite, or a rotation is invalid.
         FormatError: not TOML.
     """
     path = Path(path)
@@ -41,11 +41,11 @@ def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
             data = {f"cam_{port}": table for port, table in below.items()}
         tables = [key for key, table in data.items() if isinstance(table, dict) and "matrix" in table]
     if not tables:
-        raise CalibrationError('has no camera tables "[cam_0]", "[cam_1]", ...', path=path)
+        raise CalibrationError('has no camera tables such as "[cam_0]", "[cam_1]".', path=path)
     cameras = [_camera(path, table, data[table]) for table in tables]
     names = [camera.name for camera in cameras]
     if len(set(names)) != len(names):
-        raise CalibrationError(f"names a camera twice: {', '.join(names)}.", path=path)
+        raise CalibrationError(f"has a duplicate camera name: {', '.join(names)}.", path=path)
     return cameras
 
 
@@ -60,7 +60,7 @@ def _numbers(path: Path, table: str, values: dict[str, object], key: str, shapes
         allowed = " or ".join(str(s) for s in shapes)
         raise CalibrationError(f'[{table}] "{key}" has shape {array.shape}, allowed is {allowed}.', path=path)
     if not np.isfinite(array).all():
-        raise CalibrationError(f'[{table}] "{key}" holds a value that is not finite.', path=path)
+        raise CalibrationError(f'[{table}] "{key}" has a value that is not finite.', path=path)
     return array
 
 
@@ -84,11 +84,11 @@ def _camera(path: Path, table: str, values: object) -> Camera:
     defect = float(rigidity_defect(make_transform(rotation, np.zeros(3))))
     if defect > _ROTATION_TOLERANCE:
         raise CalibrationError(
-            f"[{table}] rotation is not a rotation (R R^T - I up to {defect:.2g}, allowed {_ROTATION_TOLERANCE:g}).",
+            f"[{table}] rotation is not orthonormal (R R^T - I up to {defect:.2g}, allowed {_ROTATION_TOLERANCE:g}).",
             path=path,
             hint="Write the Rodrigues vector of a proper rotation, world to camera.",
         )
-    # Exact rotation from one written with few digits.
+    # Orthonormalise a rotation written with few digits.
     rotation = so3_exp(so3_log(rotation))
     name = str(values.get("name", table))
     return Camera(name, (int(size[0]), int(size[1])), K, distortion, make_transform(rotation, translation))

@@ -21,7 +21,7 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, wxyz_from_matrix
 
 _FILES = ("cameras.txt", "images.txt")
-# Per model: which parameters are fx, fy, cx, cy and, from there on, OpenCV's distortion; SIMPLE ones share f.
+# Focal parameters of each model (f: shared by x and y), and number of OpenCV distortion terms after the centre.
 _MODELS = {
     "SIMPLE_PINHOLE": ("f", 0),
     "PINHOLE": ("fxfy", 0),
@@ -36,9 +36,9 @@ _LARGEST_SKEW = 1e-9
 
 
 def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
-    """Read a COLMAP text model; return the cameras by name, in the model's unit.
+    """Read a COLMAP text model; return the cameras sorted by name, in the model's unit.
 
-    Several images of one camera must share its pose and lens: the cameras of a capture stand still.
+    All images of a camera must have the same pose and lens, since cameras of a capture are static.
 
     Raises:
         CalibrationError: a file is missing, a value is missing or wrong, or the camera model is not supported.
@@ -49,10 +49,10 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
     images: list[tuple[str, Camera]] = []
     for row in _image_rows(path):
         if row[8] not in lenses:
-            raise CalibrationError(f"image {row[9]} names camera {row[8]}, which cameras.txt does not hold.", path=path)
+            raise CalibrationError(f"image {row[9]} refers to camera {row[8]}, which is not in cameras.txt.", path=path)
         q, t = np.split(_floats(path, row[1:8]), [4])
         if not np.linalg.norm(q) > 0:
-            raise CalibrationError(f"image {row[9]} has a quaternion of length 0.", path=path)
+            raise CalibrationError(f"image {row[9]} has a zero quaternion.", path=path)
         size, K, distortion = lenses[row[8]]
         file = " ".join(row[9:])
         images.append((file, Camera(file, size, K, distortion, make_transform(matrix_from_wxyz(q), t))))
@@ -61,28 +61,28 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
     counted = _COUNTED.search(read_text(path, MOST_BYTES))
     if counted is not None and int(counted[1]) > len(images):
         raise CalibrationError(
-            f"is cut off: {len(images)} of {counted[1]} images that its header counts.",
+            f"is truncated: it has {len(images)} of the {counted[1]} images in its header.",
             path=path,
-            hint='Write the model again; of one that was shortened by hand, correct "# Number of images".',
+            hint='Export the model again; if images were removed by hand, correct "# Number of images".',
         )
     return cameras_of_images(path, images)
 
 
 def _image_rows(path: Path) -> Iterator[list[str]]:
-    """Yield the words of each image; what follows it is its line of points, three numbers each, or the next image.
+    """Yield the words of each image line; an optional line of points, three numbers each, may follow it.
 
     Raises:
-        CalibrationError: a line is neither.
+        CalibrationError: a line is neither an image nor points.
     """
     after_image = False
     for row in _rows(path):
-        # the third number of a point is that of a point in space
+        # the third number of a point is the ID of a 3D point
         if not row or (after_image and _POINTS.fullmatch(" ".join(row))):
             after_image = False
             continue
         if len(row) < 10 or not all(_is_number(word) for word in row[:9]):
             raise CalibrationError(
-                f'"{" ".join(row):.80}" is not an image: an id, 4 + 3 pose values, a camera id and a name are needed.',
+                f'"{" ".join(row):.80}" is not an image line: ID, 4 + 3 pose values, camera ID and name are needed.',
                 path=path,
             )
         after_image = True
@@ -98,7 +98,7 @@ def _is_number(word: str) -> bool:
 
 
 def _rows(path: Path) -> list[list[str]]:
-    """Return the words of every line but remarks."""
+    """Return the words of every line except comments."""
     try:
         text = read_text(path, MOST_BYTES)
     except FormatError as error:
@@ -107,7 +107,7 @@ def _rows(path: Path) -> list[list[str]]:
         raise CalibrationError(
             f"cannot be read ({error.message.rstrip('.')}).",
             path=path,
-            hint=f"The model here is binary; write it as text: {convert}"
+            hint=f"This model is binary; convert it to text: {convert}"
             if binary
             else "A COLMAP text model has cameras.txt and images.txt.",
         ) from error
@@ -118,9 +118,9 @@ def _floats(path: Path, words: Iterable[str]) -> Array:
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
-        raise CalibrationError(f'"{" ".join(words)}" are not numbers.', path=path) from error
+        raise CalibrationError(f'"{" ".join(words)}" is not a list of numbers.', path=path) from error
     if not np.isfinite(values).all():
-        raise CalibrationError(f'"{" ".join(words)}" holds a value that is not finite.', path=path)
+        raise CalibrationError(f'"{" ".join(words)}" has a value that is not finite.', path=path)
     return values
 
 
@@ -155,10 +155,10 @@ FORMAT = CameraFormat(
 
 
 def save_colmap(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """Write cameras as a COLMAP text model in mm, one picture `NAME.png` each; `points3D.txt` is empty.
+    """Write cameras as a COLMAP text model in mm, with one image `NAME.png` each and an empty `points3D.txt`.
 
     Raises:
-        CalibrationError: a camera has skewed pixels, which COLMAP's models do not have.
+        CalibrationError: a camera has pixel skew, which COLMAP's models lack.
         OutputError: a file cannot be written.
     """
     lenses = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6"]
@@ -166,9 +166,9 @@ def save_colmap(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
     for number, camera in enumerate(cameras, start=1):
         (fx, skew, cx), (_, fy, cy) = camera.K[:2]
         if abs(skew) > _LARGEST_SKEW * fx:
-            raise CalibrationError(f"camera {camera.name} has skewed pixels, which COLMAP cannot express.")
+            raise CalibrationError(f"camera {camera.name} has pixel skew, which COLMAP does not support.")
         lens = np.pad(camera.distortion, (0, 8 - camera.distortion.size))
-        values = np.concatenate([[fx, fy, cx + 0.5, cy + 0.5], lens])  # COLMAP counts from the corner of a pixel
+        values = np.concatenate([[fx, fy, cx + 0.5, cy + 0.5], lens])  # COLMAP's origin is the pixel corner
         shown = " ".join(repr(float(value)) for value in values)
         lenses.append(f"{number} FULL_OPENCV {camera.size_px[0]} {camera.size_px[1]} {shown}")
         T = camera.T_cam_world

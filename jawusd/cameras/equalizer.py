@@ -1,11 +1,11 @@
 """Cameras of 3DEqualizer: its Nuke export (.nk), with the lenses beside it (`lens_3de`).
 
-Poses, focal length and film back come from the `Camera` nodes that "Export Project, Nuke" writes (that script, in a
-studio's version: NyanNyanGringo/match-move-exporter on GitHub): camera axes x right, y up, z backward; `rotate` in
+Poses, focal length and film back come from the `Camera` nodes of "Export Project, Nuke" (see a studio's version of that
+script: NyanNyanGringo/match-move-exporter on GitHub): camera axes x right, y up, z backward; `rotate` in
 degrees, z applied first, then x, then y (`rot_order ZXY`); `translate` in the units of the project, mostly cm; `focal`,
-`haperture` and `vaperture` in mm; `win_translate` is -2 times the lens centre's offset over the film back. An `Axis`
-above a camera is the scene's transform and scale. The optical axis meets the film back at its middle plus that offset,
-x right, y up; the film back spans the outer edges of the pixels. The size of the pictures is not in the file.
+`haperture` and `vaperture` in mm; `win_translate` is -2 times the lens centre offset over the film back. A parent
+`Axis` holds the scene transform and scale. The optical axis meets the film back at its centre plus that offset, x
+right, y up; the film back spans the outer edges of the pixels. The image size is not in the file.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def load_3de(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read the cameras of 3DEqualizer's Nuke export by name, with the lenses beside it, in the project's unit.
+    """Read the cameras of 3DEqualizer's Nuke export, sorted by name, with lenses beside it, in the project's unit.
 
-    A camera takes the lens that has its name (of the node, the file, or within it), else the only one there is; where
-    there is none, it is a pinhole, for footage that was undistorted.
+    A camera uses the lens of the same name (of the node, the file, or within it), or the only lens. Without lenses, it
+    is a pinhole camera, for undistorted footage.
 
     Args:
-        path: the script, or the folder that holds it.
+        path: the script or its folder.
         sizes: (width, height) [px] of the pictures by camera.
 
     Raises:
-        CalibrationError: no camera, a camera that moves or zooms, a size that is not known, a distortion model that is
-            not read, or a lens that cannot be identified or cannot be written with OpenCV's coefficients.
+        CalibrationError: no camera, a camera that moves or zooms, an unknown size or distortion model, or a lens that
+            is ambiguous or cannot be approximated by OpenCV's coefficients.
         FormatError: a file cannot be read.
     """
     scripts = [path] if path.is_file() else sorted(path.glob("*.nk"))
@@ -52,13 +52,13 @@ def load_3de(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
             if not re.fullmatch(r"Camera\d?", node.kind):
                 continue
             if node.name in cameras:
-                raise CalibrationError(f"names camera {node.name} twice.", path=script)
+                raise CalibrationError(f"has two cameras named {node.name}.", path=script)
             cameras[node.name] = _camera(script, node, lenses, sizes)
     if not cameras:
         raise CalibrationError(
-            "holds no Camera node.",
+            "has no Camera node.",
             path=path,
-            hint='3DEqualizer writes cameras with "Export Project, Nuke"; lenses alone have no poses.',
+            hint='Export cameras from 3DEqualizer with "Export Project, Nuke"; lens exports have no poses.',
         )
     return [cameras[name] for name in sorted(cameras)]
 
@@ -79,14 +79,14 @@ def _camera(path: Path, node: NukeNode, lenses: list[FoundLens], sizes: Mapping[
     )
     if not (focal_mm > 0 and min(back) > 0):
         raise CalibrationError(
-            f"camera {name} has the focal length {focal_mm:g} mm and the film back {back[0]:g} x {back[1]:g} mm, "
-            "allowed are lengths above 0.",
+            f"camera {name} has focal length {focal_mm:g} mm and film back {back[0]:g} x {back[1]:g} mm; all must be "
+            "above 0.",
             path=path,
         )
     if (steady_values(path, node, "win_scale", (1.0, 1.0)) != 1).any() or steady_values(path, node, "winroll", (0.0,))[
         0
     ] != 0:
-        raise CalibrationError(f"camera {name} has win_scale or winroll, allowed are 1 1 and 0.", path=path)
+        raise CalibrationError(f"camera {name} has win_scale or winroll set, allowed are 1 1 and 0.", path=path)
     shift = steady_values(path, node, "win_translate", (0.0, 0.0))
     offset = (-float(shift[0]) * back[0] / 2, -float(shift[1]) * back[1] / 2)
     lens = _lens_of(path, name, lenses)
@@ -108,7 +108,7 @@ def _camera(path: Path, node: NukeNode, lenses: list[FoundLens], sizes: Mapping[
 
 
 def _world_to_camera(path: Path, node: NukeNode) -> Array:
-    """Return T_cam_world of a camera, below the axes it hangs on."""
+    """Return T_cam_world of a camera, including its parent axes."""
     R, t = _placed(path, node)
     above = node.parent
     while above is not None and re.fullmatch(r"(Axis|Camera)\d?", above.kind):
@@ -118,7 +118,7 @@ def _world_to_camera(path: Path, node: NukeNode) -> Array:
         )
         if np.ptp(scale) > 1e-9 or scale[0] <= 0:
             raise CalibrationError(
-                f"{above.name}, above camera {node.name}, has the scale {scale.tolist()}, allowed is one above 0.",
+                f"{above.name}, parent of camera {node.name}, has scale {scale.tolist()}; it must be uniform and > 0.",
                 path=path,
             )
         R, t = turn @ R, turn @ (scale[0] * t) + shift
@@ -127,14 +127,15 @@ def _world_to_camera(path: Path, node: NukeNode) -> Array:
 
 
 def _placed(path: Path, node: NukeNode) -> tuple[Array, Array]:
-    """Return the rotation (3, 3) and translation (3,) of a node at rest."""
+    """Return the rotation (3, 3) and translation (3,) of a static node."""
     for knob in ("useMatrix", "pivot", "skew"):
         if set(re.findall(r"[\w.]+", node.knobs.get(knob, "0"))) - {"0", "false", "0.0"}:
-            raise CalibrationError(f"node {node.name} has {knob}, which 3DEqualizer does not write.", path=path)
+            raise CalibrationError(f"node {node.name} has {knob} set, which is not supported.", path=path)
     order = node.knobs.get("rot_order", "ZXY")
     if sorted(order) != ["X", "Y", "Z"] or node.knobs.get("xform_order", "SRT") != "SRT":
         raise CalibrationError(
-            f'node {node.name} has the orders "{order}", allowed are SRT and ZXY or alike.', path=path
+            f'node {node.name} has rot_order "{order}" or xform_order other than SRT, which is not supported.',
+            path=path,
         )
     angles = np.deg2rad(knob_values(path, node, "rotate", (0.0, 0.0, 0.0)))
     turns = np.broadcast_to(np.eye(3), (len(angles), 3, 3))
@@ -144,7 +145,7 @@ def _placed(path: Path, node: NukeNode) -> tuple[Array, Array]:
     reach = SAME * float(np.abs(places[0]).max())
     if np.abs(turns - turns[0]).max() > SAME or np.abs(places - places[0]).max() > reach + 1e-12:
         raise CalibrationError(
-            f"camera {node.name} moves from frame to frame; the cameras of a capture stand still.",
+            f"camera {node.name} moves between frames; cameras of a capture must be static.",
             path=path,
             hint="Constrain it to a fixed position in 3DEqualizer, and export again.",
         )
@@ -158,7 +159,7 @@ def _lens_of(path: Path, name: str, lenses: list[FoundLens]) -> Lens | None:
         if candidates:
             listed = ", ".join(f"{lens.name} ({lens.path.name})" for lens in candidates)
             raise CalibrationError(
-                f"camera {name} may have any of the lenses {listed}.",
+                f"camera {name} matches several lenses: {listed}.",
                 path=path,
                 hint=f"Name the lens file after the camera: {name}.txt.",
             )
@@ -173,7 +174,7 @@ def _check_same_plate(
         shown = [f"{v[0]:.6g} x {v[1]:.6g} mm with the lens centre at {v[2]:.4g}, {v[3]:.4g}" for v in
                  (theirs, (*back_mm, *offset_mm))]  # fmt: skip
         raise CalibrationError(
-            f"camera {name} has a film back of {shown[1]}, its lens {lens.name} in {lens.path.name} one of {shown[0]}.",
+            f"camera {name} has film back {shown[1]}, but its lens {lens.name} in {lens.path.name} has {shown[0]}.",
             path=path,
             hint="Export camera and lens from the same project.",
         )

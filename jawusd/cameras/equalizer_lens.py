@@ -1,14 +1,14 @@
-"""Lenses of 3DEqualizer, from text files and from nodes of Nuke, and their models as OpenCV's coefficients.
+"""Lenses of 3DEqualizer, from text files and Nuke nodes, converted to OpenCV's coefficients.
 
-A text file (File, Export, Lens) holds: name; film back width and height, focal length, film aspect, lens centre offset
-x and y, all in cm, pixel aspect; 0, 1 or DISTORTION_...; the model; per parameter its name, its value, the number of
-keys of its curve, and a line per key; <end_of_file>. `LD_...` nodes (File, Export, Nuke LD_3DE4 Lens Distortion Node)
-hold the same as knobs.
+A text file (File, Export, Lens) has: name; film back width and height, focal length, film aspect, lens centre offset x
+and y, all in cm, pixel aspect; 0, 1 or DISTORTION_...; the model; per parameter its name, value, number of curve keys,
+and a line per key; <end_of_file>. `LD_...` nodes (File, Export, Nuke LD_3DE4 Lens Distortion Node) have the same data
+as knobs.
 
 The models (Science-D-Visions, "The Standard Models for Lens Distortion in 3DE4", and its Lens Distortion Plugin Kit)
-take recorded points to undistorted ones, on coordinates from the lens centre, y up, over half the film back's diagonal.
-OpenCV's go the other way: its coefficients are fitted to the model over the picture, and a lens that they miss by more
-than 0.05 px is refused. Only "OpenCV Radial Degree 6, Decentered Degree 2" has OpenCV's own coefficients.
+map recorded to undistorted points, in coordinates from the lens centre, y up, over half the film back diagonal. OpenCV
+maps in the other direction: its coefficients are fitted to the model over the picture, and residuals above 0.05 px are
+refused. Only "OpenCV Radial Degree 6, Decentered Degree 2" uses OpenCV's own coefficients.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Size = tuple[int, int]
 _MOST_BYTES = 4 << 20
 _CLASSIC, _RADIAL = "3DE Classic LD Model", "3DE4 Radial - Standard, Degree 4"
 _BROWN, _OPENCV = "3DE4 Brown-Conrady, Degree 6/2", "OpenCV Radial Degree 6, Decentered Degree 2"
-# The parameters of each model, with their values where a file leaves them out, as Nuke does with defaults.
+# Parameters of each model, with their defaults, which Nuke omits.
 _PARAMETERS: dict[str, dict[str, float]] = {
     _CLASSIC: {
         "Distortion": 0.0,
@@ -70,12 +70,12 @@ _STATIC = ("0", "DISTORTION_STATIC")
 _FOV = {"xa": 0.0, "xb": 1.0, "ya": 0.0, "yb": 1.0}
 _LARGEST_ERROR_PX = 0.05
 _MM_PER_CM = 10.0
-_GRID, _BEYOND = 33, 0.03  # points along a side of the picture, and how far beyond it they reach
+_GRID, _BEYOND = 33, 0.03  # fitting points per side of the picture, and margin around it [share of the side]
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Hold one lens."""
+    """A lens."""
 
     name: str
     path: Path
@@ -87,7 +87,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class FoundLens:
-    """Hold where a lens is, and how to read it."""
+    """A lens that was found and can be read."""
 
     name: str
     path: Path
@@ -95,7 +95,7 @@ class FoundLens:
 
 
 def find_lenses(folder: Path, scripts: Mapping[Path, list[NukeNode]]) -> list[FoundLens]:
-    """Return the lenses of Nuke scripts, given by file, and of the text files of a folder."""
+    """Return the lenses in Nuke scripts (nodes by file) and in the text files of a folder."""
     out = []
     for script, nodes in scripts.items():
         for node in nodes:
@@ -110,7 +110,7 @@ def find_lenses(folder: Path, scripts: Mapping[Path, list[NukeNode]]) -> list[Fo
 
 
 def _node_lens(path: Path, node: NukeNode, name: str) -> Lens:
-    """Return the lens of an LD node; its class and knobs are the model's names in letters, digits and underscores."""
+    """Return the lens of an LD node, whose class and knob names are the model's with underscores."""
     models = {_nuke_name(model): model for model in _PARAMETERS}
     model = models.get(node.kind.removeprefix("LD").lstrip("_"))
     if model is None:
@@ -122,7 +122,7 @@ def _node_lens(path: Path, node: NukeNode, name: str) -> Lens:
     for side, whole in _FOV.items():
         if abs(value(f"field_of_view_{side}_unit", whole) - whole) > 1e-6:
             raise CalibrationError(
-                f"lens {node.name} has a field of view that is not the whole picture (field_of_view_{side}_unit), "
+                f"lens {node.name} has a field of view other than the whole picture (field_of_view_{side}_unit), "
                 "allowed are 0, 1, 0, 1.",
                 path=path,
                 hint="Set the camera's field of view to the whole picture in 3DEqualizer.",
@@ -147,10 +147,10 @@ def _nuke_name(name: str) -> str:
 
 
 def _lens_lines(path: Path) -> list[str] | None:
-    """Return the lines of a lens file; none if a text file is something else.
+    """Return the lines of a lens file; None for other text files.
 
     Raises:
-        CalibrationError: it ends as a lens file does, but does not begin so.
+        CalibrationError: it ends like a lens file but has an invalid beginning.
     """
     try:
         lines = [line.strip() for line in read_text(path, _MOST_BYTES).splitlines()]
@@ -164,9 +164,9 @@ def _lens_lines(path: Path) -> list[str] | None:
         pass
     if "<end_of_file>" in lines:
         raise CalibrationError(
-            "is a lens file whose first four lines are not name, seven numbers, kind of distortion and model.",
+            "is a lens file, but its first four lines are not name, seven numbers, type of distortion and model.",
             path=path,
-            hint="Export the lens again, or take the file away.",
+            hint="Export the lens again, or remove the file.",
         )
     return None
 
@@ -178,7 +178,7 @@ def _text_lens(path: Path, lines: list[str]) -> Lens:
         raise _unread(path, model)
     if mode not in _STATIC:
         raise CalibrationError(
-            f'lens {lines[0]} has a distortion that changes ("{mode}"), allowed is {" or ".join(_STATIC)}.',
+            f'lens {lines[0]} has an animated distortion ("{mode}"), allowed is {" or ".join(_STATIC)}.',
             path=path,
             hint="Make the lens static in 3DEqualizer, and export it again.",
         )
@@ -190,14 +190,14 @@ def _text_lens(path: Path, lines: list[str]) -> Lens:
             at += 3 + int(lines[at + 2])
     except (ValueError, IndexError) as error:
         raise CalibrationError(
-            f'line {at + 1}: "{lines[at]:.60}" is not followed by a number and the keys of its curve.', path=path
+            f'line {at + 1}: "{lines[at]:.60}" must be followed by a number and the keys of its curve.', path=path
         ) from error
     unknown = sorted(set(values) - set(_PARAMETERS[model]))
     if unknown or not np.isfinite(list(values.values())).all():
         raise CalibrationError(
-            f'{model} has no "{unknown[0]}", allowed are {", ".join(_PARAMETERS[model])}.'
+            f'{model} has no parameter "{unknown[0]}", allowed are {", ".join(_PARAMETERS[model])}.'
             if unknown
-            else "holds a value that is not finite.",
+            else "has a value that is not finite.",
             path=path,
         )
     back = (_MM_PER_CM * width, _MM_PER_CM * height)
@@ -208,24 +208,24 @@ def _unread(path: Path, model: str) -> CalibrationError:
     return CalibrationError(
         f'has the distortion model "{model}", allowed are {", ".join(_PARAMETERS)}.',
         path=path,
-        hint="Calibrate with one of them, or undistort the footage and take the lens file away.",
+        hint="Calibrate with one of them, or undistort the footage and remove the lens file.",
     )
 
 
 def opencv_of(
     lens: Lens, K: Array, size: Size, back_mm: tuple[float, float], focal_mm: float
 ) -> tuple[Array, Array, Array]:
-    """Return K (3, 3), OpenCV's coefficients, and a rotation vector (3,) [rad] by which the camera's points turn first.
+    """Return K (3, 3), OpenCV's coefficients, and a rotation vector (3,) [rad] to apply to camera points first.
 
     Args:
         lens: the lens.
-        K: the camera's pinhole [px].
+        K: the camera's pinhole matrix [px].
         size: width and height of its picture [px].
         back_mm: width and height of its film back.
         focal_mm: its focal length.
 
     Raises:
-        CalibrationError: they miss the lens by more than 0.05 px.
+        CalibrationError: the residual is above 0.05 px.
     """
     values = list(lens.values.values())
     if values == list(_PARAMETERS[lens.model].values()):
@@ -241,17 +241,17 @@ def opencv_of(
     fitted, distortion, turn, off = opencv_lens(K, recorded, ideal)
     if off > _LARGEST_ERROR_PX:
         raise CalibrationError(
-            f'lens {lens.name} ("{lens.model}") cannot be written with OpenCV\'s coefficients (off by {off:.2f} px, '
-            f"allowed are {_LARGEST_ERROR_PX:g}).",
+            f'lens {lens.name} ("{lens.model}") cannot be approximated by OpenCV\'s coefficients (error {off:.2f} px, '
+            f"allowed {_LARGEST_ERROR_PX:g} px).",
             path=lens.path,
-            hint="Solve without decentering and bending, or undistort the footage in 3DEqualizer or Nuke and take the "
-            "lens file away.",
+            hint="Solve without decentering and bending, or undistort the footage in 3DEqualizer or Nuke and remove "
+            "the lens file.",
         )
     return fitted, distortion, turn
 
 
 def _undistorted(model: str, values: list[float], x: Array, y: Array) -> tuple[Array, Array]:
-    """Return undistorted points of recorded ones, from the lens centre, y up, over half the film back's diagonal.
+    """Undistort points, relative to the lens centre, y up, over half the film back diagonal.
 
     The Standard Models for Lens Distortion in 3DE4; Lens Distortion Plugin Kit 2.12.
     """

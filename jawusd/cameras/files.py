@@ -1,7 +1,7 @@
-"""Calibrations of other programs, recognised by file name: a registry of the modules beside this one.
+"""Load calibrations of any supported program, recognised by file name: a registry of the modules in this folder.
 
-A module that defines a CameraFormat as FORMAT (see `parts`) is a format. Files that none of them reads are TOML of
-aniposelib, Pose2Sim or Caliscope: `calibration`.
+A module that defines a CameraFormat named FORMAT (see `parts`) is registered. All other files are read as TOML of
+aniposelib, Pose2Sim or Caliscope by `calibration`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _NOT_READ = {
     ".npz": "numpy",
     ".mat": "MATLAB",
 }
-_INSTEAD = "Export the cameras for Nuke (.nk, from 3DEqualizer) or as USD; `jawusd cameras -h` lists what is read."
+_INSTEAD = "Export the cameras for Nuke (.nk, from 3DEqualizer) or as USD; `jawusd cameras -h` lists all formats."
 
 
 @cache
@@ -43,10 +43,10 @@ def _formats() -> list[CameraFormat]:
 
 def _toml(path: Path, _: Mapping[str, Size]) -> list[Camera]:
     if path.is_dir():
-        raise CalibrationError("is a folder without cameras of a kind that is read.", path=path, hint=_INSTEAD)
+        raise CalibrationError("is a folder without cameras in a supported format.", path=path, hint=_INSTEAD)
     if path.suffix.lower() in _NOT_READ:
         what = _NOT_READ[path.suffix.lower()]
-        raise CalibrationError(f"is a file of {what}, which is not read.", path=path, hint=_INSTEAD)
+        raise CalibrationError(f"is a file of {what}, which is not supported.", path=path, hint=_INSTEAD)
     return load_calibration(path)
 
 
@@ -60,14 +60,14 @@ def _format_of(path: Path) -> CameraFormat:
 def load_cameras_file(
     path: str | os.PathLike[str], unit_mm: float = 1.0, sizes: Mapping[str, Size] | None = None
 ) -> list[Camera]:
-    """Read cameras of any known kind of calibration, in the file's order: lengths in mm, OpenCV axes and pixels.
+    """Read cameras from any supported calibration, in file order; lengths in mm, OpenCV axes and pixels.
 
     Args:
         path: TOML of aniposelib, Pose2Sim or Caliscope, a COLMAP text model (its folder or one of its files),
             nerfstudio's transforms.json, Metashape XML, RealityScan CSV or (a folder of) XMP, OpenCV YAML, XML or JSON,
             or 3DEqualizer's Nuke script (or its folder).
         unit_mm: length of the file's unit.
-        sizes: (width, height) [px] of the pictures by camera, for formats that do not hold them; see `lacks_sizes`.
+        sizes: (width, height) [px] of the pictures by camera, for formats without them; see `lacks_sizes`.
 
     Raises:
         CalibrationError: a value is missing or wrong, or the camera model is not supported.
@@ -82,10 +82,10 @@ def load_cameras_file(
 
 
 def calibration_files(path: Path) -> list[Path]:
-    """Return the files that make up a calibration."""
+    """Return the files of a calibration."""
     return _format_of(path).files(path)
 
 
 def lacks_sizes(path: Path) -> bool:
-    """Tell whether a calibration's format does not hold the size of the pictures."""
+    """Tell whether a calibration's format lacks the image size."""
     return _format_of(path).lacks_sizes

@@ -1,12 +1,13 @@
 """Cameras of Agisoft Metashape: XML (File, Export, Export Cameras, "Agisoft XML").
 
 Metashape User Manual, appendix "Camera models", frame camera: `transform` of a camera maps camera to chunk, x right, y
-down, z forward; the chunk's (or component's) transform leads from there to the world, with a scale. With x, y
-undistorted, r their length and lengths over the focal length,
+down, z forward; the transform of the chunk or component maps to the world, with a scale. With undistorted x, y over the
+focal length, and r their norm,
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y,
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p2 (r^2 + 2 y^2) + 2 p1 x y,
     u = width / 2 + cx + x' f + x' b1 + y' b2,  v = height / 2 + cy + y' f,
-the corner of the top-left pixel at (0, 0). OpenCV's p1 and p2 are Metashape's p2 and p1. The unit is mostly metres.
+where the corner of the top-left pixel is at (0, 0). OpenCV's p1 and p2 are Metashape's p2 and p1. The unit is usually
+the metre.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ _HALF_PX, _MOST_PX = 0.5, 1e6
 
 
 def load_metashape(path: Path) -> list[Camera]:
-    """Read the aligned cameras of a Metashape XML, by their labels, in the file's unit.
+    """Read the aligned cameras of a Metashape XML, named by their labels, in the file's unit.
 
     Raises:
-        CalibrationError: no cameras are aligned, two have one label, or a sensor is no frame camera or has no
+        CalibrationError: no cameras are aligned, two have the same label, or a sensor is not a frame camera or has no
             calibration.
         FormatError: the file is damaged.
     """
@@ -46,12 +47,10 @@ def load_metashape(path: Path) -> list[Camera]:
         (chunk, node)
         for chunk in root.findall("chunk") or [root]
         for node in chunk.iter("camera")
-        if (node.findtext("transform") or "").strip()  # others are not aligned
+        if (node.findtext("transform") or "").strip()  # cameras without one are not aligned
     ]
     if not nodes:
-        raise CalibrationError(
-            "holds no aligned cameras.", path=path, hint="Align the photos, then export the cameras."
-        )
+        raise CalibrationError("has no aligned cameras.", path=path, hint="Align the photos, then export the cameras.")
     names = names_of_labels(path, [str(node.get("label")) for _, node in nodes])
     cameras = [_camera(path, name, chunk, node) for name, (chunk, node) in zip(names, nodes, strict=True)]
     return sorted(cameras, key=lambda camera: camera.name)
@@ -64,7 +63,7 @@ def _camera(path: Path, name: str, chunk: ElementTree.Element, node: ElementTree
     R, t, scale = _placement(path, components.get(str(node.get("component_id")), chunk.find("transform")))
     sensor = sensors.get(str(node.get("sensor_id")))
     if sensor is None:
-        raise CalibrationError(f"camera {name} names a sensor that the file does not hold.", path=path)
+        raise CalibrationError(f"camera {name} refers to a sensor that is not in the file.", path=path)
     size, K, lens = _lens(path, sensor)
     centre = scale * R @ T_chunk_cam[:3, 3] + t
     return Camera(name, size, K, lens, world_to_camera(path, name, R @ T_chunk_cam[:3, :3], centre))
@@ -81,7 +80,7 @@ def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
     kind = node.get("type", sensor.get("type", "frame"))
     if kind != "frame":
         raise CalibrationError(
-            f'sensor {label} is a "{kind}" camera; "frame" cameras are read.', path=path, hint=UNDISTORT
+            f'sensor {label} is a "{kind}" camera; only "frame" cameras are supported.', path=path, hint=UNDISTORT
         )
     values = {child.tag: child.text or "" for child in node}
 
@@ -95,12 +94,12 @@ def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
     if not focal > 0 or min(size) < 1:
         raise CalibrationError(f"sensor {label} has no focal length or no resolution.", path=path)
     wide = value("fx", focal + value("b1"))
-    # Before version 1.0, cx and cy counted from the corner, and fx stood beside fy.
+    # Before version 1.0, cx and cy were relative to the corner, and there were fx and fy.
     old = "fx" in values
     cx = value("cx") + (0.0 if old else size[0] / 2) - _HALF_PX
     cy = value("cy") + (0.0 if old else size[1] / 2) - _HALF_PX
     K = np.array([[wide, value("b2"), cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    for key in ("p3", "p4"):  # which older versions fitted
+    for key in ("p3", "p4"):  # fitted by older versions
         if value(key):
             raise CalibrationError(
                 f"sensor {label} has {key} = {value(key):g}, allowed is 0.", path=path, hint=UNDISTORT
@@ -110,7 +109,7 @@ def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
 
 
 def _placement(path: Path, node: ElementTree.Element | None) -> tuple[Array, Array, float]:
-    """Return rotation, translation and scale of a chunk's or component's transform; none is the identity."""
+    """Return rotation, translation and scale of a chunk's or component's transform; identity for None."""
     if node is None:
         return np.eye(3), np.zeros(3), 1.0
     parts = {child.tag: child.text or "" for child in node}

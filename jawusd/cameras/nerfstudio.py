@@ -24,7 +24,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
-    """Read nerfstudio's transforms.json; return the cameras by name, in the file's unit before its `applied_scale`.
+    """Read nerfstudio's transforms.json; return the cameras sorted by name, in units before its `applied_scale`.
 
     Raises:
         CalibrationError: a value is missing or wrong, or the camera model is not supported.
@@ -60,7 +60,7 @@ def _lens(path: Path, values: dict[str, object], where: str) -> tuple[tuple[int,
     model = values.get("camera_model", "OPENCV")
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL") or values.get("is_fisheye"):
         raise CalibrationError(
-            f'{where} has the camera model "{model}"; only perspective models are read.',
+            f'{where} has the camera model "{model}"; only perspective models are supported.',
             path=path,
             hint=UNDISTORT,
         )
@@ -71,7 +71,7 @@ def _lens(path: Path, values: dict[str, object], where: str) -> tuple[tuple[int,
             raise CalibrationError(f'{where} has no number "{key}".', path=path)
         found[key] = float(value)
     if found["k4"] != 0:
-        # nerfstudio's k4 is a fourth power of r^2; OpenCV's fourth coefficient is in a denominator.
+        # nerfstudio's k4 multiplies r^8; OpenCV's fourth coefficient is in a denominator.
         raise CalibrationError(f"{where} has k4 = {found['k4']:g}, allowed is 0.", path=path)
     K = corner_matrix(path, where, found["fl_x"], found["fl_y"], found["cx"], found["cy"])
     lens = np.array([found[key] for key in ("k1", "k2", "p1", "p2", "k3")])
@@ -82,7 +82,7 @@ def _data(path: Path) -> dict[str, object]:
     try:
         data = parse_json(read_text(path, MOST_BYTES), path)
     except FormatError as error:
-        raise CalibrationError(f"is not JSON that can be read ({error.message.rstrip('.')}).", path=path) from error
+        raise CalibrationError(f"cannot be read as JSON ({error.message.rstrip('.')}).", path=path) from error
     if not isinstance(data, dict):
         raise CalibrationError("is not a JSON object.", path=path)
     return data

@@ -1,8 +1,8 @@
-"""Read the nodes of a Nuke script: their knobs, and which node feeds which.
+"""Read the nodes of a Nuke script, with their knobs and connections.
 
-A script is a list of nodes, `Class {`, one knob a line, `}`. A node takes its inputs from a stack, one if `inputs` does
-not say otherwise, and puts itself there; `push` and `set` put other nodes there. Knobs at their defaults are not
-written. An animated knob is a curve, `{curve x1001 0.5 x1002 0.6}`: frames behind x, values without.
+A script is a list of nodes: `Class {`, one knob per line, `}`. A node pops its inputs from a stack (one unless `inputs`
+is given) and pushes itself; `set` and `push` name nodes and push them again. Knobs with default values are omitted. An
+animated knob is a curve, `{curve x1001 0.5 x1002 0.6}`: frames have the prefix x.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.formats.text import read_text
 
-SAME = 1e-3  # share by which a length, or angle [rad] by which a pose, may differ and count as the same
+SAME = 1e-3  # tolerance for equality: relative for lengths, [rad] for rotations
 
 _MOST_BYTES = 64 << 20
-_MOST_LEVELS = 4  # of braces in a knob
+_MOST_LEVELS = 4  # nesting of braces in a knob
 _START = re.compile(r"^\s*(?P<kind>\w+)\s*\{\s*$")
 _KNOB = re.compile(r"^\s*(?P<name>\w+)(?:\s+(?P<value>.*))?$", re.DOTALL)
 _BRACE = re.compile(r"(?<!\\)[{}]")
@@ -29,11 +29,11 @@ _BRACE = re.compile(r"(?<!\\)[{}]")
 
 @dataclass(frozen=True)
 class NukeNode:
-    """Hold one node."""
+    """A node of a script."""
 
-    kind: str  # its class, as "Camera2"
+    kind: str  # class, such as "Camera2"
     knobs: Mapping[str, str]  # as written
-    parent: NukeNode | None  # what its first input is fed by
+    parent: NukeNode | None  # the node connected to its first input
 
     @property
     def name(self) -> str:
@@ -42,7 +42,7 @@ class NukeNode:
 
 
 def read_nuke_script(path: Path) -> list[NukeNode]:
-    """Return the nodes of a script in its order, those inside groups among them.
+    """Return the nodes of a script in file order, including those inside groups.
 
     Raises:
         FormatError: the file cannot be read.
@@ -78,7 +78,7 @@ def _depth(line: str) -> int:
 
 
 def _knobs(body: list[str]) -> dict[str, str]:
-    """Return the knobs of a node; one that opens braces goes on until they are closed."""
+    """Return the knobs of a node; a knob with open braces continues on the next line."""
     out: dict[str, str] = {}
     text, depth = "", 0
     for line in body:
@@ -90,10 +90,10 @@ def _knobs(body: list[str]) -> dict[str, str]:
 
 
 def knob_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...]) -> Array:
-    """Return the values of a knob at every frame that it is keyed at, shape (F, C); C is the length of the default.
+    """Return the values of a knob at its key frames, shape (F, C), where C is the length of the default.
 
     Raises:
-        CalibrationError: it holds an expression or something else that is no number.
+        CalibrationError: it has an expression or another value that is not a number.
     """
     text = node.knobs.get(knob)
     if text is None:
@@ -103,9 +103,9 @@ def knob_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...
         values = [[float(word) for word in words if not _is_sign(word)] for words in channels]
     except ValueError as error:
         raise CalibrationError(
-            f'node {node.name}: {knob} is "{text:.60}", allowed are numbers.',
+            f'node {node.name}: {knob} is "{text:.60}", only numbers are allowed.',
             path=path,
-            hint="Bake expressions, or export from the tracking program again.",
+            hint="Bake expressions, or export again from the tracking program.",
         ) from error
     frames = max((len(column) for column in values), default=0)
     filled = [column * frames if len(column) == 1 else column for column in values]
@@ -115,22 +115,22 @@ def knob_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...
         )
     table = np.array(filled).T
     if not np.isfinite(table).all():
-        raise CalibrationError(f"node {node.name}: {knob} holds a value that is not finite.", path=path)
+        raise CalibrationError(f"node {node.name}: {knob} has a value that is not finite.", path=path)
     return table
 
 
 def steady_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...]) -> Array:
-    """Return the values of a knob that keeps them on all frames, shape (C,); see `knob_values`.
+    """Return the values of a constant knob, shape (C,); see `knob_values`.
 
     Raises:
-        CalibrationError: they change.
+        CalibrationError: the knob is animated.
     """
     table = knob_values(path, node, knob, default)
     if np.ptp(table, axis=0).max() > SAME * max(1e-6, float(np.abs(table[0]).max())):
         raise CalibrationError(
-            f"node {node.name}: {knob} changes from frame to frame, allowed is one value.",
+            f"node {node.name}: {knob} is animated; it must be constant.",
             path=path,
-            hint="A capture has fixed lenses; solve with a fixed focal length, and export again.",
+            hint="Lenses of a capture are fixed: solve with a fixed focal length, and export again.",
         )
     return np.asarray(table[0], np.float64)
 
@@ -162,5 +162,5 @@ def _unwrapped(items: list[object]) -> list[object]:
 
 
 def _is_sign(word: str) -> bool:
-    """Tell what in a curve is not a value: the word itself, frames, kinds of interpolation, slopes."""
+    """Tell whether a word of a curve is not a value: the keyword, a frame, an interpolation type, or a slope."""
     return word == "curve" or bool(re.fullmatch(r"[A-Za-z]|[a-z]-?[\d.]+(?:e[-+]?\d+)?", word))

@@ -1,9 +1,9 @@
 """Cameras in OpenCV's storage: YAML, XML and JSON.
 
-`cv::FileStorage` (https://docs.opencv.org/4.x/d4/da4/group__core__xml.html): matrices in the forms that OpenCV's
-samples, ROS `camera_info` and EasyMocap write: camera_matrix, cameraMatrix, K or M with distortion coefficients, and R
-(3 x 3 or Rodrigues vector) and T, world to camera. Names may end with the camera's, `K_left`, `R_left`; of M1, D1, M2,
-D2, R, T the first camera is the world. Pixels and axes are OpenCV's. Values that no camera needs may be anything.
+`cv::FileStorage` (https://docs.opencv.org/4.x/d4/da4/group__core__xml.html), with matrices as written by OpenCV's
+samples, ROS `camera_info` and EasyMocap: camera_matrix, cameraMatrix, K or M with distortion coefficients, and R (3 x 3
+or Rodrigues vector) and T, world to camera. Names may have the camera as suffix, `K_left`, `R_left`; with M1, D1, M2,
+D2, R, T, the first camera is the world. Pixels and axes are OpenCV's. Other values are ignored.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp
 
 _MOST_BYTES = 16 << 20
 _YAML = (".yml", ".yaml")
-_BEGINNING = 4096  # bytes in which XML and JSON show that they are OpenCV's
+_BEGINNING = 4096  # bytes searched for OpenCV's marks in XML and JSON
 _MATRIX = re.compile(
     r"^\s*(?P<name>[\w.-]+)\s*:\s*(?:!!opencv-matrix)?\s*\n\s*rows\s*:\s*(?P<rows>\d+)\s*\n\s*cols\s*:\s*(?P<cols>\d+)"
     r"\s*\n(?:\s*dt\s*:\s*\S+\s*\n)?\s*data\s*:\s*\[(?P<data>[^\]]*)\]",
@@ -46,9 +46,9 @@ def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
     """Read cameras from OpenCV's storage: one file per camera, named after it, or files that hold several.
 
     Args:
-        paths: the files; what one says of a camera is joined with what others say, and cameras whose lens alone is
-            known are left out.
-        sizes: of the pictures by camera, where the files do not say them.
+        paths: the files; values of a camera are merged over all files. If any camera has a pose, those without one are
+            ignored.
+        sizes: (width, height) [px] of the pictures by camera, if not in the files.
 
     Raises:
         CalibrationError: a camera lacks intrinsics, pose or size, or a value is wrong.
@@ -61,9 +61,9 @@ def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
             twice = [role for role in parts if role in own and not np.array_equal(parts[role], own[role])]
             if twice:
                 raise CalibrationError(
-                    f"says {twice[0]} of camera {name or path.stem} otherwise than another file beside it.",
+                    f"has another {twice[0]} for camera {name or path.stem} than another file in the folder.",
                     path=path,
-                    hint="Give each camera a file of its own, and a name of its own.",
+                    hint="Give each camera its own file and name.",
                 )
             own.update(parts)
     shared = found.pop("", {}) if any("K" in parts for name, parts in found.items() if name) else {}
@@ -75,12 +75,12 @@ def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
     known = {name: parts for name, parts in whole.items() if "K" in parts}
     cameras = [_camera(paths[0], name, parts, sizes) for name, parts in (posed or known).items()]
     if not cameras:
-        raise CalibrationError("holds no camera matrix.", path=paths[0])
+        raise CalibrationError("has no camera matrix.", path=paths[0])
     return sorted(cameras, key=lambda camera: camera.name)
 
 
 def _parts_of(path: Path) -> dict[str, dict[str, Array]]:
-    """Return the matrices and numbers of a file, by camera and role; "" is the camera that is not named."""
+    """Return the matrices and numbers of a file, by camera and role; "" is the unnamed camera."""
     out: dict[str, dict[str, Array]] = {}
     seen: set[str] = set()
     for key, shape, words in _values(path):
@@ -91,7 +91,9 @@ def _parts_of(path: Path) -> dict[str, dict[str, Array]]:
                 continue
             if key in seen:
                 raise CalibrationError(
-                    f'holds "{key}" twice.', path=path, hint="Write a file per camera, or names as K_left and K_right."
+                    f'has "{key}" twice.',
+                    path=path,
+                    hint="Write one file per camera, or names such as K_left, K_right.",
                 )
             seen.add(key)
             parts = out.setdefault(named["camera"] or "", {})
@@ -106,17 +108,15 @@ def _array(path: Path, key: str, shape: tuple[int, ...], words: list[str]) -> Ar
     try:
         data = np.array([float(word) for word in plain]).reshape(shape)
     except ValueError as error:
-        what = (
-            "is not a matrix as its rows and cols say" if shape else f"is {' '.join(words):.40}, which is not a number"
-        )
+        what = "does not match its rows and cols" if shape else f"is {' '.join(words):.40}, which is not a number"
         raise CalibrationError(f'"{key}" {what}.', path=path) from error
     if not np.isfinite(data).all():
-        raise CalibrationError(f'"{key}" holds a value that is not finite.', path=path)
+        raise CalibrationError(f'"{key}" has a value that is not finite.', path=path)
     return data
 
 
 def _values(path: Path) -> Iterator[tuple[str, tuple[int, ...], list[str]]]:
-    """Yield the name, shape and words of each value at the top of a file; a scalar's or text's shape is ()."""
+    """Yield the name, shape and words of each top-level value; the shape of scalars and text is ()."""
     suffix = path.suffix.lower()
     if suffix == ".xml":
         for node in parsed_xml(path):
@@ -147,7 +147,7 @@ def _values(path: Path) -> Iterator[tuple[str, tuple[int, ...], list[str]]]:
 
 
 def _is_opencv(path: Path) -> int:
-    """Return 1 for YAML, 2 for XML and JSON that begin as OpenCV's storage, 0 for others."""
+    """Return 1 for YAML, 2 for XML and JSON with OpenCV's marks, 0 for others."""
     suffix = path.suffix.lower()
     if suffix in _YAML or suffix not in (".xml", ".json") or not path.is_file():
         return int(suffix in _YAML)
@@ -167,13 +167,13 @@ def _camera(path: Path, name: str, parts: Mapping[str, Array], sizes: Mapping[st
     lacking = [role for role in ("K", "R", "T") if role not in parts]
     if lacking:
         raise CalibrationError(
-            f"camera {name} has no {lacking[0]}.", path=path, hint="Pose (R, T) and intrinsics (K, D) are both needed."
+            f"camera {name} has no {lacking[0]}.", path=path, hint="Both pose (R, T) and intrinsics (K, D) are needed."
         )
     if "width" in parts and "height" in parts:
         sides = np.array([parts["width"], parts["height"]], np.float64).ravel()
         if sides.size != 2 or not ((sides >= 1) & (sides <= _MOST_PX)).all():
             raise CalibrationError(
-                f"camera {name} has pictures of {sides.tolist()} px, allowed are 1 to 1e6.", path=path
+                f"camera {name} has image size {sides.tolist()} px, allowed is 1 to 1e6 px.", path=path
             )
         size = (int(sides[0]), int(sides[1]))
     elif name in sizes or plain_name(name) in sizes:
@@ -185,9 +185,12 @@ def _camera(path: Path, name: str, parts: Mapping[str, Array], sizes: Mapping[st
     if K.shape != (3, 3) or R.shape != (3, 3) or T.shape != (3,) or lens.size not in (0, 4, 5, 8, 12, 14):
         raise CalibrationError(f"camera {name} has a matrix of the wrong size.", path=path)
     if lens[8:].any():
-        raise CalibrationError(f"camera {name} has thin-prism or tilt coefficients, allowed are 8.", path=path)
+        raise CalibrationError(
+            f"camera {name} has thin-prism or tilt coefficients; only the first 8 coefficients are supported.",
+            path=path,
+        )
     if rigidity_defect(make_transform(R, np.zeros(3))) > _LARGEST_DEFECT or not np.isfinite(K).all():
-        raise CalibrationError(f"camera {name} has a rotation that is none.", path=path)
+        raise CalibrationError(f"camera {name} has a rotation that is not orthonormal.", path=path)
     return Camera(name, size, K, lens[:8], make_transform(R, T))
 
 

@@ -1,4 +1,4 @@
-"""What readers of cameras share: the description of a format, names, sizes, lens models, XML, numbers."""
+"""Shared by the camera readers: the format registry entry, names, sizes, lens models, XML, numbers."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Size = tuple[int, int]
 MOST_BYTES = 64 << 20
 UNDISTORT = "Undistort the footage first, or calibrate with OpenCV's standard model."
 _LARGEST_DEFECT = 1e-3
-# Images of one camera may differ this much before they count as a moving camera.
+# Tolerances between images of a static camera: rotation [rad], and position relative to its distance.
 _MOVED_RAD, _MOVED_SHARE = 1e-3, 1e-3
-_LARGEST_ERROR_PX = 0.05  # of a lens written with other coefficients
+_LARGEST_ERROR_PX = 0.05  # of a converted lens model
 _MODEL_KEYS = ("distortion_model", "distortion_type", "lens_model", "camera_model", "model_type", "projection_model")
 _FLAG_KEYS = ("fisheye", "fisheye_model", "is_fisheye", "use_fisheye", "xi")  # xi: omnidirectional
 # Names of OpenCV's radial-tangential model with up to eight coefficients, in ROS, Kalibr, camodocal and others.
@@ -37,28 +37,28 @@ _OTHER_MODELS = re.compile(
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """Describe a format of cameras: a module of this folder with one of these as FORMAT is all that a new one needs."""
+    """A camera format. To add one, define it as FORMAT in a module of this folder."""
 
-    # 1 if a file or folder is of this format by its name, 2 if it begins so, 0 if it is another
+    # whether a path has this format: 0 no, 1 by its name, 2 by its content
     reads: Callable[[Path], int]
-    # reads the cameras in the file's order and unit, given (width, height) [px] of pictures by camera
+    # returns the cameras in the file's order and unit, given (width, height) [px] of the pictures by camera
     load: Callable[[Path, Mapping[str, Size]], list[Camera]]
-    files: Callable[[Path], list[Path]] = lambda path: [path]  # that make up such a calibration
-    lacks_sizes: bool = False  # it does not hold the sizes of pictures, or not always
+    files: Callable[[Path], list[Path]] = lambda path: [path]  # all files of a calibration
+    lacks_sizes: bool = False  # image sizes are not, or not always, in the file
 
 
 def files_in(path: Path, *suffixes: str) -> list[Path]:
-    """Return the files of a folder that have one of some suffixes; none if it is no folder."""
+    """Return the files of a folder with one of the suffixes; empty if it is not a folder."""
     return sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes) if path.is_dir() else []
 
 
 def plain_name(name: str) -> str:
-    """Return a name in the letters that cameras of a capture may have."""
+    """Return a name with only the characters allowed in camera names of a capture."""
     return re.sub(r"[^A-Za-z0-9_\-]+", "_", name)
 
 
 def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
-    """Return a name for each label of a picture: without folder and suffix, which are kept where names would be equal.
+    """Return a unique name for each picture label; folder and suffix are dropped unless needed.
 
     Raises:
         CalibrationError: two labels are equal.
@@ -75,9 +75,9 @@ def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
     if times > 1:
         alike = ", ".join(f'"{label}"' for label, own in zip(labels, names, strict=True) if own == name)
         raise CalibrationError(
-            f"labels {times} cameras alike: {alike}. Each needs a name of its own.",
+            f"has {times} cameras with the same label: {alike}. Labels must be unique.",
             path=path,
-            hint="Rename the pictures, as left_0001.jpg, or the cameras, and export them again.",
+            hint="Rename the pictures (such as left_0001.jpg) or cameras, and export again.",
         )
     return names
 
@@ -86,34 +86,34 @@ def known_size(path: Path, name: str, sizes: Mapping[str, Size]) -> Size:
     """Return the size of a camera's pictures.
 
     Raises:
-        CalibrationError: it is not known.
+        CalibrationError: the size is unknown.
     """
     for known in (name, plain_name(name)):
         if known in sizes:
             return sizes[known]
     raise CalibrationError(
-        f"camera {name}: the size of pictures is not in the file, and there is no footage of that name "
-        f"(there is: {', '.join(sizes) or 'none'}).",
+        f"camera {name}: the image size is not in the file, and there is no footage with that name "
+        f"(available: {', '.join(sizes) or 'none'}).",
         path=path,
-        hint="Name the picture of each camera as its [[camera]], or give --size.",
+        hint="Use the [[camera]] names as picture names, or give --size.",
     )
 
 
 def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> None:
-    """Check that what a file says of its lens model, by the keys that programs use, is OpenCV's standard one.
+    """Check that the lens model in a file, under the keys of common programs, is OpenCV's standard model.
 
     Raises:
-        CalibrationError: it is another one.
+        CalibrationError: it is another model.
     """
     for key, value in values.items():
         said = re.sub(r"[\s-]+", "_", str(value).strip().lower())
         flag = key.lower() in _FLAG_KEYS and said not in ("0", "false", "no", "none", "")
         named = key.lower() in _MODEL_KEYS and said not in _READ_MODELS
-        # a "camera_model" may be the name of a product
+        # "camera_model" may be a product name
         if flag or (named and (key.lower().startswith("distortion") or _OTHER_MODELS.search(said))):
             raise CalibrationError(
-                f"{where} has {key} = {value}, a lens model that is not read; OpenCV's radial-tangential one is "
-                "(plumb_bob, rational_polynomial).",
+                f"{where} has {key} = {value}, a lens model that is not supported; allowed is OpenCV's "
+                "radial-tangential model (plumb_bob, rational_polynomial).",
                 path=path,
                 hint=UNDISTORT,
             )
@@ -123,14 +123,14 @@ def numbers(path: Path, text: str, count: int, what: str) -> Array:
     """Return the numbers of a text, shape (count,).
 
     Raises:
-        CalibrationError: they are others.
+        CalibrationError: the text has other content.
     """
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError as error:
-        raise CalibrationError(f'{what}: "{text:.60}" are not numbers.', path=path) from error
+        raise CalibrationError(f'{what}: "{text:.60}" is not a list of numbers.', path=path) from error
     if len(values) != count or not np.isfinite(values).all():
-        raise CalibrationError(f"{what} has {len(values)} values, {count} finite ones are needed.", path=path)
+        raise CalibrationError(f"{what} has {len(values)} values, {count} finite numbers are needed.", path=path)
     return values
 
 
@@ -138,26 +138,26 @@ def parsed_xml(path: Path) -> ElementTree.Element:
     """Return the root of an XML file.
 
     Raises:
-        CalibrationError: it is none, or declares a document type.
+        CalibrationError: it is not XML, or declares a document type.
         FormatError: it cannot be read.
     """
     text = read_text(path, MOST_BYTES)
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can name other files, and grow without end
-        raise CalibrationError("declares a document type, which calibrations do not.", path=path)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can reference other files and expand without bound
+        raise CalibrationError("declares a document type, which is not allowed.", path=path)
     try:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        raise CalibrationError(f"is not XML that can be read ({error}).", path=path) from error
+        raise CalibrationError(f"cannot be read as XML ({error}).", path=path) from error
 
 
 def world_to_camera(path: Path, name: str, rotation: Array, centre: Array) -> Array:
-    """Return T_cam_world of a camera's axes in the world (3, 3) and its centre (3,).
+    """Return T_cam_world from a camera's axes in the world (3, 3) and its centre (3,).
 
     Raises:
-        CalibrationError: the axes are not square.
+        CalibrationError: the axes are not orthonormal.
     """
     if rigidity_defect(make_transform(rotation, np.zeros(3))) > _LARGEST_DEFECT:
-        raise CalibrationError(f"camera {name} has a rotation that is none.", path=path)
+        raise CalibrationError(f"camera {name} has a rotation that is not orthonormal.", path=path)
     u, _, vt = np.linalg.svd(rotation)
     exact = u @ vt
     return make_transform(exact.T, -exact.T @ centre)
@@ -167,13 +167,13 @@ def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tan
     """Return OpenCV's coefficients of a lens with four radial terms and OpenCV's (p1, p2).
 
     Raises:
-        CalibrationError: they follow the lens by more than 0.05 px off.
+        CalibrationError: the approximation error is above 0.05 px.
     """
     k, error_px = opencv_radial(K, size, radial)
     if error_px > _LARGEST_ERROR_PX:
         raise CalibrationError(
-            f"camera {name}: its lens cannot be written with OpenCV's coefficients (off by {error_px:.2f} px, allowed "
-            f"are {_LARGEST_ERROR_PX:g}).",
+            f"camera {name}: its lens cannot be approximated by OpenCV's coefficients (error {error_px:.2f} px, "
+            f"allowed {_LARGEST_ERROR_PX:g} px).",
             path=path,
             hint="Calibrate without k4, or undistort the footage first.",
         )
@@ -182,20 +182,20 @@ def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tan
 
 
 def corner_matrix(path: Path, where: str, fx: float, fy: float, cx: float, cy: float) -> Array:
-    """Return K (3, 3) of values for pixels whose first one has its centre at (0.5, 0.5).
+    """Return K (3, 3) from values in coordinates where the centre of the first pixel is at (0.5, 0.5).
 
     Raises:
-        CalibrationError: a focal length cannot be.
+        CalibrationError: a focal length is not positive.
     """
     if not (fx > 0 and fy > 0):
-        raise CalibrationError(f"{where} has the focal lengths {fx:g} and {fy:g} px, allowed are > 0 px.", path=path)
+        raise CalibrationError(f"{where} has focal lengths {fx:g} and {fy:g} px; they must be > 0 px.", path=path)
     return np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
 
 
 def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[Camera]:
-    """Return the cameras by name that took images (file, camera).
+    """Return the cameras of images (file, camera), sorted by name.
 
-    An image in a folder is named after it (`cam0/0001.png` is cam0), else after its file (`cam0.png`).
+    The camera's name is the image's folder (`cam0/0001.png` is cam0) or, without one, the file name (`cam0.png`).
 
     Raises:
         CalibrationError: images of one camera have different poses or lenses.
@@ -212,15 +212,15 @@ def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[
         moved = np.linalg.norm(known.centre_world() - camera.centre_world())
         what = ""
         if turned > _MOVED_RAD or moved > _MOVED_SHARE * np.linalg.norm(known.centre_world()) + 1e-12:
-            what = "stands in different places"
+            what = "has different poses"
         elif known.size_px != camera.size_px or not _same_lens(known, camera):
             what = "has different lenses"
         if what:
             raise CalibrationError(
                 f"camera {name} {what} in its images.",
                 path=path,
-                hint="Name the images after the cameras, one per camera (cam0.png) or one folder each (cam0/0001.png), "
-                "and let the images of a camera share its lens.",
+                hint="Name images after their cameras, one per camera (cam0.png) or one folder each (cam0/0001.png), "
+                "and use one lens for all images of a camera.",
             )
     return [cameras[name] for name in sorted(cameras)]
 

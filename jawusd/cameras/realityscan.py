@@ -1,15 +1,15 @@
 """Cameras of RealityScan (RealityCapture): XMP beside the pictures, and CSV.
 
 XMP, `IMAGE.xmp` ("Camera Geometry in RealityScan", dev.epicgames.com, and "RealityCapture XMP Camera Math",
-support.capturingreality.com): Rotation (row by row) takes world to camera axes, x right, y down, z forward; Position is
-the camera's centre. FocalLength35mm is for 36 mm along the longer side; PrincipalPointU and V are from the middle of
-the picture in lengths of that side. Distortion "brown3" and "brown4" (with t2: tangential) works as OpenCV's on
-coordinates over the focal length: k1 k2 k3 k4 t1 t2 with t1, t2 = OpenCV's p1, p2. The size of the picture is not in
-the file.
+support.capturingreality.com): Rotation (row-major) maps world to camera axes, x right, y down, z forward; Position is
+the camera's centre. FocalLength35mm refers to 36 mm along the longer side; PrincipalPointU and V are relative to the
+image centre, in units of that side. Distortion "brown3" and "brown4" (t2: with tangential terms) equals OpenCV's in
+coordinates over the focal length: k1 k2 k3 k4 t1 t2, where t1, t2 are OpenCV's p1, p2. The image size is not in the
+file.
 
-CSV ("Internal/External camera parameters"; columns may be chosen and are found by name): x, y, alt is the camera's
-centre; the camera's axes in the world, x right, y up, z backward, are Rz(-heading) Rx(pitch) Ry(roll) in degrees, as
-nerfstudio and brush read them; f, px, py, k1 .. k4, t1, t2 as in XMP.
+CSV ("Internal/External camera parameters"; columns are found by name): x, y, alt is the camera's centre; the camera's
+axes in the world, x right, y up, z backward, are Rz(-heading) Rx(pitch) Ry(roll) in degrees, as in nerfstudio and
+brush; f, px, py, k1 .. k4, t1, t2 as in XMP.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read the XMP files of a folder as cameras by the files' names, in their unit.
+    """Read the XMP files of a folder as cameras named after the files, in their unit.
 
     Args:
-        folder: of the files.
-        sizes: (width, height) [px] of the pictures by camera; those of others are not read.
+        folder: the folder of the files.
+        sizes: (width, height) [px] of the pictures by camera.
 
     Raises:
-        CalibrationError: a size is not known, or a value is missing or wrong.
+        CalibrationError: a size is unknown, or a value is missing or wrong.
         FormatError: a file is damaged.
     """
     out = []
@@ -70,9 +70,9 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
         model = values.get("DistortionModel", "perspective").lower()
         if not model.startswith(("brown", "perspective")):
             raise CalibrationError(
-                f'has the distortion model "{model}"; "brown3" and "brown4" are read.',
+                f'has the distortion model "{model}"; "brown3" and "brown4" are supported.',
                 path=path,
-                hint="Choose Brown3 or Brown4 with tangential as distortion model, and align again.",
+                hint="Choose Brown3 or Brown4 with tangential distortion, and align again.",
             )
         terms = numbers(path, values.get("DistortionCoeficients", "0 0 0 0 0 0"), 6, "DistortionCoeficients")
         for key, square in (("Skew", 0.0), ("AspectRatio", 1.0)):
@@ -85,12 +85,12 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
         centre = numbers(path, values["Position"], 3, "Position")
         out.append(Camera(path.stem, size, K, lens, world_to_camera(path, path.stem, rotation.T, centre)))
     if not out:
-        raise CalibrationError("holds no .xmp files.", path=folder)
+        raise CalibrationError("has no .xmp files.", path=folder)
     return out
 
 
 def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read RealityScan's camera parameters, by the names of the pictures, in the file's unit.
+    """Read cameras from RealityScan's camera parameters, named after the pictures, in the file's unit.
 
     Args:
         path: the CSV.
@@ -98,15 +98,13 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
 
     Raises:
         CalibrationError: a column or a size is missing, or a value is not finite.
-        FormatError: the file is no table of numbers.
+        FormatError: the file is not a table of numbers.
     """
     table = read_table(path, _MOST_BYTES, comment="#cameras")
     header = [word.lstrip("#").strip().lower() for word in table.header]
     lacking = [key for key in _NEEDED if key not in header]
     if lacking:
-        raise CalibrationError(
-            f"has no column {lacking[0]}; RealityScan's camera parameters have {', '.join(_NEEDED)}.", path=path
-        )
+        raise CalibrationError(f"has no column {lacking[0]}; required are {', '.join(_NEEDED)}.", path=path)
     columns = [k for k, key in enumerate(header) if key in (*_NEEDED[1:], *_LENS)]
     column = header.index("name")
     names = names_of_labels(path, [row[column] for row in table.rows])
@@ -124,21 +122,21 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
         T_world_cam = make_transform(axes, np.array([found["x"], found["y"], found["alt"]]))
         out.append(Camera(name, size, K, lens, se3_inverse(T_world_cam)))
     if not out:
-        raise CalibrationError("holds no cameras.", path=path)
+        raise CalibrationError("has no cameras.", path=path)
     return sorted(out, key=lambda camera: camera.name)
 
 
 def _lens(
     path: Path, name: str, size: Size, f35_mm: float, principal: tuple[float, float], terms: Array
 ) -> tuple[Array, Array]:
-    """Return K (3, 3) and OpenCV's coefficients of RealityScan's values: terms are k1 k2 k3 k4 t1 t2.
+    """Return K (3, 3) and OpenCV's coefficients from RealityScan's values; terms are k1 k2 k3 k4 t1 t2.
 
     Raises:
-        CalibrationError: the focal length cannot be, or the lens cannot be written with OpenCV's coefficients.
+        CalibrationError: the focal length is not positive, or OpenCV's coefficients cannot approximate the lens.
     """
     longer = max(size)
     if not f35_mm > 0:
-        raise CalibrationError(f"camera {name} has the focal length {f35_mm:g} mm, allowed is more than 0.", path=path)
+        raise CalibrationError(f"camera {name} has focal length {f35_mm:g} mm; it must be > 0.", path=path)
     focal = f35_mm / _FILM_MM * longer
     cx, cy = (principal[k] * longer + size[k] / 2 - _HALF_PX for k in (0, 1))
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])

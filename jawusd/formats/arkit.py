@@ -40,11 +40,11 @@ _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:[.,]\d+)?)")
 _RATES = (24, 25, 30, 48, 50, 60, 100, 120)
 _NTSC_SLACK = 0.006
 _DAY_S = 86_400
-_FEWEST_REPEATED = 3  # time codes, of which most stand in several rows
-_FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # in the median second, of the samples a second that were asked for
-_MOST_STEPS_OFF = 2.0  # of the step from one second to the next, from that within seconds
-# ARKit gives 0 to 1. Captures with a personal neutral face or gains go a little beyond; percent, and weights normalised
-# to mean and deviation, go far beyond.
+_FEWEST_REPEATED = 3  # distinct time codes needed to detect repetition
+_FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # rows in the median second, over the requested rate
+_MOST_STEPS_OFF = 2.0  # deviation of the step across seconds from the step within seconds [steps]
+# ARKit gives 0 to 1. A personal neutral face or gains exceed this slightly; percent and standardised weights exceed it
+# by far.
 _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
 _MAX_MAPPING_BYTES = 1 << 20
@@ -55,14 +55,13 @@ _Weights = tuple[_Number, _Number, _Number, _Number]
 
 @dataclass(frozen=True, eq=False)
 class FaceCapture:
-    """Hold the jaw's weights of a face capture."""
+    """The jaw weights of a face capture."""
 
-    frames: Array  # frames after the first row, increasing, fractions kept, shape (F,)
-    # JawOpen, JawLeft, JawRight, JawForward, nominally 0 .. 1, NaN without a face, shape (F, 4). Left is the subject's
-    # left.
+    frames: Array  # frame numbers from the first row on, increasing, possibly fractional, shape (F,)
+    # JawOpen, JawLeft, JawRight, JawForward, nominally 0 .. 1, NaN without a face, shape (F, 4); subject's left
     weights: Array
     fps: float  # frames per second
-    timecode: str  # that of the first row, as written
+    timecode: str  # time code of the first row, as written
 
 
 def shares_of(weights: Array) -> Array:
@@ -76,12 +75,12 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
 
     Args:
         path: the CSV.
-        fps: frames per second of the result: those of the samples, those that the time codes count, or a whole
-            multiple or part of the latter. None for the rate of the time codes; they must pass a full second then.
+        fps: frames per second of the result: the sample rate, the time code rate, or an integer multiple or fraction
+            of the latter. None uses the time code rate; the capture must then contain a full second.
 
     Raises:
-        FormatError: not such a table; a value that is no finite number, a time code that does not follow the one
-            before, or a rate that does not fit. The message names line and column.
+        FormatError: not such a table, a value that is not finite, a time code that does not increase, or a rate that
+            does not fit. The message names line and column.
     """
     path = Path(path)
     table = read_table(path, _MAX_BYTES, short_rows=True)
@@ -89,7 +88,7 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
     for name in (_TIME, *JAW_COLUMNS):
         if columns.count(name) != 1:
             raise FormatError(
-                f'names the column "{name}" {columns.count(name)} times, expected once.',
+                f'has the column "{name}" {columns.count(name)} times, expected once.',
                 path=path,
                 hint="Live Link Face exports Timecode, JawOpen, JawLeft, JawRight and JawForward.",
             )
@@ -99,7 +98,7 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
     written = [row[at].strip() if len(row) > at else "" for row in table.rows]
     codes = np.array([_seconds_and_frame(code, table.named(i, at), path) for i, code in enumerate(written)])
     seconds, inside = codes[:, 0].astype(np.int64), _spread(codes)
-    # Past midnight the time codes start over.
+    # Time codes restart at midnight.
     seconds += _DAY_S * np.concatenate([[0], np.cumsum(np.diff(seconds) < -_DAY_S // 2)])
     number = _numbers_per_second(seconds, inside, fps, table, at)
     dropped = _dropped(seconds, inside, number, any(";" in code for code in written))
@@ -135,13 +134,13 @@ def _check_weights(weights: Array, table: TextTable) -> None:
     if _LEAST_WEIGHT <= worst <= _MOST_WEIGHT or not np.isfinite(worst):
         return
     hint = (
-        "These look like percent: divide all weights by 100."
+        "These look like percentages: divide all weights by 100."
         if worst > _PERCENT
-        else ("Export the weights as the device gives them, not normalised or scaled.")
+        else ("Export the weights as recorded, not normalised or scaled.")
     )
     raise FormatError(
-        f'{table.places[row]}, column "{JAW_COLUMNS[column]}" is {worst:g}; weights of ARKit go from 0 to 1, allowed '
-        f"are {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g}.",
+        f'{table.places[row]}, column "{JAW_COLUMNS[column]}" is {worst:g}; ARKit weights range from 0 to 1, allowed '
+        f"is {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g}.",
         path=table.path,
         hint=hint,
     )
@@ -156,10 +155,10 @@ def _seconds_and_frame(code: str, named: str, path: Path) -> tuple[int, float]:
 
 
 def _spread(codes: Array) -> Array:
-    """Return the frames within the second of rows that share a time code, as evenly as the samples were taken.
+    """Return the frame within the second of every row; rows that repeat a time code are spread evenly.
 
-    Most codes must stand in several rows. Where there are fewer rows than usual, the last ones of the first code are
-    there, and the first ones of all others.
+    This applies if most codes are repeated. A code with fewer rows than usual has lost its first rows if it is the
+    first code, otherwise its last rows.
 
     Args:
         codes: seconds and frames within the second, shape (F, 2).
@@ -178,17 +177,17 @@ def _spread(codes: Array) -> Array:
 def _numbers_per_second(
     seconds: NDArray[np.int64], inside: Array, fps: float | None, table: TextTable, column: int
 ) -> int:
-    """Return how many numbers the time codes count in a second: the usual rate that best continues across seconds."""
+    """Return how many frames the time codes count per second: the standard rate that best fits across seconds."""
     top = int(np.argmax(inside))
     highest = math.floor(inside[top])
     given = 0 if fps is None else math.ceil(fps - _NTSC_SLACK)
     same = np.diff(seconds) == 0
     step = float(np.median(np.diff(inside)[same])) if same.any() else 1.0
-    at_rate = round(given * step, 3)  # of codes on which the samples come at the given rate
+    at_rate = round(given * step, 3)  # code rate if the samples come at the given rate
     rates = [rate for rate in sorted({*_RATES, given, at_rate}) if rate > highest and rate % 1 == 0]
-    # Not at the start of a minute, where numbers may be left out.
+    # Not at the start of a minute, where numbers may be dropped.
     turns = np.flatnonzero((np.diff(seconds) == 1) & (seconds[1:] % 60 != 0))
-    # The first and the last second are incomplete: only those between them show how far numbers go.
+    # The first and last seconds are incomplete.
     rows_of_whole = np.unique(seconds, return_counts=True)[1][1:-1]
     found = 0
     if turns.size and rates and (rows_of_whole.size or given):
@@ -200,8 +199,8 @@ def _numbers_per_second(
         found = int(at_rate) if at_rate in _RATES and at_rate > highest and step < 1 else given
     if not found:
         raise FormatError(
-            "the time codes do not tell the frame rate: they pass no full second, or count at none of "
-            f"{', '.join(map(str, _RATES))} numbers a second.",
+            "the frame rate cannot be found from the time codes: there is no full second, or the rate is none of "
+            f"{', '.join(map(str, _RATES))} frames per second.",
             path=table.path,
             hint="Give the rate with --fps." if fps is None else None,
         )
@@ -210,29 +209,29 @@ def _numbers_per_second(
         not given or not max(given, found) % min(given, found) or _FEWEST_ROWS * given <= samples <= _MOST_ROWS * given
     )
     if highest >= found or not fits:
-        counted = "" if highest >= found else f" and {found} of them in a second"
+        counted = "" if highest >= found else f", and the codes count {found} frames per second"
         raise FormatError(
-            f"{table.named(top, column)} counts frame {highest} of a second{counted}, at {fps:g} frames per second "
-            f"allowed are 0 .. {given - 1}.",
+            f"{table.named(top, column)} has frame number {highest}{counted}; at {fps:g} frames per second allowed is "
+            f"0 .. {given - 1}.",
             path=table.path,
-            hint="Leave --fps out; --resample brings the motion to another rate." if counted else None,
+            hint="Omit --fps; --resample changes the rate of the motion." if counted else None,
         )
     return found
 
 
 def _is_of_ntsc(rate: float) -> bool:
-    """Tell whether a rate is one like 29.97, short for 30000 / 1001."""
+    """Tell whether a rate is an NTSC rate, such as 29.97 = 30000 / 1001."""
     return abs(rate - math.ceil(rate - _NTSC_SLACK) * 1000 / 1001) < _NTSC_SLACK
 
 
 def _dropped(seconds: NDArray[np.int64], inside: Array, number: int, marked: bool) -> int:
-    """Return how many numbers the time codes leave out at the start of a minute, 0 where they count them all."""
+    """Return how many numbers the time codes drop at the start of a minute, 0 without drop-frame counting."""
     if number not in (30, 60):
         return 0
     count = number // 15
     if marked:
         return count
-    # unmarked: none of these numbers, and a step from the last one of a minute to the one after those left out
+    # Unmarked drop-frame codes skip these numbers from the end of one minute to the start of the next.
     first = (seconds % 60 == 0) & (seconds // 60 % 10 != 0)
     stepped = first[1:] & (np.floor(inside[1:]) == count) & (np.floor(inside[:-1]) == number - 1)
     stepped &= np.diff(seconds) == 1
@@ -242,22 +241,24 @@ def _dropped(seconds: NDArray[np.int64], inside: Array, number: int, marked: boo
 def _frames(
     seconds: NDArray[np.int64], inside: Array, number: int, dropped: int, table: TextTable, column: int
 ) -> Array:
-    """Return the numbers that the time codes count from the first row on."""
+    """Return the frame numbers of the time codes, counted from the first row."""
     minutes = seconds // 60
     frames = seconds * number + inside - dropped * (minutes - minutes // 10)
     steps = np.diff(frames)
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 1
-        raise FormatError(f"{table.named(row, column)} does not come after the row before.", path=table.path)
+        raise FormatError(
+            f"{table.named(row, column)} is not later than the row before; time codes must increase.", path=table.path
+        )
     return frames - frames[0]
 
 
 class ArkitMapping(BaseModel):
-    """Hold what the weights of one person mean; four numbers are of JawOpen, JawLeft, JawRight, JawForward.
+    """A person's mapping from jaw weights to d; groups of four are JawOpen, JawLeft, JawRight, JawForward.
 
-    d = rest_mm + (gain_mm + u_open * opened_gain_mm) @ u, where u is how far each weight is from its neutral value,
-    less the dead zone, and 0 inside of it; u_open is JawOpen's. What a gain says of another direction than its weight's
-    own is the cross-talk; opened gains, because reach to the sides and forward changes as the jaw opens.
+    d = rest_mm + (gain_mm + u_open * opened_gain_mm) @ u, where u is the deviation of each weight from its neutral
+    value, reduced by the dead zone (0 inside it), and u_open that of JawOpen. Gains of other directions are cross-talk.
+    Opened gains model that lateral and forward reach change as the jaw opens.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -287,7 +288,7 @@ def moved_terms(weights: Array, neutral: Array, dead_zone: Array) -> Array:
 
 
 def load_mapping(path: str | os.PathLike[str]) -> ArkitMapping:
-    """Read a mapping.
+    """Read an ARKit mapping.
 
     Raises:
         FormatError: not such a file; the message names the entry.
@@ -298,7 +299,7 @@ def load_mapping(path: str | os.PathLike[str]) -> ArkitMapping:
 
 
 def save_mapping(path: str | os.PathLike[str], mapping: ArkitMapping) -> None:
-    """Write a mapping atomically.
+    """Write an ARKit mapping atomically.
 
     Raises:
         OutputError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Write outputs so that a reader never meets half of one: temporary file, fsync, rename. Pipes and devices stay."""
+"""Write outputs atomically: temporary file, fsync, rename. Pipes and devices are written in place."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from jawusd.base.errors import OutputError, shown
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# Prefix of every unfinished file and folder, by which what a killed run leaves behind is recognised and deleted.
+# Prefix of unfinished files and folders, by which leftovers of killed runs are found and deleted.
 _UNFINISHED = ".jawusd-tmp-"
-_LONGEST_SUFFIX = 16  # bytes; a temporary name fits where the name itself does
-#: What to do where a file or folder cannot be written.
-ELSEWHERE = "Name a place where you may write."
-# What some file systems cannot do: fsync, modes.
+_LONGEST_SUFFIX = 16  # bytes; keeps temporary names within the length limit
+#: Hint where a file or folder cannot be written.
+ELSEWHERE = "Choose a folder where you have write access."
+# Errors of file systems without fsync or modes.
 _UNSUPPORTED = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM)
 
 
 def destination(path: str | os.PathLike[str]) -> Path:
-    """Return the file that an output goes to: the path itself, or what a link names within its own folder.
+    """Return the file that an output is written to: the path itself, or the target of a link within its folder.
 
     Raises:
-        OutputError: a folder, a disk, a socket, a link out of its folder, or a name that no file can have.
+        OutputError: a folder, a disk, a socket, a link out of its folder, or an invalid name.
     """
     target = Path(path)
     try:
@@ -48,15 +48,15 @@ def destination(path: str | os.PathLike[str]) -> Path:
         raise OutputError(f"cannot write here: {getattr(error, 'strerror', error)}.", path=path) from error
     if found is not None and not stat.S_ISREG(found):
         what = "a folder" if stat.S_ISDIR(found) else "neither a file nor a pipe"
-        raise OutputError(f"is {what}; no file takes its place.", path=path, hint="Name another file.")
+        raise OutputError(f"is {what}; it is not replaced by a file.", path=path, hint="Name another file.")
     return target
 
 
 def refuse_existing(path: Path, force: bool) -> None:
-    """Check before any work that a file may be written: there is none of that name, or it may be overwritten.
+    """Check before any work that an output may be written: it does not exist yet, or `force` is set.
 
     Raises:
-        OutputError: it exists, or see `destination`.
+        OutputError: it exists, or as `destination`.
     """
     destination(path)
     if os.path.lexists(path) and not force and not is_stream(path):
@@ -64,7 +64,7 @@ def refuse_existing(path: Path, force: bool) -> None:
 
 
 def is_stream(path: Path) -> bool:
-    """Tell whether a path is written to as it is: a pipe, a device as /dev/null, the file behind /dev/stdout."""
+    """Tell whether a path is written in place: a pipe, a device such as /dev/null, the file behind /dev/stdout."""
     found = _mode(path)
     if found is None:
         return False
@@ -79,7 +79,7 @@ def _mode(path: Path) -> int | None:
 
 
 def _standard(path: Path) -> int | None:
-    """Return which standard stream a link as /dev/stdout stands for."""
+    """Return the number of the standard stream that a link such as /dev/stdout refers to."""
     for number in (1, 2):
         with contextlib.suppress(OSError):
             if path.is_symlink() and os.path.samestat(path.stat(), os.fstat(number)):
@@ -88,15 +88,15 @@ def _standard(path: Path) -> int | None:
 
 
 def open_stream(path: Path) -> int:
-    """Return a handle to write to what `is_stream`.
+    """Open a path for which `is_stream` holds; return a file descriptor for writing.
 
     Raises:
-        OutputError: it cannot be written, or is a pipe that no program reads.
+        OutputError: it cannot be written, or is a pipe without a reader.
     """
     number = _standard(path)
     if number is not None:
         return os.dup(number)
-    try:  # opening a pipe that no program reads would wait without an end
+    try:  # opening a pipe without a reader would block
         handle = os.open(path, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
     except OSError as error:
         why = "no program reads this pipe" if error.errno == errno.ENXIO else error.strerror
@@ -107,12 +107,12 @@ def open_stream(path: Path) -> int:
 
 @contextlib.contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path of the same suffix, and rename it to `path` when the block ends well.
+    """Yield a temporary path with the same suffix, and rename it to `path` if the block succeeds.
 
-    A missing folder is made. Links are followed as `destination` says. Pipes and devices get the finished content.
+    Missing folders are created. Links are resolved by `destination`. Pipes and devices get the finished content.
 
     Raises:
-        OutputError: the folder cannot be written, the disk is full, or the output may not go there.
+        OutputError: the folder cannot be written, the disk is full, or the destination is not allowed.
     """
     target = destination(path)
     stream = is_stream(target)
@@ -138,7 +138,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, target)
         _sync_folder(target.parent)
     except OSError as error:
-        after = "" if stream else " What was there before is untouched."
+        after = "" if stream else " An existing file is unchanged."
         raise OutputError(f"could not be written: {error.strerror}.{after}", path=path) from error
     finally:
         temporary.unlink(missing_ok=True)
@@ -155,7 +155,7 @@ def _unless_unsupported() -> Iterator[None]:
 
 @contextlib.contextmanager
 def scratch_folder(beside: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary folder beside a file that is going to be written, and delete it at the end of the block.
+    """Yield a temporary folder beside an output file, and delete it at the end of the block.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -175,7 +175,7 @@ def scratch_folder(beside: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def clear_unfinished(folder: str | os.PathLike[str]) -> None:
-    """Delete what runs that were killed left unfinished in a folder and below; nobody else may be writing there."""
+    """Delete unfinished outputs of killed runs in a folder and its subfolders; no other process may write there."""
     for left in list(Path(folder).rglob(f"{_UNFINISHED}*")):
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left, ignore_errors=True)
@@ -214,14 +214,14 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
     """Write UTF-8 text to a file atomically.
 
     Raises:
-        OutputError: the file cannot be written, or a name in the text is not UTF-8.
+        OutputError: the file cannot be written, or the text contains a name that is not UTF-8.
     """
     try:
         data = text.encode()
-    except UnicodeEncodeError as error:  # bytes of names, as Python keeps them
+    except UnicodeEncodeError as error:  # undecodable bytes of file names, kept as surrogates
         name = error.object[max(0, error.start - 20) : error.end + 20]
         raise OutputError(
-            f'holds UTF-8 text, which cannot say the name in "{name}".', path=path, hint="Rename that file or folder."
+            f'would contain a name that is not UTF-8: "{name}".', path=path, hint="Rename that file or folder."
         ) from error
     write_bytes_atomic(path, data)
 
@@ -229,7 +229,7 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
 def write_csv_atomic(
     path: str | os.PathLike[str], columns: Sequence[str], rows: Iterable[Mapping[str, object]]
 ) -> None:
-    """Write a table with a header as CSV atomically; text in it cannot control a terminal.
+    """Write a table with a header as CSV atomically; control characters in its text are escaped.
 
     Raises:
         OutputError: the file cannot be written.
@@ -242,21 +242,24 @@ def write_csv_atomic(
 
 
 def write_npz_atomic(path: str | os.PathLike[str], arrays: Mapping[str, ArrayLike], *, packed: bool = True) -> None:
-    """Write an npz atomically, compressed unless it must be quick, byte for byte the same for the same arrays.
+    """Write an npz atomically; equal arrays give equal bytes.
 
-    Every array is written row by row: simple readers take no other order.
+    Arrays are written in C order, which simple readers require.
+
+    Args:
+        packed: compress the arrays.
 
     Raises:
         OutputError: the file cannot be written.
         ValueError: an array would need a pickle.
     """
-    import numpy as np  # commands check their outputs with this module before they load anything heavy
+    import numpy as np  # commands import this module for output checks, before anything heavy
 
     buffer = io.BytesIO()
     rows = {name: np.asarray(value, order="C") for name, value in arrays.items()}
     for name, array in rows.items():
         if array.dtype.hasobject:
-            raise ValueError(f"{name} holds Python objects; files carry plain arrays only")
+            raise ValueError(f"{name} holds Python objects; only plain arrays can be written")
     # numpy stamps every member with 1980-01-01, so equal content gives equal bytes.
     (np.savez_compressed if packed else np.savez)(buffer, allow_pickle=False, **rows)
     write_bytes_atomic(path, buffer.getvalue())

@@ -1,4 +1,4 @@
-"""The description of a capture: `capture.toml`, format jawusd-capture/1."""
+"""Captures: `capture.toml`, format jawusd-capture/1."""
 
 from __future__ import annotations
 
@@ -18,29 +18,31 @@ from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
 
 FAMILY, VERSION = "jawusd-capture", 1
-_MOST_PICKS = 200  # on a row of teeth; the triples of them, of which some are tried, grow with the third power
+_MOST_PICKS = 200  # per arch; the number of triples to sample from grows with the cube
 
 
 class Sync(Strict):
-    """Say how the cameras are aligned in time.
+    """How the cameras are synchronised.
 
-    `flash` looks for light flashes and, where a clip shows none, listens to the sound; `audio` only listens.
-    `timecode` compares the time codes of the clips, `numbers` those of their pictures. `offsets` gives, per camera, the
-    whole number with: frame k of the camera shows the instant of frame k + offset of the reference camera.
+    `flash` uses light flashes or, if a clip shows none, the sound; `audio` uses only the sound. `timecode` compares the
+    time codes of the clips, `numbers` the frame numbers of image sequences. `offsets` gives an integer per camera:
+    frame k of the camera shows the same instant as frame k + offset of the reference camera.
     """
 
     method: Annotated[
         Literal["flash", "audio", "timecode", "numbers", "offsets"],
         Key(
-            '"flash": light flashes, else sound; "audio": sound alone; "timecode": by the time codes of the clips; '
-            '"numbers": by the numbers of the pictures; "offsets": as given.'
+            '"flash": light flashes, or sound if there are none; "audio": sound only; "timecode": time codes of the '
+            'clips; "numbers": frame numbers of image sequences; "offsets": as given.'
         ),
     ] = "flash"
-    reference: Annotated[str | None, Key("Camera that counts the frames; the first if not given.", '"left"')] = None
+    reference: Annotated[
+        str | None, Key("Reference camera, whose frames are counted; default: the first.", '"left"')
+    ] = None
     offsets: Annotated[
         dict[str, int] | None,
         Key(
-            "Per camera: its frame k shows the instant of frame k + offset of the reference camera.",
+            "Per camera: its frame k shows the same instant as frame k + offset of the reference camera.",
             "{ left = 0, right = 5 }",
             "frames",
         ),
@@ -48,26 +50,26 @@ class Sync(Strict):
 
 
 class PickView(Strict):
-    """Give the pixel of a picked vertex in one camera (OpenCV pixels of the recorded picture)."""
+    """The pixel of a picked vertex in one camera (OpenCV pixels of the recorded picture)."""
 
     camera: Annotated[str, Key("Name of the camera.", '"left"')]
-    x: Annotated[float, Key("Pixel column; the middle of the first pixel is 0.", "651.5", "px")]
+    x: Annotated[float, Key("Pixel column; the centre of the first pixel is 0.", "651.5", "px")]
     y: Annotated[float, Key("Pixel row.", "250.4", "px")]
 
 
 class Pick(Strict):
-    """Join a vertex of a teeth scan with the pixels where it is seen."""
+    """A vertex of a teeth scan and the pixels where it is seen."""
 
     vertex: Annotated[
         int,
         Field(ge=0),
-        Key("Number of a vertex of the scan, from 0 in the order of its file; `jawusd view` writes it.", "0"),
+        Key("Index of a vertex of the scan, from 0 in file order; `jawusd view` writes it.", "0"),
     ]
     views: Annotated[
         tuple[PickView, ...],
         Field(min_length=2),
         Key(
-            "Where it is seen, in two cameras or more.",
+            "Where it is seen, in two or more cameras.",
             '[{ camera = "left", x = 651.5, y = 250.4 }, { camera = "right", x = 663.2, y = 290.4 }]',
             "px",
         ),
@@ -75,7 +77,7 @@ class Pick(Strict):
 
 
 class Bootstrap(Strict):
-    """Give the picks that start the tracking, on one frame of the reference camera."""
+    """The picks that initialise tracking, on one frame of the reference camera."""
 
     frame: Annotated[int, Field(ge=0), Key("Frame of the reference camera in which the points are picked.", "120")]
     upper: Annotated[tuple[Pick, ...], Field(max_length=_MOST_PICKS)] = ()
@@ -83,16 +85,16 @@ class Bootstrap(Strict):
 
 
 class MotionSection(Strict):
-    """Name a reference frame with the teeth in occlusion."""
+    """The rest frame, with the teeth in occlusion."""
 
     rest_frame: Annotated[
         Annotated[int, Field(ge=0)] | None,
-        Key("A frame with the teeth together; the most closed ones are searched if not given.", "46"),
+        Key("A frame with the teeth together; default: the most closed frames are found automatically.", "46"),
     ] = None
 
 
 class AnatomySection(Strict):
-    """Override what is otherwise derived from the scans."""
+    """Overrides of values that are derived from the scans."""
 
     T_anatomical_skull: Annotated[
         list[list[float]] | None,
@@ -114,30 +116,30 @@ class AnatomySection(Strict):
 
 
 class Capture(Strict):
-    """Describe a capture; all paths are absolute once loaded."""
+    """A capture; paths are absolute once loaded."""
 
     folder: Path
     name: Annotated[
         str,
         Field(min_length=1, pattern=r"^[A-Za-z0-9_\-. ]+$"),
-        Key("Name of the person or the take: letters, digits, spaces, _ - and dots.", '"anna"'),
+        Key("Name of the subject or take: letters, digits, spaces, _ - and dots.", '"anna"'),
     ]
-    fps: Annotated[float, Field(gt=0, le=10000), Key("Rate of the clips.", "23.976", "frames per second")]
+    fps: Annotated[float, Field(gt=0, le=10000), Key("Frame rate of the clips.", "23.976", "frames per second")]
     frames: Annotated[
         tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None,
-        Key("First frame, and one past the last, of the reference camera; all if not given.", "[30, 270]", "frames"),
+        Key("First frame, and one past the last, of the reference camera; default: all.", "[30, 270]", "frames"),
     ] = None
     calibration: Annotated[
         Path | None,
-        Key("Calibration of the cameras; without it one is made from [boards].", '"calibration.toml"'),
+        Key("Calibration of the cameras; default: calibrated from [boards].", '"calibration.toml"'),
     ] = None
     calibration_unit_mm: Annotated[
         float,
         Field(gt=0, le=1e6),
-        Key("Length of the calibration's unit: 1000 where it is in metres.", "1000.0", "mm"),
+        Key("Length of the calibration's unit: 1000 if it is in metres.", "1000.0", "mm"),
     ] = 1.0
     colour_config: Annotated[
-        Path | None, Key("OpenColorIO config for colour spaces of the footage by name.", '"config.ocio"')
+        Path | None, Key("OpenColorIO config that defines named colour spaces of the footage.", '"config.ocio"')
     ] = None
     scans: Scans
     cameras: Annotated[tuple[CameraSource, ...], Field(min_length=1, max_length=64, alias="camera")]
@@ -154,14 +156,14 @@ class Capture(Strict):
             camera.model_copy(update={key: value for key, value in own.items() if getattr(camera, key) is None})
             for camera in self.cameras
         )
-        object.__setattr__(self, "cameras", cameras)  # the capture itself cannot be changed otherwise
+        object.__setattr__(self, "cameras", cameras)  # the model is frozen
         names = [camera.name for camera in self.cameras]
         listed = ", ".join(names)
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             raise ValueError(
-                f'[[camera]] name = "{twice[0]}" is given {len(twice)} times, camera names must differ '
-                f"(found {listed}). Call each camera by a name of its own"
+                f'[[camera]] name = "{twice[0]}" is used {len(twice)} times, camera names must be unique '
+                f"(found {listed}). Give each camera its own name"
             )
         if self.frames is not None and self.frames[0] >= self.frames[1]:
             raise ValueError(
@@ -170,8 +172,8 @@ class Capture(Strict):
             )
         if self.boards is not None and len(self.boards.videos) != len(names):
             raise ValueError(
-                f"[boards] videos names {len(self.boards.videos)} clips, needed are {len(names)}, one for each of "
-                f"{listed}. Name them in the order of the cameras"
+                f"[boards] videos lists {len(self.boards.videos)} clips, {len(names)} are needed, one per camera: "
+                f"{listed}. List them in the order of the cameras"
             )
         self._check_names_of_cameras(names)
         return self
@@ -188,13 +190,13 @@ class Capture(Strict):
             unknown = [name for name in found if name not in names]
             if unknown:
                 raise ValueError(
-                    f'{key} names camera "{unknown[0]}", allowed are {listed}. Write the name as its [[camera]] has it'
+                    f'{key} names camera "{unknown[0]}", allowed are {listed}. Use the name from its [[camera]] table'
                 )
         missing = [name for name in names if self.sync.offsets is not None and name not in self.sync.offsets]
         if missing:
             raise ValueError(
                 f"[sync] offsets has no entry for {missing[0]}, needed are {listed}. "
-                f"Write it as {missing[0]} = 0, in frames; the reference camera's is 0"
+                f"Add it as {missing[0]} = 0, in frames; the offset of the reference camera is 0"
             )
 
     @property
@@ -203,47 +205,47 @@ class Capture(Strict):
         return self.sync.reference or self.cameras[0].name
 
 
-_MOST_LOOKED_AT = 4096
+_MOST_LOOKED_AT = 4096  # bytes checked for null bytes
 
 
 def _refuse_other_files(path: Path) -> None:
-    """Refuse what cannot be a capture.toml, with what to do instead.
+    """Refuse a path that cannot be a capture.toml, with advice.
 
     Raises:
-        FormatError: it is missing, or is no text.
+        FormatError: it is missing, or not text.
     """
     if not path.exists():
         hint = f"There is no folder {path.parent} either."
         if not path.is_absolute():
-            hint = f"Paths begin in the folder you are in, {Path.cwd()}."
+            hint = f"Paths are relative to the current folder, {Path.cwd()}."
         if path.parent.is_dir():
-            hint = f"`jawusd init {path.parent}` writes one from the footage and scans in that folder."
+            hint = f"`jawusd init {path.parent}` creates one from the footage and scans in that folder."
             if (path.parent / "actor.usda").exists():
-                hint = "That folder holds a rig; name the capture that it was built from."
+                hint = "That folder contains a rig; name the capture it was built from."
             elif close := similar_names(path):
-                hint = f"Did you mean {close}? Else {hint}"
+                hint = f"Did you mean {close}? Otherwise, {hint}"
         raise FormatError("there is no such file.", path=path, hint=hint)
     if path.is_file() and path.suffix.lower() != ".toml":
         with open(path, "rb") as file:
             is_text = b"\0" not in file.read(_MOST_LOOKED_AT)
         if not is_text:
             raise FormatError(
-                f'is no text, "{path.suffix}" is no capture: a capture is a folder with a capture.toml.',
+                f'is not text, and "{path.suffix}" is not a capture: a capture is a folder with a capture.toml.',
                 path=path,
-                hint=f"Write one for the footage beside it: jawusd init {path.parent}",
+                hint=f"Create one for this footage: jawusd init {path.parent}",
             )
 
 
-#: Keys that are read from the file before the models are.
+#: Keys that are checked before the models are validated.
 _BEFORE = (
-    KeyEntry("", "format", "text", "", Key("Kind and version of the file.", f'"{FAMILY}/{VERSION}"')),
+    KeyEntry("", "format", "text", "", Key("Format and version of the file.", f'"{FAMILY}/{VERSION}"')),
     KeyEntry("", "units", '"mm"', '"mm"', Key("Unit of all lengths.", '"mm"')),
 )
-_LABELS = Key("Instead of `upper` and `lower`: one label image per frame, by its gray values.", '"labels/%06d.png"')
+_LABELS = Key("Instead of `upper` and `lower`: one label image per frame, with gray values.", '"labels/%06d.png"')
 
 
 def capture_keys() -> list[KeyEntry]:
-    """Return every key that a capture.toml may have, in the order of the file."""
+    """Return all keys of a capture.toml, in file order."""
     out = list(_BEFORE)
     for entry in entries(Capture, skipped=("folder",)):
         out.append(entry)
@@ -253,13 +255,13 @@ def capture_keys() -> list[KeyEntry]:
 
 
 def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
-    """Read `capture.toml`, given itself or by its folder; the paths of the capture are absolute.
+    """Read `capture.toml`, given by its path or folder; paths in the result are absolute.
 
     Raises:
         FormatError: not such a file; the message names the key.
         UnitsError: lengths not in mm.
         VersionError: written for a newer jawusd.
-        CaptureError: a file it names does not exist, or lies outside its folder.
+        CaptureError: a referenced file does not exist, or is outside the capture's folder.
     """
     capture, problems = read_capture(path, allow_outside=allow_outside)
     if capture is None or problems:
@@ -270,9 +272,9 @@ def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -
 def read_capture(
     path: str | os.PathLike[str], *, allow_outside: bool = False
 ) -> tuple[Capture | None, list[JawusdError]]:
-    """Read a capture as `load_capture` does, and return everything that is wrong with it instead of raising.
+    """Read a capture like `load_capture`, but return all problems instead of raising the first.
 
-    The capture is None if values are missing or wrong; if it names files that do not exist, it still names them.
+    The capture is None if values are missing or wrong. Paths of missing files are kept.
     """
     path = Path(path)
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""Put new picks into a capture.toml and leave everything else in it, comments included, as it is."""
+"""Replace the picks in a capture.toml and preserve everything else, including comments."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _TABLE = "bootstrap"
 
 
 def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bootstrap | None) -> None:
-    """Replace `[bootstrap]` of a capture.toml, or add it, if its picks are still the expected ones.
+    """Replace or add `[bootstrap]` of a capture.toml, if its picks are still the expected ones.
 
     Raises:
         FormatError: the file is not TOML.
-        OutputError: its picks are no longer the expected ones, they are written in a form that cannot be replaced
-            safely, or the file cannot be written. Nothing has changed then.
+        OutputError: the picks have changed, have a form that cannot be replaced safely, or the file cannot be written.
+            The file is then unchanged.
     """
-    path = Path(path).resolve()  # a link stays a link
+    path = Path(path).resolve()  # keeps a link a link
     check_input(path)
     try:
         data = path.read_bytes()
-        encoding = json.detect_encoding(data)  # as `jawusd.base.tables.read_text` does, and keeps
+        encoding = json.detect_encoding(data)  # same rule as `jawusd.base.tables.read_text`; preserved on writing
         text = data.decode(encoding)
         found = tomllib.loads(text).get(_TABLE)
         there = None if found is None else Bootstrap.model_validate(found)
@@ -42,9 +42,9 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
         raise FormatError(f"[{_TABLE}] cannot be read: {error.errors()[0]['msg']}.", path=path) from error
     if there != expected:
         raise OutputError(
-            f"its [{_TABLE}] was changed by somebody else since it was read.",
+            f"its [{_TABLE}] was changed by another program since it was read.",
             path=path,
-            hint="Open the capture again to see the picks that are there now.",
+            hint="Open the capture again to see the current picks.",
         )
     try:
         changed = with_bootstrap(text, picks)
@@ -52,16 +52,16 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
         raise OutputError(
             f"{error}.",
             path=path,
-            hint=f"Bring [{_TABLE}] into the form of tables, [{_TABLE}] and [[{_TABLE}.upper]], or delete it.",
+            hint=f"Write [{_TABLE}] as tables, [{_TABLE}] and [[{_TABLE}.upper]], or delete it.",
         ) from error
     write_bytes_atomic(path, changed.encode(encoding))
 
 
 def with_bootstrap(text: str, picks: Bootstrap) -> str:
-    """Return a capture.toml with other picks; comments among the old ones are kept.
+    """Return the text of a capture.toml with new picks; comments among the old ones are kept.
 
     Raises:
-        ValueError: the picks there are written as something else than tables.
+        ValueError: the old picks are not written as tables.
     """
     blocks = list(_blocks(text))
     newline = "\r\n" if "\r\n" in text else "\n"
@@ -90,7 +90,7 @@ def _lines(picks: Bootstrap) -> list[str]:
 
 
 def _blocks(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield the first key of every table header with its lines and those below it; "" before the first header."""
+    """Yield every table's top-level name with its header and content lines; "" before the first header."""
     table = ""
     lines: list[str] = []
     for statement in _statements(text):
@@ -102,7 +102,7 @@ def _blocks(text: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def _statements(text: str) -> Iterator[list[str]]:
-    """Yield the lines of each header, value, comment or blank line; values may run over several lines."""
+    """Yield the lines of each header, value, comment or blank line; values may span several lines."""
     pending: list[str] = []
     for line in text.split("\n")[: None if not text.endswith("\n") else -1]:
         pending.append(line + "\n")
@@ -117,14 +117,14 @@ def _statements(text: str) -> Iterator[list[str]]:
 
 
 def _comments(lines: list[str], last: bool) -> list[str]:
-    """Return the comments among the statements of a block; a value with a comment beside it becomes one as a whole."""
+    """Return the comments of a block; a value with a trailing comment becomes a comment as a whole."""
     among = lines[: len(lines) - len(_after(lines))] if last else lines
-    # No value of picks holds a #: what has one carries a comment.
+    # Values of picks contain no #, so a # starts a comment.
     return [line.strip() if line.lstrip().startswith("#") else f"# {line.strip()}" for line in among if "#" in line]
 
 
 def _after(lines: list[str]) -> list[str]:
-    """Return the blank lines and comments at the end of a block: they belong to what follows."""
+    """Return the blank lines and comments at the end of a block, which belong to the next one."""
     count = 0
     while count < len(lines) and lines[-1 - count].strip()[:1] in ("", "#"):
         count += 1
@@ -132,17 +132,17 @@ def _after(lines: list[str]) -> list[str]:
 
 
 def _check(before: str, after: str, picks: Bootstrap) -> None:
-    """Compare the contents of two texts.
+    """Check that two texts differ only in the picks.
 
     Raises:
-        ValueError: more than the picks has changed.
+        ValueError: they differ elsewhere.
     """
     try:
         old, new = tomllib.loads(before), tomllib.loads(after)
         written = Bootstrap.model_validate(new.pop(_TABLE))
     except (tomllib.TOMLDecodeError, ValidationError) as error:
-        raise ValueError(f"[{_TABLE}] is not written as tables of its own") from error
+        raise ValueError(f"[{_TABLE}] is not written as separate tables") from error
     old.pop(_TABLE, None)
     rounded = Bootstrap.model_validate(tomllib.loads("\n".join(_lines(picks)).replace(f"[[{_TABLE}.", "[[")))
     if old != new or written != rounded:
-        raise ValueError(f"[{_TABLE}] is not written as tables of its own")
+        raise ValueError(f"[{_TABLE}] is not written as separate tables")

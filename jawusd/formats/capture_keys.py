@@ -17,20 +17,20 @@ from typing import Annotated, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-_CLOSE = 0.6  # similarity of a misspelt key to the one meant, by difflib's ratio: "mask" and "masks" have 0.89
+_CLOSE = 0.6  # least difflib ratio of a suggested key; "mask" and "masks" have 0.89
 _ALLOWED_SHOWN = 300  # characters
 
 Location = tuple[int | str, ...]
-#: Kinds of pydantic's errors in plain words; the limits stand in the error's context, by the name in braces.
+#: Messages by pydantic's error type; names in braces are keys of the error's context.
 _WORDS = {
     "greater_than": "must be more than {gt:g}",
     "greater_than_equal": "must be {ge:g} or more",
     "less_than": "must be less than {lt:g}",
     "less_than_equal": "must be {le:g} or less",
     "literal_error": "must be {expected}",
-    "string_pattern_mismatch": "has letters that are not allowed, or none; allowed are {signs}",
+    "string_pattern_mismatch": "is empty or has characters that are not allowed; allowed are {signs}",
     "string_too_short": "is empty",
-    "too_short": "has {actual_length} entries, {min_length} or more are needed",
+    "too_short": "has {actual_length} entries, at least {min_length} are needed",
     "too_long": "has {actual_length} entries, at most {max_length} are allowed",
     "missing": "is missing",
     "too_few": "has too few entries",
@@ -38,8 +38,8 @@ _WORDS = {
 _NEEDED = (
     (("float", "finite"), "a number is needed"),
     (("int",), "a whole number is needed"),
-    (("string",), 'text in quotes is needed, as "left"'),
-    (("path",), 'a path in quotes is needed, as "left.mp4"'),
+    (("string",), 'text in quotes is needed, such as "left"'),
+    (("path",), 'a path in quotes is needed, such as "left.mp4"'),
     (("bool",), "true or false is needed"),
     (("tuple", "list"), "a list in brackets is needed"),
     (("model", "dict"), "a table is needed"),
@@ -48,38 +48,38 @@ _NEEDED = (
 
 @dataclass(frozen=True)
 class Key:
-    """Describe one key of a file to people: stands in the annotation of the model's field."""
+    """Documentation of one key, in the annotation of the model's field."""
 
     meaning: str
-    example: str = ""  # as written in the file, to the right of the =
+    example: str = ""  # as written to the right of the =
     unit: str = ""
 
 
 @dataclass(frozen=True)
 class KeyEntry:
-    """Hold one key of the reference."""
+    """One key of the reference."""
 
-    table: str  # as the file writes it: "", "[scans]", "[[camera]]"
+    table: str  # as written in the file: "", "[scans]", "[[camera]]"
     name: str
     kind: str  # "text", "number", "path", ...
-    default: str  # "" if it must be given, "none" if leaving it out means something of its own
+    default: str  # "" if required, "none" if omitting it has a meaning of its own
     key: Key
 
 
 def describe_key(field: FieldInfo) -> Key:
-    """Return what a field's annotation says of it."""
+    """Return the documentation in a field's annotation."""
     return next((item for item in field.metadata if isinstance(item, Key)), Key(""))
 
 
 def entries(
     model: type[BaseModel], table: str = "", prefix: str = "", skipped: tuple[str, ...] = ()
 ) -> Iterator[KeyEntry]:
-    """Yield the keys of a model and of the tables in it, in the order of the file.
+    """Yield the keys of a model and of its nested tables, in file order.
 
     Args:
         model: the model of the table.
-        table: what the file calls it.
-        prefix: what comes before its keys, where they are written in the table above: "masks.".
+        table: the table's header in the file.
+        prefix: prefix of keys that are written in the table above, such as "masks.".
         skipped: fields that are not read from the file.
     """
     inner: list[tuple[str, str, type[BaseModel]]] = []
@@ -100,7 +100,7 @@ def entries(
 
 
 def table_model(field: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
-    """Return the model of a field that is a table of its own, and whether there may be several of them."""
+    """Return the model of a field that is a table, and whether it is an array of tables."""
     for part in _parts(field.annotation):
         if isinstance(part, type) and issubclass(part, BaseModel):
             return part, False
@@ -112,7 +112,7 @@ def table_model(field: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
 
 
 def _parts(annotation: object) -> list[object]:
-    """Return the members of a union without None, annotations taken off; other types alone."""
+    """Return the members of a union except None, without annotations; for other types, the type itself."""
     if get_origin(annotation) is Annotated:
         return _parts(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
@@ -149,7 +149,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def reference_lines(listed: list[KeyEntry], width: int = 100) -> list[str]:
-    """Return keys as text: a heading per table, a line with name, kind and default per key, its meaning below."""
+    """Return keys as text: a heading per table; per key a line with name, kind and default, and its meaning below."""
     import textwrap
 
     lines: list[str] = []
@@ -159,7 +159,7 @@ def reference_lines(listed: list[KeyEntry], width: int = 100) -> list[str]:
             table = entry.table
             lines += ["", table or "(top of the file, before the first table)"]
         unit = f" [{entry.key.unit}]" if entry.key.unit else ""
-        need = "must be given" if entry.default == "" else f"default {entry.default}"
+        need = "required" if entry.default == "" else f"default {entry.default}"
         lines.append(f"  {entry.name}{unit}: {entry.kind}; {need}")
         lines += textwrap.wrap(
             entry.key.meaning, width, initial_indent="      ", subsequent_indent="      ", break_on_hyphens=False
@@ -172,10 +172,10 @@ def reference_lines(listed: list[KeyEntry], width: int = 100) -> list[str]:
 def problems_of(
     error: ValidationError, model: type[BaseModel], data: Mapping[str, object]
 ) -> list[tuple[str, str | None]]:
-    """Return what is wrong, each as a sentence that names table and key, and what to do, None if that is plain.
+    """Return the problems, each as a sentence that names table and key, and a hint or None.
 
     Args:
-        error: raised when `data`, read from the file, was given to `model`.
+        error: raised when `model` validated `data`, the content of the file.
     """
     found = error.errors()
     unknown = [(problem["loc"][:-1], str(problem["loc"][-1])) for problem in found if _is_unknown(problem["type"])]
@@ -184,13 +184,13 @@ def problems_of(
     for problem in sorted(found, key=lambda problem: not _is_unknown(problem["type"])):
         location, kind = problem["loc"], problem["type"]
         if kind == "too_short" and location in deeper:
-            continue  # wrong entries are not counted
+            continue  # the entries themselves are reported
         if _is_unknown(kind):
             out.append(_unknown_key(str(location[-1]), location[:-1], model, place(location[:-1], data)))
         elif kind == "missing" and any(
             table == location[:-1] and _meant(key, [str(location[-1])]) for table, key in unknown
         ):
-            continue  # a misspelt key also makes the right one missing; the misspelling is the cause
+            continue  # missing only because it is misspelt, which is reported
         else:
             out.append(_wrong_value(problem, location, model, data))
     return out
@@ -201,7 +201,7 @@ def _is_unknown(kind: str) -> bool:
 
 
 def place(location: Location, data: Mapping[str, object]) -> str:
-    """Return a table as the file writes it: `[scans]`, `[[camera]] 2 ("left")`, `[[bootstrap.upper]] 1, views 2`."""
+    """Return a table as written in the file: `[scans]`, `[[camera]] 2 ("left")`, `[[bootstrap.upper]] 1, views 2`."""
     if not location:
         return ""
     at: object = data
@@ -223,7 +223,7 @@ def place(location: Location, data: Mapping[str, object]) -> str:
 
 
 def _unknown_key(key: str, table: Location, model: type[BaseModel], where: str) -> tuple[str, str | None]:
-    """Say that a key is not known, which are, and which one may be meant."""
+    """Return the message and hint for an unknown key: the allowed keys, and a suggestion."""
     allowed = [name for name in _keys(_model_at(table, model)) if name != "folder"]
     top = [name for name in _keys(model) if name != "folder"]
     inside = f"{where}: " if where else ""
@@ -232,13 +232,13 @@ def _unknown_key(key: str, table: Location, model: type[BaseModel], where: str) 
     if meant:
         advice = f'Did you mean "{meant}"?'
     elif elsewhere:
-        advice = f'"{key}" stands at the top of the file, before the first [table].'
+        advice = f'"{key}" goes at the top of the file, before the first [table].'
     elif owner := _owner(key, model):
         advice = f'"{key}" belongs to {owner}.'
     else:
-        advice = "See `jawusd init --reference`."
+        advice = "`jawusd init --reference` lists all keys."
     listed = ", ".join(allowed if table else ["format", "units", *allowed])
-    return f'{inside}there is no key "{key}"; allowed are {listed[:_ALLOWED_SHOWN]}.', advice
+    return f'{inside}unknown key "{key}"; allowed are {listed[:_ALLOWED_SHOWN]}.', advice
 
 
 def _wrong_value(
@@ -258,12 +258,15 @@ def _wrong_value(
         inside = f"{said}: " if said else ""
         return f"{inside}{str(values.get('error', problem['msg'])).rstrip('.')}.", None
     if kind in ("tuple_type", "list_type") and isinstance(given, dict):
-        return f"[{name}] is one table; write [[{name}]], with double brackets, for each one.", None
+        return f"[{name}] is a single table; write [[{name}]], with double brackets, for each one.", None
     field = _field_at(location, model)
     below, many = (None, False) if field is None else table_model(field)
     key = Key("") if field is None else describe_key(field)
     if below is not None and not key.meaning and kind == "missing":
-        return f"[[{name}]] is missing." if many else f"[{name}] is missing.", "See `jawusd init --reference`."
+        return (
+            f"[[{name}]] is missing." if many else f"[{name}] is missing.",
+            "`jawusd init --reference` lists all keys.",
+        )
     words = _WORDS.get(kind)
     if "pattern" in values:
         values = {**values, "signs": _signs(str(values["pattern"]))}
@@ -275,12 +278,12 @@ def _wrong_value(
 
 
 def _signs(pattern: str) -> str:
-    """Return what a pattern of one class of signs allows, in words; another pattern as it is."""
+    """Return the characters that a pattern of one character class allows; other patterns unchanged."""
     inside = re.fullmatch(r"\^\[(.+)\]\+\$", pattern)
     if inside is None:
         return f"{pattern.strip('^$')}"
     signs = [sign.removeprefix("\\") for sign in re.findall(r"\w-\w|\\?.", inside[1])]
-    return " ".join("blanks" if sign == " " else sign for sign in signs)
+    return " ".join("spaces" if sign == " " else sign for sign in signs)
 
 
 def _found(kind: str, given: object) -> str:
@@ -298,7 +301,7 @@ def _needed(kind: str, message: str) -> str:
 
 
 def _meant(key: str, allowed: Iterable[str]) -> str:
-    """Return the allowed key most like a misspelt one, "" if none is."""
+    """Return the allowed key most similar to a misspelt one, "" if there is none."""
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in allowed}
     close = difflib.get_close_matches(re.sub(r"[^a-z0-9]", "", key.lower()), plain, n=1, cutoff=_CLOSE)
     return plain[close[0]] if close else ""
@@ -328,7 +331,7 @@ def _named(key: int | str, model: type[BaseModel] | None) -> FieldInfo | None:
 
 
 def _owner(key: str, model: type[BaseModel]) -> str:
-    """Return the table that has a key, as the file writes it, "" if none has."""
+    """Return the table that contains a key, as written in the file, "" if there is none."""
     for name, field in model.model_fields.items():
         below, many = table_model(field)
         if below is not None and key in _keys(below):

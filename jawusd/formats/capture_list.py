@@ -1,4 +1,4 @@
-"""A list of captures: a text file with one capture a line, and optionally a name for its output.
+"""A list of captures: a text file with one capture per line, and optionally a name for its output.
 
     # comments and empty lines are skipped; paths are relative to the folder of this file
     day_1/anna/capture.toml
@@ -6,7 +6,7 @@
     day_2/ben, ben_again
     "day_2/ben, late", ben_late
 
-It is CSV: a path with a comma goes in double quotes.
+The format is CSV: quote paths that contain a comma.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-. ]*")
 
 @dataclass(frozen=True)
 class ListedCapture:
-    """Name one capture of a list."""
+    """One capture of a list."""
 
-    path: Path  # capture.toml or its folder, absolute; it need not exist
-    name: str  # of the folder that its results go to, unlike all others of the list
+    path: Path  # capture.toml or its folder, absolute; may not exist
+    name: str  # name of its output folder, unique in the list
 
 
 def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
@@ -45,17 +45,17 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         item = _listed(line, folder, path, number)
-        # Some file systems ignore case.
+        # Some file systems are case-insensitive.
         earlier = lines.setdefault(item.name.casefold(), number)
         if earlier != number:
             raise FormatError(
-                f'lines {earlier} and {number} would both go to the folder "{item.name}".',
+                f'lines {earlier} and {number} have the same output folder "{item.name}".',
                 path=path,
-                hint="Give one of them a name of its own: PATH, NAME.",
+                hint="Name one of them after a comma: PATH, NAME.",
             )
         found.append(item)
     if not found:
-        raise FormatError("names no capture; one path a line is expected.", path=path)
+        raise FormatError("lists no captures; one path per line is expected.", path=path)
     return found
 
 
@@ -73,9 +73,10 @@ def _listed(line: str, folder: Path, path: Path, number: int) -> ListedCapture:
     name = cells[1] if len(cells) == 2 else _default_name(capture)
     if not _NAME.fullmatch(name) or name.endswith((".", " ")):
         raise FormatError(
-            f'line {number}: "{name}" is no name for a folder; letters, digits, "_", "-", "." and blanks are allowed.',
+            f'line {number}: "{name}" is not a valid folder name; allowed are letters, digits, "_", "-", "." and '
+            "spaces.",
             path=path,
-            hint="Give it a name after a comma: PATH, NAME.",
+            hint="Add a name after a comma: PATH, NAME.",
         )
     return ListedCapture(capture, name)
 

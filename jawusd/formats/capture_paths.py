@@ -1,4 +1,4 @@
-"""Make the paths in a capture.toml absolute, and say which lead nowhere or out of its folder."""
+"""Resolve the paths in a capture.toml, and report those that are missing or outside its folder."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from jawusd.formats.capture_keys import Location, place
 from jawusd.formats.file_names import is_pattern, wrong_kind
 
 M = TypeVar("M", bound=BaseModel)
-_MOVE = "Move the file inside, or allow it with --allow-outside."
-_SHOWN = 3  # names like a missing one
-_DRIVE = re.compile(r"[A-Za-z]:[\\/]")  # how paths of Windows begin
-_NO_NAME = re.compile(r"[\x00-\x1f]")  # what a backslash and a letter make in TOML: \t of videos\take.mp4
-_RELATIVE = "Write it from the folder of the capture on, with slashes, as video/left.mp4."
+_MOVE = "Move the file into that folder, or allow it with --allow-outside."
+_SHOWN = 3  # suggested names
+_DRIVE = re.compile(r"[A-Za-z]:[\\/]")  # prefix of a Windows path
+_NO_NAME = re.compile(r"[\x00-\x1f]")  # from TOML escapes, such as \t in videos\take.mp4
+_RELATIVE = "Write it relative to the capture's folder, with slashes, such as video/left.mp4."
 
 
 def resolve_paths(
     model: M, source: Path, data: Mapping[str, object], *, allow_outside: bool
 ) -> tuple[M, list[JawusdError]]:
-    """Return a model with every path absolute, and an error for each that is outside the folder or does not exist.
+    """Return a model with absolute paths, and an error for each path outside the folder or missing.
 
     Args:
         model: read from a file.
         source: that file; paths are relative to its folder.
         data: its contents, for the names of tables.
-        allow_outside: let paths leave the folder.
+        allow_outside: allow paths outside the folder.
 
     Raises:
-        TypeError: what is given is no model.
+        TypeError: the argument is not a model.
     """
     folder = source.resolve().parent
     problems: list[JawusdError] = []
@@ -46,8 +46,8 @@ def resolve_paths(
         try:
             problem = _problem(value, full, folder, allow_outside) or _misnamed(location, full)
             problem = problem or _named_twice(location, full, named, data)
-        except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, links in a circle
-            problem = f"is no path that can be followed ({error!s:.100}).", None
+        except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, circular links
+            problem = f"is not a valid path ({error!s:.100}).", None
         if problem is not None:
             text, hint = problem
             where = _where(location, data)
@@ -66,7 +66,7 @@ def resolve_paths(
 
     resolved = walk(model, ())
     if not isinstance(resolved, type(model)):
-        raise TypeError("resolving a model must give a model of its kind")
+        raise TypeError("only pydantic models can be resolved")
     return resolved, problems
 
 
@@ -81,26 +81,26 @@ def _where(location: Location, data: Mapping[str, object]) -> str:
 
 
 def _problem(value: Path, full: Path, folder: Path, allow_outside: bool) -> tuple[str, str | None] | None:
-    """Return what is wrong with a path and what to do, None if nothing is."""
+    """Return the problem with a path and a hint, None if it is fine."""
     if os.name != "nt" and _DRIVE.match(str(value)):
-        return "is a path of Windows, which leads nowhere here.", _RELATIVE
-    # Resolve links as well: a link may lead out of the folder though its name does not.
+        return "is a Windows path, which does not exist on this system.", _RELATIVE
+    # Resolve links too: a link inside the folder may lead out of it.
     anchor = full.parent if is_pattern(full) else full
     inside, exists = anchor.resolve().is_relative_to(folder), anchor.exists()
     if not allow_outside and not inside:
-        return "leads out of the folder of the capture.", _MOVE
+        return "is outside the folder of the capture.", _MOVE
     if not allow_outside and (link := _link_out(anchor, folder)) is not None:
-        return f"is not safe: the link {link} leads out of the folder of the capture.", _MOVE
+        return f"is not safe: the link {link} leads outside the folder of the capture.", _MOVE
     if exists:
         return None
     if "\\" in str(value) or _NO_NAME.search(str(value)):
-        return "does not exist; a backslash separates no folders.", _RELATIVE
+        return "does not exist; backslashes do not separate folders here.", _RELATIVE
     kind = "folder" if is_pattern(full) else "file"
     return f"does not exist: there is no {kind} {anchor}.", _similar(anchor)
 
 
 def _misnamed(location: Location, full: Path) -> tuple[str, str | None] | None:
-    """Return what is wrong with the kind of a file, and what to do."""
+    """Return the problem with the type of a file, and a hint."""
     key = next((str(part) for part in reversed(location) if isinstance(part, str)), "")
     kind = wrong_kind(key, full)
     return None if kind is None else (kind, f"Name another file for {key}.")
@@ -109,17 +109,17 @@ def _misnamed(location: Location, full: Path) -> tuple[str, str | None] | None:
 def _named_twice(
     location: Location, full: Path, named: dict[tuple[str, Path], Location], data: Mapping[str, object]
 ) -> tuple[str, str | None] | None:
-    """Return what is wrong with a scan, clip or mask that another key names too; note it for those that follow."""
+    """Return the problem with a scan, clip or mask that another key uses too; record it otherwise."""
     group = next((str(part) for part in location if part in ("scans", "masks", "video", "videos")), "")
     other = named.setdefault((group, full), location)
-    # One file may hold the labels of both rows of a camera.
+    # One label file may hold both arches of a camera.
     if not group or other == location or (group == "masks" and other[:2] == location[:2]):
         return None
-    return f"is named before, by {_where(other, data)}; each needs its own file.", "Name the right file here or there."
+    return f"is already used by {_where(other, data)}; each needs its own file.", "Correct one of the two."
 
 
 def _link_out(place: Path, folder: Path) -> str | None:
-    """Return a link in a folder of pictures or labels that leads out of the capture's folder; None if none does."""
+    """Return a link in a folder of pictures or labels that leads outside the capture's folder, or None."""
     if not place.is_dir():
         return None
     with os.scandir(place) as entries:
@@ -128,7 +128,7 @@ def _link_out(place: Path, folder: Path) -> str | None:
 
 
 def _similar(path: Path) -> str:
-    """Return advice that names what there is of nearly that name."""
+    """Return a hint that suggests similar names."""
     if not path.parent.is_dir():
         return f"There is no folder {path.parent} either."
     found = similar_names(path)
@@ -136,7 +136,7 @@ def _similar(path: Path) -> str:
 
 
 def similar_names(path: Path) -> str:
-    """Return what there is of nearly the name of a path, in its folder: "left.mp4 or left.mov", "" if nothing is."""
+    """Return similar names in the folder of a path, such as "left.mp4 or left.mov", "" if there are none."""
     names = sorted(entry.name for entry in path.parent.iterdir() if not entry.name.startswith("."))
     lower = {name.lower(): name for name in names}
     close = [lower[found] for found in difflib.get_close_matches(path.name.lower(), lower, n=_SHOWN)]

@@ -1,4 +1,4 @@
-"""Write a new capture.toml with comments that say what each part is, and what is still missing."""
+"""Write a new capture.toml, with comments that explain each part and mark missing values."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePath
 
-#: What stands where a value must be filled in.
+#: Marks a value to be filled in.
 FILL = "# FILL IN:"
 
 
 @dataclass(frozen=True)
 class CameraSketch:
-    """Hold what was found of one camera; paths are relative to the capture."""
+    """Files found for one camera; paths are relative to the capture."""
 
     name: str
     video: PurePath | None = None
     masks: Mapping[str, PurePath] = field(default_factory=dict)  # by "upper" and "lower"
     board: PurePath | None = None
-    remark: str = ""  # on its footage, as a comment
+    remark: str = ""  # about its footage, as a comment
 
 
 @dataclass(frozen=True)
 class BoardSketch:
-    """Hold what board the clips show."""
+    """The calibration board found in the clips."""
 
     pattern: str = "chessboard"
     cols: int | None = None
@@ -35,7 +35,7 @@ class BoardSketch:
 
 @dataclass(frozen=True)
 class CaptureSketch:
-    """Hold what was found of a capture; what is None was not."""
+    """Files and values found for a capture; None if not found."""
 
     name: str
     fps: float | None = None
@@ -47,10 +47,10 @@ class CaptureSketch:
 
 
 def capture_text(sketch: CaptureSketch) -> str:
-    """Return a capture.toml. What is missing stands as a comment that says so, so that the file is TOML in any case."""
+    """Return a capture.toml. Missing values become comments, so that the text is always valid TOML."""
     lines = [
-        "# A capture for jawusd: one person, one take. `jawusd check FOLDER` says what is wrong with it,",
-        "# `jawusd init --reference` explains every key. Paths are relative to this file; lengths are mm.",
+        "# A capture for jawusd: one subject, one take. `jawusd check FOLDER` reports problems,",
+        "# `jawusd init --reference` explains all keys. Paths are relative to this file; lengths are in mm.",
         "",
         'format = "jawusd-capture/1"',
         f"name = {_text(sketch.name)}",
@@ -63,13 +63,13 @@ def capture_text(sketch: CaptureSketch) -> str:
         *_cameras(sketch.cameras),
         *_board(sketch),
         "[sync]",
-        'method = "flash"  # the room light goes off and on at the start and at the end; else the sound aligns',
-        "# offsets = { NAME = 0, OTHER = 5 }  # instead: frame k of a camera is frame k + offset of the first one",
+        'method = "flash"  # room light switched off and on at start and end; without flashes, the sound is used',
+        "# offsets = { NAME = 0, OTHER = 5 }  # or given: frame k of a camera is frame k + offset of the first one",
         "",
         "# [motion]",
-        "# rest_frame = 46  # a frame with the teeth together; searched if not given",
+        "# rest_frame = 46  # a frame with the teeth together; default: found automatically",
         "",
-        "# Without picks the teeth are searched. `jawusd view FOLDER` is where picks are made, if that fails.",
+        "# The teeth are located automatically. If that fails, make picks with `jawusd view FOLDER`.",
     ]
     return "\n".join(lines) + "\n"
 
@@ -129,14 +129,14 @@ def _board(sketch: CaptureSketch) -> Iterable[str]:
     clips = [camera.board for camera in sketch.cameras]
     board = sketch.board
     if board is None:
-        yield "# [boards]  # clips of a chessboard, one per camera: the build calibrates by itself"
+        yield "# [boards]  # clips of a chessboard, one per camera: the build calibrates from them"
         yield "# cols = 9"
         yield "# rows = 6"
         yield "# square_mm = 8.0"
         yield '# videos = ["board_left.mp4", "board_right.mp4"]'
         yield ""
         return
-    # Beside a calibration boards are not needed; they stay as comments, for a calibration of one's own.
+    # With a calibration, boards are not needed; they are kept as comments.
     mute = "# " if sketch.calibration is not None else ""
     yield f"{mute}[boards]  # clips of a calibration board, in the order of the cameras"
     yield f'{mute}pattern = "{board.pattern}"'

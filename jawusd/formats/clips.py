@@ -27,24 +27,24 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError
 
 _CODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.,])(\d{2,3})")
-_PER_DAY_HOURS = 24
+_HOURS_PER_DAY = 24
 _PATH = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
-_HEAD, _LONG_HEAD = 8, 16  # bytes of an atom's size and type; of one of more than 4 GB
-_TO_ENTRIES = 8  # version, flags and count of a table
-_MOST_ATOMS = 100_000  # a damaged file has no end of them
+_HEAD, _LONG_HEAD = 8, 16  # bytes of an atom's size and type; the latter for atoms above 4 GB
+_TO_ENTRIES = 8  # bytes of a table's version, flags and count
+_MOST_ATOMS = 100_000  # bounds the search in damaged files
 
 
 @dataclass(frozen=True)
 class ClipSource:
-    """Hold a video or a pattern of numbered pictures, and what the files themselves may not say.
+    """A video or image sequence, with properties that the files may lack.
 
     Attributes:
         path: the file, or a pattern as in `formats.file_names`.
-        fps: rate of numbered pictures; a video has its own.
-        colour_space: "display", "linear", "cineon" or a name of the OpenColorIO config; None lets the files decide.
+        fps: frame rate of an image sequence; ignored for videos.
+        colour_space: "display", "linear", "cineon" or a name in the OpenColorIO config; None: by file type.
         colour_config: OpenColorIO config.
-        pixel_aspect: width of a pixel over its height; None lets the file decide.
-        timecode: of the first picture; "" lets the file decide.
+        pixel_aspect: width of a pixel over its height; None: from the file.
+        timecode: of the first picture; "": from the file.
     """
 
     path: Path
@@ -56,57 +56,58 @@ class ClipSource:
 
     @property
     def is_light(self) -> bool:
-        """Tell whether the pictures are light in fractions, as only EXR holds it."""
+        """Whether the pictures are floating-point light (EXR)."""
         return self.path.suffix.lower() == ".exr"
 
 
 @dataclass(frozen=True, eq=False)
 class LightCurve:
-    """Hold the brightness of one clip."""
+    """Brightness of one clip over time."""
 
     times_s: Array  # presentation time of every picture after the first one [s], shape (n,)
     frames: NDArray[np.int64]  # its frame on the clip's even grid, shape (n,)
     brightness: Array  # its mean brightness, 0 .. 255, shape (n,)
-    # when the light suddenly went off, and on [frames], shapes (a,), (b,)
+    # times at which the light suddenly went off, and on [frames], shapes (a,), (b,)
     off_frames: Array
     on_frames: Array
 
 
 def frame_of_timecode(text: str, fps: float) -> int:
-    """Return how many frames a time code counts since midnight.
+    """Return the frames since midnight of a time code.
 
     Args:
-        text: HH:MM:SS:FF, or with ";" or "." before FF if frame numbers are dropped.
-        fps: frames per second; of a rate like 23.976 time codes count 24 numbers.
+        text: HH:MM:SS:FF, or with ";" or "." before FF for drop-frame counting.
+        fps: frames per second; time codes at 23.976 count 24 frames per second.
 
     Raises:
-        CaptureError: it is no time code, or none of this rate.
+        CaptureError: it is not a time code, or not valid at this rate.
     """
     found = _CODE.fullmatch(text.strip())
     if found is None:
         raise CaptureError(f'the time code "{text:.40}" is not HH:MM:SS:FF.')
     hours, minutes, seconds, frame = (int(found[k]) for k in (1, 2, 3, 5))
     number = math.ceil(fps - 0.01)
-    if hours >= _PER_DAY_HOURS or minutes > 59 or seconds > 59 or frame >= number:
+    if hours >= _HOURS_PER_DAY or minutes > 59 or seconds > 59 or frame >= number:
         raise CaptureError(
-            f'the time code "{text}" cannot be: at {fps:g} frames per second the last one is 23:59:59:{number - 1:02}.'
+            f'the time code "{text}" is not valid: at {fps:g} frames per second, the last one is '
+            f"23:59:59:{number - 1:02}."
         )
     total = (3600 * hours + 60 * minutes + seconds) * number + frame
     if found[4] == ":":
         return total
     if number not in (30, 60, 120):
         raise CaptureError(
-            f'the time code "{text}" drops frame numbers; that is done at 29.97, 59.94 and 119.88, not at {fps:g}.'
+            f'the time code "{text}" is drop-frame, which is only defined at 29.97, 59.94 and 119.88, not at {fps:g}.'
         )
     dropped = number // 15
     if frame < dropped and seconds == 0 and minutes % 10:
-        raise CaptureError(f'the time code "{text}" is left out in drop-frame counting.')
+        raise CaptureError(f'the time code "{text}" does not exist in drop-frame counting.')
     whole = 60 * hours + minutes
     return total - dropped * (whole - whole // 10)
 
 
 def timecode_rates(path: str | os.PathLike[str]) -> list[Fraction]:
-    """Return how many frames per second the time code tracks of a file count; none where it has none, or is another.
+    """Return the frame rates of a file's time code tracks; empty for other files.
 
     Raises:
         OSError: it cannot be read.
@@ -117,7 +118,7 @@ def timecode_rates(path: str | os.PathLike[str]) -> list[Fraction]:
 
 
 def _atoms(file: BinaryIO, start: int, stop: int, path: tuple[bytes, ...]) -> Iterator[int]:
-    """Yield where the contents of atoms begin that lie on a path of types."""
+    """Yield the content positions of the atoms at a path of types."""
     for _ in range(_MOST_ATOMS):
         file.seek(start)
         head = file.read(_LONG_HEAD)
@@ -139,11 +140,11 @@ def _atoms(file: BinaryIO, start: int, stop: int, path: tuple[bytes, ...]) -> It
 
 
 def _rate(file: BinaryIO, place: int) -> Fraction | None:
-    """Return the rate in the first entry of a table of sample descriptions; None if it is no time code."""
+    """Return the rate in the first entry of a sample description table; None if it is not a time code."""
     file.seek(place + _TO_ENTRIES)
     entry = file.read(34)
     if len(entry) < 33 or entry[4:8] != b"tmcd":
         return None
-    # After type, index and flags: units per second, and those of a frame.
+    # After type, index and flags: time scale, and units per frame.
     scale, duration = struct.unpack_from(">2I", entry, 24)
     return Fraction(scale, duration) if scale and duration else None

@@ -1,4 +1,4 @@
-"""Results of the paper's experiments on one take: what was computed, ready to be drawn and tabulated."""
+"""Results of the paper's experiments on one take, as drawn in figures and written to a table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TABLE_COLUMNS = ("experiment", "model", "quantity", "count", "mean_mm", "median_
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """Name a set of distances."""
+    """A named set of distances."""
 
     experiment: str  # "condyle path", "reconstruction" or "synthesis": paper Figs. 5, 12 and 13
     model: str
@@ -33,35 +33,35 @@ class Distances:
 
 @dataclass(frozen=True, eq=False)
 class CondylePath:
-    """Hold the opening movement of one model at the condyles, anatomical frame."""
+    """The opening movement of one model at the condyles, anatomical frame."""
 
     model: str
     opening_mm: Array  # vertical opening at the incisal point [mm], shape (K,)
     points: Array  # centres of the left and right condyle [mm], shape (2, K, 3)
-    # outline of the left condyle in the sagittal plane through its centre at some openings: segments (z, y) [mm], each
+    # outline of the left condyle at some openings, in the sagittal plane through its centre: segments (z, y) [mm], each
     # of shape (S, 2, 2); empty without a mandible mesh
     heads: tuple[Array, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterPath:
-    """Hold where the left condyle goes when one parameter of a model moves alone, anatomical frame."""
+    """The path of the left condyle when only one parameter of a model varies, anatomical frame."""
 
     model: str
     parameter: int  # 0 opening, 1 laterotrusion, 2 protrusion
-    values_mm: Array  # of the parameter [mm], shape (K,)
+    values_mm: Array  # values of the parameter [mm], shape (K,)
     points: Array  # centre of the left condyle [mm], shape (K, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Show which part of the envelope was captured, in the parameters d of the default model."""
+    """The captured part of the envelope, in the parameters d of the default model."""
 
     d: Array  # captured poses [mm], shape (N, 3)
-    # rings of the paper's bounds in (d1, d2) and (d1, d3) [mm], each ring (n, 2)
+    # boundary rings of the paper's bound in (d1, d2) and (d1, d3) [mm], each of shape (n, 2)
     outlines: tuple[tuple[Array, ...], tuple[Array, ...]]
     slices_d1: Array  # openings [mm], shape (K,)
-    # valid d2 and d3 [mm] of the slice hull on the habitual path there, lowest and highest, shape (2, K, 2)
+    # lowest and highest valid d2 and d3 [mm] of the slice hull on the habitual path, shape (2, K, 2)
     slices: Array
     # points (d1, d2) and (d1, d3) [mm] inside the slice hull far from every captured pose, each (G, 2)
     gaps: tuple[Array, Array]
@@ -70,7 +70,7 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class Experiments:
-    """Hold the results."""
+    """Results of all experiments."""
 
     actor: str
     frames: int  # number of captured poses that were used
@@ -80,7 +80,7 @@ class Experiments:
     condyle_paths: tuple[CondylePath, ...]  # one per model
     distances: tuple[Distances, ...]  # everything measured, in the order of the table
     coverage: Coverage  # captured part of the envelope
-    # how many frames each model left out; models that could not be fitted, and why; what was not requested
+    # number of frames each model excluded; models that could not be fitted, and why; experiments not requested
     notes: tuple[str, ...]
     parameter_paths: tuple[ParameterPath, ...] = ()  # of the linear and the default model, for each parameter
 

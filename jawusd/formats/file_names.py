@@ -22,7 +22,7 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mxf", ".mts", ".mpg
 PICTURES = (".png", ".tif", ".tiff", ".exr", ".dpx", ".jpg", ".jpeg")
 MESHES = (".ply", ".stl", ".obj", ".dcm")
 
-# What keys of a capture.toml cannot name, by what they are for.
+# Suffixes that keys of a capture.toml cannot have, by group of keys.
 _WRONG = {
     "scans": (("a video", VIDEOS), ("a picture", PICTURES)),
     "footage": (("a mesh", MESHES), ("a calibration", (".toml", ".json", ".xml", ".csv", ".yml", ".yaml"))),
@@ -30,8 +30,8 @@ _WRONG = {
 }
 _NEEDED = {
     "scans": "a mesh is needed (.ply, .stl, .obj or .dcm)",
-    "footage": "a video or numbered pictures are needed",
-    "calibration": "a calibration is needed; clips of a board go into [boards] videos",
+    "footage": "a video or an image sequence is needed",
+    "calibration": "a calibration is needed; clips of a board belong in [boards] videos",
 }
 _GROUPS = {
     **dict.fromkeys(("upper_teeth", "lower_teeth", "mandible", "skull"), "scans"),
@@ -41,19 +41,19 @@ _GROUPS = {
 
 
 def is_pattern(path: Path) -> bool:
-    """Tell whether a path names numbered files rather than one."""
+    """Tell whether a path is a pattern of numbered files rather than one file."""
     try:
         return any(sign in path.name for sign in "%#*?") and not path.is_file()
-    except (OSError, ValueError):  # too long, a null byte: its reader says so
+    except (OSError, ValueError):  # too long, a null byte; the reader reports it
         return False
 
 
 def numbered_files(pattern: Path) -> dict[int, Path]:
-    """Return the files of a pattern by their numbers, increasing.
+    """Return the files of a pattern by number, increasing.
 
     Raises:
-        CaptureError: the pattern has no number or several, the folder is missing or holds no such file, or two files
-            have one number.
+        CaptureError: the pattern has no number or several, the folder is missing or has no such file, or two files
+            have the same number.
     """
     name = pattern.name
     folder = pattern.parent
@@ -71,34 +71,34 @@ def numbered_files(pattern: Path) -> dict[int, Path]:
             raise CaptureError(
                 f"{found[number].name} and {entry.name} both have the number {number}.",
                 path=pattern,
-                hint=f"Name one of them, as {_one_of(entry.name)}.",
+                hint=f"Write a pattern that matches only one of them, such as {_one_of(entry.name)}.",
             )
         found[number] = entry
     if not found:
-        raise CaptureError(f"no file of the folder is named like {name}.", path=pattern, hint=_offer(folder))
+        raise CaptureError(f"no file in the folder matches {name}.", path=pattern, hint=_offer(folder))
     return dict(sorted(found.items()))
 
 
 def _matching(pattern: Path) -> re.Pattern[str]:
-    """Return what matches the file names of a pattern; its group, if it has one, is the number."""
+    """Return a regular expression for the file names of a pattern; its group, if any, is the number."""
     name = pattern.name
     for sign, width in ((_PRINTF, lambda m: int(m[1] or 1)), (_HASHES, lambda m: len(m[0]))):
         places = list(sign.finditer(name))
         if len(places) > 1:
             raise CaptureError(
-                "the name has two numbers; one is allowed.", path=pattern, hint="Write the fixed one in digits."
+                "the pattern has two numbers; one is allowed.", path=pattern, hint="Write the fixed one in digits."
             )
         if places:
             start, end = places[0].span()
             digits = rf"(\d{{{width(places[0])},}})"
             return re.compile(re.escape(name[:start]) + digits + re.escape(name[end:]))
     if "%" in name:
-        raise CaptureError("the name needs one number such as %06d.", path=pattern, hint="Correct it in capture.toml.")
+        raise CaptureError("the pattern needs a number such as %06d.", path=pattern, hint="Correct it in capture.toml.")
     return re.compile(fnmatch.translate(name))
 
 
 def groups(names: Iterable[str]) -> Mapping[str, list[int]]:
-    """Return the numbers of files by the pattern of their names, as `%06d`; names without digits are left out."""
+    """Return the numbers of files by their name pattern (`%06d`); names without digits are ignored."""
     out: dict[str, list[int]] = defaultdict(list)
     widths: dict[str, set[int]] = defaultdict(set)
     for name in names:
@@ -117,7 +117,7 @@ def groups(names: Iterable[str]) -> Mapping[str, list[int]]:
 
 
 def gaps(numbers: Iterable[int]) -> str:
-    """Return which numbers are missing between the first and the last, as "1007, 1010 to 1012", "" if none is."""
+    """Return the missing numbers between the first and the last, such as "1007, 1010 to 1012", "" if none."""
     there = sorted(numbers)
     out = []
     for before, after in zip(there, there[1:]):
@@ -132,19 +132,19 @@ def _one_of(name: str) -> str:
 
 
 def _offer(folder: Path) -> str:
-    """Return advice that names the patterns there are in a folder."""
+    """Return a hint with the most common patterns in a folder."""
     found = groups(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
     if not found:
         return "Correct the path in capture.toml."
-    return f"There is {' and '.join(sorted(found, key=lambda key: -len(found[key]))[:2])}."
+    return f"The folder has {' and '.join(sorted(found, key=lambda key: -len(found[key]))[:2])}."
 
 
 def wrong_kind(key: str, path: PurePath) -> str | None:
-    """Return what a file is that a key of capture.toml cannot name, and what is needed; None if it may be named.
+    """Return why a file has the wrong type for a key of capture.toml, and what is needed; None if it fits.
 
     Args:
-        key: that names the file: `upper_teeth`, `video`, `calibration`, ...
-        path: the file; its suffix tells.
+        key: the key, such as `upper_teeth`, `video`, `calibration`.
+        path: the file, judged by its suffix.
     """
     group = _GROUPS.get(key, "")
     for kind, suffixes in _WRONG.get(group, ()):

@@ -1,4 +1,4 @@
-"""What checks and estimates found about a capture, in one form for the terminal, JSON, tracks and reports."""
+"""Findings of checks and estimates, in one form for the terminal, JSON, tracks and reports."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ Severity = Literal["error", "warning", "note"]
 
 @dataclass(frozen=True)
 class Finding:
-    """Say what is wrong or doubtful, where, by how much, and what to do.
+    """A problem or remark: place, measured value, limit, and what to do.
 
     An error makes the result impossible or useless; a warning may make it wrong; a note explains what was done.
     """
 
-    kind: str  # a stable name for programs, in lower case with underscores: "scans_apart"
+    kind: str  # stable identifier for programs, such as "scans_apart"
     severity: Severity
     message: str  # one sentence without the place: what was found and what is allowed, with units
-    value: float | None = None  # the figure found, in the unit the message names
+    value: float | None = None  # the measured value, in the unit given in the message
     limit: float | None = None  # what is allowed, in the same unit
     path: str | None = None
     camera: str | None = None
@@ -45,7 +45,7 @@ class Finding:
 
     @classmethod
     def from_json(cls, found: Mapping[str, str | float | int]) -> Finding:
-        """Return the finding that `as_json` gave; what is missing or unknown is left out."""
+        """Return the finding from the output of `as_json`; unknown fields are ignored, missing ones get defaults."""
         severities: dict[object, Severity] = {"error": "error", "note": "note"}
         texts = {name: str(found[name]) for name in ("path", "camera", "hint") if name in found}
         numbers = {name: float(found[name]) for name in ("value", "limit") if name in found}
@@ -70,5 +70,5 @@ def _readable(found: dict[str, str | float | int]) -> dict[str, str | float | in
     return found
 
 
-#: `Finding.as_json`, as pydantic checks it.
+#: Output of `Finding.as_json`, validated by pydantic.
 FoundJson = Annotated[dict[str, str | float | int], AfterValidator(_readable)]

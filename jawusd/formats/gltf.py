@@ -1,7 +1,7 @@
-"""Binary glTF 2.0 (.glb): meshes under named nodes, and their motion, for the web.
+"""Binary glTF 2.0 (.glb) for the web: meshes under named nodes, and their animation.
 
-Khronos Group, "glTF 2.0 Specification", 2021. Lengths are metres in the file and mm here, y is up; nodes move by
-translation and quaternion, which readers interpolate linearly and by slerp.
+Khronos Group, "glTF 2.0 Specification", 2021. Lengths are metres in the file and mm here, y is up; nodes are animated
+by translation and quaternion, which viewers interpolate linearly and by slerp.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _VERTICES, _INDICES = 34962, 34963  # targets of buffer views
 
 @dataclass(frozen=True)
 class Material:
-    """Hold how a surface looks where it has no colours of its own."""
+    """A material, used where a surface has no vertex colours."""
 
     color: tuple[float, float, float]  # linear red, green, blue, 0 .. 1
     roughness: float
@@ -37,24 +37,24 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Hold a mesh whose faces have materials."""
+    """A mesh with materials by face."""
 
     name: str
     vertices: Array  # positions [mm], shape (V, 3)
     normals: Array  # unit, shape (V, 3)
     parts: Mapping[str, NDArray[np.int32]]  # faces (F, 3) by the names of their materials
-    colors: Array | None = None  # linear red, green, blue per vertex, shape (V, 3), which multiply the material's
-    uv: Array | None = None  # places in a picture, u to the right, v upwards, shape (V, 2)
+    colors: Array | None = None  # linear RGB per vertex, multiplied by the material's, shape (V, 3)
+    uv: Array | None = None  # texture coordinates, u to the right, v upwards, shape (V, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """Hold surfaces that move together."""
+    """Surfaces that move together."""
 
     name: str
     pose: Array  # at rest, shape (4, 4) [mm]
     surfaces: Sequence[Surface]
-    times_s: Array = field(default_factory=lambda: np.empty(0))  # of the motion, increasing, not negative, shape (n,)
+    times_s: Array = field(default_factory=lambda: np.empty(0))  # key times, >= 0, increasing, shape (n,)
     poses: Array = field(default_factory=lambda: np.empty((0, 4, 4)))  # at these times, shape (n, 4, 4) [mm]
 
 
@@ -66,15 +66,15 @@ def save_glb(
     generator: str,
     extras: Mapping[str, object],
 ) -> None:
-    """Write nodes under one root of a name, atomically; times that single precision cannot tell apart are left out.
+    """Write nodes under a named root, atomically; times that are equal in single precision are dropped.
 
     Args:
         path: File to write.
-        name: Of the root, and of the animation.
+        name: Name of the root and of the animation.
         materials: By the names that surfaces use.
-        nodes: What to write.
-        generator: The program that writes.
-        extras: What to note with the animation.
+        nodes: Nodes to write.
+        generator: Name of the writing program.
+        extras: Metadata of the animation.
 
     Raises:
         OutputError: the file cannot be written.
@@ -113,7 +113,7 @@ def save_glb(
 
 
 def frame_rate(path: str | os.PathLike[str]) -> float | None:
-    """Return the frames per second that a .glb of `save_glb` notes with its animation; None for other files."""
+    """Return the frame rate in the animation metadata of a .glb from `save_glb`; None for other files."""
     try:
         with open(path, "rb") as file:
             magic, length = struct.unpack("<4s8xI4x", file.read(20))
@@ -125,7 +125,7 @@ def frame_rate(path: str | os.PathLike[str]) -> float | None:
 
 
 class _Builder:
-    """Collect arrays in one buffer, and what describes them."""
+    """Builder of the binary buffer, its views and accessors."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -133,7 +133,7 @@ class _Builder:
         self.accessors: list[dict[str, object]] = []
 
     def add(self, values: _Values, *, target: int | None = None, limits: bool = False) -> int:
-        """Append an array, shape (n,) or (n, k); return the number of its accessor."""
+        """Append an array, shape (n,) or (n, k); return the index of its accessor."""
         kind = {np.dtype("<f4"): _FLOAT, np.dtype("<u2"): _UINT16, np.dtype("<u4"): _UINT32}[values.dtype]
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes}
         self.views.append(view if target is None else {**view, "target": target})
@@ -154,12 +154,12 @@ class _Builder:
         return len(self.accessors) - 1
 
     def primitives(self, surface: Surface, materials: Sequence[str]) -> list[dict[str, object]]:
-        """Append a surface; return its primitives, one per material, which share their vertices."""
+        """Append a surface; return its primitives, one per material, with shared vertices."""
         attributes = {
             "POSITION": self.add(np.asarray(surface.vertices * _MM, "<f4"), target=_VERTICES, limits=True),
             "NORMAL": self.add(np.asarray(surface.normals, "<f4"), target=_VERTICES),
         }
-        if surface.uv is not None:  # v goes downwards in the file
+        if surface.uv is not None:  # v points down in the file
             attributes["TEXCOORD_0"] = self.add(np.asarray(surface.uv * [1, -1] + [0, 1], "<f4"), target=_VERTICES)
         if surface.colors is not None:
             opaque = np.column_stack([np.clip(surface.colors, 0, 1), np.ones(len(surface.colors))])

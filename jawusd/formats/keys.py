@@ -15,17 +15,17 @@ from jawusd.base.tables import read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_model
 
-#: Keys are written out frame by frame: an hour at 60 per second fits.
+#: Largest length, an hour at 60 frames per second, since every frame is written; and largest frame number.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
 _MAX_BYTES = 64 << 20
-#: Largest parameter [mm], a kilometre: squares and products of larger ones overflow on the way into the bound.
+#: Largest parameter [mm]: larger values overflow when projected into the bound.
 FARTHEST_MM = 1e6
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Parameter = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST_MM, le=FARTHEST_MM)]
 
 
 class Key(BaseModel):
-    """Hold the parameters d [mm] at one frame."""
+    """The parameters d [mm] at one frame."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -36,23 +36,23 @@ class Key(BaseModel):
 
 
 class Keys(BaseModel):
-    """Hold an animation: frames rise strictly, `fps` frames per second."""
+    """An animation of strictly increasing frames at `fps` frames per second."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     fps: float = Field(gt=0, le=10000, allow_inf_nan=False, description="a number above 0, at most 10000 [1/s]")
     interpolation: Literal["linear", "smooth"] = Field("linear", description='"linear" or "smooth"')
-    keys: tuple[Key, ...] = Field(min_length=1, description='a list of keys, as [{"frame": 0, "d": [0, 0, 0]}]')
+    keys: tuple[Key, ...] = Field(min_length=1, description='a list of keys, such as [{"frame": 0, "d": [0, 0, 0]}]')
 
     @model_validator(mode="after")
     def _rising(self) -> Keys:
         frames = [key.frame for key in self.keys]
         if frames[-1] - frames[0] > MOST_FRAMES or max(abs(frames[0]), abs(frames[-1])) > FARTHEST_FRAME:
             found = f"frames {frames[0]:g} to {frames[-1]:g}"
-            raise ValueError(f"{found}: allowed are {MOST_FRAMES} within +-{FARTHEST_FRAME:g}")
+            raise ValueError(f"{found}: allowed are {MOST_FRAMES} frames within +-{FARTHEST_FRAME:g}")
         for before, after in zip(frames, frames[1:], strict=False):
             if after <= before:
-                raise ValueError(f"frames must rise, frame {after:g} follows {before:g}")
+                raise ValueError(f"frames must increase, but frame {after:g} follows {before:g}")
         return self
 
     def arrays(self) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@
                    "condyle_left": [...], "condyle_right": [...]},
      "T_anatomical_skull": [[...], [...], [...], [...]]}
 
-All five points lie in one frame with the teeth in occlusion, on the mandible; the transform to the anatomical frame is
+The five points are on the mandible, in one frame with the teeth in occlusion. The transform to the anatomical frame is
 optional.
 """
 
@@ -30,7 +30,7 @@ _MAX_BYTES = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class LandmarkFile:
-    """Hold the file."""
+    """Content of a landmarks file."""
 
     landmarks: Array  # in the order of `geometry.LANDMARKS` [mm], shape (5, 3)
     T_anatomical_skull: Array | None  # the file's frame to the anatomical frame, shape (4, 4), or None
@@ -53,7 +53,9 @@ def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
         raise UnitsError(f'units are "{data.get("units")}", allowed is "mm".', path=path)
     unknown = sorted(set(data) - {"format", "units", "landmarks", "T_anatomical_skull"})
     if unknown:
-        raise FormatError(f'"{unknown[0]}" is not a key of this format.', path=path)
+        raise FormatError(
+            f'unknown key "{unknown[0]}"; allowed are format, units, landmarks and T_anatomical_skull.', path=path
+        )
     named = data.get("landmarks")
     if not isinstance(named, dict) or set(named) != set(LANDMARKS):
         raise FormatError(f'"landmarks" must name exactly {", ".join(LANDMARKS)}.', path=path)

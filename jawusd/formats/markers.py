@@ -1,16 +1,17 @@
-"""Tables of marker positions, as optical systems write them.
+"""Tables of marker positions from optical tracking systems.
 
-Tables, one row of x, y, z of every marker per frame, frames numbered from 0, of any locale (see `jawusd.base.tables`):
+Supported tables have one row per frame with x, y, z of every marker, in any locale (see `jawusd.base.tables`); frames
+are numbered from 0:
 
-* numbers alone, as Northern Digital's `opto2ascii` writes them;
-* a probe of ArtiSynth (Modelling Guide, "Numeric probes", text format): `start stop scale`, then `interpolation size
-  step`, then the rows. A marker per file is common: a pattern of numbered files is read as one table;
-* 3D data of Qualisys Track Manager (TSV export): lines of `KEY value`, of which `MARKER_NAMES` is needed; in mm;
+* plain numbers, as written by Northern Digital's `opto2ascii`;
+* ArtiSynth probes (Modelling Guide, "Numeric probes", text format): `start stop scale`, then `interpolation size step`,
+  then the rows. Often there is one file per marker: a pattern of numbered files is read as one table;
+* 3D data of Qualisys Track Manager (TSV export) in mm: lines of `KEY value`, of which `MARKER_NAMES` is required;
 * TRC of Motion Analysis and OpenSim: `DataRate`, `NumMarkers`, `Units` above their values, then `Frame#`, `Time`;
-* CSV of Vicon Nexus, its section `Trajectories`; model outputs and devices are passed over.
+* CSV of Vicon Nexus, section `Trajectories`; model outputs and devices are ignored.
 
-A marker is out of sight where a coordinate is blank, nan or huge (-3.697314e28), or all three are exactly 0 (not in
-probes, which are simulated). Frames that a numbered table leaves out are frames without markers.
+A marker is hidden where a coordinate is blank, nan or huge (-3.697314e28), or all three are exactly 0 (except in
+probes, which are simulated). Frames that a numbered table omits have no markers.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ from jawusd.base.tables import read_text, split_rows, to_numbers
 from jawusd.formats.file_names import is_pattern, numbered_files
 
 READ = (
-    "Read are C3D, TSV of Qualisys Track Manager (3D), TRC, CSV of Vicon Nexus (Trajectories), probes of ArtiSynth, "
-    "and rows of numbers alone."
+    "Supported are C3D, TSV of Qualisys Track Manager (3D), TRC, CSV of Vicon Nexus (Trajectories), ArtiSynth probes, "
+    "and plain rows of numbers."
 )
-#: Endings of files that hold markers or motion in ways that are not read.
+#: Suffixes of marker and motion files that are not supported.
 _NOT_READ = {
     ".mat": "a MATLAB file",
     ".qtm": "a project file of Qualisys Track Manager",
@@ -46,7 +47,7 @@ _NOT_READ = {
 _LENGTHS = ("mm", "cm", "m")
 _MAX_BYTES = 1 << 28
 _MOST_FRAMES = 10_000_000
-_OUT_OF_SIGHT = 1e20  # and beyond: no length
+_OUT_OF_SIGHT = 1e20  # coordinates from here on mark a hidden marker
 _INTERPOLATIONS = ("step", "linear", "parabolic", "cubic", "cubicstep", "quadraticstep", "sphericallinear")
 _LEADING_ZERO = re.compile(r"[+-]?0\d+")
 
@@ -55,13 +56,13 @@ _Rows = list[tuple[int, list[str]]]
 
 @dataclass(frozen=True, eq=False)
 class MarkerTable:
-    """Hold the markers of a take.
+    """Marker positions of a take.
 
     Attributes:
-        points: positions in the file's unit, shape (F, N, 3), NaN where a marker was not seen.
-        names: of the markers, empty where the file names none.
-        unit: of the positions, "mm", "cm" or "m"; None where the file does not say it.
-        fps: frames per second, None where the file does not say it.
+        points: positions in the file's unit, shape (F, N, 3), NaN where a marker is hidden.
+        names: marker names, empty if the file has none.
+        unit: unit of the positions, "mm", "cm" or "m"; None if the file has none.
+        fps: frames per second, None if the file has none.
     """
 
     points: Array
@@ -71,11 +72,11 @@ class MarkerTable:
 
 
 def mark_hidden(points: Array, zeros: bool = True) -> Array:
-    """Return positions (F, N, 3) with NaN where a marker is out of sight.
+    """Return positions (F, N, 3) with NaN where a marker is hidden.
 
     Args:
-        points: as a file holds them.
-        zeros: a marker at exactly 0 0 0 is out of sight.
+        points: positions as read from the file.
+        zeros: treat a marker at exactly 0 0 0 as hidden.
     """
     with np.errstate(invalid="ignore"):
         seen: Mask = np.all(np.abs(points) < _OUT_OF_SIGHT, axis=-1)
@@ -88,12 +89,11 @@ def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
     """Read marker positions from text.
 
     Args:
-        path: a table, or a pattern (`Marker%d_Traj.txt`) of numbered tables of the same length, whose markers are put
-            side by side in the order of the numbers.
+        path: a table, or a pattern (`Marker%d_Traj.txt`) of numbered tables of equal length, whose markers are
+            concatenated in numerical order.
 
     Raises:
-        FormatError: not such a table, a value that is not a number, tables of different lengths, or a file that ends
-            before its last frame.
+        FormatError: not such a table, a value that is not a number, tables of different lengths, or a truncated file.
         CaptureError: a pattern without files.
     """
     path = Path(path)
@@ -114,11 +114,11 @@ def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
 def _read_table(path: Path) -> MarkerTable:
     kind = _NOT_READ.get(path.suffix.lower())
     if kind is not None:
-        raise FormatError(f"is {kind}, no table of markers that is read.", path=path, hint=READ)
+        raise FormatError(f"is {kind}, not a supported marker table.", path=path, hint=READ)
     rows, separator = split_rows(read_text(path, _MAX_BYTES), path, blank_rows=True)
     if not rows:
         raise FormatError("holds no frames.", path=path)
-    if max(len(row) for _, row in rows) == 1:  # blanks alone
+    if max(len(row) for _, row in rows) == 1:  # separated by spaces only
         rows = [(line, row[0].split()) for line, row in rows]
     keys = [row[0].strip().lower() for _, row in rows]
     if "marker_names" in keys or "data_included" in keys:
@@ -130,13 +130,13 @@ def _read_table(path: Path) -> MarkerTable:
     sections = [row[0].strip() for _, row in rows if row[0].strip().lower() in ("model outputs", "devices", "joints")]
     if sections or keys[0] == "format version":
         what = f"has the sections {', '.join(sections)} of Vicon Nexus" if sections else "is a CSV of OptiTrack Motive"
-        raise FormatError(f"{what}, no table of markers that is read.", path=path, hint=READ)
+        raise FormatError(f"{what}, not a supported marker table.", path=path, hint=READ)
     return MarkerTable(_plain(rows, separator, path))
 
 
 def _plain(rows: _Rows, separator: str, path: Path) -> Array:
-    """Return the positions of numbers alone, or of an ArtiSynth probe, shape (F, N, 3)."""
-    if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # blanks beside separators
+    """Return the positions in plain numbers or an ArtiSynth probe, shape (F, N, 3)."""
+    if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # spaces as well as separators
         rows = [(line, separator.join(row).split()) for line, row in rows]
     probe = len(rows) > 1 and rows[1][1][0].strip().lower() in _INTERPOLATIONS
     if probe:
@@ -151,7 +151,7 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
     cells = [cell.strip() for _, row in rows for cell in row] if separator == "," else []
     if any(map(_LEADING_ZERO.fullmatch, cells)) and not any("." in cell for cell in cells):
         raise FormatError(
-            "has decimal commas and commas between the numbers.", path=path, hint="Write decimals with points."
+            "uses commas both as decimal signs and as separators.", path=path, hint="Write decimals with points."
         )
     for line, row in rows:
         if len(row) != width:
@@ -164,9 +164,9 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
 
 
 def _positions(rows: _Rows, first: int, width: int, path: Path, zeros: bool = True) -> Array:
-    """Return cells as positions (F, N, 3), NaN where a marker is out of sight; blanks at the end may be missing."""
+    """Return cells as positions (F, N, 3), NaN where a marker is hidden; trailing blanks may be missing."""
     if not rows or not width:
-        raise FormatError("holds no frames, or no markers.", path=path)
+        raise FormatError("has no frames or no markers.", path=path)
     cells = []
     for line, row in rows:
         found = [cell if cell.strip() else "nan" for cell in row[first : first + width]]
@@ -186,15 +186,15 @@ def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
     keys = {row[0].strip().upper(): [cell.strip() for cell in row[1:] if cell.strip()] for _, row in rows[:40]}
     included = "".join(keys.get("DATA_INCLUDED", ["3D"])[:1])
     if included != "3D" or "MARKER_NAMES" not in keys:
-        raise FormatError(f"holds {included} data of Qualisys Track Manager, not the markers.", path=path, hint=READ)
+        raise FormatError(f"has {included} data of Qualisys Track Manager, not markers.", path=path, hint=READ)
     names = tuple(keys["MARKER_NAMES"])
     count = _whole(keys.get("NO_OF_MARKERS"), len(names), "NO_OF_MARKERS", path)
     if count != len(names):
-        raise FormatError(f"says that it has {count} markers and names {len(names)}.", path=path)
+        raise FormatError(f"declares {count} markers but names {len(names)}.", path=path)
     data = [(line, row) for line, row in rows if _is_number_or_blank(row[0])]
     header = next((row for _, row in rows if row[0].strip().lower() == "frame"), [])
     first = [cell.strip().lower() in ("frame", "time") for cell in header[:2]].count(True)
-    if not header:  # frame and time stand before the markers where there are two numbers more
+    if not header:  # two extra numbers are frame and time
         filled = max((k + 1 for _, row in data for k, cell in enumerate(row) if cell.strip()), default=0)
         first = max(filled - 3 * count, 0)
     points = _positions(data, first, 3 * count, path)
@@ -212,7 +212,7 @@ def _read_trc(rows: _Rows, at: int, path: Path) -> MarkerTable:
     names = tuple(cell.strip() for cell in rows[at][1][2:] if cell.strip())
     count = _whole(keys.get("nummarkers"), len(names), "NumMarkers", path)
     if count != len(names):
-        raise FormatError(f"says that it has {count} markers and names {len(names)}.", path=path)
+        raise FormatError(f"declares {count} markers but names {len(names)}.", path=path)
     data = [(line, row) for line, row in rows[at + 1 :] if row[0].strip() and row[0].strip().lower() != "x1"]
     points = _positions(data, 2, 3 * count, path)
     _check_count(_whole(keys.get("numframes"), len(data), "NumFrames", path), len(data), path)
@@ -223,7 +223,7 @@ def _read_trc(rows: _Rows, at: int, path: Path) -> MarkerTable:
 
 
 def _read_vicon(rows: _Rows, path: Path) -> MarkerTable:
-    """Read the section Trajectories of a CSV of Vicon Nexus: title, rate, names, columns, units, then the frames."""
+    """Read the section Trajectories of a Vicon Nexus CSV: title, rate, names, columns, units, then frames."""
     if len(rows) < 5:
         raise FormatError("its section Trajectories has no frames.", path=path)
     named, columns, units = ([cell.strip() for cell in row] for _, row in rows[2:5])
@@ -236,7 +236,7 @@ def _read_vicon(rows: _Rows, path: Path) -> MarkerTable:
         k for k, name in enumerate(named) if name and [cell.upper() for cell in columns[k : k + 3]] == ["X", "Y", "Z"]
     ]
     if not places or not data:
-        raise FormatError("its section Trajectories has no markers, or no frames.", path=path)
+        raise FormatError("its section Trajectories has no markers or no frames.", path=path)
     found = {units[k].lower() for k in places if k < len(units)}
     if len(found) != 1:
         raise FormatError(f"its markers have the units {', '.join(sorted(found))}; one is expected.", path=path)
@@ -250,15 +250,15 @@ def _read_vicon(rows: _Rows, path: Path) -> MarkerTable:
 
 
 def _with_gaps(data: _Rows, points: Array, path: Path) -> Array:
-    """Return positions with a frame of NaN for each number that the first column leaves out."""
+    """Return positions with NaN frames for numbers missing in the first column."""
     numbers = to_numbers([row[:1] for _, row in data], lambda i, _: f"line {data[i][0]}, frame", path)[:, 0]
     steps = np.diff(numbers)
     if (steps < 1).any() or (numbers % 1 != 0).any():
         line = data[int(np.argmax(steps < 1)) + 1][0]
-        raise FormatError(f"line {line}: frames must be whole numbers that rise.", path=path)
+        raise FormatError(f"line {line}: frames must be increasing whole numbers.", path=path)
     rows = (numbers - numbers[:1]).astype(np.int64)
     if rows.size and rows[-1] >= _MOST_FRAMES:
-        raise FormatError(f"runs over {rows[-1] + 1} frames, at most {_MOST_FRAMES} are read.", path=path)
+        raise FormatError(f"spans {rows[-1] + 1} frames, at most {_MOST_FRAMES} are allowed.", path=path)
     whole = np.full((int(rows.max(initial=-1)) + 1, *points.shape[1:]), np.nan)
     whole[rows] = points
     return whole
@@ -271,7 +271,7 @@ def _is_number_or_blank(cell: str) -> bool:
 def _check_count(said: int, found: int, path: Path) -> None:
     if found != said:
         raise FormatError(
-            f"is cut off or was cut by hand: it says that it has {said} frames, and holds {found}.",
+            f"is truncated or was edited: its header declares {said} frames, but it has {found}.",
             path=path,
             hint="Export it again, or correct the number in its header.",
         )
@@ -296,14 +296,14 @@ def _rate(cells: list[str] | None, key: str, path: Path) -> float | None:
 
 
 def length_unit(unit: str, path: Path) -> str | None:
-    """Return a unit that a file names in lower case, None if it names none.
+    """Return the unit in lower case, None if it is empty.
 
     Raises:
-        UnitsError: it is not read.
+        UnitsError: the unit is not supported.
     """
     unit = unit.strip()
     if unit and unit.lower() not in _LENGTHS:
-        raise UnitsError(f'lengths are in "{unit}", read are {", ".join(_LENGTHS)}.', path=path)
+        raise UnitsError(f'lengths are in "{unit}", allowed are {", ".join(_LENGTHS)}.', path=path)
     return unit.lower() or None
 
 
@@ -313,6 +313,6 @@ def _probe_size(row: list[str], path: Path) -> int:
         return int(row[1])
     except (IndexError, ValueError) as error:
         raise FormatError(
-            'line 2 is not that of an ArtiSynth probe, as "Linear 9 0.02" (interpolation, numbers per frame, step).',
+            'line 2 must be like "Linear 9 0.02" in an ArtiSynth probe (interpolation, numbers per frame, step).',
             path=path,
         ) from error

@@ -12,22 +12,22 @@ from jawusd.base.arrays import Array, Mask
 
 GUM, TOOTH, BOUNDARY, BASE = 0, 1, 2, 3
 
-# How far red or green must exceed the other channels (of 255) to be a label: painted labels exceed them by more (pure
-# red by 255), the gum of photographic scan textures, such as (200, 110, 110), by less.
+# Excess of red or green over the other channels (of 255) that marks a label: painted labels have more (pure red 255),
+# gum in photographic textures, such as (200, 110, 110), less.
 _PAINT_CONTRAST = 100
-_FEWEST_PAINTED = 0.01  # share of the vertices; a handful of reddish ones is not a labelling
+_FEWEST_PAINTED = 0.01  # share of vertices; fewer are not a labelling
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Hold a triangle mesh."""
+    """A triangle mesh."""
 
     vertices: Array  # positions [mm], shape (V, 3), float64
     faces: NDArray[np.int32]  # vertex indices, counter-clockwise seen from outside, shape (F, 3), int32
     colors: NDArray[np.uint8] | None = None  # red, green, blue per vertex, shape (V, 3), uint8, or None
-    # of a teeth scan, if known otherwise than by its paint: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,), uint8
+    # labels of a teeth scan other than painted ones: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,), uint8
     labels: NDArray[np.uint8] | None = None
-    # places of the corners of every face in a picture, u to the right, v upwards, shape (F, 3, 2), float64, or None
+    # texture coordinates of face corners, u to the right, v upwards, shape (F, 3, 2), float64, or None
     uv: Array | None = None
 
     def __post_init__(self) -> None:
@@ -50,9 +50,9 @@ class Mesh:
 def without_loose(
     vertices: Array, faces: NDArray[np.int64] | NDArray[np.int32], colors: NDArray[np.uint8] | None
 ) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Return vertices (V, 3) and colours with those that no face uses moved onto others, spread over all of them.
+    """Return vertices (V, 3) and colours with unused vertices moved onto used ones, spread evenly over them.
 
-    So they keep their numbers, which picks name, and neither sizes nor middles nor labels count them.
+    Indices stay valid for picks, and unused vertices do not affect sizes, centres and labels.
     """
     used = np.zeros(len(vertices), bool)
     used[faces] = True
@@ -65,10 +65,10 @@ def without_loose(
 
 
 def painted_labels(mesh: Mesh) -> NDArray[np.uint8] | None:
-    """Return GUM, TOOTH or BOUNDARY per vertex of a painted teeth scan, shape (V,); None where it is not painted.
+    """Return GUM, TOOTH or BOUNDARY per vertex of a painted teeth scan, shape (V,); None if it is not painted.
 
-    Red vertices are teeth, green ones teeth whose border is of interest (the incisal edge), all others gum. Hardly any
-    red or green is no paint.
+    Red vertices are teeth, green ones are teeth at a border of interest (the incisal edge), others are gum. A scan with
+    very few red or green vertices counts as not painted.
     """
     if mesh.colors is None:
         return None
@@ -80,16 +80,16 @@ def painted_labels(mesh: Mesh) -> NDArray[np.uint8] | None:
 
 
 def natural_colors(mesh: Mesh) -> NDArray[np.uint8] | None:
-    """Return colours that show how a scan looks, shape (V, 3); None for paint, one colour all over, and no colours."""
+    """Return the natural colours of a scan, shape (V, 3); None if painted, uniform or missing."""
     if mesh.colors is None or painted_labels(mesh) is not None or (mesh.colors == mesh.colors[:1]).all():
         return None
     return mesh.colors
 
 
 def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
-    """Return GUM, TOOTH or BOUNDARY per vertex of a teeth scan, shape (V,); everything that is tooth is > 0.
+    """Return GUM, TOOTH or BOUNDARY per vertex of a teeth scan, shape (V,); tooth labels are > 0.
 
-    These are the mesh's labels, its base counted as gum; without labels its paint; without either, all is tooth.
+    Uses the mesh's labels, with its base as gum, or painted labels; without either, everything is tooth.
     """
     if mesh.labels is not None:
         return np.where(mesh.labels == BASE, GUM, mesh.labels).astype(np.uint8)
@@ -98,16 +98,16 @@ def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
 
 
 def crown_face_mask(mesh: Mesh) -> Mask:
-    """Return which faces of a teeth scan belong to crowns, shape (F,): those with two or three tooth corners."""
+    """Return which faces of a teeth scan are crown, shape (F,): those with two or three tooth vertices."""
     return (tooth_labels(mesh) != GUM)[mesh.faces].sum(axis=1) >= 2
 
 
 class Mark(NamedTuple):
-    """Say what a colour means."""
+    """A colour in contact pictures."""
 
     color: tuple[int, int, int]  # red, green, blue, 0 to 255
     meaning: str
-    apart_mm: float  # surfaces nearer than this have it; of teeth that run too deep, beyond the closed bite
+    apart_mm: float  # used where surfaces are closer than this; negative: deeper than in the closed bite
 
 
 DEEP = Mark((120, 40, 200), "deeper than in the closed bite", -0.15)

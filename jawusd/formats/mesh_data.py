@@ -1,4 +1,4 @@
-"""What the mesh readers share: the numbers of a mesh file, limits, polygons cut into triangles, colours as bytes."""
+"""Shared by the mesh readers: raw mesh data, size limits, triangulation of polygons, colours as bytes."""
 
 from __future__ import annotations
 
@@ -15,47 +15,49 @@ Indices = NDArray[np.int64]
 
 MOST_BYTES = 4 << 30
 MOST_TRIANGLES, MOST_VERTICES = 10_000_000, 30_000_000
-NO_COLOUR = 128  # gray, where a file says nothing
+NO_COLOUR = 128  # gray for vertices without a colour
 
-COPY_AGAIN = "Copy the file again from where it was made, or export it again."
+COPY_AGAIN = "Copy the file again from its source, or export it again."
 
 
 class MeshData(NamedTuple):
-    """Hold a mesh as its file has it."""
+    """A mesh as read from a file."""
 
     vertices: Array  # shape (V, 3)
     faces: Indices  # triangles, shape (F, 3); indices may lie outside the vertices
     colors: NDArray[np.uint8] | None = None  # red, green, blue per vertex, shape (V, 3)
-    uv: Array | None = None  # places of the corners in a texture, shape (F, 3, 2)
+    uv: Array | None = None  # texture coordinates of the corners, shape (F, 3, 2)
 
 
 def read_mesh_bytes(path: Path) -> bytes:
     """Return the content of a mesh file.
 
     Raises:
-        CaptureError: it has more than MOST_BYTES.
+        CaptureError: it is larger than MOST_BYTES.
         OSError: it cannot be read.
     """
     size = path.stat().st_size
     if size > MOST_BYTES:
-        raise CaptureError(f"is {size:,} bytes, at most {MOST_BYTES:,} are read.", path=path, hint="Decimate the mesh.")
+        raise CaptureError(
+            f"is {size:,} bytes, at most {MOST_BYTES:,} are allowed.", path=path, hint="Decimate the mesh."
+        )
     return path.read_bytes()
 
 
 def check_count(path: Path, count: int, what: str) -> None:
-    """Check how many "vertices", "triangles" or "faces" a file has, before they are read.
+    """Check the number of "vertices", "triangles" or "faces" of a file before reading them.
 
     Raises:
         CaptureError: too many.
     """
     most = MOST_VERTICES if what == "vertices" else MOST_TRIANGLES
     if count > most:
-        raise CaptureError(f"has {count:,} {what}, at most {most:,} are read.", path=path, hint="Decimate the mesh.")
+        raise CaptureError(f"has {count:,} {what}, at most {most:,} are allowed.", path=path, hint="Decimate the mesh.")
 
 
 def cut_off(path: Path, found: int, said: int, what: str) -> CaptureError:
-    """Return the error for a file that ends too early."""
-    return CaptureError(f"is cut off: {found} of {said} {what}.", path=path, hint=COPY_AGAIN)
+    """Return the error for a truncated file."""
+    return CaptureError(f"is truncated: it has {found} of {said} {what}.", path=path, hint=COPY_AGAIN)
 
 
 def byte_colors(values: Array) -> NDArray[np.uint8] | None:
@@ -68,19 +70,18 @@ def byte_colors(values: Array) -> NDArray[np.uint8] | None:
 
 
 def cut_polygons(vertices: Array, counts: Indices, corners: Indices) -> tuple[Indices, Indices]:
-    """Cut polygons into triangles, as fans.
+    """Triangulate polygons as fans.
 
-    A fan begins at the first corner from which all triangles look the polygon's way, so that quads with a dent stay
-    whole; polygons with fewer than three corners are dropped.
+    A fan starts at the first corner from which all triangles face the same way as the polygon, so that concave quads
+    are correct; polygons with fewer than three corners are dropped.
 
     Args:
         vertices: shape (V, 3).
-        counts: corners of each polygon, shape (P,).
-        corners: vertex indices of all polygons one after another, shape (C,).
+        counts: number of corners of each polygon, shape (P,).
+        corners: concatenated vertex indices of all polygons, shape (C,).
 
     Returns:
-        For every triangle, in the order of the polygons: its three positions in `corners` (F, 3), and its vertices
-        (F, 3).
+        For every triangle, in polygon order: its three positions in `corners` (F, 3), and its vertices (F, 3).
     """
     starts = np.cumsum(counts) - counts
     triangles, owners = [], []
@@ -100,9 +101,9 @@ def cut_polygons(vertices: Array, counts: Indices, corners: Indices) -> tuple[In
 
 
 def _fan_starts(vertices: Array, polygons: Indices) -> Indices:
-    """Return per polygon (m, n) the order of its corners that begins where a fan fits, shape (m, n)."""
+    """Return the corner order of each polygon (m, n), rotated to start at a valid fan apex, shape (m, n)."""
     m, n = polygons.shape
-    turns = (np.arange(n)[:, None] + np.arange(n)) % n  # row k begins at corner k
+    turns = (np.arange(n)[:, None] + np.arange(n)) % n  # row k starts at corner k
     chosen = np.zeros(m, np.int64)
     points = vertices[np.clip(polygons, 0, len(vertices) - 1)]
     open_ones = np.ones(m, bool)

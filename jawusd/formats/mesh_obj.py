@@ -1,7 +1,7 @@
-"""Wavefront OBJ: points, places in a texture and faces of text files ("Object Files (.obj)", Alias|Wavefront, 1995).
+"""Wavefront OBJ: vertices, texture coordinates and faces ("Object Files (.obj)", Alias|Wavefront, 1995).
 
-Negative indices count back from the line that uses them. Vertices may carry a colour after their coordinates, from 0 to
-1 (MeshLab, Blender) or 0 to 255. Materials, normals, groups, lines and curves are not read.
+Negative indices count back from the line that uses them. Vertices may have a colour after their coordinates, 0 to 1
+(MeshLab, Blender) or 0 to 255. Materials, normals, groups, lines and curves are ignored.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from jawusd.formats.mesh_data import (
 
 _MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
-_COUNTED = re.compile(r"^#\s*Faces:\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE)  # as MeshLab writes above the faces
-# OBJ has no counts. A file that ends within a line, and leaves this share of its vertices without a face, is cut off.
+_COUNTED = re.compile(r"^#\s*Faces:\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE)  # written by MeshLab above the faces
+# OBJ has no counts. A file without a final line end, and with this share of unused vertices, counts as truncated.
 _LEAST_LOOSE = 0.1
 
 
 def read_obj(path: Path) -> MeshData:
-    """Read an OBJ file, its vertices and faces in the order of the file.
+    """Read an OBJ file; vertices and faces keep the file's order.
 
     Raises:
-        CaptureError: it is cut off, or a number or an index is none.
+        CaptureError: it is truncated, or a number or an index is invalid.
     """
     data = read_mesh_bytes(path)
     text = data.decode(_MARKS.get(data[:2], "utf-8-sig"), errors="replace")
@@ -45,7 +45,9 @@ def read_obj(path: Path) -> MeshData:
     places: list[list[str]] = []
     counts: list[int] = []
     corners: list[str] = []
-    relative: list[tuple[int, int, int]] = []  # first corner of a face with negative indices, points and places so far
+    relative: list[
+        tuple[int, int, int]
+    ] = []  # per face with negative indices: its first corner, vertices and texture coordinates so far
     for line in text.replace("\\\n", " ").split("\n"):
         words = (line.partition("#")[0] if "#" in line else line).split()
         kind = words[0] if words else ""
@@ -68,7 +70,7 @@ def read_obj(path: Path) -> MeshData:
 
 
 def _points(path: Path, rows: list[list[str]]) -> tuple[Array, np.typing.NDArray[np.uint8] | None]:
-    """Return vertices (V, 3) and their colours; vertices without one among coloured ones are gray."""
+    """Return vertices (V, 3) and their colours, if any; vertices without a colour are gray."""
     vertices = _numbers(path, [row[:3] for row in rows], 3)
     coloured = [k for k, row in enumerate(rows) if len(row) >= 6]
     if not coloured:
@@ -94,7 +96,7 @@ def _numbers(path: Path, rows: list[list[str]], columns: int) -> Array:
 def _indices(
     path: Path, corners: list[str], counts: list[int], relative: list[tuple[int, int, int]]
 ) -> tuple[Indices, Indices | None]:
-    """Return the point and, if all corners have one, the place of every corner (C,), counted from 0."""
+    """Return the vertex and, if all corners have one, the texture index of every corner (C,), from 0."""
     texture = None
     try:
         if any("/" in corner for corner in corners):
@@ -106,7 +108,7 @@ def _indices(
             at = np.fromiter(map(int, corners), np.int64, len(corners))
     except ValueError as error:
         bad = next(corner for corner in corners if not re.fullmatch(r"-?\d+(?:/(?:-?\d+)?){0,2}", corner))
-        raise _wrong(path, f"f ... {bad}", "indices as 12, 12/7, 12/7/9 or 12//9") from error
+        raise _wrong(path, f"f ... {bad}", "indices such as 12, 12/7, 12/7/9 or 12//9") from error
     length = np.array(counts, np.int64)
     owner = np.repeat(np.arange(len(counts)), length)
     before = np.zeros((2, len(counts)), np.int64)
@@ -117,7 +119,7 @@ def _indices(
     out = []
     for values, counted in zip((at, texture), before, strict=True):
         if values is not None and (values == 0).any():
-            raise _wrong(path, f"f ... {corners[int(np.flatnonzero(values == 0)[0])]}", "indices from 1, or below 0")
+            raise _wrong(path, f"f ... {corners[int(np.flatnonzero(values == 0)[0])]}", "indices other than 0")
         out.append(None if values is None else np.where(values > 0, values - 1, counted[owner] + values))
     return np.asarray(out[0], np.int64), out[1]
 
@@ -132,19 +134,19 @@ def _uv(path: Path, rows: list[list[str]], texture: Indices | None, placed: Indi
 
 
 def _check_whole(path: Path, text: str, polygons: int, vertices: Array, faces: Indices) -> None:
-    """Raise if a file was cut off among its faces."""
+    """Raise if a file is truncated within its faces."""
     said = _COUNTED.findall(text)
     if len(said) == 1 and int(said[0]) > polygons:
         raise cut_off(path, polygons, int(said[0]), "faces")
     used = len(np.unique(faces[(faces >= 0) & (faces < len(vertices))]))
     if not text.endswith("\n") and used < (1 - _LEAST_LOOSE) * len(vertices) and polygons:
         raise CaptureError(
-            f"is cut off after {polygons} faces: it ends within a line, and {len(vertices) - used} of {len(vertices)} "
-            "vertices have no face.",
+            f"is truncated after {polygons} faces: it ends within a line, and {len(vertices) - used} of "
+            f"{len(vertices)} vertices have no face.",
             path=path,
             hint=COPY_AGAIN,
         )
 
 
 def _wrong(path: Path, found: str, allowed: str) -> CaptureError:
-    return CaptureError(f'"{found:.60}" is not a line with {allowed}.', path=path, hint="Export the mesh again.")
+    return CaptureError(f'the line "{found:.60}" must have {allowed}.', path=path, hint="Export the mesh again.")

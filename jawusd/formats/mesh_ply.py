@@ -1,7 +1,7 @@
 """PLY, text and binary of both byte orders (G. Turk, "The PLY Polygon File Format", Stanford, 1994).
 
-Read are vertices with colours and places in a texture, faces of any number of corners, with places of their corners
-(`texcoord`, MeshLab), and triangle strips, which -1 separates. Other elements, and what follows the last, are skipped.
+Supports vertices with colours and texture coordinates, polygons with texture coordinates per corner (`texcoord`,
+MeshLab), and triangle strips separated by -1. Other elements, and data after the last, are ignored.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _PLURAL = {"vertex": "vertices", "tristrips": "triangle strips"}
 @dataclass(frozen=True)
 class _Property:
     name: str
-    value: str  # numpy's type, as the header states it
-    length: str = ""  # numpy's type of the length of a list, "" if it is none
+    value: str  # numpy dtype from the header
+    length: str = ""  # numpy dtype of a list's length, "" for scalars
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,14 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Table:
-    """Hold the values of an element: a column (n,) a property, and of lists their lengths (n,) and all values."""
+    """Values of an element: a column (n,) per scalar property; lengths (n,) and concatenated values per list."""
 
     columns: dict[str, Array]
     lists: dict[str, tuple[Indices, Array]]
-    kinds: dict[str, str]  # numpy's types, as the header states them
+    kinds: dict[str, str]  # numpy dtypes from the header
 
     def joined(self, choices: tuple[tuple[str, ...], ...]) -> tuple[Array | None, str]:
-        """Return the first of several sets of columns that there is, shape (n, k), and its type; None if none is."""
+        """Return the first complete set of columns, shape (n, k), and its dtype; None if there is none."""
         for names in choices:
             if all(name in self.columns for name in names):
                 return np.column_stack([self.columns[name] for name in names]), self.kinds[names[0]]
@@ -70,10 +70,10 @@ class _Table:
 
 
 def read_ply(path: Path) -> MeshData:
-    """Read a PLY file, its vertices and faces in the order of the file.
+    """Read a PLY file; vertices and faces keep the file's order.
 
     Raises:
-        CaptureError: it is cut off, or header and data do not agree.
+        CaptureError: it is truncated, or header and data do not match.
     """
     data = read_mesh_bytes(path)
     elements, at, order = _header(path, data)
@@ -125,7 +125,7 @@ def _mesh(path: Path, tables: dict[str, _Table]) -> MeshData:
 
 
 def _strip_triangles(values: Indices) -> Indices:
-    """Return the triangles of strips, (F, 3): every second one is turned, and those that repeat a corner are empty."""
+    """Return the triangles of strips, (F, 3): every second one is flipped, degenerate ones are dropped."""
     place = np.arange(len(values))
     corners = np.stack([values[:-2], values[1:-1], values[2:]], axis=1) if len(values) > 2 else np.zeros((0, 3), int)
     begin = np.maximum.accumulate(np.where(values < 0, place + 1, 0))
@@ -136,10 +136,10 @@ def _strip_triangles(values: Indices) -> Indices:
 
 
 def _header(path: Path, data: bytes) -> tuple[list[_Element], int, str]:
-    """Return the elements, where their data begin, and the byte order; "" for text."""
+    """Return the elements, the offset of their data, and the byte order; "" for text."""
     found = _END.search(data)
     if data.removeprefix(b"\xef\xbb\xbf")[:3].lower() != b"ply" or found is None:
-        raise CaptureError('is no PLY file: "ply" or "end_header" is missing.', path=path, hint="Export it again.")
+        raise CaptureError('is not a PLY file: "ply" or "end_header" is missing.', path=path, hint="Export it again.")
     elements: list[_Element] = []
     order: str | None = None
     for line in data[: found.start()].decode("utf-8", errors="replace").splitlines():
@@ -157,7 +157,7 @@ def _header(path: Path, data: bytes) -> tuple[list[_Element], int, str]:
             raise _bad_header(path, f'has the line "{line:.60}", which is not PLY') from error
     names = [element.name for element in elements]
     if order is None or len(set(names)) < len(names) or any(element.rows < 0 for element in elements):
-        raise _bad_header(path, 'has no "format", an element twice, or a count below 0')
+        raise _bad_header(path, 'has no "format", a duplicate element, or a negative count')
     return elements, found.end(), order
 
 
@@ -170,7 +170,7 @@ def _plural(element: _Element) -> str:
 
 
 def _numbers(text: bytes) -> tuple[Array, str | None]:
-    """Return the numbers of a text up to the first word that is none, and that word unless it is the last."""
+    """Return the numbers of a text up to the first invalid word, and that word unless it is the last."""
     words = text.split()
     try:
         return np.fromiter(map(float, words), np.float64, len(words)), None
@@ -187,24 +187,24 @@ def _numbers(text: bytes) -> tuple[Array, str | None]:
 
 
 def _check_columns(path: Path, text: bytes, rows: int, used: int) -> None:
-    """Raise if the lines of a text hold more numbers than the header describes; lines behind the last do not matter."""
+    """Raise if the lines of a text hold more numbers than the header declares; extra lines are ignored."""
     lines = [line for line in text.splitlines() if line.strip()][:rows]
     held = sum(len(line.split()) for line in lines)
     if len(lines) == rows and held != used:
-        raise _bad_header(path, f"describes {used} numbers in {rows} lines, they hold {held}")
+        raise _bad_header(path, f"declares {used} numbers in {rows} lines, but they have {held}")
 
 
 class _Reader:
-    """Read the rows of one element, at once where all lists are of one length."""
+    """Reader of one element; reads all rows at once if their lists have equal lengths."""
 
     def __init__(self, path: Path, element: _Element, order: str) -> None:
         self._path, self._element = path, element
-        # the numbers of a text are held as doubles
+        # numbers of text files are stored as doubles
         self._values = [(order + one.value if order else "<f8") for one in element.properties]
         self._lengths = [one.length and (order + one.length if order else "<f8") for one in element.properties]
 
     def read(self, data: bytes, at: int) -> tuple[_Table, int]:
-        """Return the table that begins at a byte, and where the next one begins."""
+        """Return the table at an offset, and the offset of the next one."""
         rows, listed = self._element.rows, sum(map(bool, self._lengths))
         if not rows or not self._values:
             return self._table([], np.zeros((0, listed), np.int64)), at
@@ -230,14 +230,14 @@ class _Reader:
         return cut_off(self._path, whole, self._element.rows, _plural(self._element))
 
     def _row_type(self, counts: list[int]) -> np.dtype[np.void]:
-        """Return the type of rows whose lists have these lengths: fields "p0", "p1", ..., lengths "n0", ..."""
+        """Return the dtype of rows whose lists have these lengths: fields "p0", "p1", ..., lengths "n0", ..."""
         parts: list[tuple[str, str, tuple[int, ...]]] = []
         for k, (value, length) in enumerate(zip(self._values, self._lengths, strict=True)):
             parts += [(f"n{k}", length, ()), (f"p{k}", value, (counts.pop(0),))] if length else [(f"p{k}", value, ())]
         return np.dtype(parts)
 
     def _walk(self, data: bytes, at: int, rows: int) -> tuple[Indices, Indices]:
-        """Return where rows begin and the last one ends (n + 1,), and the lengths of their lists, shape (n, lists)."""
+        """Return the offsets of rows and the end (n + 1,), and the lengths of their lists, shape (n, lists)."""
         steps = [
             (np.dtype(value).itemsize, Struct(length[0] + _LETTERS[length[1:]]) if length else None)
             for value, length in zip(self._values, self._lengths, strict=True)
@@ -261,7 +261,7 @@ class _Reader:
         return np.array(starts, np.int64), np.array(counts, np.int64).reshape(rows, -1)
 
     def _table(self, groups: list[tuple[Indices, NDArray[np.void]]], counts: Indices) -> _Table:
-        """Return rows that were read in groups, of the given places among all."""
+        """Return the table of rows that were read in groups, each with its row indices."""
         columns: dict[str, Array] = {}
         lists: dict[str, tuple[Indices, Array]] = {}
         for k, one in enumerate(self._element.properties):

@@ -1,6 +1,6 @@
-"""STL, binary and text (3D Systems, "StereoLithography Interface Specification", 1989): no shared points.
+"""STL, binary and text (3D Systems, "StereoLithography Interface Specification", 1989); vertices are not shared.
 
-Binary: 80 bytes of header, the count, and 50 bytes a triangle: normal, corners, two bytes that colours are put in.
+Binary: 80 bytes of header, the count, and 50 bytes per triangle: normal, corners, two bytes often used for colours.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from jawusd.formats.mesh_data import COPY_AGAIN, MOST_TRIANGLES, MeshData, check
 
 _HEADER = 84
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_LENGTHS = (1e-6, 1e5)  # coordinates behind the last triangle within these are triangles, not something else
+_LENGTHS = (1e-6, 1e5)  # range of plausible coordinates, to detect triangles beyond the declared count
 _SOLID = re.compile(rb"\n[ \t]*(end)?solid\b[^\n]*")
 _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 
 
 def read_stl(path: Path) -> MeshData:
-    """Read an STL file, three vertices a triangle.
+    """Read an STL file, with three vertices per triangle.
 
     Raises:
-        CaptureError: it is cut off, its count is wrong, or a number is none.
+        CaptureError: it is truncated, its count is wrong, or a number is invalid.
     """
     data = read_mesh_bytes(path)
     begins_as_text = data[:512].removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() == b"solid"
-    # The highest byte of a binary count is zero; text holds no zero bytes. Binary headers may begin with "solid", too.
+    # The highest byte of a binary count is zero; text has no zero bytes. Binary headers may also start with "solid".
     corners = _text(path, data) if begins_as_text and 0 not in data[80:_HEADER] else _binary(path, data)
     return MeshData(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
@@ -40,11 +40,11 @@ def _binary(path: Path, data: bytes) -> Array:
         raise CaptureError("is neither a text nor a binary STL file.", path=path, hint="Export it again.")
     said = int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
     whole = (len(data) - _HEADER) // _TRIANGLE.itemsize
-    if said > max(whole, MOST_TRIANGLES):  # of a writer that did not know it, or of no STL at all
+    if said > max(whole, MOST_TRIANGLES):  # the writer did not know the count, or the file is not STL
         raise CaptureError(
-            f"says that it has {said:,} triangles, but there is room for {whole:,}.",
+            f"declares {said:,} triangles, but has room for {whole:,}.",
             path=path,
-            hint="Export it again, under a name that says its format.",
+            hint="Export it again, with the suffix of its format.",
         )
     if said > whole:
         raise cut_off(path, whole, said, "triangles")
@@ -52,9 +52,7 @@ def _binary(path: Path, data: bytes) -> Array:
     rows = np.frombuffer(data, _TRIANGLE, whole, _HEADER)["corners"].astype(np.float64)
     more = int(_are_triangles(rows[said:]).sum())
     if more:
-        raise CaptureError(
-            f"says that it has {said} triangles, but {more} more follow.", path=path, hint="Export it again."
-        )
+        raise CaptureError(f"declares {said} triangles, but {more} more follow.", path=path, hint="Export it again.")
     return rows[:said]
 
 
@@ -74,7 +72,7 @@ def _text(path: Path, data: bytes) -> Array:
     facets = body.count(b"facet") - whole
     check_count(path, facets, "triangles")
     if facets != whole or ends.count(True) != ends.count(False):
-        raise CaptureError(f'is cut off after {whole} triangles: "endsolid" is missing.', path=path, hint=COPY_AGAIN)
+        raise CaptureError(f'is truncated after {whole} triangles: "endsolid" is missing.', path=path, hint=COPY_AGAIN)
     rows = _VERTEX.findall(body)
     if len(rows) != 3 * facets:
         raise CaptureError(

@@ -1,7 +1,7 @@
 """The fitted jaw model: `model.npz`, format jawusd-model/2.
 
-The arrays that a decoder needs (`JawModel.arrays`) carry the same names here, in the rig and in the evaluator, which
-checks them when it is made; this module checks only what it adds.
+The decoder arrays (`JawModel.arrays`) have the same names here, in the rig and in the evaluator, which validates them
+on construction; this module validates only the additional arrays.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_
 
 @dataclass(eq=False)
 class JawModel:
-    """Hold a fitted model and its parameters of the captured poses."""
+    """A fitted model and its parameters of the captured poses."""
 
     arrays: dict[str, Array]  # the decoder's named arrays, see `jawusd.evaluator`
     frames: NDArray[np.int64]  # captured frame numbers, shape (F,)
-    d: Array  # parameters of the captured poses [mm], NaN where the frame was lost, shape (F, 3)
-    residual_mm: Array  # rms landmark distance of pose and model [mm], NaN where lost, shape (F,)
-    trained: Mask  # the frame took part in the fit, shape (F,)
+    d: Array  # parameters of the captured poses [mm], NaN for lost frames, shape (F, 3)
+    residual_mm: Array  # rms landmark distance between pose and model [mm], NaN for lost frames, shape (F,)
+    trained: Mask  # frames used in the fit, shape (F,)
     # kind, method, actor, error tables, warnings, configuration, versions, hashes
     meta: dict[str, object] = field(default_factory=dict)
 
@@ -61,7 +61,7 @@ def load_model(path: str | os.PathLike[str]) -> JawModel:
     """Read a model.
 
     Raises:
-        FormatError: not a model file, wrong shapes, or a header whose values have other types.
+        FormatError: not a model file, wrong shapes, or header values of the wrong type.
         VersionError: written by a newer version.
         UnitsError: other units or twist order.
     """

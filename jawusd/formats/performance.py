@@ -21,21 +21,21 @@ _PREFIX = "solved_"
 class SolveState(IntEnum):
     """Values of `Performance.state`."""
 
-    LOST = 0  # pictures that nothing fits: the motion before and after carries the jaw
+    LOST = 0  # no pose fits the pictures; interpolated
     SOLVED = 1  # both arches found
-    CARRIED = 2  # an arch out of sight: lips closed, no picture
+    CARRIED = 2  # an arch is hidden (lips closed, no picture); interpolated
 
     def __str__(self) -> str:
         return self.name.lower()
 
 
-#: What the states mean, for people.
+#: Descriptions of the states.
 STATE_WORDS: dict[SolveState, str] = {
     SolveState.SOLVED: "solved from the pictures",
-    SolveState.CARRIED: "out of sight: carried by the motion around",
-    SolveState.LOST: "lost: nothing fits the pictures there",
+    SolveState.CARRIED: "hidden: interpolated from neighbouring frames",
+    SolveState.LOST: "lost: no pose fits the pictures",
 }
-#: Red, green and blue of an arch in pictures, by state; they differ in brightness too.
+#: RGB of an arch in pictures, by state; the colours also differ in brightness.
 STATE_COLOURS: dict[SolveState, tuple[int, int, int]] = {
     SolveState.SOLVED: (0, 190, 120),
     SolveState.CARRIED: (255, 225, 0),
@@ -45,25 +45,25 @@ STATE_COLOURS: dict[SolveState, tuple[int, int, int]] = {
 
 @dataclass(eq=False)
 class Performance:
-    """Hold a performance; every frame has a pose, and `covariance` says what it is worth.
+    """A performance; every frame has a pose, and `covariance` gives its uncertainty.
 
     Attributes:
         frames: frame numbers of the reference camera, shape (F,).
-        T_world_upper: the head, shape (F, 4, 4).
+        T_world_upper: pose of the head, shape (F, 4, 4).
         d: jaw parameters [mm], shape (F, 3).
-        covariance: of a step of the head in its own axes about `pivot` (omega [rad], v [mm]) and of d [mm], shape
+        covariance: covariance of a head twist in head axes about `pivot` (omega [rad], v [mm]) and of d [mm], shape
             (F, 9, 9).
         pivot: point of the upper scan [mm], shape (3,).
         state: `SolveState`, shape (F,).
-        found: arches whose outlines took part, (upper, lower), shape (F, 2).
-        use: masks, or cameras, that took part, shape (F, 2, C).
-        uncovered: share of every mask that the scan leaves uncovered, shape (F, 2, C); NaN without a mask.
-        residual_px, matched_px: spread of the outlines' residuals, and contour that was matched, shape (F, 2).
+        found: arches whose outlines were used, (upper, lower), shape (F, 2).
+        use: masks, or cameras, that were used, shape (F, 2, C).
+        uncovered: fraction of each mask not covered by the scan, shape (F, 2, C); NaN without a mask.
+        residual_px, matched_px: standard deviation of outline residuals, and length of matched contour, shape (F, 2).
         margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).
         valid: the rig allows the pose: inside its bound, or within the tolerance of measured poses, shape (F,).
-        verdict: what the rig says of the pose, in words, length F.
+        verdict: the rig's verdict on the pose, in words, length F.
         camera_names: length C.
-        notes: what was estimated for the whole take.
+        notes: estimates for the whole take.
     """
 
     frames: NDArray[np.int64]
@@ -90,7 +90,7 @@ class Performance:
 
 
 def write_performance(path: str | os.PathLike[str], performance: Performance, fps: float) -> None:
-    """Write the jaw of every frame as CSV, atomically: `HEADER`; lengths in mm, times from frame 0 on.
+    """Write the jaw of every frame as CSV, atomically, with columns `HEADER`; lengths in mm, time 0 at frame 0.
 
     Raises:
         OutputError: the file cannot be written.
@@ -106,7 +106,7 @@ def write_performance(path: str | os.PathLike[str], performance: Performance, fp
 
 @dataclass(frozen=True, eq=False)
 class SolvedJaw:
-    """Hold the jaw of a performance.
+    """The jaw of a performance, stored in `tracks.npz`.
 
     Attributes:
         d: jaw parameters [mm], shape (F, 3).
@@ -138,16 +138,16 @@ class SolvedJaw:
 
 
 def take_solved(arrays: NamedArrays, count: int, path: str | os.PathLike[str]) -> SolvedJaw | None:
-    """Return what a file says of so many frames of a performance; None if it holds other tracks.
+    """Return the performance arrays of a tracks file with `count` frames; None if it has none.
 
     Raises:
-        FormatError: an array is missing, of another shape, not finite, or names no state.
+        FormatError: an array is missing, has the wrong shape, is not finite, or has an unknown state.
     """
     if _PREFIX + "d" not in arrays:
         return None
     found = {name: take(arrays, _PREFIX + name, shape, path) for name, shape in _shapes(count).items()}
     if not np.isin(found["state"], list(SolveState)).all():
-        raise FormatError(f'"{_PREFIX}state" holds a number that names no state.', path=path)
+        raise FormatError(f'"{_PREFIX}state" has an unknown state.', path=path)
     return SolvedJaw(
         found["d"], found["sigma_mm"], found["margin_mm"], found["state"].astype(np.int8), found["valid"].astype(bool)
     )

@@ -1,4 +1,4 @@
-"""What photographs of teeth that are together tell: photos.json, format jawusd-photos/1."""
+"""The closed bite estimated from photographs: photos.json, format jawusd-photos/1."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ FORMAT = "jawusd-photos/1"
 
 @dataclass(frozen=True, eq=False)
 class AlignedPhoto:
-    """Hold the pose and lens of one photograph; pixels are those of the picture, mirrored if it is."""
+    """Pose and lens of one photograph, in pixels of the picture as stored (mirrored if it is)."""
 
     name: str
     size_px: tuple[int, int]
-    mirrored: bool  # taken over a mirror: poses hold for the picture with left and right exchanged
+    mirrored: bool  # taken in a mirror: poses refer to the horizontally flipped picture
     focal_px: float
     distortion: float  # OpenCV's k1
     middle_px: Array  # principal point, shape (2,)
     T_cam_upper: Array  # upper scan to camera, shape (4, 4)
-    outline_rms_px: float  # distance of all drawn points from the outlines, in px of a picture 1440 px wide
+    outline_rms_px: float  # rms distance of drawn points from the outlines, in px of a picture 1440 px wide
     outline_median_px: float
-    free_rms_px: float  # the same without lines along the gum
-    # mean squared distance in place and direction over that of half a millimetre, at most 1, of the row that fits worse
+    free_rms_px: float  # the same without gum lines
+    # mean squared distance in position and direction, relative to half a millimetre, at most 1, of the worse arch
     misfit: float
-    other_hand: float  # misfit if it were mirrored the other way, over its own, at the start [-]
-    T_upper_lower_alone: Array  # the bite by this photograph alone, shape (4, 4)
-    alone_off_mm: float  # how far that one lies from the common one at the lower incisor
+    other_hand: float  # misfit with the opposite mirroring over `misfit`, at the initial pose [-]
+    T_upper_lower_alone: Array  # the bite from this photograph alone, shape (4, 4)
+    alone_off_mm: float  # distance of that bite from the common one at the lower incisor
 
     def as_json(self) -> dict[str, object]:
-        """Return the fields as JSON knows them."""
+        """Return the fields for JSON."""
         u, v = self.middle_px.tolist()
         return {
             "name": self.name,
@@ -56,13 +56,11 @@ class AlignedPhoto:
 
 @dataclass(frozen=True, eq=False)
 class AlignedPhotos:
-    """Hold photographs with the bite they share."""
+    """Photographs and their common bite."""
 
     T_upper_lower: Array  # lower scan to upper scan with the teeth together, shape (4, 4)
-    gum_mm: (
-        Array  # by how much gum lines are drawn nearer to the gum than the crowns reach, upper and lower, shape (2,)
-    )
-    depth_mm: float  # how deep crowns run into one another
+    gum_mm: Array  # offset of drawn gum lines from the scans' towards the gum, upper and lower, shape (2,)
+    depth_mm: float  # penetration depth of the crowns
     photos: tuple[AlignedPhoto, ...]
     findings: tuple[Finding, ...]
 

@@ -35,7 +35,7 @@ MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 PARAMETER_COLUMNS = ("d1", "d2", "d3")
 _MAX_BYTES = 1 << 30
-# A matrix written with 5 decimals is rigid to about this.
+# Rigidity defect of a matrix written with 5 decimals.
 _RIGID_TOLERANCE = 1e-3
 _ZERO_QUATERNION = 1e-6
 _JOINT_COLUMNS = "shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,qz,clamped_mm"
@@ -48,7 +48,7 @@ def _read_table(path: Path) -> TextTable:
         table = _json_table(path)
     named = [name for name in table.header if name]
     if len(set(named)) != len(named):
-        raise FormatError(f"names a column twice: {', '.join(named)}.", path=path)
+        raise FormatError(f"has a duplicate column: {', '.join(named)}.", path=path)
     return table
 
 
@@ -76,7 +76,7 @@ def _numbers(table: TextTable, names: tuple[str, ...]) -> Array:
         raise FormatError(
             f"{table.named(i, columns[j])} is {table.rows[i][columns[j]]}; all values must be finite.",
             path=table.path,
-            hint="Leave out frames without a pose.",
+            hint="Omit frames without a pose.",
         )
     return out
 
@@ -104,9 +104,9 @@ def read_poses(
     """Read jaw poses from CSV or JSON: frame numbers (F,) and T_skull_mandible (F, 4, 4).
 
     Args:
-        path: table with matrix or quaternion columns, see the module; the last matrix row may be left out.
-        columns: names in the file of columns that are not named as in the module, e.g. {"tx": "X"}; without a frame
-            column its rows are then numbered from 0.
+        path: table with matrix or quaternion columns, see the module; the last matrix row may be omitted.
+        columns: the file's names of columns that differ from the module's, e.g. {"tx": "X"}; rows are then numbered
+            from 0 if there is no frame column.
 
     Raises:
         FormatError: columns missing, a value that is not a finite number, or a matrix that is not rigid.
@@ -115,10 +115,10 @@ def read_poses(
 
 
 def read_poses_or_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
-    """Read frame numbers (F,) and parameters d [mm] (F, 3) or else T_skull_mandible (F, 4, 4) from CSV or JSON.
+    """Read frame numbers (F,), and parameters d [mm] (F, 3) or T_skull_mandible (F, 4, 4), from CSV or JSON.
 
     Raises:
-        FormatError: columns of neither, a value that is not a finite number, or a matrix that is not rigid.
+        FormatError: columns missing, a value that is not a finite number, or a matrix that is not rigid.
     """
     table = _read_table(Path(path))
     if PARAMETER_COLUMNS[0] in table.header:
@@ -138,7 +138,7 @@ def _poses_of(table: TextTable, columns: Mapping[str, str] | None) -> tuple[NDAr
     for name, theirs in (columns or {}).items():
         if theirs not in table.header:
             raise FormatError(
-                f'has no column "{theirs}" to be read as "{name}"; it has {_listed(table)}.', path=table.path
+                f'has no column "{theirs}" to read as "{name}"; it has {_listed(table)}.', path=table.path
             )
     if columns and called["frame"] not in table.header:
         frames = np.arange(len(table.rows))
@@ -160,7 +160,7 @@ def _poses_of(table: TextTable, columns: Mapping[str, str] | None) -> tuple[NDAr
             f"has neither the columns {matrix[0]} ... {matrix[11]} nor {', '.join(quaternion)}; "
             f"it has {_listed(table)}.",
             path=table.path,
-            hint=None if columns else "`jawusd fit` takes other names with --columns, e.g. tx=X,ty=Y,...",
+            hint=None if columns else "Map other names with `jawusd fit --columns`, e.g. tx=X,ty=Y,...",
         )
     return frames, _checked_rigid(T, table)
 
@@ -195,7 +195,7 @@ def _parameters_of(table: TextTable) -> tuple[NDArray[np.int64], Array]:
 
 
 def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: Array) -> None:
-    """Write T_skull_mandible (F, 4, 4) of frames (F,) as CSV with matrix columns, atomically and with all digits.
+    """Write T_skull_mandible (F, 4, 4) of frames (F,) as CSV with matrix columns, atomically, in full precision.
 
     Raises:
         OutputError: the file cannot be written.
@@ -204,7 +204,7 @@ def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: Arra
 
 
 def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d: Array) -> None:
-    """Write parameters d [mm] (F, 3) as CSV, atomically and with all digits.
+    """Write parameters d [mm] (F, 3) as CSV, atomically, in full precision.
 
     Raises:
         OutputError: the file cannot be written.
@@ -228,18 +228,18 @@ def write_table(
 
 @dataclass(frozen=True, eq=False)
 class JointDelta:
-    """Hold what one shape does to the joint."""
+    """The joint transform of one ARKit shape."""
 
-    shape: str  # as ARKit names it
+    shape: str  # ARKit's name
     weight: float  # 0 .. 1
     d: Array  # the pose [mm], shape (3,)
     translation_mm: Array  # of the joint, skull axes, shape (3,)
     rotation: Array  # skull axes, shape (3, 3)
-    clamped_mm: float  # by which d was brought inside the bound
+    clamped_mm: float  # distance by which d was clamped to the bound
 
 
 def save_joint_table(path: str | os.PathLike[str], rows: Iterable[JointDelta]) -> None:
-    """Write a table atomically.
+    """Write a joint table atomically.
 
     Raises:
         OutputError: the file cannot be written.
@@ -254,9 +254,9 @@ def save_joint_table(path: str | os.PathLike[str], rows: Iterable[JointDelta]) -
 
 
 def fixed_angles(R: Array) -> Array:
-    """Return the angles [rad] about the fixed axes x, then y, then z, shape (3,), R = Rz Ry Rx (3, 3).
+    """Return the angles [rad] about the fixed axes x, then y, then z, shape (3,), of R = Rz Ry Rx (3, 3).
 
-    J. J. Craig, "Introduction to Robotics", eq. 2.66, for turns about y of less than a quarter.
+    J. J. Craig, "Introduction to Robotics", eq. 2.66, for rotations about y below 90 degrees.
     """
     about_y = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
     return np.array([np.arctan2(R[2, 1], R[2, 2]), about_y, np.arctan2(R[1, 0], R[0, 0])])

@@ -1,4 +1,4 @@
-"""What the report of a build, or of a solved performance, shows: gathered, but not yet rated or drawn."""
+"""Data of the reports of a build and of a solved performance, before rating and drawing."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from jawusd.formats.tracks import Tracks
 
 @dataclass(frozen=True)
 class Origin:
-    """Say how a build was made; empty where that is not recorded."""
+    """Provenance of a build; empty where not recorded."""
 
     finished: str  # date and time
-    command: str  # the command line; "" also where a program called the build
+    command: str  # the command line; "" if called from Python
     versions: Mapping[str, str]  # by package
 
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """Describe the input of one camera."""
+    """Input of one camera."""
 
     name: str
     video: str  # file name of the footage, "" without any
@@ -34,7 +34,7 @@ class CameraFacts:
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """Hold one frame of the footage with the tracked scans drawn over it, all cameras side by side."""
+    """One frame of the footage with the tracked scans drawn over it, all cameras side by side."""
 
     frame: int  # of the reference camera
     reason: str  # why this frame is shown
@@ -43,7 +43,7 @@ class Overlay:
 
 @dataclass(frozen=True, eq=False)
 class ContactPicture:
-    """Hold the contacts of the teeth in one pose, both arches side by side."""
+    """The tooth contacts in one pose, both arches side by side."""
 
     title: str
     clearance_mm: float
@@ -52,9 +52,9 @@ class ContactPicture:
 
 @dataclass(frozen=True, eq=False)
 class ReplayPart:
-    """Hold a mesh of the replay."""
+    """A mesh of the replay."""
 
-    name: str  # shown to people
+    name: str  # display name
     kind: str  # "bone", "tooth" or "gum": how it is coloured
     moves: bool  # it belongs to the mandible
     mesh: Mesh  # decimated, anatomical frame, at the closed bite [mm]
@@ -62,43 +62,43 @@ class ReplayPart:
 
 @dataclass(frozen=True)
 class RigFacts:
-    """Hold the checks of the rig files."""
+    """Results of checking the rig files."""
 
     table_error_mm: float  # largest vertex distance of the sampled decoder to the exact model [mm]
-    findings: tuple[str, ...]  # of the validators, "severity: message"; empty when all is well
+    findings: tuple[str, ...]  # of the validators, "severity: message"; empty if there are none
 
 
 @dataclass(frozen=True, eq=False)
 class ReportData:
-    """Hold what the report shows."""
+    """Data of the report of a build."""
 
     actor: str
     tracks: Tracks
     model: JawModel
     sync: SyncNotes
-    cameras: tuple[CameraFacts, ...]  # empty where the capture is not at hand
-    inferred: tuple[str, ...]  # what was derived instead of being given
+    cameras: tuple[CameraFacts, ...]  # empty if the capture is not available
+    inferred: tuple[str, ...]  # values that were derived instead of given
     seconds: Mapping[str, float]  # per stage [s]
     hashes: Mapping[str, str]  # SHA-256 by file name of the build
     origin: Origin
     rig: RigFacts
-    experiments: Experiments | None  # the paper's experiments, None if they could not be done
+    experiments: Experiments | None  # the paper's experiments, None if they failed
     overlays: tuple[Overlay, ...]  # frames of the footage, the worst first
     parts: tuple[ReplayPart, ...]
-    left_out: tuple[str, ...]  # what the report does not show, and why
+    left_out: tuple[str, ...]  # parts omitted from the report, and why
     findings: tuple[Finding, ...] = ()  # of the check before the first stage
-    contacts: tuple[ContactPicture, ...] = ()  # of the teeth; empty where the scans do not show them
+    contacts: tuple[ContactPicture, ...] = ()  # empty if the scans do not show contacts
 
 
 @dataclass(frozen=True, eq=False)
 class SolveReportData:
-    """Hold what the report of a solved performance shows."""
+    """Data of the report of a solved performance."""
 
     shot: str
     tracks: Tracks  # with `solved`
     fps: float  # frames per second
-    limits: str  # what the result is worth, in words; "" where it is not known
-    cameras: tuple[CameraFacts, ...]  # empty where the shot is not at hand
+    limits: str  # accuracy and limits of the result, in words; "" if unknown
+    cameras: tuple[CameraFacts, ...]  # empty if the shot is not available
     overlays: tuple[Overlay, ...]  # frames of the shot, the worst first
     versions: Mapping[str, str]  # by package
-    left_out: tuple[str, ...]  # what the report does not show, and why
+    left_out: tuple[str, ...]  # parts omitted from the report, and why

@@ -1,7 +1,7 @@
-"""Rigid bodies that carry markers.
+"""Rigid bodies with markers.
 
-They are a marker description file of Northern Digital (`.rig`), which names its markers by their numbers in the table,
-or these numbers alone, or the names of markers.
+A body is given by a marker description file of Northern Digital (`.rig`), by the numbers of its markers in the table,
+or by their names.
 """
 
 from __future__ import annotations
@@ -22,12 +22,11 @@ _RIG_COUNT = "number of markers"
 
 @dataclass(frozen=True)
 class RigidBody:
-    """Hold what is known of a rigid body: its markers and their positions on it.
+    """A rigid body: its markers and, if known, their positions on it.
 
     Attributes:
         markers: numbers in the table, counted from 1, or names.
-        points: positions in the body's own frame, shape (N, 3), in the unit of its file; None where only the markers
-            are known.
+        points: positions in the body's frame, shape (N, 3), in the unit of its file, or None.
     """
 
     markers: tuple[int | str, ...]
@@ -55,9 +54,9 @@ def _read_rig(path: Path) -> RigidBody:
     counts = [line.partition(";")[0].strip() for line in lines if _RIG_COUNT in line.lower()]
     if len(counts) != 1 or not counts[0].isdigit():
         raise FormatError(
-            f'is not a marker description: no line tells the "{_RIG_COUNT}".',
+            f'is not a marker description: there is no line "{_RIG_COUNT}".',
             path=path,
-            hint="Name a .rig file, or the numbers or names of the rigid body's markers, as 5,6,7,8 or HL,HR,HF.",
+            hint="Give a .rig file, or the numbers or names of the body's markers, such as 5,6,7,8 or HL,HR,HF.",
         )
     header = next((k for k, line in enumerate(lines) if line.split()[:4] == ["Marker", "X", "Y", "Z"]), len(lines))
     rows = [line.split() for line in lines[header + 1 :] if line.strip()]
@@ -67,16 +66,16 @@ def _read_rig(path: Path) -> RigidBody:
     except (IndexError, ValueError) as error:
         raise FormatError(f'a marker is not written as "number x y z views" ({error}).', path=path) from error
     if len(markers) != int(counts[0]):
-        raise FormatError(f"says that it has {counts[0]} markers and lists {len(markers)}.", path=path)
+        raise FormatError(f"declares {counts[0]} markers but lists {len(markers)}.", path=path)
     if not np.isfinite(points).all():
-        raise FormatError("holds a position that is not a finite number.", path=path)
+        raise FormatError("has a position that is not a finite number.", path=path)
     return RigidBody(markers, points)
 
 
 def _checked(body: RigidBody, where: str) -> RigidBody:
     numbers = ", ".join(map(str, body.markers))
     if len(set(body.markers)) != len(body.markers) or 0 in body.markers or "" in body.markers:
-        raise FormatError(f"markers {numbers}: each must be named once, counted from 1.", path=where)
+        raise FormatError(f"markers {numbers}: each must be listed once, numbered from 1.", path=where)
     if len(body.markers) < 3:
-        raise FormatError(f"names the markers {numbers or 'none'}; three or more are needed.", path=where)
+        raise FormatError(f"lists the markers {numbers or 'none'}; at least three are needed.", path=where)
     return body

@@ -1,9 +1,9 @@
-"""Which vertices of a teeth scan are crown, gum and base: npz, format jawusd-scan-labels/1, beside the scan.
+"""Labels of crown, gum and base of a teeth scan: npz, format jawusd-scan-labels/1, beside the scan.
 
     labels (V,) uint8    0 gum, 1 crown, 2 crown at a border of interest, 3 base plate; in the order of the scan file
     meta                 JSON: scan_sha256 of the scan's vertices, source, weak_share
 
-The hash ties labels to one version of the scan: they are refused for any other.
+The hash ties labels to one version of the scan; they are refused for any other.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ LabelSource = Literal["automatic", "reviewed"]
 
 @dataclass(frozen=True, eq=False)
 class ScanLabels:
-    """Hold the labels of one scan."""
+    """Labels of one scan."""
 
     labels: NDArray[np.uint8]  # GUM, TOOTH, BOUNDARY or BASE of `formats.mesh` per vertex of the scan file, shape (V,)
-    source: LabelSource  # found from the shape, or seen and accepted by a person
-    weak_share: float = 0.0  # share of the border between crown and gum that the shape hardly supports, 0 .. 1
+    source: LabelSource  # "automatic": from the shape; "reviewed": accepted by a user
+    weak_share: float = 0.0  # share of the crown-gum border with weak geometric evidence, 0 .. 1
 
 
 def labels_path(scan: Path, folder: Path | None = None) -> Path:
-    """Return the file of the labels of a scan: beside it, or in a folder of labels."""
+    """Return the label file of a scan: beside it, or in a folder of labels."""
     return (scan.parent if folder is None else folder) / f"{scan.stem}{SUFFIX}"
 
 
 def scan_hash(mesh: Mesh) -> str:
-    """Return the SHA-256 of the vertices of a scan, by which its labels know it."""
+    """Return the SHA-256 of the vertices of a scan, which identifies it in its labels."""
     return hashlib.sha256(mesh.vertices.tobytes()).hexdigest()
 
 
@@ -82,7 +82,7 @@ def load_scan_labels(path: str | os.PathLike[str], mesh: Mesh) -> ScanLabels:
         raise FormatError(
             f"was made for another version of the scan ({len(labels)} vertices, the scan has {len(mesh.vertices)}).",
             path=path,
-            hint="Make new labels with jawusd scans --force, or delete the file.",
+            hint="Create new labels with `jawusd scans --force`, or delete the file.",
         )
     if not np.isin(labels, range(BASE + 1)).all():
         raise FormatError(f'"labels" must be 0 to {BASE}, found {labels.max():g}.', path=path)

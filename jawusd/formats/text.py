@@ -18,13 +18,13 @@ from jawusd.formats.capture_keys import table_model
 Model = TypeVar("Model", bound=BaseModel)
 
 _MOST_TOML_BYTES = 4 << 20
-_SHOWN = 80  # characters of a line
-# Tables within tables that one key may name: tomllib takes time by their square, hours for a file of 200 kB.
+_SHOWN = 80  # characters of a line in messages
+# Dotted parts of a key: tomllib takes quadratic time, hours for a file of 200 kB.
 _MOST_DOTS = 64
 _NAME = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_NAME}[ \t]*+\.[ \t]*+){{{_MOST_DOTS}}}", re.ASCII)
 T = TypeVar("T")
-#: Frames that a camera is off by.
+#: Frame offset of a camera.
 Frames = Annotated[int, Field(ge=-10_000_000, le=10_000_000)]
 
 _Table = dict[str, dict[str, float]]
@@ -32,37 +32,37 @@ _ByCamera = dict[str, list[float]]
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
-    """Return the tables and values of a TOML file.
+    """Return the content of a TOML file.
 
     Raises:
-        FormatError: missing, too large, no text or not TOML.
+        FormatError: missing, too large, not text or not TOML.
     """
     path = Path(path)
     text = read_text(path, _MOST_TOML_BYTES)
     if _LONG_KEY.search(text):
-        raise FormatError(f"has a key of more than {_MOST_DOTS} names with dots between.", path=path)
+        raise FormatError(f"has a dotted key of more than {_MOST_DOTS} parts.", path=path)
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # also of numbers of more than 4300 digits
+    except (ValueError, RecursionError) as error:  # includes numbers of more than 4300 digits
         said, hint = _not_toml(text, str(error))
         raise FormatError(f"is not valid TOML: {said}.", path=path, hint=hint) from error
 
 
 def _not_toml(text: str, said: str) -> tuple[str, str]:
-    """Return what is wrong with the line that an error of tomllib names, and what to do."""
+    """Return the message and hint for an error of tomllib."""
     place = re.search(r" \(at line (\d+), column \d+\)$", said)
     line = text.split("\n")[int(place[1]) - 1].strip() if place else ""
     if place:
         said = f"line {place[1]}, {line[:_SHOWN]}: {said[: place.start()]}"
     if "\\" in line:
-        return said, 'Write paths with slashes, as "video/left.mp4", on Windows too.'
+        return said, 'Write paths with slashes, such as "video/left.mp4", also on Windows.'
     if re.search("[\u2018-\u201f\u00ab\u00bb]", line):
-        return said, 'Write straight quotes, as name = "anna"; word processors make others of them.'
-    return said, 'Text stands in quotes, as name = "anna", and tables in brackets, as [scans].'
+        return said, 'Write straight quotes, such as name = "anna"; word processors replace them by curly ones.'
+    return said, 'Write text in quotes, such as name = "anna", and tables in brackets, such as [scans].'
 
 
 def parse_json(text: str, path: Path) -> object:
-    """Return the value of a JSON text read from a file.
+    """Parse a JSON text read from a file.
 
     Raises:
         FormatError: it is not JSON.
@@ -72,19 +72,19 @@ def parse_json(text: str, path: Path) -> object:
     except json.JSONDecodeError as error:
         line = text.split("\n")[error.lineno - 1].strip()
         before = text[: error.pos].rstrip()[-1:]
-        hint = "Put names and text in straight double quotes, commas between entries, none after the last."
+        hint = "Put names and text in straight double quotes, and commas between entries but not after the last."
         if re.match(r"//|/\*|#", text[error.pos :]):
-            hint = "Take comments out: JSON has none."
+            hint = "Remove comments: JSON has none."
         elif before == ",":
-            hint = "Take out the comma before it, or add what should follow."
+            hint = "Remove the comma before it, or add the missing entry."
         said = f"line {error.lineno}, {line[:_SHOWN]}: {error.msg}" if line else f"line {error.lineno}: {error.msg}"
         raise FormatError(f"is not JSON: {said}.", path=path, hint=hint) from error
-    except (ValueError, RecursionError) as error:  # of numbers of more than 4300 digits, or lists in lists
+    except (ValueError, RecursionError) as error:  # numbers of more than 4300 digits, or deep nesting
         raise FormatError(f"is not JSON ({error}).", path=path) from error
 
 
 def parse_model(text: str, path: Path, model: type[Model], hint: str | None = None) -> Model:
-    """Return a JSON text read from a file as a model, whose fields say in their descriptions what they need.
+    """Parse a JSON text read from a file into a model; field descriptions are used in messages.
 
     Raises:
         FormatError: it is not JSON, or a value is missing or wrong.
@@ -97,7 +97,7 @@ def parse_model(text: str, path: Path, model: type[Model], hint: str | None = No
 
 
 def _fault(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return what is wrong in words, as `keys, entry 1: d needs three numbers`."""
+    """Return the message for a validation error, such as `keys, entry 1: d needs three numbers`."""
     problem = error.errors()[0]
     kind, given = problem["type"], problem["input"]
     names: list[str] = []
@@ -118,16 +118,16 @@ def _fault(error: ValidationError, model: type[BaseModel]) -> str:
     if kind == "value_error":
         return str(problem["ctx"]["error"])
     if kind == "extra_forbidden" and above is not None:
-        return f'{where}there is no key "{name}"; allowed are {", ".join(above.model_fields)}'
+        return f'{where}unknown key "{name}"; allowed are {", ".join(above.model_fields)}'
     found = "" if isinstance(given, dict | list) else f", found {json.dumps(given, default=str):.80}"
     return f"{where}{name} needs {needed}{found}"
 
 
 def of_kind(found: object, kind: type[T], name: str, path: str | os.PathLike[str], hint: str) -> T:
-    """Return a value of a JSON file by a name as a kind, as a typed dictionary.
+    """Return a named value of a JSON file, validated against a type.
 
     Raises:
-        FormatError: it is of another kind.
+        FormatError: it has another type.
     """
     try:
         return TypeAdapter(kind).validate_python(found)

@@ -21,7 +21,7 @@ from jawusd.formats.performance import SolvedJaw, take_solved
 from jawusd.geometry import LANDMARKS, rigidity_defect
 
 FAMILY, VERSION = "jawusd-tracks", 1
-_APART_S = 0.5  # neighbours show the same trouble
+_APART_S = 0.5  # least distance of chosen frames; neighbours show the same problem
 
 
 class TrackStatus(IntEnum):
@@ -43,64 +43,64 @@ _WHOLE = ("frames", "status", "prior_aided", "masks_used", "lost_reason")
 
 
 class LostReason(IntEnum):
-    """Values of `Tracks.lost_reason`: which check made the tracker give an arch up, with the figure it looks at."""
+    """Values of `Tracks.lost_reason`: the failed check by which the tracker lost an arch, and its measure."""
 
     NONE = 0  # not lost, or not recorded
-    FEW_MASKS = 1  # masks that took part
+    FEW_MASKS = 1  # number of masks used
     LITTLE_CONTOUR = 2  # matched contour [px]
     ROUGH_FIT = 3  # standard deviation of the residuals [px]
-    LOW_SCORE = 4  # matched contour over the recent median, with residuals above theirs as well [-]
-    UNCOVERED_MASK = 5  # largest share of a mask that the scan leaves uncovered [-]
+    LOW_SCORE = 4  # matched contour over its recent median, with residuals also above theirs [-]
+    UNCOVERED_MASK = 5  # largest fraction of a mask not covered by the scan [-]
     UNCERTAIN = 6  # standard deviation of the crowns' position [mm]
 
     def __str__(self) -> str:
         return self.name.lower().replace("_", " ")
 
     def explain(self, value: float, limit: float) -> str:
-        """Say what was found and what was needed."""
+        """Return the measured value and the limit in words."""
         return _EXPLANATIONS[self].format(value=value, limit=limit)
 
 
 _EXPLANATIONS = {
     LostReason.NONE: "no reason is recorded",
-    LostReason.FEW_MASKS: "masks that took part: {value:.0f}, at least {limit:.0f} are needed",
-    LostReason.LITTLE_CONTOUR: "matched contour {value:.0f} px, at least {limit:.0f} px are needed",
+    LostReason.FEW_MASKS: "{value:.0f} masks used, at least {limit:.0f} are needed",
+    LostReason.LITTLE_CONTOUR: "matched contour {value:.0f} px, at least {limit:.0f} px is needed",
     LostReason.ROUGH_FIT: "residual {value:.2f} px, less than {limit:.2f} px is needed",
     LostReason.LOW_SCORE: "matched contour {value:.0%} of the usual, at least {limit:.0%} is needed",
-    LostReason.UNCOVERED_MASK: "{value:.1%} of a mask stays uncovered, at most {limit:.0%} is allowed",
+    LostReason.UNCOVERED_MASK: "{value:.1%} of a mask is not covered by the scan, at most {limit:.0%} is allowed",
     LostReason.UNCERTAIN: "expected error of the crowns {value:.2f} mm, at most {limit:.2f} mm is allowed",
 }
 
 
 @dataclass(eq=False)
 class Tracks:
-    """Hold the tracked poses of a take; NaN where a jaw was not tracked.
+    """Tracked poses of a take; NaN where an arch was not tracked.
 
-    The plain poses are final; the `raw_` poses are the first pass, without smoothing or kinematic prior: models are
-    fitted to them and scored on them.
+    Poses without prefix are final. `raw_` poses are from the first pass, without smoothing or kinematic prior; models
+    are fitted to and evaluated on them.
 
     Attributes:
         frames: frame numbers of the reference camera, shape (F,).
         T_world_upper, T_world_lower, T_upper_lower: final poses, shape (F, 4, 4); the last is T_skull_mandible.
         raw_T_world_upper, raw_T_world_lower, raw_T_upper_lower: first-pass poses, shape (F, 4, 4).
         status: `TrackStatus` of (upper, lower), shape (F, 2).
-        prior_aided: the frame was found again with a kinematic prior, shape (F,). `prior_spread_mm` in the meta data
-            says that all final poses were weighed with one, as those of colours are.
-        coverage_error: mask pixels the projected scan leaves uncovered, as a fraction of the mask (E_SP of paper
-            eq. 8 over segmented pixels), shape (F, 2, C); NaN without a mask.
-        masks_used: the masks that took part in the raw poses, shape (F, 2, C); the others are missing or spoiled.
+        prior_aided: the frame was recovered with a kinematic prior, shape (F,). If the metadata has `prior_spread_mm`,
+            all final poses used a prior, as in tracking by colour.
+        coverage_error: fraction of mask pixels not covered by the projected scan (E_SP of paper eq. 8 over segmented
+            pixels), shape (F, 2, C); NaN without a mask.
+        masks_used: masks used for the raw poses, shape (F, 2, C); others are missing or outliers.
         covariance_upper, covariance_lower: covariance of the left twist xi [rad, mm] with T_true = exp(xi) T, world
             frame, about the world origin, shape (F, 6, 6).
         covariance_relative: the same of T_upper_lower in the skull frame, shape (F, 6, 6).
         sigma_mm: standard deviation of the landmarks' position in the skull frame [mm], shape (F, 5).
         residual_px: rms distance of matched contour samples at the working size [px], shape (F, 2).
         matched_px: matched contour length at the working size [px], shape (F, 2).
-        lost_reason: `LostReason` of the first pass, shape (F, 2); it stays where a prior then found the pose. Files may
-            lack it and the next two.
-        lost_value, lost_limit: the figure that was found and its limit, in the unit the reason names, shape (F, 2);
-            NaN without a reason.
+        lost_reason: `LostReason` of the first pass, shape (F, 2); kept if a prior later recovered the pose. Optional in
+            files, like the next two.
+        lost_value, lost_limit: the measured value and its limit, in the unit of the reason, shape (F, 2); NaN without
+            a reason.
         camera_names: the cameras, length C.
-        solved: of a solved performance, jaw parameters and state of every frame; None for other tracks.
+        solved: jaw parameters and state per frame of a solved performance; otherwise None.
     """
 
     frames: NDArray[np.int64]
@@ -138,12 +138,12 @@ class Tracks:
         return np.asarray(np.isfinite(self.T_upper_lower).all((1, 2)))
 
     def row_of(self, frame: int) -> int | None:
-        """Return the index of a frame; None where it is not in the tracks."""
+        """Return the index of a frame; None if it is not in the tracks."""
         row = int(np.searchsorted(self.frames, frame))
         return row if row < len(self.frames) and self.frames[row] == frame else None
 
     def explain_loss(self, index: int, arch: int) -> str:
-        """Say why an arch (0 upper, 1 lower) was given up in the frame at an index."""
+        """Return why an arch (0 upper, 1 lower) was lost at a frame index."""
         reason = LostReason(int(self.lost_reason[index, arch]))
         return reason.explain(self.lost_value[index, arch], self.lost_limit[index, arch])
 
@@ -207,7 +207,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         UnitsError: other units or twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
-    limit = meta.pop("margin_limit_mm", None)  # of older files: the smallest margin, which is below zero
+    limit = meta.pop("margin_limit_mm", None)  # older files store the smallest margin, a negative value
     if isinstance(limit, float):
         meta["tolerance_mm"] = -limit
     check_notes(meta, TracksMeta, path)
@@ -215,16 +215,16 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
         raise FormatError('"meta" has no list "camera_names".', path=path)
     count = len(take(arrays, "frames", (None,), path))
-    if "masks_used" not in arrays and "coverage_error" in arrays:  # trackers other than ours need not say
+    if "masks_used" not in arrays and "coverage_error" in arrays:  # optional for other trackers
         arrays["masks_used"] = np.isfinite(arrays["coverage_error"])
     values = {
-        # NaN is how a lost frame is written, so only whole numbers must be finite.
+        # Lost frames are NaN, so only integer arrays must be finite.
         name: take(arrays, name, shape, path, finite=name in _WHOLE)
         for name, shape in _shapes(count, len(names)).items()
         if not name.startswith("lost_") or "lost_reason" in arrays  # older files have none of the three
     }
     if not np.isin(values.get("lost_reason", 0), list(LostReason)).all():
-        raise FormatError('"lost_reason" holds a number that names no reason.', path=path)
+        raise FormatError('"lost_reason" has an unknown reason.', path=path)
     for name in values:
         if "T_" in name:
             present = np.isfinite(values[name]).all((1, 2))
@@ -248,12 +248,12 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
 
 
 def used_coverage(tracks: Tracks) -> Array:
-    """Return the share of each mask left uncovered, NaN where it is missing or took no part, shape (F, 2, C)."""
+    """Return the uncovered fraction of each mask, NaN where it is missing or unused, shape (F, 2, C)."""
     return np.where(tracks.masks_used, tracks.coverage_error, np.nan)
 
 
 def uncovered_percent(tracks: Tracks) -> Array:
-    """Return the mask area left uncovered per frame and arch [%], mean over the masks used, shape (F, 2); NaN: none."""
+    """Return the uncovered mask area per frame and arch [%], mean over the masks used, shape (F, 2); NaN if none."""
     value = used_coverage(tracks)
     known = np.isfinite(value)
     total = np.where(known, value, 0.0).sum(axis=2)
@@ -263,13 +263,13 @@ def uncovered_percent(tracks: Tracks) -> Array:
 def worst_frames(
     badness: Array, frames: NDArray[np.int64], fps: float, most: int, taken: Sequence[int] = ()
 ) -> list[int]:
-    """Return indices of the frames with the highest badness, the worst first, no two within half a second.
+    """Return indices of the frames with the highest badness, worst first, no two within half a second.
 
     Args:
         badness: shape (F,); frames with NaN are never chosen.
         frames: frame numbers, shape (F,).
-        most: how many at most.
-        taken: indices of frames chosen before, to keep away from.
+        most: largest number of frames.
+        taken: indices of frames chosen before, to keep the same distance from.
     """
     apart = max(round(_APART_S * fps), 1)
     found: list[int] = []

@@ -1,4 +1,4 @@
-"""Frames by presentation time, masks, overlays and clips: the pictures of a capture, read and written.
+"""Read and write the pictures of a capture: clips by presentation time, masks, overlays, videos.
 
-Owns PyAV and the decoding by OpenCV; knows meshes only as what overlays draw.
+The only room that may import PyAV; imports `meshes` only to draw overlays.
 """

@@ -1,4 +1,4 @@
-"""What lies behind drawn scans: a camera's footage, or its masks where it has none."""
+"""Background of drawn scans: a camera's footage, or its masks if there is none."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from jawusd.formats.capture import CameraSource
 from jawusd.media.footage import FrameReader, open_clip
 from jawusd.media.masks import mask_size_px, open_masks
 
-#: Gray of masks of the upper and the lower teeth, and of what is neither.
+#: Gray values of upper teeth, lower teeth and background in masks.
 _UPPER, _LOWER, _NEITHER = 150, 105, 25
 
 
 class Backdrop:
-    """Read the pictures of one camera by frames of the reference camera; safe to use from several threads.
+    """Pictures of one camera by frames of the reference camera; thread-safe.
 
     Attributes:
         size_px: (width, height) of the pictures.
         count: one past the camera's own last frame.
-        is_footage: they are footage, not masks.
+        is_footage: whether the pictures are footage, not masks.
     """
 
     def __init__(self, source: CameraSource, offset: int) -> None:
-        """Open what a camera has; frame k of it shows the instant of frame k + offset of the reference camera.
+        """Open the footage or masks; frame k shows the same instant as frame k + offset of the reference camera.
 
         Raises:
             CaptureError: it has neither video nor masks, or they cannot be decoded.
@@ -43,13 +43,13 @@ class Backdrop:
             self.count = max(masks.count for masks in self._masks)
         else:
             raise CaptureError(
-                "has neither a video nor masks, so there is nothing to draw over.",
+                "has neither a video nor masks to draw over.",
                 camera=source.name,
-                hint="Name one of them in the capture file.",
+                hint="Add one of them in the capture file.",
             )
 
     def picture(self, frame: int) -> NDArray[np.uint8] | None:
-        """Return the picture at a frame of the reference camera, (h, w, 3) RGB, read-only; None where there is none.
+        """Return the picture at a frame of the reference camera, (h, w, 3) RGB, read-only, or None.
 
         Raises:
             CaptureError: it cannot be decoded.

@@ -1,4 +1,4 @@
-"""What a clip of a camera gives, whether it is one video file or numbered pictures."""
+"""The interface of clips, implemented by videos and image sequences."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from jawusd.base.errors import CaptureError
 from jawusd.media.pixels import Colour, ColourPicture, Slices
 from jawusd.media.timeline import Timeline
 
-#: What is wrong with an interlaced clip, and what to do.
-INTERLACED = "its pictures are marked as interlaced: each is woven of two instants, half a frame apart"
+#: Message and hint for interlaced clips.
+INTERLACED = "its pictures are marked as interlaced: each combines two instants, half a frame apart"
 INTERLACED_HINT = (
-    "Record progressive pictures; or make a picture of each instant and double fps, for all clips alike: "
+    "Record progressive video; or convert every field to a frame and double fps, for all clips: "
     "ffmpeg -i IN -vf bwdif=mode=send_field -c:v libx264 -crf 12 OUT.mp4."
 )
 
@@ -33,25 +33,25 @@ class VideoFrame:
 
 
 class Clip(ABC):
-    """Give access to the pictures of a clip; holds no open file, so threads may share it.
+    """A clip. It keeps no file open, so threads may share it.
 
     Attributes:
         path: the file, or the pattern of the files.
         count: number of pictures.
         times_s: presentation times after the first picture [s], shape (count,), increasing.
-        timeline: which picture is shown at which frame.
-        keys: numbers of pictures that decode by themselves, shape (n,).
-        start_s: presentation time of the first picture in the file, where its sound counts from too [s].
+        timeline: maps frames to pictures.
+        keys: indices of key frames, shape (n,).
+        start_s: presentation time of the first picture in the file, on the same clock as its sound [s].
         fps: average pictures per second.
-        rotation_deg: counter-clockwise turn stored in the file: 0, 90, 180 or 270. It is applied to every picture.
+        rotation_deg: counter-clockwise rotation stored in the file: 0, 90, 180 or 270. It is applied to every picture.
         size_px: (width, height) after rotation.
-        pixel_aspect: width of a pixel over its height, after rotation, as the file says; pictures are left as stored.
-        timecode: of the first picture, as HH:MM:SS:FF; "" if the file has none.
-        timecode_fps: how many frames per second it counts; None if the file does not say.
-        is_interlaced: pictures, as far as they were decoded, are marked as woven of two instants.
-        has_alpha: the pictures carry transparency.
-        is_gray: they are stored as one channel.
-        is_rgb: they are stored as red, green and blue.
+        pixel_aspect: width of a pixel over its height, after rotation, from the file; pictures are not resampled.
+        timecode: time code of the first picture, as HH:MM:SS:FF; "" if there is none.
+        timecode_fps: frames per second of the time code; None if unknown.
+        is_interlaced: whether a decoded picture was marked as interlaced.
+        has_alpha: whether the pictures have an alpha channel.
+        is_gray: whether they are stored as one channel.
+        is_rgb: whether they are stored as RGB.
     """
 
     path: Path
@@ -88,8 +88,8 @@ class Clip(ABC):
         Args:
             first: number of the first picture.
             last: one after the last picture; None = to the end.
-            colour: what the pictures come as.
-            region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the turned picture; None = all of it.
+            colour: format of the pictures.
+            region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the rotated picture; None = all of it.
             threads: decoder threads; 0 lets the codec choose.
 
         Raises:
@@ -101,18 +101,18 @@ class Clip(ABC):
         width, height = self.size_px
         x0, y0, x1, y1 = region or (0, 0, width, height)
         if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
-            raise ValueError(f"region {region} is not inside the picture of {width} x {height} px")
+            raise ValueError(f"region {region} must be inside the picture of {width} x {height} px")
         window = (slice(y0, y1), slice(x0, x1))
         return self._converted(first, last, colour, window, threads)
 
     def pictures(
         self, wanted: Sequence[int | None], *, colour: Colour = "gray", threads: int = 0
     ) -> Iterator[NDArray[np.uint8] | None]:
-        """Yield a picture for each of increasing numbers, None for None, decoding what lies between only once.
+        """Yield a picture for each of increasing indices and None for None, decoding every picture at most once.
 
         Args:
-            wanted: numbers of pictures, rising, and None, for which nothing comes.
-            colour: what the pictures come as.
+            wanted: indices of pictures, increasing, or None.
+            colour: format of the pictures.
             threads: decoder threads; 0 lets the codec choose.
 
         Raises:
@@ -124,7 +124,7 @@ class Clip(ABC):
             yield None if number is None else next(frame.image for frame in decoded if frame.index == number)
 
     def colour_pictures(self, wanted: Sequence[int | None], *, threads: int = 0) -> Iterator[ColourPicture | None]:
-        """Yield as `pictures` does, in RGB; pictures of videos are converted by the parts that are asked for.
+        """Yield RGB pictures like `pictures`; videos convert only the parts that are accessed.
 
         Raises:
             CaptureError: a picture lies outside the file or cannot be decoded.
@@ -134,7 +134,7 @@ class Clip(ABC):
     def _check_range(self, first: int, last: int) -> None:
         if not 0 <= first <= last <= self.count:
             raise CaptureError(
-                f"frames {first} to {last - 1} asked for, the video holds frames 0 to {self.count - 1}.",
+                f"frames {first} to {last - 1} are requested, but the video has frames 0 to {self.count - 1}.",
                 path=self.path,
                 hint="Correct `frames` in capture.toml, or copy the video again if it should be longer.",
             )

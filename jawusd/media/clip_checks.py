@@ -1,4 +1,4 @@
-"""Can the clips of a capture be read, do cameras freeze, and do the clips fit one another? In some seconds."""
+"""Quick checks of clips: decoding errors, frozen pictures, and frame rates."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from jawusd.formats.finding import Finding
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT, Clip
 from jawusd.media.picture_sequence import PictureSequence
 
-# Cameras that drift apart by less than this over a take keep their offset [frames].
+# Drift between cameras over a take that is ignored [frames].
 _DRIFT_FRAMES = 0.5
-# Rates stated to three digits differ from the file's by less; 23.976 against 24 is within, 25 is not [1].
+# Relative tolerance of frame rates: accepts rounding to three digits and 23.976 for 24, but not 25 [1].
 _RATE_TOLERANCE = 0.005
-_DECODED_PX = 1.5e9  # of a clip: 700 pictures of full HD, some seconds
-_ENDS_S = 4.0  # what `sync` reads first
+_DECODED_PX = 1.5e9  # pixels decoded per clip: 700 pictures of full HD, a few seconds
+_ENDS_S = 4.0  # duration that `sync` reads first
 _PART = 48  # pictures
 _SPARSE = 4  # every 4th pixel in both directions
 _LISTED = 5
-# When pictures count as repeated, in shares of the usual change, the 75th percentile of so many pictures around.
-# Chosen on `tests/benchmarks/frozen.py`, which states how often still and noisy scenes are taken for frozen ones.
+# Thresholds for repeated pictures, relative to the usual change: a percentile over a window of pictures.
+# Chosen on `tests/benchmarks/frozen.py`, which measures false alarms in still and noisy scenes.
 _MOST, _AROUND = 75, 48
-_FEWEST = 12  # pictures, of which a usual change can be told
+_FEWEST = 12  # pictures needed to estimate the usual change
 _LEAST_CHANGE = 0.1  # of 255 levels
-_SAME, _ALIKE = 0.05, 0.03  # of long runs, and of one or two pictures, which a motion that turns back resembles
+_SAME, _ALIKE = 0.05, 0.03  # for long runs, and for one or two pictures, which resemble a reversal of motion
 _SHORT, _SOME, _LONG = 2, 5, 12  # pictures
 _STOPS, _FARTHER = (0.5, 4.0), 1.25
 _FAR_BELOW = 0.2  # of the 25th percentile
 _REGULAR = 0.15  # of the pictures
-_MISSING_SHARE = 0.01  # of the frames without a picture of their own that a constant rate may show
+_MISSING_SHARE = 0.01  # share of frames without a picture that is accepted at a constant rate
 
 
 def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
-    """Decode a clip, a long one in parts; yield an error if a picture cannot be, and warnings about what they show.
+    """Decode a clip, or parts of a long one; yield errors for undecodable pictures, and warnings about the content.
 
     Kinds: "clip_damaged", "interlaced", "pictures_repeated".
     """
@@ -66,18 +66,18 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
         yield Finding(
             "pictures_repeated",
             "warning",
-            f"frames {listed}{more} show the picture before again: the camera froze, or pictures were doubled",
+            f"frames {listed}{more} repeat the picture before: the camera froze, or pictures were duplicated",
             sum(end - start + 1 for start, end in repeated),
             0,
             path=str(video.path),
             camera=camera,
             frame=numbers[0][0],
-            hint="Export the clip again at its own frame rate, or leave those frames out of the take.",
+            hint="Export the clip again at its own frame rate, or exclude those frames from the take.",
         )
 
 
 def _parts(video: Clip) -> list[tuple[int, int]]:
-    """Return which pictures to decode: all, or both ends, where cameras are aligned, and parts between."""
+    """Return the ranges of pictures to decode: all, or both ends, used for synchronisation, and parts between."""
     most = int(_DECODED_PX / (video.size_px[0] * video.size_px[1]))
     if video.count <= most:
         return [(0, video.count)]
@@ -97,11 +97,11 @@ def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
 
 
 def repeated_runs(changes: Array) -> list[tuple[int, int]]:
-    """Return the first and last picture of runs that show the picture before them again.
+    """Return the first and last picture of runs that repeat the picture before them.
 
-    Scenes that stand still are repeated by encoders, too, but there changes fade and grow: here they stop at once and
-    go on at once, after one or two repeated pictures by more than usual. A light that goes off changes more before it
-    than usual. Scenes without any usual change tell nothing.
+    Encoders also repeat pictures of static scenes, but there changes fade out and in. In a freeze they stop and resume
+    abruptly, and after one or two repeated pictures the change is larger than usual. A light switched off causes a
+    larger change before the run. Scenes without a usual change are not judged.
 
     Args:
         changes: of `picture_changes`, shape (n,).
@@ -116,20 +116,20 @@ def repeated_runs(changes: Array) -> list[tuple[int, int]]:
     short = [
         run for run in runs if run[1] - run[0] < _SHORT and known[run[0] : run[1] + 1].max() <= _ALIKE * usual[run[0]]
     ]
-    regular = len(short) > _REGULAR * len(known)  # as of a clip converted from another rate
+    regular = len(short) > _REGULAR * len(known)  # such as after frame rate conversion
     found = [run for run in runs if (run in short and regular) or _stands_out(known, *run)]
     return [(first + 1, last + 1) for first, last in found]
 
 
 def _stands_out(changes: Array, first: int, last: int) -> bool:
-    """Tell whether changes stop at once before a run, and go on at once after it."""
+    """Tell whether changes stop and resume abruptly around a run."""
     outside = np.concatenate([changes[max(0, first - _AROUND) : first], changes[last + 1 : last + 1 + _AROUND]])
     if first == 0 or len(outside) < _FEWEST:
         return False  # many takes begin at rest
     little, usual = np.percentile(outside, (100 - _MOST, _MOST))
     before = changes[max(0, first - 2) : first].max()
     length, most = last - first + 1, changes[first : last + 1].max()
-    # Where even the quietest pictures change, by noise or motion, no encoder repeats one by chance.
+    # If even the quietest pictures change, by noise or motion, encoders do not repeat pictures.
     restless = length >= _SOME and little > _LEAST_CHANGE and most <= _FAR_BELOW * little
     least = _STOPS[0] * (little if restless else usual)
     if usual <= _LEAST_CHANGE or not least <= before <= _STOPS[1] * usual:
@@ -148,9 +148,9 @@ def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator
     """Compare the rates of clips with that of the capture [frames per second] and with one another.
 
     Args:
-        videos: by the names of their cameras.
-        fps: what the capture says.
-        path: of the capture, for the findings.
+        videos: clips by camera.
+        fps: frame rate in the capture.
+        path: path of the capture, for the findings.
     """
     for name, video in videos.items():
         rate = video.timeline.rate
@@ -158,12 +158,12 @@ def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator
             yield Finding(
                 "fps_differs",
                 "warning",
-                f"fps is {fps:g} in the capture, but the clip shows {rate:.3f} pictures per second",
+                f"fps is {fps:g} in the capture, but the clip has {rate:.3f} pictures per second",
                 rate,
                 fps,
                 path=path,
                 camera=name,
-                hint="Correct fps, or convert the clip: speeds and times would be wrong.",
+                hint="Correct fps or convert the clip, otherwise speeds and times are wrong.",
             )
         if isinstance(video, PictureSequence) and video.timeline.missing:
             yield Finding(
@@ -173,13 +173,13 @@ def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator
                 video.timeline.missing / video.timeline.count,
                 path=str(video.path),
                 camera=name,
-                hint="Export them again, or leave it: those frames are tracked without this camera.",
+                hint="Export them again, or ignore this: those frames are tracked without this camera.",
             )
         elif (share := video.timeline.missing / video.timeline.count) > _MISSING_SHARE:
             yield Finding(
                 "pictures_missing",
                 "warning",
-                f"{video.timeline.missing} of {video.timeline.count} frames have no picture: dropped, or variable rate",
+                f"{video.timeline.missing} of {video.timeline.count} frames have no picture: dropped or variable rate",
                 share,
                 _MISSING_SHARE,
                 path=str(video.path),
@@ -195,7 +195,7 @@ def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator
             yield Finding(
                 "rates_differ",
                 "warning",
-                f"the clip runs at {video.timeline.rate:.3f} pictures per second, that of the first camera at "
+                f"the clip has {video.timeline.rate:.3f} pictures per second, that of the first camera "
                 f"{reference.timeline.rate:.3f}: they drift apart by {drift:.1f} frames",
                 drift,
                 _DRIFT_FRAMES,

@@ -15,7 +15,7 @@ from jawusd.base.inputs import check_input
 
 #: Most pixels of a picture, four times 8K: a few bytes can declare one that fills the memory.
 MOST_PX = 1 << 27
-#: Formats of one file. FFmpeg also follows playlists (HLS, DASH, concat, SDP), which name other files and addresses.
+#: Self-contained formats. FFmpeg also follows playlists (HLS, DASH, concat, SDP), which refer to other files and URLs.
 FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "mxf", "flv", "ogg", "asf", "nut",
     "ivf", "dv", "h264", "hevc", "av1", "obu", "m4v", "mjpeg", "yuv4mpegpipe", "gif", "apng", "rm", "gxf", "wtv", "y4m",
@@ -30,8 +30,8 @@ PICTURES = (
 )  # fmt: skip
 
 
-# Decoders that raise errors for damage only if they are asked to, checksums included. Not all: that of TIFF refuses
-# good files then, and others gain nothing.
+# Decoders for which strict error detection, including checksums, is enabled. Not all: the TIFF decoder then refuses
+# valid files, and others gain nothing.
 _STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
 _STRICT_CODECS = ("hevc", "mjpeg", "png")
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
@@ -41,35 +41,36 @@ _NAMES = ("h264", "hevc", "prores", "dnxhd", "ffv1", "vp9", "av1", "mjpeg", "png
 def open_container(
     path: str | os.PathLike[str], formats: tuple[str, ...] = FORMATS, most_px: int = MOST_PX
 ) -> av.container.InputContainer:
-    """Open a video or sound file, or one of other formats.
+    """Open a video or sound file, or a file of the given formats.
 
-    Decoders raise errors for damage that they see, or mark pictures as corrupt, and refuse pictures of more than so
-    many pixels.
+    Decoders raise errors for damage or mark pictures as corrupt, and refuse pictures of more than `most_px` pixels.
 
     Raises:
-        av.FFmpegError: it is none, or one that names other files.
+        av.FFmpegError: it has another format, or refers to other files.
         OSError: it cannot be read.
     """
     limit = {"max_pixels": str(most_px)}
     options = {"format_whitelist": ",".join(formats), "protocol_whitelist": "file"}
-    container = av.open(os.fspath(path), metadata_errors="replace", options=options | limit)  # it decodes some, too
+    container = av.open(
+        os.fspath(path), metadata_errors="replace", options=options | limit
+    )  # this also decodes some pictures
     for stream in container.streams.video:
-        if stream.codec_context is not None:  # of codecs that are not known
+        if stream.codec_context is not None:  # None for unknown codecs
             strict = _STRICT if stream.codec_context.name in _STRICT_CODECS else {}
             stream.codec_context.options = limit | strict
     return container
 
 
 def slices_are_whole(packet: bytes) -> bool:
-    """Compare the slices of an FFV1 picture with their checksums; false also where they have none.
+    """Verify the slice checksums of an FFV1 picture; false also if there are none.
 
-    FFmpeg replaces slices whose checksum is wrong by those of the picture before, and sets no flag. RFC 9043, 4.9: a
-    slice ends in its size (3 bytes), a status (1) and a CRC (4; polynomial 0x04C11DB7, highest bit first, from 0).
+    FFmpeg silently replaces damaged slices by those of the previous picture. RFC 9043, 4.9: a slice ends with its size
+    (3 bytes), a status (1) and a CRC (4; polynomial 0x04C11DB7, highest bit first, initial value 0).
     """
     end = len(packet)
     while end >= 8:
         size = int.from_bytes(packet[end - 8 : end - 5], "big") + 8
-        # zlib has the lowest bit first, and inverts.
+        # zlib uses the lowest bit first, and inverts.
         if size > end or zlib.crc32(packet[end - size : end].translate(_REVERSED), 0xFFFFFFFF) != 0xFFFFFFFF:
             return False
         end -= size
@@ -77,7 +78,7 @@ def slices_are_whole(packet: bytes) -> bool:
 
 
 def decodable() -> dict[str, bool]:
-    """Return whether each codec that footage comes in can be decoded, by ffmpeg's name."""
+    """Return whether common codecs can be decoded, by ffmpeg's name."""
     return {name: _has(name) for name in _NAMES}
 
 
@@ -90,7 +91,7 @@ def _has(name: str) -> bool:
 
 
 class Sound(NamedTuple):
-    """Hold the sound of a file."""
+    """The sound of a file."""
 
     samples: NDArray[np.float32]  # one channel, shape (n,)
     rate_hz: int  # samples per second
@@ -98,7 +99,7 @@ class Sound(NamedTuple):
 
 
 def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
-    """Return the first sound track of a file, None if it carries none.
+    """Return the first sound track of a file, None if there is none.
 
     Raises:
         CaptureError: the file or its sound cannot be decoded.

@@ -1,13 +1,13 @@
-"""Bring pictures of any depth to the 8 bits of a display: what the trackers look at.
+"""Convert pictures of any bit depth to 8-bit display values, which the trackers use.
 
 Colour spaces, by name:
 
-- "display": as a display shows it; more than 8 bits are only rounded. Taken for whole numbers where nothing is said.
-- "linear": proportional to light, 1 is white. Shown by the curve of sRGB, IEC 61966-2-1; above 1 is white. Taken for
-  fractions (EXR) where nothing is said.
+- "display": display-referred; more than 8 bits are rounded. Default for integers.
+- "linear": proportional to light, 1 is white. Encoded by the sRGB curve, IEC 61966-2-1; clipped at 1. Default for
+  floating point (EXR).
 - "cineon": printing density of film scans, 10 bits: 685 is white, 95 is black, 0.002 density per step, gamma 0.6
   (Kodak, "Conversion of 10-bit Log Film Data To 8-bit Linear or Video Data", 1995); then as "linear".
-- any other name is a colour space of an OpenColorIO config, brought to its default display and view.
+- any other name is a colour space of an OpenColorIO config, converted to its default display and view.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ _WHITE, _BLACK, _DENSITY, _GAMMA, _STEPS = 685.0, 95.0, 0.002, 0.6, 1023.0
 
 
 def to_display(stored: Stored, largest: int, space: str | None, config: Path | None) -> NDArray[np.uint8]:
-    """Return a picture as a display shows it, (h, w) or (h, w, 3) uint8, 0 .. 255.
+    """Return a display-referred picture, (h, w) or (h, w, 3) uint8, 0 .. 255.
 
     Args:
-        stored: as the file holds it: whole numbers 0 .. largest, or fractions.
-        largest: white of whole numbers, 255, 1023, 4095 or 65535.
-        space: its colour space; None is "display" for whole numbers and "linear" for fractions.
-        config: OpenColorIO config that knows other names.
+        stored: pixels as stored: integers 0 .. largest, or floating point.
+        largest: white of integers, 255, 1023, 4095 or 65535.
+        space: its colour space; None is "display" for integers and "linear" for floating point.
+        config: OpenColorIO config that defines other names.
 
     Raises:
-        CaptureError: the colour space is not known.
+        CaptureError: the colour space is unknown.
         MissingDependencyError: it needs OpenColorIO.
     """
     fractions = stored.dtype.kind == "f"
@@ -47,7 +47,7 @@ def to_display(stored: Stored, largest: int, space: str | None, config: Path | N
         return _by_config(values if fractions else values / np.float32(largest), space, config)
     if stored.dtype == np.float32:
         return _curve(np.asarray(stored, np.float32), space)
-    # Two bytes have 65536 values: a table of them is faster than any formula.
+    # Two bytes have 65536 values: a lookup table is fastest.
     codes = stored.view(np.uint16) if stored.dtype == np.float16 else stored
     return _table(stored.dtype.name, largest, space)[codes]
 
@@ -61,7 +61,7 @@ def _table(kind: str, largest: int, space: str) -> NDArray[np.uint8]:
 
 
 def _curve(values: NDArray[np.float32], space: str) -> NDArray[np.uint8]:
-    """Return values, 1 for white, as 8 bits; what is no number is black."""
+    """Return values, with 1 as white, as 8 bits; NaN becomes black."""
     with np.errstate(over="ignore", invalid="ignore"):
         light = np.nan_to_num(values.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
         if space == "cineon":
@@ -75,7 +75,7 @@ def _curve(values: NDArray[np.float32], space: str) -> NDArray[np.uint8]:
 
 
 class _Processor(Protocol):
-    """What is used of OpenColorIO, which has no stubs."""
+    """The part of OpenColorIO that is used; it has no stubs."""
 
     def applyRGB(self, pixels: NDArray[np.float32]) -> None: ...
 
@@ -84,9 +84,9 @@ class _Processor(Protocol):
 def _by_config(values: NDArray[np.float32], space: str, config: Path | None) -> NDArray[np.uint8]:
     if config is None:
         raise CaptureError(
-            f'the colour space "{space}" is not known; allowed are {", ".join(SPACES)}, and names of an OpenColorIO '
+            f'the colour space "{space}" is unknown; allowed are {", ".join(SPACES)}, and names in an OpenColorIO '
             "config.",
-            hint='Name the config at the top of capture.toml: colour_config = "config.ocio".',
+            hint='Set the config at the top of capture.toml: colour_config = "config.ocio".',
         )
     shown = np.ascontiguousarray(np.broadcast_to(values[..., None], (*values.shape, 3)) if values.ndim == 2 else values)
     shown = shown.astype(np.float32)
@@ -106,4 +106,4 @@ def _processor(config: Path, space: str) -> _Processor:
         processor: _Processor = known.getProcessor(transform).getDefaultCPUProcessor()
         return processor
     except ocio.Exception as error:
-        raise CaptureError(f'OpenColorIO cannot show the colour space "{space}" ({error}).', path=config) from error
+        raise CaptureError(f'OpenColorIO cannot convert the colour space "{space}" ({error}).', path=config) from error

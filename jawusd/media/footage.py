@@ -17,13 +17,13 @@ from jawusd.media.clip import Clip, VideoFrame
 from jawusd.media.picture_sequence import PictureSequence
 from jawusd.media.video import Video
 
-_AHEAD = 24  # pictures: decoding on is faster than starting over at a key frame
+_AHEAD = 24  # pictures up to which decoding forward is faster than seeking
 _BACK = 8  # pictures decoded at once when stepping backwards
 _KEPT_BYTES = 128 << 20
 
 
 def open_clip(source: ClipSource | Path) -> Clip:
-    """Open a video or numbered pictures.
+    """Open a video or an image sequence.
 
     Raises:
         CaptureError: the clip is missing or damaged.
@@ -31,7 +31,7 @@ def open_clip(source: ClipSource | Path) -> Clip:
     source = source if isinstance(source, ClipSource) else ClipSource(source)
     if source.path.is_dir():
         raise CaptureError(
-            "is a folder.", path=source.path, hint=f'Name the pictures in it, as "{source.path.name}/*.png".'
+            "is a folder.", path=source.path, hint=f'Name the pictures in it, such as "{source.path.name}/*.png".'
         )
     clip: Clip = (
         PictureSequence(source)
@@ -45,14 +45,14 @@ def open_clip(source: ClipSource | Path) -> Clip:
 
 
 class FrameReader:
-    """Read single pictures of one video; safe to use from several threads.
+    """Random access to pictures of one video; thread-safe.
 
-    A decoder keeps running where the last picture was, so that the next one costs one picture; the last pictures are
-    kept. A jump starts at the key frame before.
+    The decoder stays at the last picture, so that the next one is cheap; recent pictures are cached. Jumps seek to the
+    previous key frame.
     """
 
     def __init__(self, video: Clip) -> None:
-        """Take the video."""
+        """Read from a clip."""
         self.video = video
         width, height = video.size_px
         self._most = max(2, min(64, _KEPT_BYTES // (3 * width * height)))
@@ -69,7 +69,8 @@ class FrameReader:
         """
         if not 0 <= index < self.video.count:
             raise CaptureError(
-                f"frame {index} asked for, the video holds frames 0 to {self.video.count - 1}.", path=self.video.path
+                f"frame {index} is requested, but the video has frames 0 to {self.video.count - 1}.",
+                path=self.video.path,
             )
         with self._lock:
             if index not in self._kept:

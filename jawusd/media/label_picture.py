@@ -1,4 +1,4 @@
-"""Draw teeth scans with crown, gum and base in colours, to be looked at from the biting side, front, left and right."""
+"""Draw teeth scans with coloured crown, gum and base labels, from the biting side, front, left and right."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ COLOURS = np.array([(214, 108, 112), (240, 234, 214), (150, 205, 130), (120, 135
 _BACKGROUND = (40, 42, 46)
 _TILE_PX = (520, 400)
 _MARGIN = 0.92  # share of a tile that the scan fills
-_FAR_MM = 1000.0  # from the eye, far enough for straight views
+_FAR_MM = 1000.0  # camera distance, far enough for near-orthographic views
 _LEAST_LIGHT = 0.35
-# Rows: rightwards, upwards and towards the eye in (left, up, front) axes of the subject. The biting side of the upper
-# arch is seen from below, of the lower one from above, the front teeth upwards.
+# Rows: right, up and towards the camera in (left, up, front) axes of the subject. The biting side of the upper arch is
+# seen from below, of the lower one from above, with the front teeth at the top.
 _SIDES = {
     "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "left": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
@@ -52,7 +52,7 @@ def label_sheet(
 
 
 def _view(points: Array, faces: NDArray[np.int32], labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Draw a surface whose points (V, 3) run to the right, upwards and towards the eye [mm]; RGB of `_TILE_PX`."""
+    """Draw a surface with points (V, 3) in view axes right, up, towards the camera [mm]; RGB of `_TILE_PX`."""
     width, height = _TILE_PX
     low, high = points.min(axis=0), points.max(axis=0)
     px_per_mm = _MARGIN * min(width / max(high[0] - low[0], 1.0), height / max(high[1] - low[1], 1.0))
@@ -73,14 +73,14 @@ def _view(points: Array, faces: NDArray[np.int32], labels: NDArray[np.uint8]) ->
     drawn = inverse_depth > 0
     depth = np.where(drawn, 1.0 / np.where(drawn, inverse_depth, 1.0), _FAR_MM) * px_per_mm
     down, right = np.gradient(depth)
-    light = 1.0 / np.sqrt(1.0 + down**2 + right**2)  # a lamp beside the eye
+    light = 1.0 / np.sqrt(1.0 + down**2 + right**2)  # headlight
     light = _LEAST_LIGHT + (1 - _LEAST_LIGHT) * light
     image[drawn] = (COLOURS[seen[drawn]] * light[drawn][:, None]).astype(np.uint8)
     return image
 
 
 def face_labels(labels: NDArray[np.uint8], faces: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Return the label of every face: crown where two corners are, else that of the gum or base corners, shape (F,)."""
+    """Return the label of every face, shape (F,): crown if two corners are, otherwise that of gum or base corners."""
     corner = labels[faces]
     tooth = (corner == TOOTH) | (corner > TOOTH) & (corner < BASE)
     rest = np.where((corner == BASE).sum(axis=1) >= 2, BASE, GUM)

@@ -1,4 +1,4 @@
-"""The clock of live pictures: that of the machine, unless a test puts another in its place."""
+"""The clock of live pictures; tests replace it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import time
 
 
 def now_s() -> float:
-    """Return the time [s], from any beginning."""
+    """Return the time [s] since an arbitrary origin."""
     return time.monotonic()
 
 
 def wait_until(time_s: float, stopped: threading.Event) -> bool:
-    """Wait for a time [s]; return whether it was stopped before."""
+    """Wait until a time [s]; return whether `stopped` was set before."""
     return stopped.wait(max(0.0, time_s - time.monotonic()))

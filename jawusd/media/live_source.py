@@ -1,4 +1,4 @@
-"""Pictures of a camera as they come: from a device, a network stream, or a file played at its own rate."""
+"""Live pictures of a camera: from a device, a network stream, or a file played at its own rate."""
 
 from __future__ import annotations
 
@@ -18,32 +18,29 @@ from jawusd.media.pixels import ColourPicture, DecodedPicture
 from jawusd.media.video import Video
 
 _WAIT_S = 0.1
-_KEPT = 8  # last pictures: more than those of an instant that waits for its turn
-# How PyAV names cameras of this machine, by the beginning of their address.
+_KEPT = 8  # buffered pictures, more than can be waiting for processing
+# PyAV's input format for local devices, by address prefix.
 _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
 
 
 @dataclass(frozen=True, eq=False)
 class LivePicture:
-    """Hold a picture: its time on the clock all sources share [s], and its pixels, RGB uint8 (H, W, 3).
-
-    What nobody looks at is not turned into RGB.
-    """
+    """A picture: its time on the common clock [s], and its pixels, RGB uint8 (H, W, 3), converted on first access."""
 
     time_s: float
     rgb: ColourPicture
 
 
 class LiveSource:
-    """Read one camera in a thread of its own; keeps the last pictures only."""
+    """Reader of one camera in its own thread, with a buffer of the last pictures."""
 
     def __init__(self, where: str, size_px: tuple[int, int], early_s: float = 0.0) -> None:
-        """Take an address.
+        """Prepare to read from an address.
 
         Args:
             where: a file, a network address (rtsp://, http://, ...), or a device (/dev/video0 on Linux).
             size_px: width and height that the camera was calibrated for.
-            early_s: how much earlier than the other sources a file was begun [s].
+            early_s: time by which a file starts before the other sources [s].
         """
         self.where, self._size_px, self._early_s = where, size_px, early_s
         self._kept: deque[LivePicture] = deque(maxlen=_KEPT)
@@ -54,7 +51,7 @@ class LiveSource:
         self.ended = False
 
     def open(self, from_s: float = 0.0) -> None:
-        """Open the source in its thread, a file at a time since the sources' recordings began [s]; see `play`."""
+        """Open the source in its thread; files start at a time from the beginning of the recordings [s]; see `play`."""
         self._heard_s = live_clock.now_s()
         threading.Thread(target=self._read, args=(from_s,), daemon=True).start()
 
@@ -68,7 +65,7 @@ class LiveSource:
             self.refuse_silence(silence_s)
 
     def refuse_silence(self, silence_s: float) -> None:
-        """Refuse a device or stream that has sent no picture for so long [s].
+        """Check that a device or stream has sent a picture within a time [s].
 
         Raises:
             CaptureError: it has not.
@@ -77,11 +74,11 @@ class LiveSource:
             raise CaptureError(
                 f"has sent no picture for {silence_s:g} s.",
                 path=self.where,
-                hint="Is the camera on, and its program sending? Allow more with --silence.",
+                hint="Check that the camera is on and sending. --silence sets the time limit.",
             )
 
     def play(self, begin_s: float) -> None:
-        """Give out pictures; those of a file as if the recordings began at a time of `live_clock.now_s`."""
+        """Start delivering pictures; the recordings of files begin at `begin_s` on `live_clock`."""
         self._begin_s = begin_s
         self._playing.set()
 
@@ -91,7 +88,7 @@ class LiveSource:
         self._playing.set()
 
     def times_s(self) -> list[float]:
-        """Return the times of the pictures kept, the newest last.
+        """Return the times of the buffered pictures, newest last.
 
         Raises:
             CaptureError: the source cannot be read.
@@ -102,7 +99,7 @@ class LiveSource:
             return [picture.time_s for picture in self._kept]
 
     def at(self, time_s: float) -> LivePicture | None:
-        """Return the kept picture nearest to a time, None before the first one."""
+        """Return the buffered picture nearest to a time, None before the first one."""
         with self._changed:
             return min(self._kept, key=lambda picture: abs(picture.time_s - time_s), default=None)
 
@@ -120,7 +117,9 @@ class LiveSource:
             for picture in pictures:
                 if picture.rgb.shape[1::-1] != self._size_px:
                     found, wanted = "{} x {}".format(*picture.rgb.shape[1::-1]), "{} x {}".format(*self._size_px)
-                    raise CaptureError(f"pictures of {found} px, the calibration is for {wanted}.", path=self.where)
+                    raise CaptureError(
+                        f"pictures have {found} px, but the calibration is for {wanted} px.", path=self.where
+                    )
                 with self._changed:
                     self._kept.append(picture)
                     self._changed.notify_all()
@@ -135,7 +134,7 @@ class LiveSource:
                 self._changed.notify_all()
 
     def _file(self, from_s: float) -> Iterator[LivePicture]:
-        """Yield the pictures of a file at the times they were taken."""
+        """Yield the pictures of a file at their recorded times."""
         video = Video(self.where)
         first = int(np.searchsorted(video.times_s, from_s + self._early_s))
         numbers = range(first, video.count)
@@ -161,5 +160,5 @@ class LiveSource:
             raise CaptureError(
                 f"cannot be read ({error}).",
                 path=self.where,
-                hint="Name a file, a device such as /dev/video0, or a stream such as rtsp://host/camera.",
+                hint="Give a file, a device such as /dev/video0, or a stream such as rtsp://host/camera.",
             ) from error

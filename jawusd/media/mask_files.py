@@ -1,4 +1,4 @@
-"""Masks written by other programs: numbered PNG files and videos, and which pixels count as tooth."""
+"""Sources of masks: numbered PNG files and videos, converted to coverage."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from jawusd.media.mask_source import SourceLevels, load_png, mask_video, png_lev
 from jawusd.media.pictures import read_palette_numbers
 from jawusd.media.pixels import Colour
 
-#: Gray values of the wanted arch and of the other one in label images; all else must be 0.
+#: Gray values of the requested and the other arch in label images; all other pixels must be 0.
 LabelValues = tuple[int, int]
 
 _NUMBER = re.compile(r"%(0(\d+))?d")
-_FEW = 6  # label values listed in an error
+_FEW = 6  # label values listed in messages
 
 
 class PngMasks:
@@ -29,7 +29,7 @@ class PngMasks:
 
     Attributes:
         count: one past the highest number.
-        odd: pictures read so far that contradict the others and count as not segmented, and how.
+        odd: rejected pictures read so far, by number, with the reason; they count as not segmented.
     """
 
     def __init__(
@@ -42,17 +42,17 @@ class PngMasks:
         """Find the files of a pattern with one %d or %06d.
 
         Args:
-            pattern: path of the files.
+            pattern: pattern of the files.
             size_px: (width, height) of all of them, if known.
             labels: see `LabelValues`.
-            is_other: tells pictures that are no masks, from which nothing follows for the others.
+            is_other: detects pictures that are not masks, which are excluded from finding the levels.
 
         Raises:
-            CaptureError: the folder is missing or holds no such file.
+            CaptureError: the folder is missing or has no such file.
         """
         self._pattern, self._size_px, self._labels, self._is_other = pattern, size_px, labels, is_other
         self.odd: dict[int, str] = {}
-        # Names, not paths: hours of several cameras are a hundred thousand files.
+        # Names, not paths, to save memory: hours of several cameras are a hundred thousand files.
         self._names = self._found(pattern) if "%" in pattern.name else _names(numbered_files(pattern))
         self.count = max(self._names) + 1
 
@@ -79,16 +79,16 @@ class PngMasks:
         names = {int(match[1]): match[0] for match in found if match}
         if not names:
             raise CaptureError(
-                "no file of the folder has such a name.", path=pattern, hint="Correct `masks` in capture.toml."
+                "no file in the folder matches this pattern.", path=pattern, hint="Correct `masks` in capture.toml."
             )
         return names
 
     @cached_property
     def levels(self) -> SourceLevels:
-        """Find what the values mean, from some pictures of the whole take.
+        """Find the meaning of the values from samples of the whole take.
 
         Raises:
-            CaptureError: the pictures have another size or are no masks.
+            CaptureError: the pictures have the wrong size or are not masks.
         """
         found = png_levels([self._path(k) for k in sorted(self._names)], self._is_other)
         if self._size_px is not None:
@@ -97,10 +97,10 @@ class PngMasks:
         return found
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
-        """Yield the masks from a number on, (h, w) uint8, None where there is no file or nothing segmented.
+        """Yield the masks from a number on, (h, w) uint8, None without a file or segmentation.
 
         Raises:
-            CaptureError: a file cannot be decoded or has another size, or the pictures are no masks.
+            CaptureError: a file cannot be decoded or has the wrong size, or the pictures are not masks.
         """
         for number in range(first, self.count):
             if number not in self._names:
@@ -141,19 +141,19 @@ class PngMasks:
 
 
 class VideoMasks:
-    """Masks as the pictures of a video: black and white, or as its transparency.
+    """Masks as a video: black and white, or its alpha channel.
 
     Attributes:
         count: number of pictures.
-        timeline: which picture is shown at which frame.
-        odd: pictures read so far that contradict the others and count as not segmented, and how.
+        timeline: maps frames to pictures.
+        odd: rejected pictures read so far, by number, with the reason; they count as not segmented.
     """
 
     def __init__(self, path: Path, size_px: tuple[int, int], labels: LabelValues | None = None) -> None:
         """Open the video; see `PngMasks` for the arguments.
 
         Raises:
-            CaptureError: the video is missing or damaged, or has another size.
+            CaptureError: the video is missing or damaged, or has the wrong size.
         """
         self._video, self._labels = mask_video(path), labels
         self.odd: dict[int, str] = {}
@@ -162,16 +162,16 @@ class VideoMasks:
 
     @cached_property
     def levels(self) -> SourceLevels:
-        """Find what the values mean; see `PngMasks.levels`."""
+        """Find the meaning of the values; see `PngMasks.levels`."""
         return video_levels(self._video.path)[0]
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
         """Yield the masks from a picture on, (h, w) uint8, None where nothing is segmented.
 
         Raises:
-            CaptureError: a picture cannot be decoded, or they are no masks.
+            CaptureError: a picture cannot be decoded, or the pictures are not masks.
         """
-        if self._labels is not None:  # luma, unless there is none: conversions would change values
+        if self._labels is not None:  # use luma where possible: conversions change values
             colour: Colour = "rgb" if self._video.is_rgb else "gray"
             for frame in self._video.frames(first, colour=colour, threads=1):
                 yield _labelled(frame.image, self._labels, self._video.path, f"picture {frame.index}: ")
@@ -201,11 +201,11 @@ def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) ->
 
 
 def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> MaskImage:
-    """Return 255 where a label image shows the wanted arch; refuse other values."""
+    """Return 255 where a label image shows the requested arch; refuse unknown values."""
     plane = image if image.ndim == 2 else image[..., 0]
     if image.ndim == 3 and not all((image[..., c] == plane).all() for c in (1, 2)):
         raise CaptureError(
-            f"{where}the label image is coloured; one gray value per row of teeth is needed.",
+            f"{where}the label image is coloured; one gray value per arch is needed.",
             path=path,
             hint="Export the labels as gray values (an index image without palette).",
         )
@@ -216,7 +216,7 @@ def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> M
         raise CaptureError(
             f"{where}the label image has the values {shown}; 0, {low} and {high} are allowed.",
             path=path,
-            hint="Correct masks.upper_value and masks.lower_value, or export without other labels, smooth edges and "
+            hint="Correct masks.upper_value and masks.lower_value, or export without other labels, antialiasing and "
             "lossy compression.",
         )
     return np.where(plane == labels[0], np.uint8(255), np.uint8(0))

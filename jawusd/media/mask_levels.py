@@ -15,80 +15,85 @@ from jawusd.base.arrays import Array
 from jawusd.media.pixels import Slices
 
 MaskImage = NDArray[np.uint8]
-RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as files store it
+RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as stored in files
 
 # Soft edges are neither teeth nor background, and so is most of a photograph: with a larger share of such pixels the
 # picture is no mask. Masks of three cameras had up to 0.024 after a blur of 8 px, small ones 0.2; their footage 0.39
 # and more.
 MOST_GRAY = 0.2
 MOST_SOFT = 0.35  # of what is not background: reached by the same masks after a blur of 8 px, not of 4 px (0.3)
-_FAINT = 0.25  # of the contrast: what stays below it is noise, and a picture without more shows no teeth
-_DEAD_ZONE = 0.06  # of the contrast, by which coding with loss misses the levels
-_NEAR = 24  # of 255: values this near to one another are one level, blurred or coded with loss
-_FLAT = 10  # of 255: pixels that differ less from their neighbours lie inside a region, not on its edge
-_ALIKE = 0.15  # of the contrast: how far the levels of two pictures of one source may differ
-_MOST_THIRD = 0.25  # area of a third level over that of the smaller of the other two; soft edges are not flat
-_SHARP = 0.8  # of its area within one step of a level's value: labels, but not the smooth parts of a photograph
+_FAINT = 0.25  # of the contrast: smaller values are noise; a picture with nothing above it shows no teeth
+_DEAD_ZONE = 0.06  # of the contrast: deviation from the levels by lossy coding
+_NEAR = 24  # of 255: closer values belong to one level, after blur or lossy coding
+_FLAT = 10  # of 255: pixels that differ less from their neighbours are inside a region, not on its edge
+_ALIKE = 0.15  # of the contrast: largest difference of levels between pictures of one source
+_MOST_THIRD = 0.25  # area of a third level over the smaller of the other two; soft edges are not flat
+_SHARP = (
+    0.8  # share of a level's area within one step of its value; labels reach it, smooth parts of photographs do not
+)
 
 
 @dataclass(frozen=True)
 class MaskLevels:
-    """Say how pictures of one source become coverage.
+    """How pictures of one source are converted to coverage.
 
-    `plane` is the channel that tells teeth from background: "alpha", "brightest" or "darkest" of the colours, or the
-    number of one of them.
+    `plane` is the channel that separates teeth from background: "alpha", the "brightest" or "darkest" colour, or the
+    index of a colour.
     """
 
     plane: str = "brightest"
     background: float = 0.0
     teeth: float = 255.0
     deep: bool = False  # 16 bit per channel
-    lossy: bool = False  # coding has left noise around the levels
+    lossy: bool = False  # lossy coding has left noise around the levels
     doubtful: bool = False  # whether border and area disagree about which level is the background
     # share of what is not background that lies between the levels
     soft: float = field(default=0.0, compare=False)
 
     @property
     def usual(self) -> bool:
-        """Tell whether black is background and full white teeth."""
+        """Whether black is background and full white is teeth."""
         white = 65535.0 if self.deep else 255.0
         near = _DEAD_ZONE * white if self.lossy else 0.0
         return abs(self.background) <= near and abs(self.teeth - white) <= near
 
     @property
     def inverted(self) -> bool:
-        """Tell whether teeth are darker than the background."""
+        """Whether teeth are darker than the background."""
         return self.teeth < self.background
 
     def coverage(self, image: RawImage) -> tuple[MaskImage | None, str]:
-        """Return the mask of a picture, 0 .. 255, half of it the outline; None without teeth, and why if that is odd.
+        """Return the mask of a picture, 0 .. 255 with the outline at half, or None; and why the picture is rejected.
 
-        The reason, to follow the name of the picture, is empty for a mask and for an empty picture. The mask may be the
-        picture itself.
+        The reason, phrased to follow the picture's name, is empty for masks and empty pictures. The mask may be the
+        input array itself.
         """
         if (image.dtype == np.uint16) != self.deep:
-            return None, f"has {8 * image.dtype.itemsize} bits per channel, unlike the others"
+            return None, f"has {8 * image.dtype.itemsize} bits per channel, unlike other pictures"
         plane = channel(image, self.plane)
         low, high, _, _ = cv2.minMaxLoc(plane)
         if low == high:
             empty = self.plane == "alpha" or abs(low - self.teeth) > abs(low - self.background)
-            return None, "" if empty else f"is {low:g} all over, which means teeth everywhere"
-        box = self._around_teeth(plane)  # mostly a tenth of the picture; all else is not looked at again
+            return None, "" if empty else f"is uniformly {low:g}, which means teeth everywhere"
+        box = self._around_teeth(plane)  # usually a tenth of the picture
         part = self._shares(plane[box])
         inside = cv2.countNonZero(cv2.inRange(part, 128, 255))
         if inside == 0:
             brightest = low if self.inverted else high
             faint = int(part.max()) <= 255 * _FAINT
-            return None, "" if faint else f"reaches only {brightest:g}, teeth are {self.teeth:g} in the others"
+            return None, "" if faint else f"reaches only {brightest:g}, but teeth are {self.teeth:g} in other pictures"
         if (gray := cv2.countNonZero(cv2.inRange(part, 26, 229)) / plane.size) > MOST_GRAY:
-            return None, f"is no mask: {gray:.0%} of it are neither teeth nor background"
+            return None, f"is not a mask: {gray:.0%} of it is neither teeth nor background"
         mask = part if part.shape == plane.shape else self._placed(part, box, plane)
         if inside > mask.size / 2 and border_share(mask, 127.5) > 0.5:
-            return None, f"has {inside / mask.size:.0%} teeth, up to the border: as if inverted, unlike the others"
+            return (
+                None,
+                f"has {inside / mask.size:.0%} teeth, up to the border: it seems inverted, unlike other pictures",
+            )
         return mask, ""
 
     def _around_teeth(self, plane: RawImage) -> Slices:
-        """Return the rows and columns of a channel outside of which all is background; at least one pixel."""
+        """Return the bounding box of everything but background in a channel; at least one pixel."""
 
         def seen(part: RawImage, axis: int) -> list[int]:
             most = part.min(axis) if self.inverted else part.max(axis)
@@ -102,7 +107,7 @@ class MaskLevels:
         return band, slice(columns[0], columns[-1] + 1, 1)
 
     def _shares(self, part: RawImage) -> MaskImage:
-        """Return the share of teeth in pixels of a channel, 0 .. 255."""
+        """Return the coverage of pixels of a channel, 0 .. 255."""
         if part.dtype != np.uint8:
             return self._table[part]
         return cast(MaskImage, part if self._as_stored else cv2.LUT(part, self._table))
@@ -116,7 +121,7 @@ class MaskLevels:
 
     @cached_property
     def _as_stored(self) -> bool:
-        """Whether 8 bit pixels are shares as they are."""
+        """Whether 8-bit pixels already are coverage."""
         return not self.deep and bool((self._table == np.arange(256)).all())
 
     @cached_property
@@ -144,7 +149,7 @@ def channel(image: RawImage, plane: str) -> RawImage:
 
 
 def spread_of_colours(image: RawImage) -> float:
-    """Return how much the channels of a picture (h, w, 3 or 4) differ at most in a pixel."""
+    """Return the largest difference between the channels of a pixel in a picture (h, w, 3 or 4)."""
     return float(cv2.minMaxLoc(cv2.subtract(channel(image, "brightest"), channel(image, "darkest")))[1])
 
 
@@ -154,26 +159,26 @@ def border_share(image: MaskImage, above: float) -> float:
 
 
 class NotMasks(Exception):
-    """Pictures are not masks: `reason` says what they hold, `hint` what to do, `index` which one shows it, if one."""
+    """Pictures are not masks, for a `reason`, with a `hint`; `index` is the picture that shows it, if there is one."""
 
     def __init__(self, index: int | None, reason: str, hint: str) -> None:
-        """Take the number of a picture within those given, None for all of them."""
+        """Store the index of the picture among those given, None for all of them."""
         super().__init__(reason)
         self.index, self.reason, self.hint = index, reason, hint
 
 
 @dataclass(frozen=True)
 class _Levels:
-    """Hold the two levels of one channel of a picture and where they lie."""
+    """The two levels of one channel of a picture, and their distribution."""
 
     low: float
     high: float
-    light: float  # share of the picture nearer to the high level
+    light: float  # share of the picture closer to the high level
     light_border: float  # the same along its border
-    gray: float  # share of the picture that is neither
-    soft: float  # share of what is not dark that is neither, if light is teeth
-    soft_dark: float  # the same of what is not light, if dark is teeth
-    third: float | None  # a further level that has much area
+    gray: float  # share of the picture at neither level
+    soft: float  # share at neither level of everything not dark, if teeth are light
+    soft_dark: float  # share at neither level of everything not light, if teeth are dark
+    third: float | None  # a third level of large area
 
     @property
     def contrast(self) -> float:
@@ -182,27 +187,27 @@ class _Levels:
 
 @dataclass(frozen=True)
 class _Looked:
-    """Hold what one picture shows in each of its channels that are not of one value."""
+    """Levels of each non-uniform channel of one picture."""
 
-    number: int  # within those looked at
+    number: int  # index among the sampled pictures
     planes: dict[str, _Levels]
-    opaque: bool  # has an alpha channel, which cuts nothing out
+    opaque: bool  # has an alpha channel that is opaque
     deep: bool
 
 
 def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], Iterable[RawImage]]) -> MaskLevels | None:
-    """Return what the values of a source mean, None if none of its pictures shows anything.
+    """Return the meaning of a source's values, None if all its pictures are empty.
 
-    The two levels are those that most pictures agree on. The background is the darker one, unless the lighter one has
-    most of the area and of the border: teeth lie amid the picture.
+    The two levels are those of most pictures. The background is the darker one, unless the lighter one has most of the
+    area and of the border, since teeth are inside the picture.
 
     Args:
-        pictures: some, from the whole take.
-        lossy: coded with loss.
-        more: gives all others, which are looked at if those show nothing.
+        pictures: samples from the whole take.
+        lossy: whether coding is lossy.
+        more: returns all other pictures, used if the samples are empty.
 
     Raises:
-        NotMasks: most pictures that show something are no masks, or have more than two levels.
+        NotMasks: most non-empty pictures are not masks, or have more than two levels.
     """
     looked = [_looked(k, image) for k, image in enumerate(pictures)]
     shown = _shown(looked)
@@ -214,14 +219,14 @@ def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], It
     if any(one.planes for one in looked):
         raise NotMasks(
             None,
-            f"the alpha channel is opaque in all {len(looked)} pictures: nothing is cut out.",
-            "Export the matte itself, in black and white, or colour with its alpha (in After Effects: RGB + Alpha).",
+            f"the alpha channel is opaque in all {len(looked)} pictures: nothing is masked.",
+            "Export the matte in black and white, or colour with alpha (in After Effects: RGB + Alpha).",
         )
     return None
 
 
 def _shown(looked: Sequence[_Looked]) -> list[_Looked]:
-    """Return the pictures that show something; programs write opaque photographs for frames that have no mask."""
+    """Return the pictures with content; some programs write opaque photographs for frames without a mask."""
     if any("alpha" in one.planes for one in looked):
         return [one for one in looked if "alpha" in one.planes]
     return [one for one in looked if one.planes and not (one.opaque and one.planes["brightest"].gray > MOST_GRAY)]
@@ -236,8 +241,8 @@ def _agreed(shown: Sequence[_Looked], lossy: bool) -> MaskLevels:
         values = sorted({levels.low, levels.high, levels.third or 0.0})
         raise NotMasks(
             number,
-            f"it holds the levels {', '.join(f'{value:g}' for value in values)}; a mask has two, background and teeth.",
-            "Export one mask per row of teeth; or name one file for both rows as masks.labels, with upper_value and "
+            f"it has the levels {', '.join(f'{value:g}' for value in values)}; a mask has two, background and teeth.",
+            "Export one mask per arch; or name one file for both arches as masks.labels, with upper_value and "
             "lower_value.",
         )
     masks = [(number, levels) for number, levels in found if levels.gray <= MOST_GRAY]
@@ -245,7 +250,7 @@ def _agreed(shown: Sequence[_Looked], lossy: bool) -> MaskLevels:
         number, levels = next((n, levels) for n, levels in found if levels.gray > MOST_GRAY)
         raise NotMasks(
             number,
-            f"{levels.gray:.0%} of it are gray, which is no mask: white is tooth and black is not.",
+            f"{levels.gray:.0%} of it is gray, so it is not a mask, in which white is tooth and black is background.",
             "Check that `masks` in capture.toml names the masks and not the footage.",
         )
     alike = max(([m for m in masks if _alike(m[1], of[1], lossy)] for of in masks), key=len)
@@ -264,7 +269,7 @@ def _alike(levels: _Levels, of: _Levels, lossy: bool) -> bool:
 
 
 def _telling_plane(shown: Sequence[_Looked]) -> str:
-    """Return the channel with the greatest contrast; alpha if there is any."""
+    """Return the channel with the highest contrast, or alpha if present."""
     totals: dict[str, float] = {}
     for one in shown:
         for plane, levels in one.planes.items():
@@ -285,7 +290,7 @@ def _looked(number: int, image: RawImage) -> _Looked:
 
 
 def _levels(plane: RawImage) -> _Levels | None:
-    """Return the levels of one channel, None if it has one value."""
+    """Return the levels of one channel, None if it is uniform."""
     low, high, _, _ = cv2.minMaxLoc(plane)
     if low == high:
         return None
@@ -300,7 +305,7 @@ def _levels(plane: RawImage) -> _Levels | None:
     counts = cv2.calcHist([unit], [0], cv2.inRange(uneven, 0, _FLAT), [256], [0, 256]).ravel().astype(np.float64)
     first, _, rest = _peak(counts)
     second, area, rest = _peak(rest)
-    if not area:  # too small to have an inside
+    if not area:  # too small for flat regions
         second = 255 if first < 128 else 0
     third, third_area, _ = _peak(rest)
     dark, light = sorted((first, second))
@@ -324,7 +329,7 @@ def _levels(plane: RawImage) -> _Levels | None:
 
 
 def _peak(counts: Array) -> tuple[int, float, Array]:
-    """Return the most frequent of 256 values, how often it or its neighbours occur, and the counts without them."""
+    """Return the most frequent of 256 values, the count of it and its neighbours, and the counts without them."""
     at = int(counts.argmax())
     near = slice(max(at - _NEAR, 0), at + _NEAR + 1)
     rest = counts.copy()

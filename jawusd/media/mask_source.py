@@ -1,4 +1,4 @@
-"""What the values of numbered mask files and of mask videos mean, looked up once per file and version."""
+"""The meaning of values in mask files and mask videos, cached per file version."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _NEUTRAL = 12  # of 255: colour that coding with loss leaves in black, gray and 
 
 @dataclass(frozen=True)
 class SourceLevels:
-    """Hold what the values of one source mean.
+    """The meaning of one source's values.
 
-    `levels` is None if none of its pictures shows anything. `palette_numbers` are read instead of colours that are all
-    the same. `sizes_px` are the (width, height) of files looked at, one file per size.
+    `levels` is None if all its pictures are empty. `palette_numbers`: read palette indices, as all colours are equal.
+    `sizes_px` are the (width, height) of sampled files, one file per size.
     """
 
     levels: MaskLevels | None
@@ -35,10 +35,10 @@ class SourceLevels:
 
 
 def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | None = None) -> SourceLevels:
-    """Find the levels of numbered files, from some of them; `is_other` tells pictures that are no masks.
+    """Find the levels of numbered files from samples; `is_other` detects pictures that are not masks.
 
     Raises:
-        CaptureError: the pictures are no masks.
+        CaptureError: the pictures are not masks.
     """
     chosen = _spread(len(files), _SAMPLED)
     sample = [files[k] for k in chosen]
@@ -51,34 +51,34 @@ def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | Non
 
 
 def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
-    """Find the levels of a video, from some of its pictures, and what to decode them as.
+    """Find the levels of a video from samples, and the format to decode.
 
     Raises:
-        CaptureError: it cannot be decoded, or the pictures are no masks.
+        CaptureError: it cannot be decoded, or the pictures are not masks.
     """
     return _video_levels_of_version(path, path.stat().st_mtime_ns)
 
 
 def mask_video(path: Path) -> Video:
-    """Return a video of masks; its table of frames is read once, though a take opens it a dozen times.
+    """Return a video of masks, cached, since a take opens it a dozen times.
 
     Raises:
         CaptureError: as `Video`.
     """
     if not path.is_file():
-        return Video(path)  # which says so
+        return Video(path)  # which reports the error
     found = path.stat()
     return _video_of_version(path, found.st_mtime_ns, found.st_size)
 
 
 @lru_cache(maxsize=64)
 def _video_of_version(path: Path, changed_ns: int, size: int) -> Video:
-    """Open a video; time of its last change and size identify its version."""
+    """Open a video; modification time and size identify its version."""
     return Video(path)
 
 
 class _Others:
-    """Hold files besides a sample; as many others are equal, so that a cache does not compare them."""
+    """Files besides a sample. Instances of equal length compare equal, so that the cache does not compare files."""
 
     def __init__(self, files: list[Path]) -> None:
         self.files, self._count = files, len(files)
@@ -91,7 +91,7 @@ class _Others:
 
 
 def _spread(count: int, most: int) -> list[int]:
-    """Return at most so many of `count` numbers, evenly spread."""
+    """Return at most `most` evenly spaced indices below `count`."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
@@ -102,7 +102,7 @@ def _png_levels_of_version(
     others: _Others,
     is_other: Callable[[RawImage], bool] | None,
 ) -> SourceLevels:
-    """Find the levels of files, reading them once; times and sizes of the sample identify their version."""
+    """Find the levels of files; modification times and sizes of the sample identify their version."""
     for palette_numbers in (False, True) if any(map(has_palette, sample)) else (False,):
         read: list[Path] = []
         sizes: dict[tuple[int, int], Path] = {}
@@ -114,7 +114,7 @@ def _png_levels_of_version(
                 try:
                     image = load_png(path)
                 except CaptureError:
-                    continue  # that frame reports it
+                    continue  # reported when the frame is read
                 if is_other is None or not is_other(image):
                     read.append(path)
                     sizes.setdefault((image.shape[1], image.shape[0]), path)
@@ -127,7 +127,7 @@ def _png_levels_of_version(
             where = read[error.index] if error.index is not None else sample[0].parent
             raise CaptureError(error.reason, path=where, hint=error.hint) from error
         if not read:
-            return SourceLevels(MaskLevels())  # nothing can be read, which every frame reports
+            return SourceLevels(MaskLevels())  # all files are unreadable; reported when frames are read
         if found is not None:
             return SourceLevels(found, palette_numbers, tuple((path, size) for size, path in sizes.items()))
     return SourceLevels(None, sizes_px=tuple((path, size) for size, path in sizes.items()))
@@ -135,10 +135,10 @@ def _png_levels_of_version(
 
 @lru_cache(maxsize=256)
 def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels, Colour]:
-    """Find the levels of a video and what to decode; the time of its last change identifies its version."""
+    """Find the levels of a video and the format to decode; the modification time identifies its version."""
     video = mask_video(path)
     colour: Colour = "gray" if video.is_gray else "rgba" if video.has_alpha else "rgb"
-    # Pictures that decode by themselves are cheap; few of them may be empty, as the first often is.
+    # Key frames are cheap to decode; some may be empty, as the first often is.
     sample = [int(video.keys[k]) for k in _spread(len(video.keys), _SAMPLED)]
     if len(sample) < _FEWEST_OF_VIDEO:
         sample = sorted({*sample, *_spread(video.count, _FEWEST_OF_VIDEO)})
@@ -168,7 +168,7 @@ def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels,
 
 
 def load_png(path: Path) -> RawImage:
-    """Return a picture as stored.
+    """Read a picture as stored.
 
     Raises:
         CaptureError: it cannot be decoded.

@@ -17,21 +17,21 @@ from jawusd.media.masks import MaskReader, open_masks
 
 ARCHES = ("upper", "lower")
 _LISTED = 5
-_SPREAD = 9  # frames looked at over a whole clip
-_POINTS = 500  # pixels kept of a mask
+_SPREAD = 9  # sampled frames per clip
+_POINTS = 500  # sampled pixels per mask
 _HALF = 128
 
 
 def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding]:
-    """Return what is to be said of the masks of one camera, from some pictures of the whole take.
+    """Return findings about the masks of one camera, from samples of the whole take.
 
     `size_px` is the (width, height) of the camera's pictures. Kinds: "camera_without_masks" and "masks_black", warnings
-    of what is not used; "mask_levels", a note of values that are not 0 and full white; "masks_soft" and
-    "mask_polarity", warnings that the outline, or background and teeth, can hardly be told apart.
+    about unused masks; "mask_levels", a note about values other than 0 and full white; "masks_soft" and
+    "mask_polarity", warnings that the outline, or which level is teeth, is ambiguous.
 
     Raises:
-        CaptureError: the masks cannot be used: missing, damaged, of another size or number than the camera's pictures,
-            or pictures that are no masks; the message names the file and what it holds.
+        CaptureError: the masks cannot be used: missing, damaged, not of the size or number of the camera's pictures, or
+            not masks; the message names the file and its content.
     """
     if source.masks is None:
         return [
@@ -40,7 +40,7 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
                 "warning",
                 "it has no masks and is not used for tracking.",
                 camera=source.name,
-                hint="Name its masks in capture.toml, or let `jawusd segment` make them.",
+                hint="Add its masks in capture.toml, or create them with `jawusd segment`.",
             )
         ]
     readers = open_masks(source, size_px)
@@ -61,7 +61,7 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
 
 
 def odd_pictures(source: CameraSource, arch: str, odd: Sequence[str]) -> list[Finding]:
-    """Return what is to be said of pictures that contradict the others, see `MaskReader.odd`; empty without any."""
+    """Return findings about pictures that are inconsistent with the others, see `MaskReader.odd`."""
     if not odd:
         return []
     more = f"; and {len(odd) - _LISTED} more" if len(odd) > _LISTED else ""
@@ -72,7 +72,7 @@ def odd_pictures(source: CameraSource, arch: str, odd: Sequence[str]) -> list[Fi
             f"{len(odd)} masks of the {arch} teeth are not used: {'; '.join(odd[:_LISTED])}{more}.",
             value=len(odd),
             camera=source.name,
-            hint="Export them like the others.",
+            hint="Export them like the other masks.",
         )
     ]
 
@@ -83,7 +83,7 @@ def _black(source: CameraSource, message: str) -> Finding:
         "warning",
         message,
         camera=source.name,
-        hint="Check that they were exported with the teeth in white, or take `masks` of this camera out.",
+        hint="Export them with the teeth in white, or remove `masks` of this camera.",
     )
 
 
@@ -91,13 +91,13 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
     out = []
     if not levels.usual:
         low, high = sorted((levels.background, levels.teeth))
-        inverted = "; they are inverted, teeth dark on light" if levels.inverted else ""
+        inverted = "; they are inverted, with teeth dark on light" if levels.inverted else ""
         channel = "transparency" if levels.plane == "alpha" else "masks"
         out.append(
             Finding(
                 "mask_levels",
                 "note",
-                f"the {channel} of {rows} teeth hold the values {low:g} and {high:g}: {levels.teeth:g} is "
+                f"the {channel} of {rows} teeth have the values {low:g} and {high:g}: {levels.teeth:g} is "
                 f"taken as teeth{inverted}.",
                 value=levels.teeth,
                 camera=source.name,
@@ -108,13 +108,13 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
             Finding(
                 "masks_soft",
                 "warning",
-                f"{levels.soft:.0%} of what the masks of {rows} teeth show lie between background "
-                f"({levels.background:g}) and teeth ({levels.teeth:g}), at most {MOST_SOFT:.0%} are usual; the outline "
-                "is taken half the way.",
+                f"{levels.soft:.0%} of the content of the masks of {rows} teeth is between background "
+                f"({levels.background:g}) and teeth ({levels.teeth:g}), at most {MOST_SOFT:.0%} is usual; the outline "
+                "is placed at half.",
                 value=round(levels.soft, 3),
                 limit=MOST_SOFT,
                 camera=source.name,
-                hint="Export masks with edges a few pixels wide, and not the footage cut out.",
+                hint="Export masks with edges a few pixels wide, not the masked footage.",
             )
         )
     if levels.doubtful:
@@ -122,10 +122,10 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
             Finding(
                 "mask_polarity",
                 "warning",
-                f"the masks of {rows} teeth hold {levels.background:g} and {levels.teeth:g}, and border and area "
-                f"of the pictures disagree about which is the background; {levels.teeth:g} is taken as teeth.",
+                f"the masks of {rows} teeth have the values {levels.background:g} and {levels.teeth:g}, and it is "
+                f"ambiguous which is the background; {levels.teeth:g} is taken as teeth.",
                 camera=source.name,
-                hint="Export them with teeth in white on black, up to the border of the picture.",
+                hint="Export them with teeth in white on black up to the border of the picture.",
             )
         )
     return out
@@ -133,12 +133,12 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
 
 @dataclass(frozen=True, eq=False)
 class MaskSamples:
-    """Hold what some masks of one camera show; frames are the camera's own."""
+    """Samples of the masks of one camera, by the camera's own frames."""
 
-    counts: tuple[int, int]  # frames of the mask sources, upper and lower
+    counts: tuple[int, int]  # number of frames of the mask sources, upper and lower
     first_last: tuple[
         tuple[int, int] | None, tuple[int, int] | None
-    ]  # frames with a mask of each arch, None: none found
+    ]  # first and last frame with a mask of each arch, None if there is none
     read: Callable[[int, int], MaskImage | None]  # arch, frame: the mask
 
     @property
@@ -147,7 +147,7 @@ class MaskSamples:
         return min((frames[0] for frames in self.first_last if frames is not None), default=None)
 
     def pixels(self, arch: int, frame: int) -> Array:
-        """Return some pixels (x, y) of a mask, shape (N <= 500, 2); N = 0 where there is none."""
+        """Return sampled pixels (x, y) of a mask, shape (N <= 500, 2); N = 0 without a mask."""
         mask = self.read(arch, frame)
         if mask is None:
             return np.empty((0, 2))
@@ -157,15 +157,15 @@ class MaskSamples:
 
 
 def sample_masks(source: CameraSource, size_px: tuple[int, int], files: ExitStack) -> MaskSamples:
-    """Look at masks spread over a clip, and find the first and the last frame that has any.
+    """Sample masks over a clip, and find the first and last frame with a mask.
 
     Args:
         source: a camera with masks.
         size_px: (width, height) of its pictures.
-        files: closes the masks when it is closed.
+        files: exit stack that closes the masks.
 
     Raises:
-        CaptureError: masks are missing, damaged, of another size or no masks.
+        CaptureError: masks are missing, damaged, of the wrong size, or not masks.
     """
     pair = [files.enter_context(reader) for reader in open_masks(source, size_px)]
     ranges = tuple(_first_last(reader) for reader in pair)
@@ -175,7 +175,7 @@ def sample_masks(source: CameraSource, size_px: tuple[int, int], files: ExitStac
 
 
 def _first_last(reader: MaskReader) -> tuple[int, int] | None:
-    """Return the first and the last frame with a mask, taking those between for masked, or None."""
+    """Return the first and last frame with a mask, assuming no gaps, or None."""
     spread = np.unique(np.linspace(0, reader.count - 1, _SPREAD).round().astype(int)).tolist()
     shown = [frame for frame in spread if _shows(reader, frame)]
     if not shown:
@@ -186,7 +186,7 @@ def _first_last(reader: MaskReader) -> tuple[int, int] | None:
 
 
 def _boundary(reader: MaskReader, shown: int, empty: int) -> int:
-    """Return the frame with a mask that is nearest to the empty one, by bisection."""
+    """Return the masked frame next to the empty ones, by bisection."""
     while abs(shown - empty) > 1:
         middle = (shown + empty) // 2
         if _shows(reader, middle):

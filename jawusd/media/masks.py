@@ -1,4 +1,4 @@
-"""Read segmentation masks, numbered by their camera's own video frames, decoding ahead in the background."""
+"""Read segmentation masks by the frames of their camera's video, decoding ahead in a background thread."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from jawusd.media.mask_levels import MaskImage, MaskLevels
 from jawusd.media.timeline import Timeline
 from jawusd.media.video import Video
 
-_LOOKED_AT = 10  # pictures of labels that are looked at first
-_AHEAD = 4  # pictures waiting at most: 8 MB of full HD per reader
+_LOOKED_AT = 10  # sampled pictures of labels
+_AHEAD = 4  # buffered pictures: 8 MB of full HD per reader
 
 
 class MaskReader:
-    """Read the masks of one arch in one camera.
+    """Reader of the masks of one arch in one camera.
 
-    Reading frame after frame decodes the next few in a background thread; any other order works and decodes on
-    demand. One reader serves one thread; use it as a context manager or close it, or its thread never ends.
+    Sequential reads decode the next frames in a background thread; random access decodes on demand. A reader is not
+    thread-safe. Use it as a context manager or close it, or its thread never ends.
 
-    Frames are those of the camera's clock: frame k is shown k nominal frame durations after its first picture. In a
-    video of variable rate some have no picture, and no mask.
+    Frames follow the camera's clock: frame k is shown k nominal frame durations after its first picture. In videos of
+    variable rate some frames have no picture, and no mask.
 
     Attributes:
         count: one past the last frame of the source.
-        levels: what the values mean; None if nothing is segmented, or if they are labels.
+        levels: meaning of the values; None if nothing is segmented, or for label images.
     """
 
     def __init__(
@@ -48,17 +48,17 @@ class MaskReader:
         labels: LabelValues | None = None,
         prepare: Callable[[MaskImage], MaskImage] | None = None,
     ) -> None:
-        """Find the masks, and what their values mean from some pictures of the whole take.
+        """Find the masks, and the meaning of their values from samples of the whole take.
 
         Args:
             path: a PNG pattern with one `%d` or `%06d` (the number of the picture in the camera's video), or a video
                 with one picture per picture, or per frame, of the camera's video.
-            timeline: of the camera's video; without one, PNG files are numbered by frames.
-            labels: for label images, the gray values of the wanted arch and of the other one.
+            timeline: timeline of the camera's video; without one, PNG files are numbered by frames.
+            labels: for label images, the gray values of the requested and the other arch.
             prepare: applied to each mask in the background thread, such as `WorkingView.mask`.
 
         Raises:
-            CaptureError: the folder or file is missing, holds no masks, or their size or count is wrong.
+            CaptureError: the folder or file is missing, has no masks, or their size or number is wrong.
         """
         self._labels = labels
         self.path = Path(path)
@@ -78,12 +78,12 @@ class MaskReader:
         self._ahead: _Ahead | None = None
 
     def read(self, frame: int) -> MaskImage | None:
-        """Return the mask (h, w) of a frame of the camera, prepared: 255 = tooth, 0 = not, soft edges in between.
+        """Return the prepared mask (h, w) of a frame of the camera: 255 = tooth, 0 = background, soft edges between.
 
-        None where the frame is not segmented: outside the video, no picture, or a black one.
+        None if the frame is not segmented: outside the video, without a picture, or black.
 
         Raises:
-            CaptureError: the picture cannot be decoded, has the wrong size, or is no mask.
+            CaptureError: the picture cannot be decoded, has the wrong size, or is not a mask.
         """
         if not 0 <= frame < self.count:
             self._previous = frame
@@ -101,10 +101,10 @@ class MaskReader:
 
     @cached_property
     def is_black(self) -> bool:
-        """Tell whether no picture shows anything.
+        """Tell whether all pictures are empty.
 
         Raises:
-            CaptureError: a picture of labels cannot be decoded, has the wrong size or means nothing.
+            CaptureError: a label image cannot be decoded, has the wrong size or unknown values.
         """
         if self._labels is None:
             return self.levels is None
@@ -114,14 +114,14 @@ class MaskReader:
 
     @property
     def odd(self) -> list[str]:
-        """Return which pictures read so far contradict the others, and how; they count as not segmented."""
+        """Return the rejected pictures read so far, with reasons; they count as not segmented."""
         return [self._source.odd[number] for number in sorted(self._source.odd)]
 
     def read_some(self, first: int, stop: int) -> list[MaskImage | None]:
-        """Return the masks of frames in a row, [first, stop), as `read` would, without decoding more than these.
+        """Return the masks of consecutive frames [first, stop), like `read`, without decoding ahead.
 
         Raises:
-            CaptureError: a picture cannot be decoded, has the wrong size, or is no mask.
+            CaptureError: a picture cannot be decoded, has the wrong size, or is not a mask.
         """
         inside = range(max(first, 0), min(stop, self.count))
         if not inside:
@@ -131,7 +131,7 @@ class MaskReader:
         return [None] * (inside.start - first) + found + [None] * (stop - inside.stop)
 
     def close(self) -> None:
-        """Stop decoding ahead; the reader can still be used."""
+        """Stop decoding ahead; the reader remains usable."""
         if self._ahead is not None:
             self._ahead.stop()
             self._ahead = None
@@ -163,7 +163,7 @@ class MaskReader:
                 continue
             if pictures is None:
                 pictures, at = self._source.masks(picture), picture
-            while at < picture:  # two pictures in one frame: the first counts
+            while at < picture:  # of two pictures in one frame, use the first
                 next(pictures)
                 at += 1
             yield next(pictures)
@@ -171,16 +171,16 @@ class MaskReader:
 
 
 def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> Timeline | None:
-    """Return the timeline that maps frames to file numbers; None where they are equal."""
+    """Return the timeline that maps frames to file numbers; None if they are equal."""
     if video is None or not (video.missing or video.is_numbered):
         return None
     if video.is_numbered:
         if not source.numbers & set(video.stored.tolist()):
             raise CaptureError(
-                f"the masks are numbered {min(source.numbers)} to {max(source.numbers)}, the camera's pictures "
+                f"the masks are numbered {min(source.numbers)} to {max(source.numbers)}, but the camera's pictures "
                 f"{video.stored[0]} to {video.stored[-1]}.",
                 path=path,
-                hint="Number masks as the pictures that they belong to.",
+                hint="Number the masks like their pictures.",
             )
         return video
     if source.count > len(video.numbers):
@@ -194,7 +194,7 @@ def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> T
 
 
 def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks) -> Callable[[int], int | None]:
-    """Return what maps frames to the numbers of masks in their source."""
+    """Return the function that maps frames to the numbers of masks in their source."""
     if timeline is None:
         return lambda frame: frame
     return timeline.number if isinstance(source, PngMasks) else timeline.picture
@@ -203,7 +203,7 @@ def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks) -> Calla
 def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -> Timeline:
     """Return the timeline that maps the camera's frames to pictures of a mask video."""
     if video is None or source.timeline.count == video.count != len(video.numbers) != source.count:
-        return source.timeline  # a constant rate was made of the variable one
+        return source.timeline  # converted from variable to constant rate
     if source.count != len(video.numbers):
         frames = f" in {video.count} frames" if video.missing else ""
         raise CaptureError(
@@ -217,10 +217,10 @@ def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -
 def open_masks(
     source: CameraSource, size_px: tuple[int, int], *, prepare: Callable[[MaskImage], MaskImage] | None = None
 ) -> tuple[MaskReader, MaskReader]:
-    """Return readers of the masks of the upper and the lower teeth of a camera that has some; see `MaskReader`.
+    """Return readers of the upper and lower teeth masks of a camera; see `MaskReader`.
 
     Raises:
-        CaptureError: masks or video are missing, damaged or do not belong together.
+        CaptureError: masks or video are missing, damaged or do not match.
         ValueError: the camera has no masks.
     """
     masks = source.masks
@@ -235,7 +235,7 @@ def open_masks(
 
 @lru_cache(maxsize=64)
 def _timeline(clip: ClipSource, changed_ns: int) -> Timeline:
-    """Return the timeline of a clip; the time of its last change identifies its version."""
+    """Return the timeline of a clip; the modification time identifies its version."""
     return open_clip(clip).timeline
 
 
@@ -247,7 +247,7 @@ def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
     """Return the (width, height) of the first mask of a PNG pattern or video.
 
     Raises:
-        CaptureError: the folder or file is missing, holds no masks, or cannot be decoded.
+        CaptureError: the folder or file is missing, has no masks, or cannot be decoded.
     """
     path = Path(path)
     if not is_pattern(path):
@@ -256,7 +256,7 @@ def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 
 class _Ahead:
-    """Run an iterator in a thread, a few items ahead of the reader."""
+    """An iterator that runs in a thread, a few items ahead of the reader."""
 
     def __init__(self, items: Generator[MaskImage | None], first_frame: int) -> None:
         self.next_frame = first_frame
@@ -275,7 +275,7 @@ class _Ahead:
 
     def stop(self) -> None:
         self._stopping.set()
-        # The thread may wait for room, and puts one item at most from now on.
+        # The thread may wait for space in the queue; it puts at most one more item.
         with contextlib.suppress(queue.Empty):
             while True:
                 self._queue.get_nowait()
@@ -288,7 +288,7 @@ class _Ahead:
                     self._put(item, None)
                     if self._stopping.is_set():
                         return
-        except Exception as error:  # handed to the thread that reads, whatever it is
+        except Exception as error:  # re-raised in the reading thread
             self._put(None, error)
 
     def _put(self, item: MaskImage | None, error: Exception | None) -> None:

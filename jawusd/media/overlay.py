@@ -1,4 +1,4 @@
-"""Draw tracked scans over the footage, for visual checks (paper figs. 10 and 11)."""
+"""Draw tracked scans over the footage for visual checks (paper figs. 10 and 11)."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from jawusd.geometry import Camera, transform_points
 from jawusd.media.backdrop import Backdrop
 from jawusd.meshes.raster import draw_depth_labels
 
-#: Red, green and blue.
+#: RGB.
 Colour = tuple[int, int, int]
 
 UPPER_COLOUR: Colour = (255, 170, 0)
 LOWER_COLOUR: Colour = (0, 200, 255)
 _LINE_PX = 2
 CAPTION_PX = 22
-#: Where a camera has no picture.
+#: Background where a camera has no picture.
 EMPTY_GRAY = 60
-_MARGIN = 0.25  # of the teeth's extent, left around them in a tile
+_MARGIN = 0.25  # margin around the teeth in a tile [share of their extent]
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedScan:
-    """Hold a teeth scan where it was tracked."""
+    """A teeth scan at its tracked pose."""
 
-    mesh: Mesh  # the scan [mm]; its gum hides what lies behind and is not painted
-    T_world_scan: Array  # its pose, shape (4, 4); NaN leaves the scan out
+    mesh: Mesh  # the scan [mm]; its gum occludes but is not drawn
+    T_world_scan: Array  # its pose, shape (4, 4); NaN omits the scan
     colour: Colour
 
 
@@ -48,7 +48,7 @@ def draw_overlay(
     """Return a copy of a recorded picture (h, w, 3) RGB with the visible crowns tinted (opacity `fill`) and outlined.
 
     Raises:
-        ValueError: the picture has not the camera's size.
+        ValueError: the picture does not have the camera's size.
     """
     if image.shape != (camera.size_px[1], camera.size_px[0], 3) or image.dtype != np.uint8:
         raise ValueError(f"picture must be RGB of {camera.size_px} px, got {image.dtype} {image.shape}")
@@ -66,7 +66,7 @@ def draw_overlay(
 
 
 def arch_colours(tracks: Tracks, row: int) -> tuple[Colour, Colour]:
-    """Return the colours of upper and lower arch in the frame at a row: of their states in a solved performance."""
+    """Return the colours of upper and lower arch in the frame at a row; by state in a solved performance."""
     if tracks.solved is None:
         return UPPER_COLOUR, LOWER_COLOUR
     whole = SolveState(int(tracks.solved.state[row]))
@@ -91,9 +91,9 @@ def tracking_sheet(
     *,
     tile_px: tuple[int, int] = (480, 270),
 ) -> NDArray[np.uint8]:
-    """Return one RGB picture with a row per frame and a column per camera, cut to the teeth and captioned.
+    """Return one RGB picture with a row per frame and a column per camera, cropped to the teeth and captioned.
 
-    A tile is gray where the camera has no picture, without tint where the jaw was lost.
+    A tile is gray without a picture, and has no tint where the jaw was lost.
 
     Args:
         frames: frames of the reference camera, all of them in tracks.
@@ -106,7 +106,7 @@ def tracking_sheet(
     row_of = {int(frame): row for row, frame in enumerate(tracks.frames)}
     missing = [frame for frame in frames if frame not in row_of]
     if missing:
-        raise ValueError(f"frame {missing[0]} is not in the tracks, which hold {len(row_of)} frames")
+        raise ValueError(f"frame {missing[0]} is not in the tracks, which have {len(row_of)} frames")
     tiles = []
     for frame in frames:
         scans = placed_scans(tracks, row_of[frame], (upper, lower))
@@ -120,13 +120,13 @@ def tracking_sheet(
 
 
 def contact_sheet(tiles: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
-    """Lay pictures of one size out in rows; return RGB uint8, the last row filled up with black.
+    """Arrange pictures of equal size in rows; return RGB uint8, the last row padded with black.
 
     Raises:
         ValueError: there are no pictures, or they differ in size.
     """
     if not tiles or columns < 1 or len({tile.shape for tile in tiles}) != 1:
-        raise ValueError(f"needs pictures of one size, got {[tile.shape for tile in tiles]}")
+        raise ValueError(f"pictures must have equal sizes, got {[tile.shape for tile in tiles]}")
     height, width, channels = tiles[0].shape
     rows = math.ceil(len(tiles) / columns)
     sheet = np.zeros((rows * height, columns * width, channels), np.uint8)
@@ -151,14 +151,14 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
 
 
 def _points(camera: Camera, scan: PlacedScan) -> NDArray[np.float32]:
-    """Return recorded pixels and depth per vertex: triangles of a scan are small enough to stay straight."""
+    """Return recorded pixels and depth per vertex; triangles are small enough to ignore distortion within them."""
     world = transform_points(scan.T_world_scan, scan.mesh.vertices)
     return np.column_stack([camera.project(world), camera.depth(world)]).astype(np.float32)
 
 
 @lru_cache(maxsize=8)
 def _parted_faces(mesh: Mesh) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the faces of gum and of crowns; kept, since a video asks for every frame."""
+    """Return the faces of gum and crowns; cached, since videos need them for every frame."""
     crown = crown_face_mask(mesh)
     return mesh.faces[~crown], mesh.faces[crown]
 
@@ -179,7 +179,7 @@ def _visible_crowns(camera: Camera, scans: Sequence[PlacedScan]) -> NDArray[np.u
 def _cut_to_teeth(
     image: NDArray[np.uint8], camera: Camera, scans: Sequence[PlacedScan], tile_px: tuple[int, int]
 ) -> NDArray[np.uint8]:
-    """Cut the surroundings of the scans out of a picture and bring them to a tile, keeping the aspect."""
+    """Crop a picture around the scans and scale it to a tile, keeping the aspect ratio."""
     seen = [_points(camera, scan)[:, :2] for scan in scans if np.isfinite(scan.T_world_scan).all()]
     whole = np.array([[0, 0], camera.size_px], float)
     low, high = whole if not seen else (np.min(np.vstack(seen), axis=0), np.max(np.vstack(seen), axis=0))
@@ -191,7 +191,7 @@ def _cut_to_teeth(
 
 
 def captioned(tile: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
-    """Return an RGB tile (h, w, 3) under a line of text."""
+    """Return an RGB tile (h, w, 3) with a caption."""
     out = np.vstack([np.zeros((CAPTION_PX, tile.shape[1], 3), np.uint8), tile])
     cv2.putText(out, text, (6, CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return out

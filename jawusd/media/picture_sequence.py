@@ -1,4 +1,4 @@
-"""Numbered pictures as a clip: a file per frame, of any depth, gaps where files are missing."""
+"""Image sequences as clips: one file per frame, of any bit depth, with gaps for missing files."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from jawusd.media.pictures import StoredPicture, read_header, read_stored
 from jawusd.media.pixels import Colour, Slices, coloured
 from jawusd.media.timeline import Timeline
 
-#: Rate where neither the capture nor the files say one: the least usual that people mean.
+#: Frame rate if neither the capture nor the files have one.
 _USUAL_RATE = 24.0
 _FASTEST_COUNT = 30.0  # of time codes in headers [frames per second]
 _AHEAD = 2  # pictures decoded ahead
 
 
 class PictureSequence(Clip):
-    """Give access to numbered pictures; see `Clip`.
+    """An image sequence; see `Clip`.
 
     Attributes:
-        numbers: of the files, increasing, shape (count,).
-        is_fractional: the files hold fractions of light, as EXR does.
+        numbers: numbers of the files, increasing, shape (count,).
+        is_fractional: whether pixels are floating-point light, as in EXR.
     """
 
     def __init__(self, source: ClipSource) -> None:
@@ -51,7 +51,7 @@ class PictureSequence(Clip):
         self.keys = np.arange(self.count)
         self.start_s, self.rotation_deg = 0.0, 0
         self.timecode = header.timecode
-        # Headers have room for 39 frames of a second: of faster pictures, several share a number (SMPTE ST 12-3).
+        # Headers can count 39 frames per second; at higher rates several pictures share a number (SMPTE ST 12-3).
         self.timecode_fps = self.fps / math.ceil(self.fps / _FASTEST_COUNT - 0.01)
         self.pixel_aspect = header.pixel_aspect
         self._space = source.colour_space or header.colour_space
@@ -62,22 +62,22 @@ class PictureSequence(Clip):
         self.has_alpha, self.is_gray, self.is_rgb = False, first.pixels.ndim == 2, first.pixels.ndim == 3
 
     def stored(self, index: int) -> StoredPicture:
-        """Return a picture as its file holds it.
+        """Return a picture as stored.
 
         Raises:
-            CaptureError: it cannot be read, or has another size than the first one.
+            CaptureError: it cannot be read, or differs in size from the first one.
         """
         found = self._stored(index)
         if found.pixels.shape[1::-1] != self.size_px:
             height, width = found.pixels.shape[:2]
             raise CaptureError(
-                f"is {width} x {height} px, the first picture {self.size_px[0]} x {self.size_px[1]} px.",
+                f"is {width} x {height} px, but the first picture is {self.size_px[0]} x {self.size_px[1]} px.",
                 path=self._files[index][1],
             )
         return found
 
     def light(self, index: int) -> NDArray[np.float32]:
-        """Return a picture of fractions as light, (h, w, 3) RGB float32.
+        """Return a floating-point picture as light, (h, w, 3) RGB float32.
 
         Raises:
             CaptureError: as `stored`.

@@ -28,7 +28,7 @@ RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 _PNG = b"\x89PNG\r\n\x1a\n"
 _HINT = "Export the pictures again, as PNG, TIFF, EXR, DPX or JPEG."
 _MOST_HEADER_BYTES = 1 << 16
-#: Most pixels of a picture, those of 8K: a few bytes can declare one that fills the memory, at up to 28 bytes a pixel.
+#: Largest picture, 8K [px]: small files can declare pictures that exhaust memory, at up to 28 bytes per pixel.
 MOST_STORED_PX = 36_000_000
 _EXR, _DPX = b"\x76\x2f\x31\x01", (b"SDPX", b"XPDS")
 _QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # orientations of Exif
@@ -36,12 +36,12 @@ _DPX_LOG = (1, 3)  # transfer characteristics of printing density and of logarit
 
 
 def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
-    """Return a picture, or None where the file is none that can be decoded."""
+    """Return a picture, or None if the file cannot be decoded."""
     try:
         check_input(path, CaptureError)
         if _pixels(path) > MOST_PX:
             return None
-        image = cv2.imdecode(np.fromfile(path, np.uint8), flags)  # imread crashes over names that are not UTF-8
+        image = cv2.imdecode(np.fromfile(path, np.uint8), flags)  # imread crashes on names that are not UTF-8
         if image is None or image.dtype == np.uint8:
             return None if image is None else np.asarray(image, np.uint8)
         return np.asarray(image, np.uint16)
@@ -50,10 +50,10 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
 
 
 def _pixels(path: Path) -> int:
-    """Return how many pixels a file says it has; of formats that say so."""
+    """Return the number of pixels in the file's header, 0 if unknown."""
     with open(path, "rb") as file:
         head = file.read(24)
-    if head.startswith(_PNG):  # most are, and there are thousands
+    if head.startswith(_PNG):  # fast path for PNG
         return int.from_bytes(head[16:20]) * int.from_bytes(head[20:24])
     try:
         with warnings.catch_warnings():
@@ -62,25 +62,25 @@ def _pixels(path: Path) -> int:
                 return image.width * image.height
     except Image.DecompressionBombError:
         return MOST_PX + 1
-    except Exception:  # what Pillow does not know, OpenCV may: it has a limit of its own
+    except Exception:  # unknown to Pillow; OpenCV has its own limit
         return 0
 
 
 def read_gray(path: Path) -> NDArray[np.uint8] | None:
-    """Return a picture in 8-bit gray, shape (h, w), or None where the file is none that can be decoded."""
+    """Return a picture in 8-bit gray, shape (h, w), or None if the file cannot be decoded."""
     picture = read_picture(path, cv2.IMREAD_GRAYSCALE)
     return None if picture is None else np.asarray(picture, np.uint8)
 
 
 def has_palette(path: Path) -> bool:
-    """Tell whether a file is a PNG whose pixels are numbers of colours in a palette."""
+    """Tell whether a file is a PNG with a palette."""
     with open(path, "rb") as file:
         head = file.read(26)
     return head.startswith(_PNG) and head[25:26] == b"\x03"  # PNG specification, section 11.2.2
 
 
 def read_palette_numbers(path: Path, picture: RawPicture) -> RawPicture:
-    """Return the palette numbers (h, w) of a PNG that has a palette; else the given picture."""
+    """Return the palette indices (h, w) of a PNG with a palette; otherwise the given picture."""
     if not has_palette(path):
         return picture
     with Image.open(path) as image:
@@ -89,7 +89,7 @@ def read_palette_numbers(path: Path, picture: RawPicture) -> RawPicture:
 
 @dataclass(frozen=True, eq=False)
 class StoredPicture:
-    """Hold a picture as its file does: (h, w) or (h, w, 3) RGB; whole numbers 0 .. largest, or fractions."""
+    """A picture as stored: (h, w) or (h, w, 3) RGB; integers 0 .. largest, or floating point."""
 
     pixels: Stored
     largest: int
@@ -97,7 +97,7 @@ class StoredPicture:
 
 @dataclass(frozen=True)
 class PictureHeader:
-    """Hold what a file says beside its pixels; what it does not say is "" or None."""
+    """Metadata of a picture file; "" or None if missing."""
 
     timecode: str = ""
     fps: float | None = None
@@ -109,7 +109,7 @@ def read_stored(path: Path) -> StoredPicture:
     """Read a picture file.
 
     Raises:
-        CaptureError: it is missing, damaged, or no picture.
+        CaptureError: it is missing, damaged, or not a picture.
     """
     check_input(path, CaptureError)
     try:
@@ -118,25 +118,25 @@ def read_stored(path: Path) -> StoredPicture:
             pixels, largest = _stored_pixels(frame)
             return StoredPicture(np.rot90(pixels, _quarters(path)), largest)
     except MemoryError as error:
-        raise CaptureError("the picture needs more memory than there is.", path=path, hint=_HINT) from error
+        raise CaptureError("there is not enough memory for the picture.", path=path, hint=_HINT) from error
     except (av.FFmpegError, OSError, StopIteration, IndexError, ValueError) as error:
-        what = f"the picture cannot be read, it is damaged or has more than {MOST_STORED_PX} px ({error!s:.100})."
+        what = f"the picture cannot be read: it is damaged or has more than {MOST_STORED_PX} px ({error!s:.100})."
         raise CaptureError(what, path=path, hint=_HINT) from error
 
 
 def _quarters(path: Path) -> int:
-    """Return how many quarters of a turn, counter-clockwise, the Exif data of a picture ask for.
+    """Return the counter-clockwise quarter turns in the Exif orientation of a picture.
 
     Raises:
-        CaptureError: they ask for it to be mirrored.
+        CaptureError: the orientation is mirrored.
     """
     try:
         with Image.open(path) as image:
             orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-    except Exception:  # what Pillow does not know (EXR, DPX) has none
+    except Exception:  # formats unknown to Pillow (EXR, DPX) have no Exif
         return 0
     if orientation in _MIRRORED:
-        raise CaptureError("the file asks to be shown mirrored; cameras see no mirrored teeth.", path=path, hint=_HINT)
+        raise CaptureError("the orientation in the file is mirrored, which is not supported.", path=path, hint=_HINT)
     return _QUARTERS.get(orientation, 0)
 
 
@@ -159,7 +159,7 @@ def _gray(frame: av.VideoFrame, bits: int) -> NDArray[np.uint16]:
 
 
 def _fractions(frame: av.VideoFrame) -> NDArray[np.float16] | NDArray[np.float32]:
-    """Return planes of fractions as they are stored, in the order red, green, blue."""
+    """Return floating-point planes as stored, in the order red, green, blue."""
     kind = np.dtype(np.float16 if "f16" in frame.format.name else np.float32)
     kind = kind.newbyteorder(">" if frame.format.name.endswith("be") else "<")
     count = len(frame.planes)
@@ -172,7 +172,7 @@ def _fractions(frame: av.VideoFrame) -> NDArray[np.float16] | NDArray[np.float32
 
 
 def read_header(path: Path) -> PictureHeader:
-    """Return what a picture file says of itself; nothing for other kinds than EXR and DPX.
+    """Return the metadata of an EXR or DPX file; empty for other formats.
 
     Raises:
         CaptureError: it cannot be read.
@@ -189,7 +189,7 @@ def read_header(path: Path) -> PictureHeader:
         if head[:4] in _DPX:
             return _dpx(head)
     except (struct.error, IndexError, ValueError):
-        pass  # the decoder says what is wrong with the file
+        pass  # the decoder reports damage
     return PictureHeader()
 
 
@@ -226,7 +226,7 @@ def _dpx(head: bytes) -> PictureHeader:
 
 
 def _timecode(code: int, bits_of_drop: bool = True) -> str:
-    """Return SMPTE ST 12-1 time code of packed decimals: hours, minutes, seconds, frames from the highest byte on."""
+    """Return SMPTE ST 12-1 time code from packed decimals: hours, minutes, seconds, frames, highest byte first."""
     tens = (0x3, 0x7, 0x7, 0x3)
     parts = [(code >> shift) & 0xFF for shift in (24, 16, 8, 0)]
     hours, minutes, seconds, frame = (10 * (part >> 4 & mask) + (part & 0xF) for part, mask in zip(parts, tens))

@@ -1,4 +1,4 @@
-"""Decoded pictures as arrays: gray at full range, RGB, RGB with transparency; turned as the file asks."""
+"""Decoded pictures as arrays: full-range gray, RGB or RGBA, rotated as the file requires."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jawusd.base.errors import CaptureError
 from jawusd.media.display import to_display
 
 Colour = Literal["gray", "rgb", "rgba"]
-#: Rows and columns of a part of a picture.
+#: Rows and columns of a region.
 Slices: TypeAlias = "tuple[slice[int, int, int], slice[int, int, int]]"
 
 # ITU-R BT.709 / BT.601 video range: 16 is black, 235 is white.
@@ -42,54 +42,54 @@ _QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])  # counter-clockwise, as dis
 
 
 def turn_deg(frame: av.VideoFrame) -> int:
-    """Return the counter-clockwise turn that a file asks for: 0, 90, 180 or 270.
+    """Return the counter-clockwise rotation stored in a file: 0, 90, 180 or 270.
 
     Raises:
-        CaptureError: its display matrix mirrors the picture, or is no quarter turn.
+        CaptureError: its display matrix mirrors the picture, or is not a multiple of 90 degrees.
     """
     try:
         stored = frame.side_data.get("DISPLAYMATRIX")
-    except ValueError:  # beside something that PyAV does not know, as Exif: the turn alone can be asked for
+    except ValueError:  # with side data unknown to PyAV, such as Exif, only the rotation is available
         return frame.rotation % 360
     if stored is None:
         return 0
     rows = np.frombuffer(bytes(cast(SideData, stored)), np.int32, 9).reshape(3, 3)[:2, :2].astype(float)
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     if not lengths.all():
-        return 0  # a matrix of zeros says nothing
-    rows /= lengths  # players scale pictures to the size of the track anyhow
+        return 0  # a zero matrix means no rotation
+    rows /= lengths  # ignore the scale, as players do
     for quarters in range(4):
         if np.allclose(rows, np.linalg.matrix_power(_QUARTER_TURN, quarters), atol=1e-3):
             return 90 * quarters
     if np.linalg.det(rows) < 0:
         raise CaptureError(
-            "the file asks to be shown mirrored; cameras see no mirrored teeth.",
-            hint="Switch mirroring off in the camera. If the stored picture is as the camera saw it, drop the mark: "
+            "the display matrix in the file mirrors the picture, which is not supported.",
+            hint="Switch mirroring off in the camera. If the stored picture is not mirrored, remove the flag: "
             "ffmpeg -display_rotation 0 -i IN -c copy OUT.",
         )
     raise CaptureError(
-        f"the file asks for a turn by {frame.rotation} degrees or a skew; only quarter turns are allowed.",
+        f"the display matrix in the file rotates by {frame.rotation} degrees or skews; allowed are multiples of 90.",
         hint="Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4.",
     )
 
 
 @lru_cache(maxsize=16)
 def _deep_table(bits: int, high: bool, full: bool) -> NDArray[np.uint8]:
-    """Return the gray of each value of luma, (65536,) uint8; video range is 16 to 235 of 8 bits, BT.709."""
+    """Return the gray of each luma value, (65536,) uint8; video range is 16 to 235 of 8 bits, BT.709."""
     luma = np.arange(1 << 16) / (1 << (16 - bits) if high else 1)
     low, span = (0.0, (1 << bits) - 1.0) if full else (16.0 * (1 << (bits - 8)), 219.0 * (1 << (bits - 8)))
     return np.asarray(np.clip(np.rint((luma - low) * 255 / span), 0, 255), np.uint8)
 
 
 class DecodedPicture:
-    """A decoded picture of which parts are turned into RGB as they are asked for, as parts of an array are.
+    """A decoded picture that converts regions to RGB on access, like an array.
 
     Attributes:
-        shape: that of the array: height, width, 3.
+        shape: height, width, 3.
     """
 
     def __init__(self, frame: av.VideoFrame, rotation_deg: int) -> None:
-        """Take what the decoder gives, and the turn that the file asks for."""
+        """Wrap a decoded frame and the rotation stored in the file."""
         self._frame, self._rotation_deg = frame, rotation_deg
         turned = rotation_deg in (90, 270)
         self.shape = (frame.width, frame.height, 3) if turned else (frame.height, frame.width, 3)
@@ -104,21 +104,21 @@ class DecodedPicture:
         return np.asarray(self[whole], dtype)
 
 
-#: A picture in RGB, (h, w, 3) uint8, as a whole or by parts.
+#: An RGB picture, (h, w, 3) uint8, as an array or converted on access.
 ColourPicture: TypeAlias = "NDArray[np.uint8] | DecodedPicture"
 
 
 def converted(frame: av.VideoFrame, colour: Colour, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
-    """Return a window (h, w), (h, w, 3) or (h, w, 4) of a decoded picture after its turn."""
+    """Return a window (h, w), (h, w, 3) or (h, w, 4) of a decoded picture after rotation."""
     if colour == "gray":
         return _gray(frame, rotation_deg, window)
     part, inside = _around(frame, _stored_window(frame, rotation_deg, window))
     pixels: NDArray[np.uint8]
     if colour == "rgb" and max(one.bits for one in frame.format.components) > _BYTE_BITS:
-        # The way from 10 bits to 8 loses up to two levels in ffmpeg; rounding from 16 bits does not.
+        # ffmpeg's conversion from 10 to 8 bits loses up to two levels; rounding from 16 bits does not.
         pixels = to_display(*deep_rgb(part), None, None)
     elif colour == "rgb" and not part.format.is_rgb:
-        # ffmpeg writes three planes twice as fast as pixels, with the same values.
+        # ffmpeg writes planar RGB twice as fast as packed RGB, with the same values.
         green, blue, red = (_plane(p) for p in part.reformat(format="gbrp", interpolation=TO_RGB).planes)
         pixels = np.asarray(cv2.merge([red, green, blue]), np.uint8)
     else:
@@ -133,7 +133,7 @@ def _plane(plane: av.video.plane.VideoPlane) -> NDArray[np.uint8]:
 
 
 def _stored_window(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> Slices:
-    """Return the rows and columns of a stored picture that its turn takes to a window."""
+    """Return the rows and columns of a stored picture that rotation maps to a window."""
     turns = rotation_deg // 90
     height, width = (frame.width, frame.height) if turns % 2 else (frame.height, frame.width)
     rows, columns = (slice(*part.indices(side)[:2]) for part, side in zip(window, (height, width), strict=True))
@@ -144,19 +144,19 @@ def _stored_window(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> S
 
 
 def _widened(part: slice[int, int, int], limit: int) -> tuple[int, int]:
-    """Return where a part of a side begins and ends with what is kept around it, in steps that ffmpeg is quick with."""
+    """Return the range of a side with margin, aligned for fast conversion."""
     start = max(0, part.start - _AROUND_PX) // _STEP_PX * _STEP_PX
     return start, min(limit, start + -(-(part.stop + _AROUND_PX - start) // _STEP_PX) * _STEP_PX)
 
 
 def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices]:
-    """Return what surrounds a window of a stored picture, and the window in it; the whole if that is not much more."""
+    """Return a crop around a window of a stored picture, and the window in it; the whole if not much larger."""
     rows, columns = window
     (top, bottom), (left, right) = (_widened(*sides) for sides in zip(window, (frame.height, frame.width)))
     height, width = bottom - top, right - left
     if height * width > 0.5 * frame.height * frame.width:
         return frame, window
-    # ffmpeg's own filter keeps what the decoder says of colours and of where they are sampled.
+    # ffmpeg's filter preserves colour metadata and chroma location.
     graph = av.filter.Graph()
     source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=_ANY_TIME)
     crop = graph.add("crop", f"{width}:{height}:{left}:{top}:exact=1")
@@ -184,7 +184,7 @@ def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np
     name = frame.format.name
     deep = _DEEP.fullmatch(name)
     if deep is not None:
-        # ffmpeg's own way to gray mixes colour into it: up to 11 levels of 255.
+        # ffmpeg's conversion to gray mixes in colour: up to 11 levels of 255.
         plane = frame.planes[0]
         stored = np.frombuffer(memoryview(plane), "<u2").reshape(-1, plane.line_size // 2)
         luma = np.rot90(stored[: frame.height, : frame.width], rotation_deg // 90)[window]
@@ -199,7 +199,7 @@ def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np
 
 
 def coloured(shown: NDArray[np.uint8], colour: Colour) -> NDArray[np.uint8]:
-    """Return a picture (h, w) or (h, w, 3) RGB in the form asked for; its transparency is none."""
+    """Return a picture (h, w) or (h, w, 3) RGB in the requested format, opaque."""
     if colour == "gray":
         gray = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY)
         return np.ascontiguousarray(gray, np.uint8)

@@ -40,15 +40,15 @@ _ROOM = 0.25  # of the teeth's extent, left around them
 _LEAST_PX = 32
 _SHOW_PARTLY_S = 0.3  # what takes longer is shown as it comes
 _WHITE: Colour = (240, 240, 240)
-_WIDE_PX = 1200  # narrower bars have a line for each piece of text
+_WIDE_PX = 1200  # narrower bars use one line per piece of text
 _LINE_PX, _LEFT_PX, _GAP_PX, _SWATCH_PX = 26, 10, 34, 14
 _FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.55
 
-Piece = tuple[str, Colour, bool]  # text, its colour, and whether a patch of the colour stands before white text
+Piece = tuple[str, Colour, bool]  # text, its colour, and whether to draw white text after a swatch of the colour
 
 
 class CameraWall:
-    """Draw all cameras side by side.
+    """All cameras of a take side by side.
 
     Attributes:
         size_px: (width, height) of the pictures.
@@ -62,10 +62,10 @@ class CameraWall:
         scans: Sequence[Mesh],
         tile_px: tuple[int, int],
     ) -> None:
-        """Cut the pictures of cameras to the teeth over a take; without tracks they are shown whole.
+        """Crop the pictures of cameras to the teeth over a take; without tracks, show them whole.
 
         Args:
-            cameras: those with a backdrop; the others are shown without scans.
+            cameras: calibrated cameras; others are shown without scans.
             backdrops: pictures by camera.
             scans: teeth scans of the tracks, upper and lower [mm].
             tile_px: (width, height) of each camera's picture.
@@ -91,9 +91,9 @@ class CameraWall:
         """Return the picture of a frame of the reference camera, (h, w, 3) RGB.
 
         Args:
-            scans: what to draw over it.
+            scans: scans to draw.
             fill: opacity of the crowns.
-            partly: called with the picture so far as cameras are decoded, if that takes a while.
+            partly: called with partial pictures while cameras are decoded, if that takes long.
 
         Raises:
             CaptureError: a camera's picture cannot be decoded.
@@ -125,7 +125,7 @@ class CameraWall:
 
 
 class _Cell:
-    """Hold how a part of one camera's pictures fits into a tile."""
+    """The mapping of a region of one camera's pictures to a tile."""
 
     def __init__(self, part: Part, camera: Camera | None, tile_px: tuple[int, int]) -> None:
         x, y, width, height = part
@@ -137,7 +137,7 @@ class _Cell:
         self._camera = None if camera is None else camera.cropped(x, y, (width, height)).scaled(self._size_px)
 
     def draw(self, image: NDArray[np.uint8] | None, scans: Sequence[PlacedScan], fill: float) -> NDArray[np.uint8]:
-        """Return the tile (h, w, 3) of a picture; empty where there is none."""
+        """Return the tile (h, w, 3) of a picture; empty for None."""
         width, height = self._tile_px
         tile = np.full((height, width, 3), EMPTY_GRAY, np.uint8)
         if image is not None:
@@ -152,9 +152,9 @@ class _Cell:
 def _teeth_parts(
     cameras: Mapping[str, Camera], tracks: Tracks, meshes: Sequence[Mesh], aspect: float
 ) -> dict[str, Part]:
-    """Return the part of each camera's pictures that holds the teeth over a take, by name.
+    """Return the region of each camera's pictures that contains the teeth over a take, by name.
 
-    The parts have the aspect (width over height) where the pictures allow it.
+    Regions have the given aspect (width over height) where possible.
     """
     rows = np.unique(np.linspace(0, len(tracks.frames) - 1, _MOST_FRAMES).round().astype(int))
     moved = []
@@ -167,7 +167,7 @@ def _teeth_parts(
 
 
 def _part_around(camera: Camera, world: Array, aspect: float) -> Part:
-    """Return the part around places (F, n, 3) [mm] of many frames, NaN where not known, inside the picture."""
+    """Return the region around points (F, n, 3) [mm] of many frames, NaN where unknown, inside the picture."""
     size = np.array(camera.size_px)
     pixels = camera.project(world)
     pixels[camera.depth(world) <= 0] = np.nan
@@ -184,10 +184,10 @@ def _part_around(camera: Camera, world: Array, aspect: float) -> Part:
 
 
 class StatusBar:
-    """Draw the bar of one take at one width."""
+    """A status bar for one take: frame and time, solved parameters, and a colour legend."""
 
     def __init__(self, tracks: Tracks, fps: float, width_px: int) -> None:
-        """Take the tracks; times count from frame 0 on."""
+        """Prepare the legend; time 0 is at frame 0."""
         self._tracks, self._fps, self._width_px = tracks, fps, width_px
         if tracks.solved is None:
             self._legend: list[Piece] = [("upper teeth", UPPER_COLOUR, True), ("lower teeth", LOWER_COLOUR, True)]

@@ -1,4 +1,4 @@
-"""Map frames, which lie evenly in time, to pictures of a video, which need not."""
+"""Map evenly spaced frames to the pictures of a video, which may be irregular."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from jawusd.base.arrays import Array
 
 
 class Timeline:
-    """Place the pictures of a video on an even grid of frames by their presentation times.
+    """The pictures of a video on a regular grid of frames, by presentation time.
 
-    Frame k is the picture shown k nominal frame durations after the first one. At a constant rate that is picture k;
-    a variable rate leaves frames without a picture.
+    Frame k is the picture shown k nominal frame durations after the first one. At a constant rate that is picture k; at
+    a variable rate some frames have no picture.
 
     Attributes:
         numbers: frame of each picture, increasing, shape (n,).
         count: one past the frame of the last picture.
-        stored: number of each picture in its files, increasing, shape (n,); in a video 0, 1, 2, ...
+        stored: number of each picture in its files, increasing, shape (n,); for videos 0, 1, 2, ...
     """
 
     def __init__(self, times_s: Array, fps: float) -> None:
@@ -26,7 +26,7 @@ class Timeline:
 
     @classmethod
     def of_files(cls, stored: NDArray[np.int64], fps: float) -> Timeline:
-        """Return the line of numbered pictures, (n,) increasing: the first is frame 0, gaps are frames without one."""
+        """Return the timeline of numbered pictures, (n,) increasing: the first is frame 0, gaps have no picture."""
         line = cls.__new__(cls)
         line._set(stored - stored[0], fps, stored)
         return line
@@ -34,26 +34,26 @@ class Timeline:
     def _set(self, numbers: NDArray[np.int64], rate: float, stored: NDArray[np.int64]) -> None:
         self.numbers, self.rate, self.stored = numbers, rate, stored
         self.count = int(numbers[-1]) + 1
-        # Of two pictures in one frame, the first counts.
+        # Of two pictures in one frame, use the first.
         self._picture = dict(zip(numbers[::-1].tolist(), range(len(numbers) - 1, -1, -1)))
 
     @property
     def is_numbered(self) -> bool:
-        """Tell whether the pictures are numbered otherwise than 0, 1, 2, ..."""
+        """Whether the pictures are numbered other than 0, 1, 2, ..."""
         return bool(self.stored[0] != 0 or self.stored[-1] != len(self.stored) - 1)
 
     def number(self, frame: int) -> int | None:
-        """Return the number in its files of the picture shown at a frame; None where there is none."""
+        """Return the file number of the picture shown at a frame, or None."""
         picture = self.picture(frame)
         return None if picture is None else int(self.stored[picture])
 
     @property
     def missing(self) -> int:
-        """Return how many frames have no picture of their own."""
+        """Return the number of frames without a picture."""
         return self.count - len(self._picture)
 
     def picture(self, frame: int) -> int | None:
-        """Return the number of the picture shown at a frame; None outside the video and where there is none."""
+        """Return the index of the picture shown at a frame; None outside the video or without a picture."""
         return self._picture.get(int(frame))
 
 
@@ -62,9 +62,9 @@ def _grid(times_s: Array, fps: float) -> tuple[NDArray[np.int64], float]:
     steps = np.diff(times_s)
     if len(steps) < 2 or not (median := float(np.median(steps))) > 0:
         return np.arange(len(times_s)), fps
-    # Frames next to each other; gaps would bias the mean, rounded time stamps the median.
+    # Use adjacent frames: gaps bias the mean, and rounded time stamps the median.
     period = float(steps[(steps > 0.5 * median) & (steps < 1.5 * median)].mean())
-    last = 16  # jitter still leaves it off by some per mille: fit longer and longer stretches
+    last = 16  # the first estimate has an error of a few per mille by jitter; refine it on growing intervals
     while True:
         stretch = times_s[:last]
         numbers = np.round(stretch / period)

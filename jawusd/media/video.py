@@ -1,8 +1,8 @@
 """Read videos by presentation time with PyAV.
 
-Frame k is the k-th picture in order of presentation, whatever order the file stores them in. The table of times is
-read from the packets once, without decoding; seeking goes to the key frame before and decodes from there, and every
-decoded picture is placed by its time stamp, so that B-frames, edit lists and variable rates cannot shift the count.
+Frame k is the k-th picture in presentation order. The table of times is read once from the packets, without decoding.
+Seeking goes to the previous key frame and decodes from there. Every decoded picture is identified by its time stamp, so
+that B-frames, edit lists and variable rates cannot shift the count.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from jawusd.media.pixels import Colour, ColourPicture, DecodedPicture, Slices, c
 from jawusd.media.timeline import Timeline
 
 _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
-_CUT_OFF = "Copy it again from the camera; a recording that was cut off has to be repaired first."
+_CUT_OFF = "Copy it again from the camera; repair an interrupted recording first."
 # WebM keeps transparency in a second stream, which only these decoders read; announced in the file's meta data.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
-# Decoders that report damage whatever the number of threads. Those that conceal it (H.264, MPEG-4) mark a picture when
+# Decoders that report damage with any number of threads. Those that conceal it (H.264, MPEG-4) mark a picture when
 # it is finished, after threads have handed it out: with eight, a third of what one thread finds in H.264 was missed.
 _THREADED = ("hevc", "prores", "ffv1")
 _PROGRESSIVE = (0, 1)  # FFmpeg's order of fields: not known, or none
 
 
 class Video(Clip):
-    """Give access to the pictures of a video file."""
+    """A video file."""
 
     def __init__(
         self,
@@ -46,11 +46,11 @@ class Video(Clip):
         """Read the table of frames and the first picture.
 
         Args:
-            path: of the file.
-            colour_space, colour_config: of its pictures, if a display does not show them as they are; see `display`.
+            path: the file.
+            colour_space, colour_config: of its pictures, if they are not display-referred; see `display`.
 
         Raises:
-            CaptureError: the file is missing, empty, truncated, not a video, or carries no presentation times.
+            CaptureError: the file is missing, empty, truncated, not a video, or has no presentation times.
         """
         self.path = Path(path)
         self._space = None if colour_space == "display" else colour_space
@@ -76,12 +76,12 @@ class Video(Clip):
             self._alpha_decoder = _ALPHA_DECODERS.get(stream.codec_context.name) if hidden else None
         self.count = len(self._pts)
         if self.count == 0:
-            raise CaptureError("the video holds no pictures.", path=path, hint="Copy it again from the camera.")
+            raise CaptureError("the video has no pictures.", path=path, hint="Copy it again from the camera.")
         if announced > stored:
             raise CaptureError(
                 f"frame {stored} of {announced} cannot be read: the file is truncated.",
                 path=path,
-                hint="Copy it again from the camera, or cut it to the part that is whole.",
+                hint="Copy it again from the camera, or trim it to the intact part.",
             )
         self.keys = np.unique(self._key_before)
         self.start_s = float(self._pts[0] * self._time_base)
@@ -90,7 +90,7 @@ class Video(Clip):
         first = next(self._decode(0, 1, threads=1))[1]
         with naming_file(path):
             self.rotation_deg = turn_deg(first)
-        aspect = float(stored_aspect or 1) or 1.0  # 0 is not known
+        aspect = float(stored_aspect or 1) or 1.0  # 0 means unknown
         self.pixel_aspect = 1 / aspect if self.rotation_deg in (90, 270) else aspect
         turned = self.rotation_deg in (90, 270)
         self.size_px = (first.height, first.width) if turned else (first.width, first.height)
@@ -118,7 +118,7 @@ class Video(Clip):
     def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
         for index, frame in self._decode(first, last, threads, alpha=colour == "rgba"):
             image = self._image(frame, colour, window)
-            image.flags.writeable = False  # the gray buffer may be a reference the decoder still needs
+            image.flags.writeable = False  # the gray buffer may be a decoder reference
             yield VideoFrame(index, float(self.times_s[index]), image)
 
     def _image(self, frame: av.VideoFrame, colour: Colour, window: Slices) -> NDArray[np.uint8]:
@@ -136,15 +136,15 @@ class Video(Clip):
             raise CaptureError(said, path=self.path, hint=hint) from error
         if not container.streams.video:
             container.close()
-            raise CaptureError("the file holds no video stream.", path=self.path, hint="Check capture.toml.")
+            raise CaptureError("the file has no video stream.", path=self.path, hint="Check the path in capture.toml.")
         context = container.streams.video[0].codec_context
         if context is None:
             container.close()
-            raise CaptureError("the pictures are in a codec that is not known here.", path=self.path, hint=_REENCODE)
+            raise CaptureError("the video codec is not supported.", path=self.path, hint=_REENCODE)
         if context.width * context.height > MOST_PX:
             container.close()
             raise CaptureError(
-                f"pictures have {context.width} x {context.height} px, at most {MOST_PX} in all are read.",
+                f"pictures have {context.width} x {context.height} px, at most {MOST_PX} px in total are allowed.",
                 path=self.path,
                 hint="Scale it down.",
             )
@@ -153,9 +153,9 @@ class Video(Clip):
     def _packet_table(
         self, container: av.container.InputContainer, stream: av.VideoStream
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.intp], int]:
-        """Return per picture its time stamp, the time its key frame is decoded at and that frame's number.
+        """Return per picture its time stamp, the decoding time of its key frame and that frame's index.
 
-        Last comes how many pictures the file stores.
+        The last value is the number of stored pictures.
         """
         pts, dts, key, stored = [], [], [], 0
         may_have_checksums = stream.codec_context.name == "ffv1"
@@ -173,7 +173,7 @@ class Video(Clip):
                     dts.append(packet.pts if packet.dts is None else packet.dts)
                     key.append(packet.is_keyframe)
         except av.FFmpegError:
-            # A truncated file: what precedes the break counts; `announced` shows whether more was promised.
+            # Truncated file: use the pictures before the break; `announced` tells whether more were declared.
             pass
         order = np.argsort(pts, kind="stable")
         times = np.array(pts, np.int64)[order]
@@ -182,7 +182,7 @@ class Video(Clip):
         return times, np.array(dts, np.int64)[order][latest], latest, stored
 
     def _decode(self, first: int, last: int, threads: int, alpha: bool = False) -> Iterator[tuple[int, av.VideoFrame]]:
-        """Yield (index, decoded frame) for every index of [first, last), or raise naming the one that is missing."""
+        """Yield (index, decoded frame) for every index of [first, last); raise an error for a missing one."""
         wanted, key, damaged = first, self._pts[self._key_before[first]], False
         broken: set[int] = set()
         with self._open() as container:
@@ -197,7 +197,7 @@ class Video(Clip):
                         return
                     if frame.pts is None or frame.pts < key:
                         continue
-                    damaged = damaged or frame.is_corrupt or frame.pts in broken  # pictures before are referred to
+                    damaged = damaged or frame.is_corrupt or frame.pts in broken  # later pictures may depend on it
                     if frame.pts < self._pts[wanted]:
                         continue
                     if frame.pts > self._pts[wanted] or damaged:
@@ -211,10 +211,10 @@ class Video(Clip):
             raise self._undecodable(wanted)
 
     def _seek(self, container: av.container.InputContainer, stream: av.VideoStream, index: int) -> None:
-        """Go to the last key frame shown no later than a picture, or before it.
+        """Seek to the last key frame shown no later than a picture, or to an earlier one.
 
-        Containers seek by the time a key frame is shown or by that of its decoding; where the first leads past the
-        picture, the second does not. MP4 seeks by the first, and by the second would begin one key frame earlier.
+        Containers seek by presentation or decoding time of a key frame; if the former leads past the picture, the
+        latter does not. MP4 uses presentation time; decoding time would start one key frame too early.
         """
         for time in (self._pts[self._key_before[index]], self._seek_dts[index]):
             container.seek(int(time), stream=stream, backward=True)
@@ -226,10 +226,10 @@ class Video(Clip):
     def _decoded(
         self, container: av.container.InputContainer, stream: av.VideoStream, alpha: bool, first: int, broken: set[int]
     ) -> Iterator[av.VideoFrame]:
-        """Yield what is decoded from here on; pictures before a time stamp only if others are made from them.
+        """Yield decoded pictures from here on; before a time stamp, decode only reference pictures.
 
-        The time stamps of packets that the container or checksums call damaged are added to a set, with those that
-        follow up to the next key frame.
+        Time stamps of packets that are damaged by container flags or checksums are added to a set, together with those
+        up to the next key frame.
         """
         if not (alpha and self._alpha_decoder):
             damaged = False
@@ -256,6 +256,6 @@ class Video(Clip):
 
 
 def _timecode(container: av.container.InputContainer, stream: av.VideoStream) -> str:
-    """Return the time code of the first picture: that of the video, of a track of its own, or of the file."""
+    """Return the time code of the first picture: from the video stream, a time code track, or the file."""
     tables = [stream.metadata, *(other.metadata for other in container.streams), container.metadata]
     return next((table["timecode"] for table in tables if table.get("timecode")), "")

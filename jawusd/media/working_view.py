@@ -14,7 +14,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry.camera import Camera
 from jawusd.media.pixels import ColourPicture, DecodedPicture, Slices
 
-_NODE_PX = 16  # spacing of the map samples that locate a region
+_NODE_PX = 16  # spacing of map samples used to locate a region
 
 
 _Pixel = TypeVar("_Pixel", np.uint8, np.float32)
@@ -28,9 +28,9 @@ def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pi
 
 
 def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return a picture of which only what lies within the sides of positions (h, w, 2) [px] is converted.
+    """Convert only the bounding box of positions (h, w, 2) [px] of a picture.
 
-    The rest is black; memory that nobody touches costs nothing.
+    The rest is black and costs no memory, as untouched pages are not allocated.
     """
     sides = np.concatenate([positions[0], positions[-1], positions[:, 0], positions[:, -1]])
     limit = np.array(picture.shape[1::-1])
@@ -43,11 +43,11 @@ def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[
 
 
 class WorkingView:
-    """Undistort and shrink the pictures of one camera.
+    """Undistortion and downscaling of the pictures of one camera; thread-safe.
 
     A working pixel is the mean of n x n bilinear samples of the recorded picture, n = the reduction rounded up, at the
-    undistorted positions of an n times larger working picture: the same as undistorting at full size and averaging
-    areas, in one interpolation and only where there is something. Safe to use from several threads.
+    undistorted positions of an n times larger working picture. This equals undistortion at full size followed by area
+    averaging, with one interpolation and only where needed.
 
     Attributes:
         camera: the pinhole camera of the working pictures.
@@ -72,17 +72,17 @@ class WorkingView:
         )
         self._map = np.asarray(maps[0], np.float32)
         self._nodes = np.ascontiguousarray(np.moveaxis(self._map[::_NODE_PX, ::_NODE_PX], 2, 0))
-        # No node of a region lies farther from its neighbour than this [px of the recorded picture].
+        # Largest distance between neighbouring nodes [px of the recorded picture].
         steps = [np.abs(np.diff(self._nodes, axis=axis)).max(initial=_NODE_PX) for axis in (1, 2)]
         self._reach_px = float(max(steps)) + 1
 
     def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the covered share of each working pixel, 255 = all, (h, w), of a recorded mask (H, W).
+        """Return the coverage of each working pixel, 255 = full, (h, w), from a recorded mask (H, W).
 
-        Only the surroundings of what is not black are touched.
+        Only the surroundings of non-black pixels are processed.
 
         Raises:
-            ValueError: the mask has not the size of the recorded pictures.
+            ValueError: the mask does not have the size of the recorded pictures.
         """
         self._check(mask)
         width, height = self.camera.size_px
@@ -96,27 +96,27 @@ class WorkingView:
         """Return a recorded picture, (H, W) or (H, W, 3), at the working size; black where nothing was recorded.
 
         Raises:
-            ValueError: the picture has not the size of the recorded ones.
+            ValueError: the picture does not have the recorded size.
         """
         self._check(image)
         width, height = self.camera.size_px
         return self._averaged(image, (slice(0, height), slice(0, width)))
 
     def light(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return recorded light (H, W, 3) without distortion, at its own size; 0 where none was recorded.
+        """Return undistorted light of recorded light (H, W, 3), at full size; 0 where nothing was recorded.
 
         Raises:
-            ValueError: the picture has not the size of the recorded ones, or the view is smaller than they are.
+            ValueError: the picture does not have the recorded size, or the view is smaller.
         """
         if image.shape[1::-1] != self.source.size_px or self._map.shape[1::-1] != self.source.size_px:
-            raise ValueError(f"light must be of {self.source.size_px} px and stay so, got {image.shape}")
+            raise ValueError(f"light must have {self.source.size_px} px, as the view, got {image.shape}")
         return remap(image, self._map)
 
     def part(self, image: ColourPicture, window: Slices) -> NDArray[np.uint8]:
-        """Return the part of `picture` at rows and columns whose start and stop lie inside it.
+        """Return the part of `picture` at rows and columns inside it.
 
         Raises:
-            ValueError: the picture has not the size of the recorded ones.
+            ValueError: the picture does not have the recorded size.
         """
         self._check(image)
         return self._averaged(image, window)
@@ -142,8 +142,8 @@ class WorkingView:
             return None
         cols = np.flatnonzero(mask[rows[0] : rows[-1] + 1].max(axis=0))
         reach, (x, y) = np.float32(self._reach_px), self._nodes
-        # Within the reach of the box there is at least one node beyond each of its sides; the ring of cells around
-        # those nodes therefore holds the box.
+        # There is at least one node beyond each side of the box within reach, so the ring of cells around those nodes
+        # contains the box.
         across: Mask = (x >= cols[0] - reach) & (x <= cols[-1] + reach)
         inside: Mask = across & (y >= rows[0] - reach) & (y <= rows[-1] + reach)
         spans = []
@@ -160,11 +160,11 @@ class WorkingView:
 def warp_nearest(
     picture: NDArray[np.uint8] | NDArray[np.float32], to_picture: Array, out: NDArray[np.uint8] | NDArray[np.float32]
 ) -> None:
-    """Write what lies nearest to where each pixel comes from, 0 beyond the picture.
+    """Resample by nearest neighbour through an affine map; 0 outside the picture.
 
     Args:
         picture: shape (H, W).
-        to_picture: from pixels of `out` to those of the picture, shape (2, 3).
-        out: receives, of the picture's type, shape (h, w).
+        to_picture: maps pixels of `out` to those of the picture, shape (2, 3).
+        out: output, of the picture's dtype, shape (h, w).
     """
     cv2.warpAffine(picture, to_picture, out.shape[::-1], out, cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)

@@ -20,9 +20,9 @@ _QUALITY = 95
 
 
 class VideoWriter:
-    """Write pictures to a video, one after the other, as a context manager.
+    """Writer of a video, as a context manager.
 
-    The file gets its name when the block ends without an exception; otherwise there is none.
+    The file appears under its name only if the block succeeds.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class VideoWriter:
             stream = container.add_stream("ffv1" if self._lossless else "libx264", rate=self._rate)
             stream.width, stream.height = self._size_px
             stream.pix_fmt = "gray" if self._lossless else "yuv420p"
-            # Every FFV1 picture a key frame: seeking costs nothing and a broken byte spoils one picture.
+            # Only key frames in FFV1: fast seeking, and damage affects one picture.
             stream.options = {"level": "3", "g": "1"} if self._lossless else {"crf": str(self._crf)}
             self._stream = stream
             self._next = 0
@@ -98,18 +98,18 @@ class VideoWriter:
 
 
 class PlateWriter:
-    """Undistort the pictures of one camera at full size and write them as JPEG, or light as EXR.
+    """Writer of the undistorted pictures of one camera at full size, as JPEG, or EXR for light.
 
-    A plate has the intrinsics K and the size of the recorded picture, so that the same pinhole camera fits it; the
-    corners that the lens did not record are black.
+    A plate has the intrinsics K and size of the recorded picture, so that the same pinhole camera applies; corners that
+    were not recorded are black.
     """
 
     def __init__(self, camera: Camera) -> None:
-        """Take the calibrated camera."""
+        """Prepare the undistortion of a camera."""
         self._view = WorkingView(camera, camera.size_px)
 
     def write(self, path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
-        """Write the plate of a recorded picture (h, w, 3) RGB.
+        """Undistort and write a recorded picture (h, w, 3) RGB.
 
         Raises:
             OutputError: the file cannot be written.
@@ -118,7 +118,7 @@ class PlateWriter:
         write_bytes_atomic(path, cv2.imencode(".jpg", plate, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
 
     def write_light(self, path: str | os.PathLike[str], image: NDArray[np.float32]) -> None:
-        """Write the plate of light (h, w, 3) RGB as EXR of half floats, ZIP compressed.
+        """Undistort and write light (h, w, 3) RGB as EXR of half floats, ZIP compressed.
 
         Raises:
             OutputError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Scans and bones: reading, crown labels, the rasteriser, solids and how they touch.
+"""Scans and bones: reading, crown labels, rasterisation, solids, collision and contact.
 
-Knows nothing of pictures, cameras' files or tracking.
+May not import `media`, `capture` or `tracking`.
 """

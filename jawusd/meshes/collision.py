@@ -1,4 +1,4 @@
-"""How deep two solids run into each other, for many poses of one against the other."""
+"""Penetration depth of two solids over many relative poses."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from jawusd.geometry.points import welded
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.meshes.solid import DistanceGrid, distance_grid, outer_faces
 
-#: Surfaces farther apart than this count as this far apart [mm].
+#: Largest distance that is measured [mm].
 FARTHEST_MM = 1.5
-#: Between the distances to a surface as curved as teeth are.
+#: Default grid step for surfaces with the curvature of teeth [mm].
 STEP_MM = 0.25
 
-_SAMPLE_MM = 0.5  # samples of a face lie no farther apart
-_BOXES_MM = (4.8, 2.4, 1.2, 0.6)  # edges, each in the one before
-_PARTS = 16  # of many poses, for threads
+_SAMPLE_MM = 0.5  # largest spacing of surface samples
+_BOXES_MM = (4.8, 2.4, 1.2, 0.6)  # edge lengths of nested boxes
+_PARTS = 16  # chunks of poses, for threads
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points of a surface in a tree of boxes, so that those far away are passed over at once.
+    """Points of a surface in a tree of boxes, so that distant points are skipped together.
 
     Attributes:
         points: in order of the smallest boxes [mm], shape (P, 3).
@@ -45,7 +45,7 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """One of two solids: its distances and its samples, in its own frame (y vertical)."""
+    """A solid: its distance grid and surface samples, in its own frame (y vertical)."""
 
     grid: DistanceGrid
     samples: Samples
@@ -54,13 +54,13 @@ class Solid:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two solids that face each other, the upper one at rest."""
+    """Two opposing solids, the upper one fixed."""
 
     upper: Solid
     lower: Solid
 
     def depth(self, T_upper_lower: Array) -> Array:
-        """Return how deep the surfaces run into each other [mm], shape (n,), in poses (n, 4, 4).
+        """Return the penetration depth of the surfaces [mm], shape (n,), in poses (n, 4, 4).
 
         The largest distance of a point of one surface inside the other solid to that solid's surface; negative, down to
         -`FARTHEST_MM`, where they are apart.
@@ -68,11 +68,11 @@ class Pair:
         return self._deepest(T_upper_lower, -FARTHEST_MM, np.inf)
 
     def is_deeper(self, T_upper_lower: Array, limit_mm: float) -> Mask:
-        """Return where `depth` is more than a limit, shape (n,), without measuring by how much."""
+        """Return where `depth` exceeds a limit, shape (n,), faster than by computing it."""
         return self._deepest(T_upper_lower, max(limit_mm, -FARTHEST_MM), limit_mm) > limit_mm
 
     def _deepest(self, T_upper_lower: Array, least: float, enough: float) -> Array:
-        """Return the depths where these are more than the least [mm], shape (n,); past `enough`, any such value."""
+        """Return the depths [mm], shape (n,), at least `least`; values above `enough` are not exact."""
         there = np.ascontiguousarray(T_upper_lower)
         back = np.ascontiguousarray(se3_inverse(there))
         found = np.full(len(there), least)
@@ -98,7 +98,7 @@ def distances(grid: DistanceGrid, points: Array) -> Array:
 
 
 def tips_box(corners: Array, up: float, height_mm: float) -> Array:
-    """Return the box (2, 3) [mm] around a solid from its tips so far towards its base; see `solid`."""
+    """Return the box (2, 3) [mm] around a solid, from its tips to `height_mm` towards its base; see `solid`."""
     box = np.array([corners.min(axis=(0, 1)) - FARTHEST_MM, corners.max(axis=(0, 1)) + FARTHEST_MM])
     if up > 0:
         box[1, 1] = min(box[1, 1], box[0, 1] + height_mm + FARTHEST_MM)
@@ -117,14 +117,14 @@ def solid(corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> So
         step_mm: between its distances, which are linear in between.
     """
     outer, entering = outer_faces(corners, up)
-    # Linear between values, distances are exact up to the farthest if values are across a diagonal beyond.
+    # Interpolation is exact up to FARTHEST_MM if values extend one cell diagonal beyond.
     grid = distance_grid(corners, outer, box, step_mm, up, FARTHEST_MM + 3.0**0.5 * step_mm)
     near = ((corners <= box[1]) & (corners >= box[0])).all(axis=2).any(axis=1)
     return Solid(grid, in_boxes(surface_points(corners[outer & near], _SAMPLE_MM)), entering)
 
 
 def surface_points(corners: Array, apart_mm: float) -> Array:
-    """Return points (P, 3) [mm] of triangles (F, 3, 3) no farther apart than given, corners among them."""
+    """Sample triangles (F, 3, 3) with a largest spacing; return points (P, 3) [mm], including corners."""
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     parts = np.maximum(np.ceil(longest / apart_mm), 1).astype(int)
     found = [np.empty((0, 3))]
@@ -136,7 +136,7 @@ def surface_points(corners: Array, apart_mm: float) -> Array:
 
 
 def in_boxes(points: Array) -> Samples:
-    """Return points (P, 3) [mm] in a tree of boxes."""
+    """Arrange points (P, 3) [mm] in a tree of boxes."""
     cells = [np.floor(points / edge).astype(np.int64) for edge in _BOXES_MM]
     order = np.lexsort([column for cell in reversed(cells) for column in cell.T])
     points = np.ascontiguousarray(points[order])
@@ -151,14 +151,14 @@ def in_boxes(points: Array) -> Samples:
 
 
 def _firsts(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return where the rows (P, k) change, and P at the end."""
+    """Return the indices where the rows (P, k) change, and P."""
     changes = np.ones(len(keys), dtype=bool)
     changes[1:] = (keys[1:] != keys[:-1]).any(axis=1)
     return np.append(np.flatnonzero(changes), len(keys))
 
 
 def _balls(points: Array, start: NDArray[np.int64]) -> Array:
-    """Return balls (n, 4) around runs of points: centre, radius [mm]."""
+    """Return bounding balls (n, 4) of runs of points: centre, radius [mm]."""
     if not len(points):
         return np.empty((0, 4))
     count = np.diff(start)
@@ -168,7 +168,7 @@ def _balls(points: Array, start: NDArray[np.int64]) -> Array:
 
 
 class _Field(NamedTuple):
-    """A distance grid as compiled functions take it: its values in a row, how many along each axis, origin, 1/step."""
+    """A distance grid for compiled functions: flat values, number along each axis, origin, 1/step."""
 
     values: NDArray[np.float32]
     nx: int
@@ -196,7 +196,7 @@ def _look_up(field: _Field, x: float, y: float, z: float) -> float:
     i, j, k = int(fx), int(fy), int(fz)
     a, b, c = fx - i, fy - j, fz - k
     values = field.values
-    # unsigned: of signed numbers it is looked at every time whether they count from the end
+    # unsigned indices avoid numba's check for negative ones
     one, row, layer = np.uint64(1), np.uint64(nz), np.uint64(ny * nz)
     at = np.uint64((i * ny + j) * nz + k)
     low = (values[at] * (1 - c) + values[at + one] * c) * (1 - b) + (
@@ -228,7 +228,7 @@ def _away(field: _Field, M: Array, x: float, y: float, z: float) -> float:
 
 @numba.njit(nogil=True, cache=True)
 def _deepest_of(field: _Field, M: Array, points: Array, first: int, end: int, best: float) -> float:
-    """Return how deep the deepest of some points is under M, or `best` if none is deeper."""
+    """Return the depth of the deepest point under M, or `best` if none is deeper."""
     for p in range(first, end):
         best = max(best, -_away(field, M, points[p, 0], points[p, 1], points[p, 2]))
     return best
@@ -238,11 +238,11 @@ def _deepest_of(field: _Field, M: Array, points: Array, first: int, end: int, be
 def _deepen(
     depth: Array, T: Array, enough: float, field: _Field, points: Array, balls: Array, nodes: NDArray[np.int64]
 ) -> None:
-    """Raise each depth to that of the deepest of the points under T[i], or to any that is more than enough."""
+    """Raise each depth to that of the deepest point under T[i], or to any value above `enough`."""
     last = 0
     for i in range(len(T) if len(nodes) else 0):
         M = T[i]
-        # what was deepest in the pose before comes first: it leaves most others behind
+        # start with the deepest point of the previous pose, which prunes most others
         best = _deepest_of(field, M, points, nodes[last, 0], nodes[last, 1], depth[i])
         n = 0
         while n < len(nodes) and best <= enough:

@@ -17,48 +17,48 @@ from jawusd.formats.mesh import BASE, DEEP, TOUCHING, Mesh
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.meshes.collision import FARTHEST_MM, STEP_MM, Pair, Solid, distances, solid, tips_box
 
-_CROWN_MM = 14.0  # from the tips of the teeth to where gums begin, at most
-_LEAST_WOUND = 0.6  # share of lines that enter a scan where they first meet it; 0.93 and more for scans wound alike
+_CROWN_MM = 14.0  # largest height of crowns above the gum
+_LEAST_WOUND = 0.6  # share of lines that enter a scan at the first crossing; 0.93 and more for consistent winding
 _WIDEST_GAP_MM = 1.0
 _DEEPEST_MM = 2.5
 _COARSEST_MM = 1.5
 
-_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # of teeth
-_CLOSE_MM = 1.0  # larger clearances are taken from the coarser field; twice what errors are measured below
-_BEYOND_MM = 1.0  # outside the bound, still sampled
-_FREE_MM = 0.8  # surfaces so far apart at all valid parameters of larger openings end the field
-_ERROR_SAMPLES = 30000  # all over the field; one in twenty is of a valid pose of close teeth
+_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # field step and largest opening for teeth
+_CLOSE_MM = 1.0  # larger clearances use the coarse field; twice the clearance up to which errors are measured
+_BEYOND_MM = 1.0  # margin sampled outside the bound
+_FREE_MM = 0.8  # the field ends at the opening from which all valid poses have this clearance
+_ERROR_SAMPLES = 30000  # over the whole field; one in twenty is a valid pose with close teeth
 _CAPTURED_QUANTILE = 0.01
 _LARGEST_LIMIT_MM = 1.0
 Picture = NDArray[np.uint8]
 
 _ENAMEL, _PAPER = np.array([236.0, 229.0, 212.0]), 255
 _LIGHT = np.array([0.3, 0.87, -0.4])
-_FLOOR_MM = 11.0  # below the tips, what is seen is gum or nothing
+_FLOOR_MM = 11.0  # depth below the tips that is shown; deeper is gum or nothing
 
 
 class NoContact(Exception):
-    """The scans do not show how the teeth meet; the message says why."""
+    """The scans do not allow computing contacts; the message gives the reason."""
 
 
 class Surfaces(Protocol):
-    """Surfaces of skull and mandible that meet: teeth, or condyles and their fossae."""
+    """Opposing surfaces of skull and mandible: teeth, or condyles and fossae."""
 
     @property
     def closed_mm(self) -> float:
-        """How deep they run into each other in the closed bite."""
+        """Penetration depth in the closed bite."""
 
     def clearances(self, T_skull_mandible: Array) -> Array:
-        """Return what they leave [mm], shape (n,), in poses (n, 4, 4), compared with the closed bite."""
+        """Return the clearance [mm], shape (n,), in poses (n, 4, 4), relative to the closed bite."""
 
 
 @dataclass(frozen=True, eq=False)
 class Teeth:
-    """Both rows of teeth in the anatomical frame, the lower ones in the closed bite.
+    """Both arches in the anatomical frame, the lower one in the closed bite.
 
     Attributes:
         pair: Both as solids.
-        closed_mm: How deep they run into each other in the closed bite; negative if they leave a gap.
+        closed_mm: Penetration depth in the closed bite; negative for a gap.
         T_anatomical_skull: Skull to anatomical coordinates, shape (4, 4).
         T_rest: T_skull_mandible of the closed bite, shape (4, 4).
     """
@@ -69,30 +69,30 @@ class Teeth:
     T_rest: Array
 
     def clearances(self, T_skull_mandible: Array) -> Array:
-        """Return the clearance [mm], shape (n,), of poses (n, 4, 4): closed bite's depth less theirs."""
+        """Return the clearance [mm], shape (n,), of poses (n, 4, 4): depth of the closed bite minus theirs."""
         A = self.T_anatomical_skull
         return self.closed_mm - self.pair.depth(A @ T_skull_mandible @ se3_inverse(A @ self.T_rest))
 
 
 def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Array) -> Teeth:
-    """Return both rows of teeth as solids.
+    """Return both arches as solids.
 
     Args:
         upper: Upper scan, skull frame [mm].
         lower: Lower scan, mandible frame [mm].
 
     Raises:
-        NoContact: A scan is too coarse or wound at random, or there is no closed bite.
+        NoContact: A scan is too coarse or inconsistently wound, or there is no closed bite.
     """
     placed = (("upper", upper, T_anatomical_skull, 1.0), ("lower", lower, T_anatomical_skull @ T_rest, -1.0))
-    with ThreadPoolExecutor(len(placed)) as pool:  # most of the work is done without Python's lock
+    with ThreadPoolExecutor(len(placed)) as pool:  # most of the work releases the GIL
         pair = Pair(*pool.map(lambda row: _solid(*row), placed))
     closed = float(pair.depth(np.eye(4)[None])[0])
     if closed < -_WIDEST_GAP_MM:
-        raise NoContact(f"the closed bite leaves more than {_WIDEST_GAP_MM:g} mm between the rows of teeth")
+        raise NoContact(f"the closed bite leaves more than {_WIDEST_GAP_MM:g} mm between the arches")
     if closed > _DEEPEST_MM:
         raise NoContact(
-            f"in the closed bite the teeth run {closed:.1f} mm into each other (at most {_DEEPEST_MM:g} mm is allowed)"
+            f"in the closed bite the teeth penetrate each other by {closed:.1f} mm (at most {_DEEPEST_MM:g} mm allowed)"
         )
     return Teeth(pair, closed, T_anatomical_skull, T_rest)
 
@@ -102,34 +102,34 @@ def _solid(name: str, mesh: Mesh, T: Array, up: float) -> Solid:
     corners = transform_points(T, mesh.vertices)[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     if not len(corners) or np.median(edges) > _COARSEST_MM:
-        raise NoContact(f"the {name} scan is coarse: edges of {np.median(edges) if len(edges) else 0:.1f} mm")
+        raise NoContact(f"the {name} scan is too coarse: edges of {np.median(edges) if len(edges) else 0:.1f} mm")
     return wound_solid(f"{name} scan", corners, up, tips_box(corners, up, _CROWN_MM))
 
 
 def wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> Solid:
-    """Return the solid of triangles wound either way, see `jawusd.meshes.collision.solid`.
+    """Return the solid of triangles of either winding, see `jawusd.meshes.collision.solid`.
 
     Raises:
-        NoContact: They are not wound alike; naming the mesh.
+        NoContact: The winding is inconsistent; the message names the mesh.
     """
     found = solid(corners, up, box, step_mm)
-    if found.entering < 0.5:  # wound the other way round
+    if found.entering < 0.5:  # inside out
         found = solid(np.ascontiguousarray(corners[:, ::-1]), up, box, step_mm)
     if found.entering < _LEAST_WOUND:
-        raise NoContact(f"the triangles of the {name} are not wound alike")
+        raise NoContact(f"the triangles of the {name} are not consistently wound")
     return found
 
 
 def sample_field(
     surfaces: Surfaces, rig: JawRig, step_mm: float = _STEP_MM, most_opening_mm: float = _MOST_OPENING_MM
 ) -> ContactField:
-    """Sample the clearance of a rig's poses over its bound, finely where surfaces are close.
+    """Sample the clearance of a rig's poses over its bound, with a finer step where surfaces are close.
 
     Args:
-        surfaces: What meets.
+        surfaces: The opposing surfaces.
         rig: The rig.
-        step_mm: Between values; those of surfaces that are apart are measured twice as far from each other.
-        most_opening_mm: Where the field ends, if the surfaces have not parted before.
+        step_mm: Grid step; twice this where the surfaces are apart.
+        most_opening_mm: Largest opening of the field, if the surfaces have not separated before.
     """
     box = _box(surfaces, rig, step_mm, most_opening_mm)
     field = _sampled(surfaces, rig, box, step_mm, _sampled(surfaces, rig, box, 2.0 * step_mm))
@@ -142,7 +142,7 @@ def sample_field(
 def _sampled(
     surfaces: Surfaces, rig: JawRig, box: Array, step_mm: float, coarse: ContactField | None = None
 ) -> ContactField:
-    """Sample the clearance over a box (3, 2) [mm]; given a coarse field, anew only where that says surfaces are close.
+    """Sample the clearance over a box (3, 2) [mm]; with a coarse field, resample only where it shows close surfaces.
 
     0 is one of the values along every axis, so that the closed bite is exact.
     """
@@ -164,7 +164,7 @@ def _sampled(
 
 
 def _box(surfaces: Surfaces, rig: JawRig, step_mm: float, most_opening_mm: float) -> Array:
-    """Return the parameters (3, 2) [mm] that the field spans: those near the bound at which surfaces are close."""
+    """Return the parameter range (3, 2) [mm] of the field: near the bound, where surfaces are close."""
     wide = rig.d_range + np.array([-_BEYOND_MM, _BEYOND_MM])
     wide[0, 1] = min(wide[0, 1], most_opening_mm)
     axes = [np.linspace(low, high, n) for (low, high), n in zip(wide, (33, 9, 7))]
@@ -209,15 +209,15 @@ class _Arch:
 
 
 class ContactMap:
-    """Draw the marks of any pose on the teeth of one person."""
+    """Pictures of the contacts of one subject's teeth in any pose, like articulating paper."""
 
     def __init__(self, teeth: Teeth) -> None:
-        """Look at both arches."""
+        """Prepare both arches."""
         self._teeth = teeth
         self._arches = _arch(teeth.pair.upper, 1.0), _arch(teeth.pair.lower, -1.0)
 
     def draw(self, T_skull_mandible: Array) -> Picture:
-        """Return the upper arch beside the lower one, fronts up, the subject's left on the right, RGB (h, w, 3)."""
+        """Return the arches side by side, front teeth at the top, subject's left on the right, RGB (h, w, 3)."""
         A, pair = self._teeth.T_anatomical_skull, self._teeth.pair
         T = A @ T_skull_mandible @ se3_inverse(A @ self._teeth.T_rest)
         upper, lower = self._arches
@@ -232,7 +232,7 @@ class ContactMap:
     def _picture(self, arch: _Arch, apart: Array) -> Picture:
         colors = arch.shade[:, None] * _ENAMEL
         closed = max(self._teeth.closed_mm, 0.0)
-        apart = apart + min(self._teeth.closed_mm, 0.0)  # scans that leave a gap in the closed bite touch there
+        apart = apart + min(self._teeth.closed_mm, 0.0)  # a gap between the scans in the closed bite counts as contact
         for mark in reversed(TOUCHING):
             colors[apart < mark.apart_mm] = mark.color
         colors[apart < DEEP.apart_mm - closed] = DEEP.color
@@ -242,7 +242,7 @@ class ContactMap:
 
 
 def _arch(solid: Solid, up: float) -> _Arch:
-    """Return where vertical lines from the other jaw first meet a solid."""
+    """Return the first intersections of a solid with vertical lines from the other jaw."""
     grid = solid.grid
     values = grid.values if up > 0 else grid.values[:, ::-1]
     inside = values < 0
@@ -250,7 +250,7 @@ def _arch(solid: Solid, up: float) -> _Arch:
     i, k = np.nonzero(inside.any(axis=1) & (layer > 0))
     j = layer[i, k]
     before, after = values[i, j - 1, k].astype(float), values[i, j, k].astype(float)
-    place = j - after / (after - before)  # of the surface, in layers
+    place = j - after / (after - before)  # position of the surface, in layers
     row = place if up > 0 else values.shape[1] - 1 - place
     height = np.full(values.shape[::2], np.nan)
     height[i, k] = place * grid.step_mm

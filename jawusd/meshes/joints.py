@@ -1,7 +1,7 @@
-"""How the condyles of a person meet their fossae: bone of mandible and skull around both joints as solids.
+"""Condyles and fossae of a subject: bone of mandible and skull around both joints as solids.
 
-Bones are not what touches in a joint: cartilage and disc lie between, which scans do not show, and condyles are where
-errors of tracking and model are largest. So what is measured here is reported and refuses no pose.
+In a joint, cartilage and disc separate the bones and are not in the scans, and tracking and model errors are largest at
+the condyles. Clearances are therefore reported, but never used to reject poses.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.meshes.collision import FARTHEST_MM, Pair
 from jawusd.meshes.contact import NoContact, wound_solid
 
-#: Between sampled clearances.
+#: Step of sampled clearances [mm].
 STEP_MM = 0.8
 
-_GRID_MM = 0.5  # between distances to bone: curved less than teeth; against 0.25, clearances differ by 0.014 at most
+_GRID_MM = 0.5  # step of the distance grid; clearances differ from those at 0.25 by at most 0.014 mm
 _CONDYLES = [index for index, name in enumerate(LANDMARKS) if name.startswith("condyle")]  # left, right
-_CONDYLE_MM = 10.0  # around the condyle's landmark: its head, no coronoid process
-_REACH_MM = 26.0  # so far the head slides, forward beyond the eminence
-_COARSEST_MM = 4.0  # of edges: a condyle is some 8 mm deep
+_CONDYLE_MM = 10.0  # radius around the landmark that contains the condylar head but not the coronoid process
+_REACH_MM = 26.0  # largest translation of the head, forward beyond the eminence
+_COARSEST_MM = 4.0  # largest edge; a condyle is about 8 mm deep
 _FEWEST_FACES = 30
-_DEEPEST_MM, _WIDEST_MM = 2.5, 8.0  # of the condyle in the skull, and from it, in the closed bite
+_DEEPEST_MM, _WIDEST_MM = 2.5, 8.0  # largest penetration of and distance to the skull in the closed bite
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +49,11 @@ class Joints:
 
     @property
     def closed_mm(self) -> float:
-        """How deep the deeper condyle runs into the skull in the closed bite."""
+        """Penetration depth of the deeper condyle in the closed bite."""
         return float(self.closed.max())
 
     def clearances(self, T_skull_mandible: Array) -> Array:
-        """Return what both condyles leave [mm], shape (n,), in poses (n, 4, 4).
+        """Return the smaller clearance of both condyles [mm], shape (n,), in poses (n, 4, 4).
 
         Below 0 where one runs into the skull, deeper than in the closed bite.
         """
@@ -84,7 +84,7 @@ def find_joints(skull: Mesh, mandible: Mesh, landmarks: Array, T_anatomical_skul
         _check_near(pair, depth)
     if closed.max() > _DEEPEST_MM:
         raise NoContact(
-            f"in the closed bite a condyle runs {closed.max():.1f} mm into the skull (at most {_DEEPEST_MM:g} mm)"
+            f"in the closed bite a condyle penetrates the skull by {closed.max():.1f} mm (at most {_DEEPEST_MM:g} mm)"
         )
     return Joints((left, right), closed, T_anatomical_skull, T_rest)
 
@@ -99,7 +99,7 @@ def _joint(above: Array, below: Array, head: Array) -> Pair:
 
 
 def _check_near(pair: Pair, depth_mm: float) -> None:
-    """Raise NoContact where a condyle, so deep in the skull, is far from it."""
+    """Raise NoContact if a condyle is too far from the skull, given its penetration depth."""
     if depth_mm > -FARTHEST_MM:
         return
     gap, _ = cKDTree(pair.upper.samples.points).query(pair.lower.samples.points)
@@ -108,10 +108,10 @@ def _check_near(pair: Pair, depth_mm: float) -> None:
 
 
 def _check_fine(name: str, corners: Array, box: Array) -> None:
-    """Raise NoContact where a bone is missing or coarse in a box (2, 3) [mm]."""
+    """Raise NoContact if a bone is missing or too coarse in a box (2, 3) [mm]."""
     part = corners[((corners >= box[0]) & (corners <= box[1])).all(axis=2).any(axis=1)]
     if len(part) < _FEWEST_FACES:
         raise NoContact(f"the {name} has no bone at the condyles")
     edge = float(np.median(np.linalg.norm(part - np.roll(part, 1, axis=1), axis=2)))
     if edge > _COARSEST_MM:
-        raise NoContact(f"the {name} is coarse at the condyles: edges of {edge:.1f} mm")
+        raise NoContact(f"the {name} is too coarse at the condyles: edges of {edge:.1f} mm")

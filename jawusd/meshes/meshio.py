@@ -23,34 +23,34 @@ from jawusd.formats.mesh_ply import read_ply
 from jawusd.formats.mesh_stl import read_stl
 from jawusd.geometry.points import welded
 
-# People who read scans with this module label them next; scripts outside the package import both from here.
+# Re-exported for scripts that read and label scans.
 __all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]
 
-_NO_FACES = "Export the surface, not a point cloud, under a name that says its format."
+_NO_FACES = "Export the surface, not a point cloud, with the suffix of its format."
 # Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch has about 80, a mandible 165, a skull 290.
 _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
 
 
-@np.errstate(invalid="ignore", over="ignore")  # damaged numbers are named, where faces use them
+@np.errstate(invalid="ignore", over="ignore")  # damaged vertices are reported below if faces use them
 def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
-    """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM, its vertices in the order of the file.
+    """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM; vertices keep the file's order.
 
-    Larger polygons are cut into triangles; STL files, which share no vertices, give three per triangle. Materials and
-    textures are not read, the places of corners in a texture are, of OBJ and PLY. A closed mesh that is inside out has
-    its triangles turned; open ones stay as they are. A vertex that no face uses keeps its number, but lies where one
-    lies that a face uses. The kind, teeth scan or bone, sets which sizes are accepted.
+    Polygons are triangulated; STL files give three vertices per triangle. Texture coordinates are read from OBJ and
+    PLY; materials and textures are ignored. Closed meshes that are inside out are flipped. Unused vertices keep
+    their index but move to the position of a used one. The kind, teeth scan or bone, sets the accepted range of
+    sizes.
 
     Raises:
-        CaptureError: the file is missing, damaged, cut off or too large, holds no triangles or coordinates that are not
-            finite, or is of a size that cannot be in mm.
+        CaptureError: the file is missing, damaged, truncated or too large, has no triangles or non-finite coordinates,
+            or has a size that cannot be in mm.
         MissingDependencyError: the mesh is a DCM file and open3sdcm is not installed.
     """
     path = Path(path)
     check_input(path, CaptureError)
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise CaptureError(f"meshes are read from {', '.join(MESHES)} files.", path=path, hint="Convert the mesh.")
+        raise CaptureError(f"meshes must be {', '.join(MESHES)} files.", path=path, hint="Convert the mesh.")
     try:
         if (said := why_unreadable(path)) is not None:
             raise CaptureError(said[0], path=path, hint=said[1])
@@ -60,7 +60,7 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     except (OSError, ValueError, OverflowError) as error:
         raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it again.") from error
     if len(data.faces) == 0:
-        raise CaptureError("the file holds no triangles.", path=path, hint=_NO_FACES)
+        raise CaptureError("the file has no triangles.", path=path, hint=_NO_FACES)
     return _checked(path, data, kind)
 
 
@@ -77,7 +77,7 @@ def _read_dcm(path: Path) -> MeshData:
         found = open3sdcm.load(str(path))
         vertices, faces = np.array(found.vertices, np.float64), np.array(found.faces).astype(np.int64)
         texture, corners = found.texture, found.uv
-    except Exception as error:  # its parser reports damaged and encrypted files by exceptions of its own
+    except Exception as error:  # the parser raises its own exceptions for damaged and encrypted files
         raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it as PLY or STL.") from error
     return MeshData(vertices, faces, _texture_colors(texture, corners, faces, len(vertices)))
 
@@ -88,7 +88,7 @@ _READERS = {".ply": read_ply, ".stl": read_stl, ".obj": read_obj, ".dcm": _read_
 def _texture_colors(
     texture: bytes | None, corners: Array | None, faces: NDArray[np.int64], count: int
 ) -> NDArray[np.uint8] | None:
-    """Return the colour of every vertex: of a texture (JPEG) at its last corner's place (u to the right, v upwards)."""
+    """Return vertex colours sampled from a texture (JPEG) at the last corner of each vertex (u right, v up)."""
     if texture is None or corners is None or len(corners) != faces.size:
         return None
     image = cv2.imdecode(np.frombuffer(texture, np.uint8), cv2.IMREAD_COLOR)
@@ -108,7 +108,7 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
     outside = np.flatnonzero(((faces < 0) | (faces >= len(data.vertices))).any(axis=1))
     if outside.size:
         raise CaptureError(
-            f"triangle {outside[0]} names a vertex that does not exist; there are {len(data.vertices)}.",
+            f"triangle {outside[0]} refers to a vertex that does not exist; there are {len(data.vertices)}.",
             path=path,
             hint="Export the mesh again.",
         )
@@ -127,7 +127,8 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
         unit = min(fitting, key=fitting.__getitem__) if fitting else ""
         guess = f" It looks like {unit}." if fitting and low <= diagonal * _UNITS_MM[unit] <= high else ""
         raise CaptureError(
-            f"the mesh is {diagonal:.4g} mm across its bounding box, a {kind} has {low:g} to {high:g} mm.{guess}",
+            f"the mesh is {diagonal:.4g} mm across its bounding box; allowed for a {kind} is {low:g} to "
+            f"{high:g} mm.{guess}",
             path=path,
             hint="Lengths must be in mm: scale the mesh and export it again.",
         )
@@ -139,19 +140,19 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
 
 
 class Winding(NamedTuple):
-    """Say how the triangles of a mesh are turned."""
+    """Winding of a mesh."""
 
-    closed: bool  # every edge is shared by exactly two triangles that run along it in opposite directions
+    closed: bool  # every edge is shared by exactly two triangles, with opposite directions
     outward: bool  # triangles are counter-clockwise seen from outside; a strong hint only, unless the mesh is closed
     volume_mm3: float  # signed volume, positive if outward
 
 
 def winding(mesh: Mesh) -> Winding:
-    """Find out whether a mesh is closed and which way its triangles are turned.
+    """Determine whether a mesh is closed and how its triangles are wound.
 
     The signed volume is the sum of the tetrahedra over the triangles with the centroid as apex (C. Zhang, T. Chen,
-    "Efficient feature extraction for 2D/3D objects in mesh representation", ICIP 2001). Vertices at the same place
-    count as one.
+    "Efficient feature extraction for 2D/3D objects in mesh representation", ICIP 2001). Coincident vertices count as
+    one.
     """
     places, index = welded(mesh.vertices)
     faces = index[mesh.faces]

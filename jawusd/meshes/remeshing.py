@@ -13,13 +13,13 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import GUM, TOOTH, Mesh, crown_face_mask
 from jawusd.geometry.points import welded
 
-# By how much the parts of a surface that meet in one point only are moved apart [mm]: validators take points at the
-# very same place for a seam that somebody forgot to merge.
+# Offset between parts of a surface that touch in a single point [mm]: validators report coincident points as unmerged
+# seams.
 _APART_MM = 1e-3
 
 
 def decimated(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Array, NDArray[np.int32]]:
-    """Return vertices (V', 3) and about `count` of the faces (F, 3) of a surface (V, 3); open borders stay in place.
+    """Return vertices (V', 3) and about `count` faces of a surface (V, 3), (F, 3); open borders are preserved.
 
     Quadric edge collapse (Garland & Heckbert 1997).
     """
@@ -34,7 +34,7 @@ def decimated(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Ar
 
 
 def proxy_of(mesh: Mesh, count: int) -> Mesh:
-    """Return a mesh of about `count` faces, and one more for each edge of a border; crowns and gum stay apart.
+    """Return a mesh of about `count` faces, plus one per border edge; crowns and gum stay separate.
 
     Borders, that between crown and gum among them, stay where they are. Labels say what is crown; colours and texture
     coordinates are left out.
@@ -51,7 +51,7 @@ def proxy_of(mesh: Mesh, count: int) -> Mesh:
 
 
 def bone_proxy_of(mesh: Mesh, count: int) -> Mesh:
-    """Return a bone of about `count` faces as a manifold: where it is porous, collapsed edges pinch it."""
+    """Return a bone of about `count` faces, repaired to a manifold after edge collapse."""
     return manifold(proxy_of(mesh, count))
 
 
@@ -64,7 +64,7 @@ def _border_edges(faces: NDArray[np.int32]) -> int:
 def decimated_scan(
     vertices: Array, crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32], crown_count: int
 ) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
-    """Return vertices, about `crown_count` crown faces, and gum faces fewer by the same share.
+    """Return vertices, about `crown_count` crown faces, and gum faces reduced by the same ratio.
 
     The line between crown and gum stays where it is.
     """
@@ -72,17 +72,17 @@ def decimated_scan(
     parts = [decimated(vertices, faces, int(share * len(faces))) for faces in (crown_faces, gum_faces)]
     points = np.concatenate([p for p, _ in parts])
     crowns, gum = parts[0][1], parts[1][1] + len(parts[0][0])
-    # The border exists on both sides; merged, it is the crown-gum line again.
+    # Merge the duplicated border of both sides back into the crown-gum line.
     places, index = welded(points)
     index = index.astype(np.int32)
     return places, np.ascontiguousarray(index[crowns]), np.ascontiguousarray(index[gum])
 
 
 def manifold(mesh: Mesh) -> Mesh:
-    """Return a surface as a manifold, of the same shape but for what cannot be one.
+    """Return a surface repaired to a manifold.
 
-    Points at the same place are merged, empty and repeated faces dropped; where more than two faces meet in an edge,
-    the smallest ones go; linked faces are wound consistently; parts that touch only in a point get a point each.
+    Coincident points are merged, degenerate and duplicate faces dropped; at edges of more than two faces, the smallest
+    are removed; connected faces are wound consistently; parts that touch in a single point get separate points.
     """
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     surface.merge_vertices()
@@ -106,7 +106,7 @@ def _surplus_faces(surface: trimesh.Trimesh) -> Mask:
 
 
 def _unpinched(vertices: Array, faces: NDArray[np.int64], surface: trimesh.Trimesh) -> tuple[Array, NDArray[np.int64]]:
-    """Return vertices and faces with a vertex of its own for every fan of faces around a point."""
+    """Return vertices and faces with a separate vertex for every fan of faces around a point."""
     corners = np.arange(faces.size).reshape(faces.shape)
     linked = []
     for (a, b), edge in zip(surface.face_adjacency, surface.face_adjacency_edges, strict=True):

@@ -18,53 +18,53 @@ from jawusd.meshes.scan_surface import ScanSurface
 from jawusd.meshes.scan_tops import Tops, biting_direction, topped_by, tops
 from jawusd.meshes.scan_walk import CreaseWalk
 
-# From corner to corner of its box, a crown with what a scan keeps of its root and gum is smaller than this, the gum of
-# an arch or a quadrant larger [mm].
+# Bounding box diagonal: crowns, including scanned root and gum, are smaller; the gum of an arch or quadrant is larger
+# [mm].
 _TOOTH_MM = 30.0
-_FEWEST_FACES = 100  # with fewer there is no shape to tell anything from, nor an arch to track
-# From corner to corner of its box the smallest crown; smaller pieces are scraps and brackets, which get the label of
-# what they lie at [mm].
+_FEWEST_FACES = 100  # fewer faces cannot be labelled or tracked
+# Bounding box diagonal of the smallest crown; smaller components are scraps and brackets, which take the label of their
+# neighbours [mm].
 _CROWN_MM = 4.0
-# The lowest part of a piece, from which the walker may start as from gum if there is no surer gum [share of height].
+# Lowest part of a component, used as gum seeds if there are no better ones [share of height].
 _LOWEST = 0.12
-# How readily walks leave a highest place for the gum, per mm of its outline [1/mm]: 0.003 (median) to 0.030 at crowns,
-# 0.026 to 0.074 at ridges without teeth, which mostly lie below the hull of the arch (40 scans of one surface).
+# Rate at which walks leave a crown top for the gum, per mm of its outline [1/mm]: 0.003 (median) to 0.030 at crowns,
+# 0.026 to 0.074 at ridges without teeth, which are mostly below the hull of the arch (40 scans of one surface).
 _LEAVING, _DOUBT_PER_MM, _MOST_DOUBT_MM = 0.06, 3.0, 0.6
-# Share of a piece's border without a crease, median over an arch: 0.02 to 0.162 where crowns carry a collar of gum (58
-# scans of synthetic persons of 5,000 faces and more), 0.8 to 1.0 at plain synthetic crowns; 0.24 to 0.34 at real ones,
-# 0.167 once when seen from the roots, whose grooves and necks look like short creases.
+# Share of a component's border without a crease, median over an arch: 0.02 to 0.162 for crowns with a collar of gum (58
+# scans of synthetic subjects with 5,000 faces and more), 0.8 to 1.0 for plain synthetic crowns, 0.24 to 0.34 for real
+# ones, and 0.167 in one scan seen from the roots, whose grooves and necks resemble short creases.
 _MOST_WEAK = 0.165
-_COARSE_MM = 1.2  # edges of this length hide a gum line [mm]: what looks like crowns alone may have one
-# Pieces that begin this far above the lower end of the crown they lie at are on it (brackets), not around it (gum)
+_COARSE_MM = 1.2  # edge length that hides a gum line: apparent crowns may contain gum
+# Components that start this far above the lower end of the adjacent crown are attached to it (brackets), not gum
 # [share of the crown's height].
 _ON_CROWN = 0.2
-# Colours are used where the redness of the highest places and of places far from them differs by so many of its
-# standard deviations there; stone casts and untextured scans stay below.
+# Least difference in redness between the highest points and points far from them, in standard deviations, for colours
+# to be used; stone casts and untextured scans stay below.
 _LEAST_CONTRAST = 4.0
-_FAR_BELOW_MM = 9.0  # below the highest place around, few crowns go on
+_FAR_BELOW_MM = 9.0  # depth below the highest point nearby, beyond most crowns
 _FEWEST = 50  # vertices of either kind
 _GRAIN = 0.003  # of 8 bit colours
 
 
 @dataclass(frozen=True, eq=False)
 class Labelling:
-    """Hold what the shape of a scan says."""
+    """Labels of a scan from its shape."""
 
     labels: NDArray[np.uint8]  # GUM or TOOTH per vertex of the scan, shape (V,)
     up: Array  # the direction in which the crowns point, shape (3,)
-    # share of the border between crown and gum on one surface that runs along no crease, 0 .. 1; 0 without a border,
-    # 1 where the faces are too large to show one
+    # share of the crown-gum border that does not follow a crease, 0 .. 1; 0 without a border, 1 if the faces are too
+    # large to show creases
     weak_share: float
 
 
 def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
-    """Tell crown and gum of a teeth scan apart by its shape, and by its colours where crowns and gum differ in them.
+    """Separate crown and gum of a teeth scan by its shape, and by its colours where these differ.
 
-    A scan of crowns alone is crown all over.
+    A scan of crowns only is entirely crown.
 
     Args:
         mesh: the scan [mm].
-        towards: middle of the other arch in the same frame, teeth in occlusion, shape (3,); None if not known.
+        towards: centre of the other arch in the same frame, teeth in occlusion, shape (3,), or None.
     """
     surface = ScanSurface.of(mesh)
     if len(surface.faces) < _FEWEST_FACES:
@@ -83,7 +83,7 @@ def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
 
 
 def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) -> tuple[Mask, float]:
-    """Return which vertices are crown, shape (v,), and the weak share of the border on pieces that carry both."""
+    """Return which vertices are crown, shape (v,), and the weak share of the border on mixed components."""
     piece, extent = surface.piece, _extent_mm(surface)
     small = extent < _TOOTH_MM
     starts = np.bincount(piece, seen.crown, len(extent))
@@ -114,7 +114,7 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
 
 
 def _carried(surface: ScanSurface, up: Array, crowns: Mask, others: Mask) -> Mask:
-    """Return which of other pieces (P,) sit on one of the crowns that are pieces of their own (P,), shape (P,)."""
+    """Return which other components (P,) sit on a crown that is a separate component, shape (P,)."""
     out = np.zeros(len(others), dtype=bool)
     if not crowns.any() or not others.any():
         return out
@@ -131,7 +131,7 @@ def _carried(surface: ScanSurface, up: Array, crowns: Mask, others: Mask) -> Mas
 
 
 def _extent_mm(surface: ScanSurface) -> Array:
-    """Return the diagonal of the box around every piece [mm], shape (P,)."""
+    """Return the bounding box diagonal of every component [mm], shape (P,)."""
     count = int(surface.piece.max()) + 1
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, surface.piece, surface.vertices)
@@ -140,7 +140,7 @@ def _extent_mm(surface: ScanSurface) -> Array:
 
 
 def _height_share(surface: ScanSurface, up: Array) -> Array:
-    """Return the height of every vertex in its piece, from 0 at its lowest to 1 at its highest place, shape (v,)."""
+    """Return the relative height of every vertex in its component, 0 lowest to 1 highest, shape (v,)."""
     height = surface.vertices @ up
     count = int(surface.piece.max()) + 1
     low, high = np.full(count, np.inf), np.full(count, -np.inf)
@@ -150,7 +150,7 @@ def _height_share(surface: ScanSurface, up: Array) -> Array:
 
 
 def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
-    """Return the crowns with scraps counted to whatever larger piece they lie at."""
+    """Return the crowns with scraps assigned to the adjacent larger component."""
     scrap = (_extent_mm(surface) < _CROWN_MM)[surface.piece]
     if not scrap.any() or scrap.all():
         return crown
@@ -161,9 +161,9 @@ def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
 
 
 def crown_by_colour(colors: NDArray[np.uint8], surface: ScanSurface, seen: Tops) -> Array | None:
-    """Return how likely each vertex of the surface is crown by its colour, 0 .. 1, shape (v,).
+    """Return the probability that each vertex of the surface is crown by its colour, 0 .. 1, shape (v,).
 
-    None where the colours say nothing.
+    None if the colours are not informative.
 
     Args:
         colors: red, green, blue per vertex of the scan, shape (V, 3).

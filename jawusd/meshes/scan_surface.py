@@ -1,4 +1,4 @@
-"""A teeth scan as one clean surface: points merged, empty and repeated faces dropped, pieces and creases found."""
+"""A teeth scan as a clean surface: points merged, degenerate and duplicate faces dropped; components and creases."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array, Indices
 from jawusd.formats.mesh import Mesh
 
-# Normals are averaged over about this length before curvature is taken [mm]: scanners round creases by some tenths of
-# a millimetre and leave waves of some hundredths, which finer meshes show.
+# Normals are averaged over this length before computing curvature [mm]: scanners round creases by some tenths of a
+# millimetre and leave ripples of some hundredths.
 _SCALE_MM = 0.35
 _MOST_ROUNDS = 12
-_FINE_MM = 0.4  # edges up to this length show creases in the vertex normals; from twice that the folds do [mm]
-_SEEN_MM = 0.75  # size of the cells in which the highest faces are what is seen from above
+_FINE_MM = 0.4  # edges up to this length use vertex normals for creases, edges of twice this use face angles [mm]
+_SEEN_MM = 0.75  # cell size for visibility from above
 
 
 @dataclass(frozen=True, eq=False)
 class ScanSurface:
-    """Hold a scan with shared vertices."""
+    """A scan with shared vertices."""
 
     vertices: Array  # [mm], shape (v, 3)
     faces: NDArray[np.int64]  # shape (f, 3)
-    of_vertex: Indices  # vertex here of every vertex of the scan, shape (V,)
-    piece: Indices  # connected piece of every vertex, shape (v,)
-    merged: int  # vertices of the scan that lay at the place of another one
-    empty: int  # faces without area that were dropped
-    repeated: int  # faces that were there twice
+    of_vertex: Indices  # surface vertex of every scan vertex, shape (V,)
+    piece: Indices  # connected component of every vertex, shape (v,)
+    merged: int  # number of coincident scan vertices
+    empty: int  # number of dropped degenerate faces
+    repeated: int  # number of dropped duplicate faces
 
     @classmethod
     def of(cls, mesh: Mesh) -> ScanSurface:
@@ -43,7 +43,7 @@ class ScanSurface:
         faces = faces[solid]
         used = np.zeros(len(vertices), dtype=bool)
         used[faces] = True
-        if used.any() and not used.all():  # vertices of no face count as the nearest one of the surface
+        if used.any() and not used.all():  # unused vertices map to the nearest surface vertex
             number = np.cumsum(used) - 1
             number[~used] = cKDTree(vertices[used]).query(vertices[~used])[1]
             vertices, index, faces = vertices[used], number[index], number[faces]
@@ -69,7 +69,7 @@ class ScanSurface:
         )
 
     def edges(self) -> Indices:
-        """Return every edge once, as two vertices, shape (E, 2)."""
+        """Return the unique edges, shape (E, 2)."""
         n = len(self.vertices)
         pairs = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         return np.stack(np.divmod(np.unique(pairs[:, 0] * n + pairs[:, 1]), n), axis=1)
@@ -79,9 +79,9 @@ class ScanSurface:
         return float(np.median(np.linalg.norm(self.vertices[edges[:, 0]] - self.vertices[edges[:, 1]], axis=1)))
 
     def wound(self, up: Array) -> ScanSurface:
-        """Return the surface with those pieces turned whose faces look inwards; `up` (3,) is the occlusal direction.
+        """Return the surface with inward-facing components flipped; `up` (3,) is the occlusal direction.
 
-        What is seen of a piece from above, it alone, must look upwards.
+        The part of a component that is visible from above must face upwards.
         """
         corners = self.vertices[self.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -110,13 +110,13 @@ class ScanSurface:
         edges = self.edges()
         length = self.edge_mm(edges)
         mean = averaging(edges, n)
-        # One round of averaging spreads by about 0.7 edges, rounds add up like variances.
+        # One averaging step has a standard deviation of about 0.7 edges; variances add.
         for _ in range(int(np.clip(round(2 * (_SCALE_MM / max(length, 1e-6)) ** 2), 0, _MOST_ROUNDS))):
             normals = mean @ normals
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
     def creases(self, edges: Indices) -> Array:
-        """Return how sharply the surface is bent inwards around every vertex [1/mm], shape (v,), >= 0.
+        """Return the inward curvature at every vertex [1/mm], shape (v,), >= 0.
 
         This is minus the smaller principal curvature, where that is negative, by Taubin's tensor of the normal
         curvatures along the edges ("Estimating the tensor of curvature of a surface from a polyhedral approximation",
@@ -146,7 +146,7 @@ class ScanSurface:
         return np.maximum(np.maximum(-least, 0.0), coarse * self._folds() / _SCALE_MM)
 
     def _folds(self) -> Array:
-        """Return the largest angle by which two faces are folded inwards at every vertex [rad], shape (v,), >= 0."""
+        """Return the largest inward fold angle between two faces at every vertex [rad], shape (v,), >= 0."""
         n = len(self.vertices)
         corners = self.vertices[self.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -166,7 +166,7 @@ class ScanSurface:
 
 
 def merged_places(vertices: Array) -> tuple[Array, Indices]:
-    """Return the different places (v, 3) among vertices (V, 3), and the place of every vertex, shape (V,)."""
+    """Return the unique positions (v, 3) of vertices (V, 3), and the index for every vertex, shape (V,)."""
     order = np.lexsort(vertices.T)
     ranked = vertices[order]
     new = np.r_[True, (ranked[1:] != ranked[:-1]).any(axis=1)]
@@ -185,7 +185,7 @@ def averaging(edges: Indices, count: int) -> csr_array:
 
 
 def _tangents(normals: Array) -> tuple[Array, Array]:
-    """Return two directions at right angles to unit normals (v, 3) and to each other."""
+    """Return two orthonormal tangents of unit normals (v, 3)."""
     helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     one = np.cross(normals, helper)
     one /= np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-12)

@@ -1,4 +1,4 @@
-"""Where the biting side of an arch is, and which places of a scan surely belong to crowns or surely to gum."""
+"""The occlusal direction of an arch, and seed points of a scan that are certainly crown or gum."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from scipy.spatial import ConvexHull, QhullError
 from jawusd.base.arrays import Array, Indices, Mask
 
 _CELL_MM = 0.75
-# A crown's highest place lies within this distance in plan of any other place of it: half of a wide molar.
+# Largest distance in plan of a crown's points from its highest point: half of a wide molar.
 _REACH_MM = 4.5
-# What lies this little below the highest place around is crown: worn crowns stand out by 3 mm and more.
+# Points up to this depth below the highest point nearby are crown: even worn crowns protrude by 3 mm.
 _BAND_MM = 1.5
-# Highest places lie this little below the hull of the arch, which a curve of Spee or an open bite leaves by 3 to 4 mm;
-# ridges where teeth are missing lie deeper.
+# Largest depth of crown tops below the hull of the arch: a curve of Spee or an open bite causes 3 to 4 mm; ridges
+# without teeth are deeper.
 _UNDER_HULL_MM = 4.5
-# Farther than this from every highest place in plan, or this deep, is no crown any more.
+# Points farther than this from every crown top in plan, or deeper, are not crown.
 _ASIDE_MM, _DEEP_MM = 5.0, 13.0
-_LEVEL = 0.95  # cosine of the steepest slope of the hull that teeth make among themselves
+_LEVEL = 0.95  # cosine of the steepest slope of the hull between teeth
 _ROUNDS = 3
-_MIDDLE_CELLS = 2  # around a piece's middle in plan
+_MIDDLE_CELLS = 2  # cells around a component's centre in plan
 
 
 @dataclass(frozen=True, eq=False)
 class Tops:
-    """Hold how the vertices of an arch lie to its highest places."""
+    """Position of the vertices of an arch relative to its highest points."""
 
-    below: Array  # depth below the highest place around [mm], shape (v,)
-    top_depth: Array  # depth of that highest place below the hull of the arch [mm], shape (v,)
-    crown: Mask  # surely crown, shape (v,)
-    gum: Mask  # surely gum, shape (v,)
+    below: Array  # depth below the highest point nearby [mm], shape (v,)
+    top_depth: Array  # depth of that point below the hull of the arch [mm], shape (v,)
+    crown: Mask  # certainly crown, shape (v,)
+    gum: Mask  # certainly gum, shape (v,)
 
 
 def biting_direction(points: Array, towards: Array | None) -> Array:
@@ -40,14 +40,14 @@ def biting_direction(points: Array, towards: Array | None) -> Array:
 
     Args:
         points: vertices of the arch, shape (v, 3).
-        towards: middle of the other arch, shape (3,), in the same frame with the teeth in occlusion; without it the
-            side is taken on which the surface is more uneven.
+        towards: centre of the other arch, shape (3,), in the same frame with the teeth in occlusion; without it, the
+            rougher side of the surface is used.
     """
     middle = points.mean(axis=0)
     _, size, axes = np.linalg.svd(points - middle, full_matrices=False)
     if towards is not None and np.linalg.norm(towards - middle) > _BAND_MM:
         away = (towards - middle) / np.linalg.norm(towards - middle)
-        # Of the thin directions, since an overjet sets the arches apart along the bite as well.
+        # Project onto the thin directions, since an overjet also displaces the arches along the occlusal plane.
         nearest = axes[(np.abs(axes @ away) / np.maximum(size, 1e-9)).argmax()]
         up = nearest * np.sign(nearest @ away)
     else:
@@ -62,13 +62,13 @@ def biting_direction(points: Array, towards: Array | None) -> Array:
 
 
 def _roughness(points: Array, up: Array) -> float:
-    """Return how unevenly the upper side of points seen along a direction (3,) stands below its hull [mm]."""
+    """Return the roughness of the upper side of points along a direction (3,), relative to its hull [mm]."""
     seen = tops(points, up)
     return float(np.std(seen.top_depth[seen.below < _BAND_MM]))
 
 
 def tops(points: Array, up: Array) -> Tops:
-    """Find the highest places of an arch along the direction `up` (3,) among points (v, 3)."""
+    """Find the highest points of an arch along the direction `up` (3,) among points (v, 3)."""
     cells, height, heights = _height_map(points, up)
     radius = round(_REACH_MM / _CELL_MM)
     row, column = np.mgrid[-radius : radius + 1, -radius : radius + 1]
@@ -85,10 +85,10 @@ def tops(points: Array, up: Array) -> Tops:
 
 
 def topped_by(points: Array, up: Array, piece: Indices) -> Mask:
-    """Return which pieces have nothing of other pieces above their own middle, shape (P,).
+    """Return which components have no other component above their centre, shape (P,).
 
     Args:
-        piece: number of the piece of every point, shape (v,).
+        piece: component of every point, shape (v,).
     """
     cells, height, heights = _height_map(points, up)
     count = int(piece.max()) + 1
@@ -115,7 +115,7 @@ def _height_map(points: Array, up: Array) -> tuple[Indices, Array, Array]:
 
 
 def _hull_height(heights: Array) -> Array:
-    """Return the height of the level upper side of the convex hull over every cell of a map, of its shape."""
+    """Return the height of the level part of the upper convex hull over every cell of a map."""
     filled = np.argwhere(np.isfinite(heights))
     places = np.column_stack([filled * _CELL_MM, heights[tuple(filled.T)]])
     out = np.full(heights.shape, np.nan)
@@ -124,7 +124,7 @@ def _hull_height(heights: Array) -> Array:
     except (QhullError, ValueError):  # a flat or tiny piece
         out[tuple(filled.T)] = places[:, 2].max()
         return out
-    # Steep sides lead down to a palate, a fold or a base plate beside the teeth; level ones are carried on over them.
+    # Steep hull facets lead down to palate, folds or base plate beside the teeth; extend the level facets over them.
     level = planes[:, 2] > _LEVEL
     planes = planes[level] if level.any() else planes[planes[:, 2].argmax()][None]
     over = -(places[:, :2] @ planes[:, :2].T + planes[:, 3]) / planes[:, 2]

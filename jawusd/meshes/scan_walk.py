@@ -1,7 +1,7 @@
-"""Find the line between crown and gum on one surface: a random walker that hardly steps across creases.
+"""Find the line between crown and gum on one surface: a random walker that rarely crosses creases.
 
-The walker (Grady, "Random walks for image segmentation", PAMI 2006) starts where the surface is surely crown or surely
-gum; a vertex is crown if a walk from it meets crown first.
+Seeds of the walker (Grady, "Random walks for image segmentation", PAMI 2006) are certainly crown or gum; a vertex is
+crown if a walk from it is more likely to reach crown first.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.meshes.scan_surface import ScanSurface
 
-# Steps become e times rarer per 1/_SHYNESS_MM of inward curvature.
-_SHYNESS_MM = 2.5
-_SHARPEST = 3.0  # sharper creases count like this one [1/mm]
-# Share of a walker's steps that end at once, in crown or gum as the colour of the place says.
+# Decay of step weights with inward curvature, exp(-_CREASE_DECAY_MM * curvature).
+_CREASE_DECAY_MM = 2.5
+_SHARPEST = 3.0  # upper limit of curvature [1/mm]
+# Share of steps that end in crown or gum according to the local colour.
 _COLOUR_WEIGHT = 0.02
-_COLOUR_STEP = 0.3  # a difference of the likelihood of crown between neighbours that supports a border
+_COLOUR_STEP = 0.3  # difference of crown probability between neighbours that supports a border
 _TOLERANCE, _STEPS = 1e-3, 600
-# A border along a weaker crease is hardly supported by the shape.
+# Borders along weaker creases count as weak.
 _EVIDENCE, _EVIDENCE_REACH_MM = 0.6, 0.5  # [1/mm], [mm]
 
 
 class CreaseWalk:
-    """Walk over one surface."""
+    """Random walks on one surface."""
 
     def __init__(self, surface: ScanSurface, by_colour: Array | None = None) -> None:
-        """Find the creases; `by_colour` is how likely each vertex is crown by its colour, 0 .. 1, shape (v,)."""
+        """Find the creases; `by_colour` is the crown probability by colour per vertex, 0 .. 1, shape (v,)."""
         self._surface, self.by_colour = surface, by_colour
         self.edges = surface.edges()
         self.crease = surface.creases(self.edges)
@@ -40,9 +40,9 @@ class CreaseWalk:
         """Return which vertices are crown, shape (v,).
 
         Args:
-            up, down: where walks start as from crown and as from gum, shape (v,).
-            most_leaving: parts of `up` that walks leave for the gum more readily than this per mm of their outline,
-                meeting no crease, are ridges of gum and given up [1/mm], shape (v,).
+            up, down: seeds of crown and gum, shape (v,).
+            most_leaving: largest rate at which walks leave a part of `up` for the gum, per mm of its outline [1/mm],
+                shape (v,). Parts above it have no crease around them: they are gum ridges and discarded as seeds.
         """
         share = self._meeting(up, down)
         leaking = self._leaking(share, up, most_leaving)
@@ -64,16 +64,16 @@ class CreaseWalk:
         return across, cKDTree(sharp).query(middle)[0] > _EVIDENCE_REACH_MM
 
     def _stepping(self) -> csr_array:
-        """Return how readily the walker steps between vertices: cotangent weights, less across creases, (v, v)."""
+        """Return the step weights between vertices: cotangent weights, reduced across creases, (v, v)."""
         surface, crease, parts = self._surface, self.crease, []
         corners = surface.vertices[surface.faces]
         for k in range(3):
             i, j = surface.faces[:, (k + 1) % 3], surface.faces[:, (k + 2) % 3]
             one, two = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
             area = np.maximum(np.linalg.norm(np.cross(one, two), axis=1), 1e-9)
-            # Limits keep slivers from tearing the surface apart or gluing it together.
+            # Clamp the weights of slivers.
             weight = np.clip(np.einsum("ij,ij->i", one, two) / area, 0.05, 3.0) / 2
-            weight *= np.exp(-_SHYNESS_MM * np.minimum(0.5 * (crease[i] + crease[j]), _SHARPEST))
+            weight *= np.exp(-_CREASE_DECAY_MM * np.minimum(0.5 * (crease[i] + crease[j]), _SHARPEST))
             parts.append((i, j, weight))
         rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
         n = len(surface.vertices)
@@ -81,7 +81,7 @@ class CreaseWalk:
         return csr_array(one_way + one_way.T)
 
     def _meeting(self, up: Mask, down: Mask) -> Array:
-        """Return how likely a walker from every vertex meets `up` before `down`, shape (v,)."""
+        """Return the probability that a walk from every vertex reaches `up` before `down`, shape (v,)."""
         share = np.where(up, 1.0, np.where(down, 0.0, 0.5))
         free, fixed = ~(up | down), up | down
         if not free.any() or not up.any() or not down.any():
@@ -97,7 +97,7 @@ class CreaseWalk:
         return share
 
     def _leaking(self, share: Array, up: Mask, most_leaving: Array) -> Mask:
-        """Return the starts, in connected parts, that walks leave for the gum too readily, shape (v,)."""
+        """Return the seeds in connected parts that walks leave for the gum too often, shape (v,)."""
         part = parts(self.edges, up)
         count = int(part.max(initial=-1)) + 1
         steps = coo_array(self._weights)
@@ -105,7 +105,7 @@ class CreaseWalk:
         leaving = (part[inside] >= 0) & (part[outside] < 0)
         i, j = inside[leaving], outside[leaving]
         flow = np.bincount(part[i], steps.data[leaving] * (1.0 - share[j]), count)
-        # A step crosses about as much of the outline as it is long.
+        # A step crosses about its own length of outline.
         length = np.linalg.norm(self._surface.vertices[i] - self._surface.vertices[j], axis=1)
         outline = np.maximum(np.bincount(part[i], length, count), 1e-9)
         number = np.maximum(np.bincount(part[i], minlength=count), 1)
@@ -113,7 +113,7 @@ class CreaseWalk:
         return np.asarray((part >= 0) & (flow / outline > most)[part])
 
     def _without_islands(self, crown: Mask, up: Mask, down: Mask) -> Mask:
-        """Return the crowns without islands: parts of either label in which no walk starts become the other one."""
+        """Return the crowns without islands: parts of either label without seeds get the other label."""
         for label, start in ((True, up), (False, down)):
             part = parts(self.edges, crown == label)
             started = np.zeros(int(part.max(initial=-1)) + 2, dtype=bool)
@@ -123,7 +123,7 @@ class CreaseWalk:
 
 
 def parts(edges: Indices, chosen: Mask) -> Indices:
-    """Return the number of the connected part of every chosen vertex, counted from 0, -1 of the others, shape (v,)."""
+    """Return the connected part of every chosen vertex, from 0, and -1 for others, shape (v,)."""
     inside = edges[chosen[edges].all(axis=1)]
     links = coo_array((np.ones(len(inside), np.int8), (inside[:, 0], inside[:, 1])), shape=(len(chosen),) * 2)
     part = connected_components(links, directed=False)[1]

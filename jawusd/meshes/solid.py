@@ -1,9 +1,9 @@
-"""Signed distances to what a scan encloses, on a grid: negative inside the crowns, also of scans that are open above.
+"""Signed distance grids of scans, negative inside the crowns; scans may be open at the base.
 
-The inside of a scan is found along vertical lines that come from the other jaw: a line is inside wherever it has
-entered more surfaces than it has left (the winding number of closed surfaces; Jacobson et al. 2013, ACM TOG 32:33, on
-why counts and not parity stand overlapping parts). It needs no closed surface, only one whose triangles are wound
-alike. Faces that lie inside other parts, as where neighbouring teeth overlap, are no surface and left out.
+Inside and outside are found along vertical lines from the other jaw: a line is inside where it has entered more
+surfaces than it has left. This winding number, unlike parity, handles overlaps (Jacobson et al. 2013, ACM TOG 32:33).
+The surface need not be closed, but must be consistently wound. Faces inside other parts, as where neighbouring teeth
+overlap, are ignored.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.meshes.spreading import spread
 
 _BUCKET_MM = 1.0
-_BAND_CELLS = 3.0  # cells around each triangle whose distance to it is computed, the others take a nearby triangle
+_BAND_CELLS = 3.0  # cells around each triangle with exact nearest triangles; others are propagated
 _DIAGONAL_CELLS = 3.0**0.5
-_OFF_FACE_MM = 0.01  # how far before a face its outside is looked at
-_JITTER_MM = np.array([1.23e-4, 0.0, 2.71e-4])  # lines through vertices and edges of round coordinates are ambiguous
+_OFF_FACE_MM = 0.01  # offset from a face for testing its outside
+_JITTER_MM = np.array([1.23e-4, 0.0, 2.71e-4])  # keeps lines from hitting vertices and edges at round coordinates
 _MOST_CROSSINGS = 256
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceGrid:
-    """Hold signed distances on a grid.
+    """Signed distances on a grid.
 
     Attributes:
-        origin: of the first value [mm], shape (3,).
-        step_mm: between values, along every axis.
+        origin: position of the first value [mm], shape (3,).
+        step_mm: grid step along every axis.
         values: signed distances [mm], negative inside, shape (nx, ny, nz), float32.
     """
 
@@ -42,7 +42,7 @@ class DistanceGrid:
 
 
 class _Columns(NamedTuple):
-    """The triangles over every square of the (x, z) plane: numbers of those over square i are list[start[i]:end[i]]."""
+    """Triangles by cells of the (x, z) plane: those over cell i are list[start[i]:end[i]]."""
 
     low: Array
     shape: tuple[int, int]
@@ -51,15 +51,15 @@ class _Columns(NamedTuple):
 
 
 def outer_faces(corners: Array, up: float) -> tuple[Mask, float]:
-    """Tell which faces bound a solid that is open to one side, and how well they are wound.
+    """Find the faces that bound a solid open at one side, and check their winding.
 
     Args:
-        corners: of the triangles [mm], shape (F, 3, 3), y vertical.
+        corners: triangles [mm], shape (F, 3, 3), y vertical.
         up: 1.0 if the solid is entered upwards (upper teeth), -1.0 if downwards (lower teeth).
 
     Returns:
-        Outer faces, shape (F,); and the share of vertical lines that enter the solid where they first meet it: 1 for
-        triangles that are counter-clockwise seen from outside, 0 for the opposite.
+        Outer faces, shape (F,); and the share of vertical lines that enter the solid at the first crossing: 1 for
+        triangles counter-clockwise seen from outside, 0 for the opposite.
     """
     flipped = _upwards(corners, up)
     columns = _columns_of(flipped)
@@ -73,17 +73,17 @@ def outer_faces(corners: Array, up: float) -> tuple[Mask, float]:
 
 
 def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: float, far_mm: float) -> DistanceGrid:
-    """Sample the signed distance to a solid: near its surface to rounding, farther away at times a little too large.
+    """Sample the signed distance to a solid: exact near its surface, sometimes slightly too large farther away.
 
-    More than 0.01 mm in 0.4 % of values 0.5 to 1 mm inside teeth, in 2 % of those 1 to 2 mm inside, 0.12 at most.
+    The error exceeds 0.01 mm for 0.4 % of values 0.5 to 1 mm inside teeth, 2 % of those 1 to 2 mm inside, 0.12 at most.
 
     Args:
-        corners: of all triangles [mm], shape (F, 3, 3), y vertical, counter-clockwise seen from outside.
-        outer: those that bound the solid, see `outer_faces`, shape (F,).
-        box: what the grid spans, rows low and high [mm], shape (2, 3).
-        step_mm: between values.
+        corners: all triangles [mm], shape (F, 3, 3), y vertical, counter-clockwise seen from outside.
+        outer: faces that bound the solid, see `outer_faces`, shape (F,).
+        box: extent of the grid, rows low and high [mm], shape (2, 3).
+        step_mm: grid step.
         up: see `outer_faces`.
-        far_mm: values outside the solid that are farther from it may be less than their distance, but not than this.
+        far_mm: distances outside the solid above this need not be exact, but stay at least this large.
     """
     nx, ny, nz = (int(n) for n in np.ceil((box[1] - box[0]) / step_mm) + 1)
     kept = np.ascontiguousarray(corners[outer])
@@ -97,14 +97,14 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
 
 
 def _walls(corners: Array, origin: Array, step: float, shape: tuple[int, ...]) -> Array:
-    """Return the first and last cells, shape (2, 3), of axes along which triangles go on beyond, else infinity."""
+    """Return the first and last cells, shape (2, 3), along axes where triangles extend beyond it, else infinity."""
     last = np.array(shape) - 1
     low, high = (corners.reshape(-1, 3) - origin).min(axis=0), (corners.reshape(-1, 3) - origin).max(axis=0)
     return np.array([np.where(low < 0, 0.0, -np.inf), np.where(high > step * last, last, np.inf)])
 
 
 def _upwards(corners: Array, up: float) -> Array:
-    """Return triangles with the open side up, wound as they were."""
+    """Return triangles with the open side up and the same winding."""
     if up > 0:
         return np.ascontiguousarray(corners)
     return np.ascontiguousarray((corners * [1.0, -1.0, 1.0])[:, ::-1])
@@ -127,7 +127,7 @@ def _columns_of(corners: Array) -> _Columns:
 
 @numba.njit(nogil=True, cache=True)
 def _crossing(corners: Array, f: int, x: float, z: float) -> tuple[int, float]:
-    """Return how a vertical line meets a triangle, 1 entering, -1 leaving, 0 not at all; and the height."""
+    """Intersect a vertical line with a triangle; return 1 entering, -1 leaving, 0 no hit, and the height."""
     ax, ay, az = corners[f, 0, 0] - x, corners[f, 0, 1], corners[f, 0, 2] - z
     bx, by, bz = corners[f, 1, 0] - x, corners[f, 1, 1], corners[f, 1, 2] - z
     cx, cy, cz = corners[f, 2, 0] - x, corners[f, 2, 1], corners[f, 2, 2] - z
@@ -223,9 +223,9 @@ def _squared_distance(corners: Array, f: int, x: float, y: float, z: float) -> f
 def _nearest_faces(
     corners: Array, origin: Array, step: float, shape: tuple[int, int, int], band: float
 ) -> NDArray[np.int32]:
-    """Return the number of the nearest triangle at the values near triangles, shape (nx, ny, nz); -1 elsewhere."""
+    """Return the nearest triangle at grid points near triangles, shape (nx, ny, nz); -1 elsewhere."""
     nearest = np.full(shape, -1, np.int32)
-    # beyond the band, a triangle whose box reaches a value is not always the nearest one
+    # beyond the band, a triangle whose box contains a grid point is not always the nearest
     best = np.full(shape, np.float32((band * step) ** 2), np.float32)
     for f in range(len(corners)):
         low, high = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -255,9 +255,9 @@ def _set_distances(
     step: float,
     far: float,
 ) -> None:
-    """Multiply signs by the distances to the nearest of a value's own triangle and those of its six neighbours.
+    """Multiply signs by the smallest distance to the triangles of a grid point and its six neighbours.
 
-    Positive ones that are certainly farther than `far` get the least that they can be.
+    Positive distances certainly above `far` get a lower bound.
     """
     nx, ny, nz = nearest.shape
     for i in range(nx):
@@ -265,7 +265,7 @@ def _set_distances(
             to_wall = min(i - walls[0, 0], walls[1, 0] - i, j - walls[0, 1], walls[1, 1] - j)
             for k in range(nz):
                 own = found = nearest[i, j, k]
-                # A surface within the walls is known at a value half a diagonal beside where it leaves its band.
+                # A surface within the walls is known at a grid point half a diagonal from where it leaves its band.
                 least = step * min(
                     np.sqrt(away[i, j, k]) + _BAND_CELLS - _DIAGONAL_CELLS, to_wall, k - walls[0, 2], walls[1, 2] - k
                 )

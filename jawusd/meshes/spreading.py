@@ -1,7 +1,7 @@
-"""Give every cell of a grid the number that its nearest numbered cell has, and how far that one is.
+"""Feature transform: assign every cell of a grid the label of the nearest labelled cell, and its distance.
 
-The feature transform of Maurer et al. (2003), IEEE TPAMI 25:265, one axis after the other; in integers and in place, so
-that it takes a fraction of the time and memory of scipy's, which keeps three coordinates of every cell.
+Maurer et al. (2003), IEEE TPAMI 25:265, axis by axis; in integers and in place, for a fraction of the time and memory
+of scipy's transform, which stores three coordinates per cell.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 @numba.njit(nogil=True, cache=True)
 def spread(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Give cells below 0 the numbers of the nearest others, in place; of several as near, of the first in order.
+    """Assign cells below 0 the number of the nearest numbered cell, in place; ties use the first in order.
 
     Args:
-        numbers: of the cells, shape (nx, ny, nz).
+        numbers: numbers of the cells, shape (nx, ny, nz).
 
     Returns:
-        The squared distances to the cells whose numbers were taken [cells^2], shape (nx, ny, nz); where there are no
-        numbers at all, more than any distance in the grid.
+        The squared distances to the nearest cells [cells^2], shape (nx, ny, nz); larger than any distance in the grid
+        if there are no numbers.
     """
     nx, ny, nz = numbers.shape
     away = np.empty((nx, ny, nz), np.int32)
@@ -37,7 +37,7 @@ def spread(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @numba.njit(nogil=True, cache=True)
 def _along_first(numbers: NDArray[np.int32], away: NDArray[np.int32]) -> None:
-    """Spread numbers along the first axis, and set the squared distances."""
+    """Propagate numbers along the first axis, and set the squared distances."""
     nx, ny, nz = numbers.shape
     none = nx + ny + nz
     for i in range(nx):
@@ -65,18 +65,18 @@ def _along_line(
     squared: NDArray[np.int64],
     site: NDArray[np.int64],
 ) -> None:
-    """Spread numbers along a line of cells whose squared distances across it are known.
+    """Propagate numbers along a line of cells with known squared distances across it.
 
     Args:
-        numbers, away: of the line's cells, shape (n,).
-        before, squared, site: room for at least as many values.
+        numbers, away: of the cells of the line, shape (n,).
+        before, squared, site: work arrays of at least this length.
     """
     last = -1
     for y in range(len(numbers)):
         before[y], squared[y] = numbers[y], away[y]
         if numbers[y] < 0:
             continue
-        while last >= 1:  # is no cell nearest to the site before this one?
+        while last >= 1:  # remove sites that are nearest to no cell
             a, b = site[last] - site[last - 1], y - site[last]
             u, v, w = squared[site[last - 1]], squared[site[last]], squared[y]
             if (a + b) * v - b * u - a * w - a * b * (a + b) <= 0:

@@ -10,7 +10,7 @@ from typing import NamedTuple, ParamSpec, TypeVar
 from pxr import Ar, Sdf, Tf, Usd
 
 from jawusd.base.errors import FormatError, RigError
-from jawusd.base.guard import most_cpu, out_of_memory, take_in_hand
+from jawusd.base.guard import most_cpu, note_input, out_of_memory
 from jawusd.base.inputs import is_allowed
 from jawusd.rig.asset_paths import (
     asset_paths,
@@ -87,7 +87,7 @@ def open_checked(path: Path) -> Usd.Stage:
     Raises:
         RigError: It is not USD, or names files that `check_reach` forbids.
     """
-    take_in_hand(path)
+    note_input(path)
     try:
         with most_cpu(MOST_CPU_S):
             layers = check_reach(path)

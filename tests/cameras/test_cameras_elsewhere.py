@@ -116,8 +116,8 @@ def test_metashape_files_that_cannot_be_read(tmp_path):
             metashape_xml(METASHAPE).replace('type="frame" class="adjusted"', 'type="fisheye" class="adjusted"'),
             "fisheye",
         ),
-        (metashape_xml({**METASHAPE, "f": "x"}).replace("'x'", "x"), "are not numbers"),
-        (metashape_xml(METASHAPE).replace('sensor_id="1"', 'sensor_id="9"'), "names a sensor"),
+        (metashape_xml({**METASHAPE, "f": "x"}).replace("'x'", "x"), "is not a list of numbers"),
+        (metashape_xml(METASHAPE).replace('sensor_id="1"', 'sensor_id="9"'), "refers to a sensor"),
         ('<!DOCTYPE d [<!ENTITY a "b">]><document/>', "document type"),
         ("<document>", "is not XML"),
     ):
@@ -162,7 +162,7 @@ def test_realityscan_xmp(tmp_path):
     assert away_px(load_cameras_file(tmp_path, 1000.0, sizes), realityscan) < PIXEL
     assert away_px(load_cameras_file(tmp_path / "left.xmp", 1000.0, sizes), realityscan) < PIXEL
     assert [path.name for path in calibration_files(tmp_path)] == ["left.xmp", "right.xmp"]
-    with pytest.raises(CalibrationError, match="the size of pictures is not in the file"):
+    with pytest.raises(CalibrationError, match="the image size is not in the file"):
         load_cameras_file(tmp_path, 1000.0, {"left": SIZE})
     for square, bent in (('Skew="0"', 'Skew="0.01"'), ('AspectRatio="1"', 'AspectRatio="1.2"')):
         (tmp_path / "left.xmp").write_text(xmp(*POSES["left"]).replace(square, bent))
@@ -192,7 +192,7 @@ def test_realityscan_csv(tmp_path):
         load_cameras_file(path, 1000.0, sizes)
     short = ",".join(lines[2].split(",")[:7])
     path.write_text(f"{'note,' * 8}{lines[1].lstrip('#')}\n{'1,' * 8}{short}\n")
-    with pytest.raises(FormatError, match="line 2 has 15 values, the header names 24"):
+    with pytest.raises(FormatError, match="line 2 has 15 values, the header has 24 columns"):
         load_cameras_file(path, 1000.0, sizes)
 
 

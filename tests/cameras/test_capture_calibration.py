@@ -151,8 +151,8 @@ def test_calibration_round_trip(folder, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("rotation = [0.1, -0.2, 0.3]", "rotation = [[1.0,0,0],[0,1.1,0],[0,0,1]]", "not a rotation"),
-        ("rotation = [0.1, -0.2, 0.3]", "rotation = [[1.0,0,0],[0,1,0],[0,0,-1]]", "not a rotation"),
+        ("rotation = [0.1, -0.2, 0.3]", "rotation = [[1.0,0,0],[0,1.1,0],[0,0,1]]", "not orthonormal"),
+        ("rotation = [0.1, -0.2, 0.3]", "rotation = [[1.0,0,0],[0,1,0],[0,0,-1]]", "not orthonormal"),
         ("rotation = [0.1, -0.2, 0.3]", "rotation = [0.1, -0.2]", "shape"),
         ("rotation = [0.1, -0.2, 0.3]", "", 'no "rotation"'),
         ("translation = [1.0, 2.0, 200.0]", "translation = [1.0, nan, 200.0]", "not finite"),

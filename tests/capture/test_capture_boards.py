@@ -236,7 +236,7 @@ def write_woven(folder, images, order):
 @pytest.mark.parametrize("order", ["tff", "bff"])
 def test_the_board_is_not_blamed_for_woven_pictures(tmp_path, order):
     videos = write_woven(tmp_path, pictures(board()), order)
-    with pytest.raises(CalibrationError, match=r"marked as interlaced: each is woven of two instants") as error:
+    with pytest.raises(CalibrationError, match=r"marked as interlaced: each combines two instants") as error:
         find_boards(NAMES, board(videos=videos), quiet)
     assert "boards" not in str(error.value) and "bwdif" in error.value.hint
 
@@ -244,7 +244,7 @@ def test_the_board_is_not_blamed_for_woven_pictures(tmp_path, order):
 def test_boards_held_still_in_interlaced_clips_are_used_and_named(tmp_path):
     still = [[camera[0]] * 6 for camera in pictures(board(), T_world_board=POSES[:1])]
     found = find_boards(NAMES, board(videos=write_woven(tmp_path, still, "tff")), quiet)
-    assert len(found.notes) == 2 and all("woven of two instants" in note for note in found.notes)
+    assert len(found.notes) == 2 and all("combines two instants" in note for note in found.notes)
 
 
 def test_clips_of_variable_rate_are_matched_by_time(tmp_path):
@@ -278,7 +278,7 @@ def test_pictures_that_cannot_be_read_are_named(tmp_path):
     (tmp_path / "c0" / "board_0003.png").write_bytes(b"no picture")
     with pytest.raises(CaptureError, match=r"board_0003\.png: is not a readable picture"):
         find_boards(NAMES, board(videos=videos), quiet)
-    with pytest.raises(CaptureError, match="no file of the folder is named like"):
+    with pytest.raises(CaptureError, match="no file in the folder matches"):
         find_boards(("c0",), board(videos=(tmp_path / "c1" / "bord_%04d.png",)), quiet)
     cv2.imwrite(str(tmp_path / "c0" / "board_0003.png"), np.zeros((100, 100), np.uint8))
     with pytest.raises(CalibrationError, match="is 100 x 100 px, but the first picture is 640 x 480"):

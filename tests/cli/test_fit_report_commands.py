@@ -130,7 +130,7 @@ def test_scans_take_the_place_of_a_capture(given, tmp_path, poses):
         (["--landmarks", "landmarks.json", "--columns", "tx"], 2, "not of the form name=column"),
         (["--landmarks", "landmarks.json", "--columns", "x=X"], 2, '"x" is not a column of poses'),
         (["--landmarks", "landmarks.json", "--columns", "tx=X,tx=Y"], 2, '"tx" is named twice'),
-        (["--landmarks", "landmarks.json", "--columns", "tx=X"], 3, 'no column "X" to be read as "tx"'),
+        (["--landmarks", "landmarks.json", "--columns", "tx=X"], 3, 'no column "X" to read as "tx"'),
         (["--landmarks", "landmarks.json", "--rest-frame", "999"], 3, "has no frame 999"),
         (["--landmarks", "nothing.json"], 3, "there is no such file"),
     ],

@@ -60,21 +60,21 @@ IN_THE_FILE = [
     ("centimetres", "fps", 'units = "cm"\nfps', "units", '"cm"', 'allowed is "mm"', "Scale to mm"),
     ("text without quotes", 'name = "x"', "name = x", "", "line 2", "TOML", "in quotes"),
     ("a video for a scan", '"u.ply"', '"left.mp4"', "[scans] upper_teeth", '"left.mp4"', "a mesh is needed", "Name"),
-    ("a scan for a clip", '= "left.mp4"', '= "u.ply"', '1 ("left") video', '"u.ply"', "a video or numbered", "Name"),
+    ("a scan for a clip", '= "left.mp4"', '= "u.ply"', '1 ("left") video', '"u.ply"', "a video or an image", "Name"),
     ("a clip to calibrate", "[scans]", 'calibration = "left.mp4"\n[scans]', "calibration", '"left', "[boards]", "Name"),
     ("one clip for two", '= "right.mp4"', '= "left.mp4"', '2 ("right") video', '"left', "own file", '1 ("left") video'),
     ("one scan for both rows", '"l.ply"', '"u.ply"', "[scans] lower_teeth", '"u.ply"', "own file", "upper_teeth"),
     ("backslashes", '= "left.mp4"', '= "clips\\left.mp4"', "line 9", "clips\\left.mp4", "TOML", '"video/left.mp4"'),
-    ("backslashes as text", '= "left.mp4"', "= 'clips\\left.mp4'", "video", "clips\\left", "separates", "video/left"),
-    ("a backslash and t", '= "left.mp4"', '= "clips\\take.mp4"', "video", r"clips\take.mp4", "separates", "video/left"),
-    ("a drive", '= "left.mp4"', '= "C:/anna/left.mp4"', "video", "C:/anna", "Windows", "from the folder of"),
+    ("backslashes as text", '= "left.mp4"', "= 'clips\\left.mp4'", "video", "clips\\left", "separate", "video/left"),
+    ("a backslash and t", '= "left.mp4"', '= "clips\\take.mp4"', "video", r"clips\take.mp4", "separate", "video/left"),
+    ("a drive", '= "left.mp4"', '= "C:/anna/left.mp4"', "video", "C:/anna", "Windows", "relative to the"),
     ("curly quotes", '"u.ply"', "\u201cu.ply\u201d", "line 5", "\u201cu.ply\u201d", "TOML", "straight quotes"),
-    ("an accent", 'name = "x"', 'name = "J\u00f6rg"', "name", '"J\u00f6rg"', "A-Z a-z 0-9 _ - . blanks", '"anna"'),
+    ("an accent", 'name = "x"', 'name = "J\u00f6rg"', "name", '"J\u00f6rg"', "A-Z a-z 0-9 _ - . spaces", '"anna"'),
 ]
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
 # How the file is stored: words; encoding; what is allowed; what to do.
 STORED = [
-    ("an accent of Windows", "cp1252", "line 2 holds the byte 0xf6", "Save it as UTF-8"),
+    ("an accent of Windows", "cp1252", "line 2 has the byte 0xf6", "Save it as UTF-8"),
 ]
 # Files that are there and hold something else: words; name; bytes; found; what to do.
 CONTENTS = [
@@ -88,12 +88,12 @@ CONTENTS = [
 TYPED = [
     ("a folder without capture", ["check", "empty"], "empty", "no such file", "", "jawusd init"),
     ("a folder's name misspelt", ["check", "emty"], "emty", "no such file", "Did you mean empty?", "jawusd init"),
-    ("a path from another folder", ["check", "shots/anna"], "shots/anna", "no such file", "the folder you are in", ""),
+    ("a path from another folder", ["check", "shots/anna"], "shots/anna", "no such file", "the current folder", ""),
     ("a clip for a capture", ["check", "left.mp4"], "left.mp4", '".mp4" is no capture', "a folder with", "jawusd init"),
     ("an output with files", ["build", ".", "-o", "full"], "full", "not empty", "", "Name a new folder"),
     ("an output that is a file", ["build", ".", "-o", "u.ply"], "u.ply", "is a file", "needs a folder", "Name a new"),
     ("an output out of reach", ["build", ".", "-o", "/dev/null/out"], "out", "cannot write here", "", "Name a"),
-    ("a rig for a capture", ["check", "rig"], "rig", "no such file", "", "That folder holds a rig; name the capture"),
+    ("a rig for a capture", ["check", "rig"], "rig", "no such file", "", "That folder contains a rig; name"),
     ("a capture for a rig", ["info", "."], ".", "without actor.usda", "", "jawusd build"),
     ("two people in one folder", ["init", "two"], "", "anna_upper.stl, bob_upper.stl", "one person", "name one"),
     ("a lens alone", ["cameras", "lens.nk", "-o", "a.toml"], "lens.nk", "no Camera node", "", "Export Project"),

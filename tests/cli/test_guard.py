@@ -36,8 +36,8 @@ def started(code):
 
 
 @pytest.mark.parametrize("name", ["SIGSEGV", "SIGBUS", "SIGABRT", "SIGILL", "SIGFPE"])
-def test_a_crash_is_one_message_with_the_file_in_hand(name):
-    code = f"guard.take_in_hand(sys.argv[1]); os.kill(os.getpid(), signal.{name})"
+def test_a_crash_is_one_message_with_the_current_file(name):
+    code = f"guard.note_input(sys.argv[1]); os.kill(os.getpid(), signal.{name})"
     done = guarded(code, "/captures/a\udcff/cam\n0.png")
     assert done.returncode == ResourceError.exit_code
     assert done.stderr.startswith("jawusd: /captures/a\\xff/cam\\n0.png: a library crashed") and name in done.stderr
@@ -81,7 +81,7 @@ def test_too_little_address_space_is_one_message(most_mb):
     line = [sys.executable, "-c", limited + "from jawusd.__main__ import main; main()", "check", "capture.toml"]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert done.returncode == ResourceError.exit_code and done.stderr.count("\n") == 1
-    assert "(ulimit -v), at least 1.5 GB are needed" in done.stderr
+    assert "(ulimit -v), at least 1.5 GB is needed" in done.stderr
 
 
 def test_no_core_files_are_left():
@@ -89,7 +89,7 @@ def test_no_core_files_are_left():
 
 
 def test_too_much_processor_time_is_one_message():
-    code = "guard.take_in_hand('/rigs/bomb.usda')\nwith guard.most_cpu(1):\n    while True: pass"
+    code = "guard.note_input('/rigs/bomb.usda')\nwith guard.most_cpu(1):\n    while True: pass"
     done = subprocess.run([sys.executable, "-c", BEGIN + "\n" + code], capture_output=True, text=True, check=False)
     assert done.returncode == ResourceError.exit_code
     assert done.stderr.startswith("jawusd: /rigs/bomb.usda: takes too much processor time")

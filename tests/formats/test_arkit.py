@@ -69,8 +69,8 @@ def test_a_short_take_does_not_tell_its_rate(tmp_path):
         ("01:00:00:02,61,0,0,0,nan,0,0", 'line 3, column "JawLeft" is nan'),
         ("01:00:00:02,61,0,0,0,0,0", "line 3 has 7 values"),
         ("1.5,61,0,0,0,0,0,0", 'line 3, column "Timecode": "1.5"'),
-        ("01:00:00:01,61,0,0,0,0,0,0", 'line 3, column "Timecode" does not come after'),
-        ("01:00:00:30,61,0,0,0,0,0,0", 'line 3, column "Timecode" counts frame 30'),
+        ("01:00:00:01,61,0,0,0,0,0,0", 'line 3, column "Timecode" is not later than'),
+        ("01:00:00:30,61,0,0,0,0,0,0", 'line 3, column "Timecode" has frame number 30'),
     ],
 )
 def test_each_fault_is_named_by_line_and_column(tmp_path, row, words):
@@ -232,11 +232,11 @@ def test_midnight_in_drop_frame_with_half_numbers(tmp_path):
 @pytest.mark.parametrize(
     ("number", "fps", "words"),
     [
-        (30, 24, ("counts frame 29", "30 of them in a second", "--resample")),
-        (25, 24, ("counts frame 24", "25 of them in a second")),
-        (24, 30, ("24 of them in a second", "at 30 frames per second")),
-        (15, None, ("do not tell the frame rate", "--fps")),
-        (15, 50, ("do not tell the frame rate",)),
+        (30, 24, ("has frame number 29", "count 30 frames per second", "--resample")),
+        (25, 24, ("has frame number 24", "count 25 frames per second")),
+        (24, 30, ("count 24 frames per second", "at 30 frames per second")),
+        (15, None, ("frame rate cannot be found", "--fps")),
+        (15, 50, ("frame rate cannot be found",)),
     ],
 )
 def test_a_rate_that_does_not_fit_the_code_is_refused(tmp_path, number, fps, words):

@@ -97,7 +97,7 @@ def test_picks_somebody_else_wrote_meanwhile_are_not_overwritten(tmp_path):
     path = tmp_path / "capture.toml"
     path.write_text(BEFORE)
     write_bootstrap(path, picks(), None)
-    with pytest.raises(OutputError, match="changed by somebody else"):
+    with pytest.raises(OutputError, match="changed by another program"):
         write_bootstrap(path, picks(shift=1.0), None)
     write_bootstrap(path, picks(shift=1.0), picks())
     assert Bootstrap.model_validate(tomllib.loads(path.read_text())["bootstrap"]) == picks(shift=1.0)

@@ -38,12 +38,12 @@ def test_a_good_file_is_read(told):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('video = "left.mp4"', 'mask.upper = "a"', '[[camera]] 1 ("left"): there is no key "mask"; allowed are name'),
+        ('video = "left.mp4"', 'mask.upper = "a"', '[[camera]] 1 ("left"): unknown key "mask"; allowed are name'),
         ('video = "left.mp4"', 'mask.upper = "a"', 'Did you mean "masks"?'),
-        ('video = "right.mp4"', 'vidoe = "right.mp4"', '[[camera]] 2 ("right"): there is no key "vidoe"'),
-        ("fps", "FPS", 'there is no key "FPS"; allowed are format, units, name, fps'),
+        ('video = "right.mp4"', 'vidoe = "right.mp4"', '[[camera]] 2 ("right"): unknown key "vidoe"'),
+        ("fps", "FPS", 'unknown key "FPS"; allowed are format, units, name, fps'),
         ("[scans]", "[scan]", 'Did you mean "scans"?'),
-        ("[scans]", "[scans]\nfps = 24.0", '"fps" stands at the top of the file, before the first [table]'),
+        ("[scans]", "[scans]\nfps = 24.0", '"fps" goes at the top of the file, before the first [table]'),
         ("[scans]", "[scans]\nsquare_mm = 2.0", '"square_mm" belongs to [boards]'),
         ("fps = 24.0\n", "", "fps is missing. For example: fps = 23.976."),
         ("fps = 24.0", 'fps = "24 fps"', 'fps = "24 fps": a number is needed (frames per second)'),
@@ -51,14 +51,14 @@ def test_a_good_file_is_read(told):
         ("fps = 24.0", "fps = 24.0\nframes = [9, 3]", "frames = [9, 3] is empty"),
         ("fps = 24.0", "fps = 24.0\nframes = [9]", "frames has too few entries. For example: frames = [30, 270]."),
         ("fps = 24.0", 'fps = 24.0\nframes = "all"', 'frames = "all": a list in brackets is needed'),
-        ('name = "x"', 'name = "x/y"', 'name = "x/y" has letters that are not allowed'),
-        ('name = "right"', 'name = "left"', "camera names must differ (found left, left)"),
+        ('name = "x"', 'name = "x/y"', 'name = "x/y" is empty or has characters that are not allowed'),
+        ('name = "right"', 'name = "left"', "camera names must be unique (found left, left)"),
         ('lower_teeth = "l.ply"', "", "[scans] lower_teeth is missing. For example: lower_teeth"),
         ('"u.ply"', '"u.stl"', '[scans] upper_teeth = "u.stl" does not exist'),
         ('"u.ply"', '"u.stl"', "Did you mean u.ply?"),
         ('video = "left.mp4"', 'video = "Left.MP4"', "Did you mean left.mp4?"),
-        ('"u.ply"', '"../u.ply"', "leads out of the folder of the capture"),
-        ('video = "left.mp4"', "video = 3", 'video = 3: a path in quotes is needed, as "left.mp4"'),
+        ('"u.ply"', '"../u.ply"', "is outside the folder of the capture"),
+        ('video = "left.mp4"', "video = 3", 'video = 3: a path in quotes is needed, such as "left.mp4"'),
         ('video = "left.mp4"', "", '[[camera]] 1 ("left"): has neither video nor masks, one is needed. For example'),
         ('video = "left.mp4"', 'masks.upper = "a.mkv"', '[[camera]] 1 ("left"), masks lower is missing'),
         ("square_mm = 8.0", 'square_mm = "8 mm"', '[boards] square_mm = "8 mm": a number is needed (mm)'),
@@ -66,9 +66,9 @@ def test_a_good_file_is_read(told):
         ("square_mm = 8.0", "", "[boards] square_mm is missing. For example: square_mm = 8.0."),
         ("cols = 9", "columns = 9", 'Did you mean "cols"?'),
         ("cols = 9", "cols = 9.5", "[boards] cols = 9.5: a whole number is needed"),
-        ("cols = 9", 'cols = 9\npattern = "charuco"', '[boards]: pattern = "charuco" needs dictionary and marker_mm'),
+        ("cols = 9", 'cols = 9\npattern = "charuco"', '[boards]: pattern = "charuco" also needs dictionary and'),
         ("cols = 9", 'cols = 9\npattern = "checkers"', 'pattern = "checkers" must be "chessboard" or "charuco"'),
-        (', "right.mp4"]', "]", "[boards] videos names 1 clips, needed are 2, one for each of left, right. Name"),
+        (', "right.mp4"]', "]", "[boards] videos lists 1 clips, 2 are needed, one per camera: left, right. List"),
         ("[boards]", '[sync]\nmethod = "clap"\n[boards]', '[sync] method = "clap" must be "flash"'),
         ("[boards]", '[sync]\nreference = "middle"\n[boards]', 'reference names camera "middle", allowed are left'),
         ("[boards]", "[sync]\noffsets = { left = 0 }\n[boards]", "no entry for right, needed are left, right."),
@@ -103,7 +103,7 @@ def test_one_mistake_is_one_message(told):
 def test_one_camera_as_a_single_table(told):
     one = GOOD[: GOOD.index("[[camera]]")] + '[camera]\nname = "left"\nvideo = "left.mp4"\n'
     assert told("[camera]", "[camera]", one) == [
-        "[camera] is one table; write [[camera]], with double brackets, for each one. "
+        "[camera] is a single table; write [[camera]], with double brackets, for each one. "
     ]
 
 

@@ -28,8 +28,8 @@ def test_paths_are_relative_to_the_list_and_names_follow_from_them(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "names no capture"),
-        ("# nothing\n", "names no capture"),
+        ("", "lists no captures"),
+        ("# nothing\n", "lists no captures"),
         ("a/anna\nb/Anna\n", "lines 1 and 2.*PATH, NAME"),
         ("anna, x, y\n", "line 1 must be"),
         (", x\n", "line 1 must be"),
@@ -47,6 +47,6 @@ def test_a_wrong_line_is_one_clear_error(tmp_path, text, words):
 
 def test_a_list_that_is_no_text_or_not_there_is_one_clear_error(tmp_path):
     (tmp_path / "b").write_bytes(b"\xff\xfe\x00")
-    for name, words in (("b", "UTF-8"), ("c", "no such file"), (".", "is not a file")):
+    for name, words in (("b", "UTF-8"), ("c", "no such file"), (".", "is not a regular file")):
         with pytest.raises(FormatError, match=words):
             load_capture_list(tmp_path / name)

@@ -51,7 +51,7 @@ def files(tmp_path):
     ],
 )
 def test_models_with_values_of_other_types_are_refused(key, value, files):
-    with pytest.raises(FormatError, match=f'no readable "{key}'):
+    with pytest.raises(FormatError, match=f'an invalid "{key}'):
         load_model(files("model.npz", **{key: value}))
 
 
@@ -68,7 +68,7 @@ def test_models_with_values_of_other_types_are_refused(key, value, files):
     ],
 )
 def test_tracks_with_values_of_other_types_are_refused(key, value, files):
-    with pytest.raises(FormatError, match=f'no readable "{key}'):
+    with pytest.raises(FormatError, match=f'an invalid "{key}'):
         load_tracks(files("tracks.npz", **{key: value}))
 
 

@@ -52,7 +52,7 @@ def test_named_pipes_are_no_files(name, tmp_path):
     thread = threading.Thread(target=read, daemon=True)
     thread.start()
     thread.join(10)
-    assert found and name in found[0] and ("is not a file" in found[0] or "no such video" in found[0])
+    assert found and name in found[0] and ("is not a regular file" in found[0] or "no such video" in found[0])
 
 
 @pytest.mark.parametrize("name", READERS)
@@ -64,7 +64,7 @@ def test_folders_are_no_files(name, tmp_path):
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no devices here")
 def test_devices_are_no_files():
-    with pytest.raises(JawusdError, match="is not a file"):
+    with pytest.raises(JawusdError, match="is not a regular file"):
         check_input("/dev/zero")
 
 

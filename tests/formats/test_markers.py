@@ -60,7 +60,7 @@ def test_a_marker_description_and_numbers(tmp_path):
         ("1 2 3 4\n", "has 4 numbers per frame"),
         ("frame,m00\n1,2\n", "is not a table of marker positions"),
         ("a b c\n1 2 3\n", "is not a table of marker positions"),
-        ("0 8 1\nLinear x 0.02\n1 2 3\n", "line 2 is not that of an ArtiSynth probe"),
+        ("0 8 1\nLinear x 0.02\n1 2 3\n", "line 2 must be like"),
         ("0 8 1\nLinear 6 0.02\n1 2 3\n", "line 3 has 3 numbers, 6 are expected"),
     ],
 )
@@ -80,11 +80,11 @@ def test_tables_of_different_lengths_are_told(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (" 3       ;Number of markers\n", "", 'no line tells the "number of markers"'),
-        (" 3 ", " 4 ", "says that it has 4 markers and lists 3"),
+        (" 3       ;Number of markers\n", "", 'there is no line "number of markers"'),
+        (" 3 ", " 4 ", "declares 4 markers but lists 3"),
         ("8                 -66.5", "8                 nan", "not a finite number"),
         ("8                 -66.5", "x                 -66.5", 'not written as "number x y z views"'),
-        ("8                 -66.5", "6                 -66.5", "each must be named once"),
+        ("8                 -66.5", "6                 -66.5", "each must be listed once"),
     ],
 )
 def test_each_mistake_of_a_description_is_named(tmp_path, old, new, words):
@@ -215,21 +215,21 @@ def test_frames_that_a_table_leaves_out_show_no_markers(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("a.tsv", qtm(cells()[:4]), "it says that it has 6 frames, and holds 4"),
-        ("a.trc", trc(cells()[:5]), "it says that it has 6 frames, and holds 5"),
+        ("a.tsv", qtm(cells()[:4]), "its header declares 6 frames, but it has 4"),
+        ("a.trc", trc(cells()[:5]), "its header declares 6 frames, but it has 5"),
         ("a.trc", trc(cells(ZEROS))[:-40], "numbers, 12 are expected"),
         ("a.trc", trc(cells(), unit="inch"), 'lengths are in "inch", read are mm, cm, m'),
-        ("a.trc", trc(cells(), frames=[1, 2, 2, 3, 4, 5]), "must be whole numbers that rise"),
-        ("a.tsv", qtm(cells()).replace("\t4\n", "\t5\n", 1), "it has 5 markers and names 4"),
+        ("a.trc", trc(cells(), frames=[1, 2, 2, 3, 4, 5]), "must be increasing whole numbers"),
+        ("a.tsv", qtm(cells()).replace("\t4\n", "\t5\n", 1), "declares 5 markers but names 4"),
         ("a.tsv", qtm(cells()).replace("DATA_INCLUDED\t3D", "DATA_INCLUDED\t6D"), "holds 6D data of Qualisys"),
         ("a.csv", vicon(cells(), outputs=True).replace("Trajectories", "Joints"), "Model Outputs, Joints, Devices"),
         ("a.csv", vicon(cells()).replace("X,Y,Z", "RX,RY,RZ"), "has no markers"),
-        ("a.csv", "Format Version,1.23,Take Name,t\n\n,Type,Marker\n", "OptiTrack Motive, no table of markers"),
+        ("a.csv", "Format Version,1.23,Take Name,t\n\n,Type,Marker\n", "OptiTrack Motive, not a supported marker"),
         ("a.mot", "Coordinates\nversion=1\n", "is a motion file of OpenSim"),
-        ("a.csv", joined(cells(NANS), ",").replace(".", ","), "decimal commas and commas between the numbers"),
+        ("a.csv", joined(cells(NANS), ",").replace(".", ","), "commas both as decimal signs and as separators"),
         ("a.csv", german(joined(cells())).replace(",", ".", 1), "commas and points cannot both be decimal signs"),
-        ("a.csv", "1,234;2,345;3,456\n", '"1,234" may be 1.234 or 1234'),
-        ("a.txt", "time x y z\n0 1 2 3\n", "Read are C3D, TSV of Qualisys"),
+        ("a.csv", "1,234;2,345;3,456\n", '"1,234" is ambiguous, 1.234 or 1234'),
+        ("a.txt", "time x y z\n0 1 2 3\n", "Supported are C3D, TSV of Qualisys"),
     ],
 )
 def test_what_is_not_read_is_refused_by_name(tmp_path, name, text, words):

@@ -71,7 +71,7 @@ def test_the_last_matrix_row_may_be_left_out(tmp_path, motion):
 @pytest.mark.parametrize(
     ("change", "columns", "words"),
     [
-        (("Frame", "Picture"), MAP, 'no column "Frame" to be read as "frame"'),
+        (("Frame", "Picture"), MAP, 'no column "Frame" to read as "frame"'),
         (("Frame", "frame"), None, "--columns"),
         (("10,", "10.5,"), MAP, 'line 2, column "Frame" is 10.5'),
         (("11,", "x,"), MAP, 'line 3, column "Frame": "x" is not a number'),
@@ -118,7 +118,7 @@ def test_landmarks_keep_their_order(tmp_path):
         ({"landmarks": {name: [0, 0] for name in NAMES}}, FormatError, 'landmark "incisor"'),
         ({"landmarks": {name: ["a", 0, 0] for name in NAMES}}, FormatError, "array of numbers"),
         ({"T_anatomical_skull": (2 * np.eye(4)).tolist()}, FormatError, "rigid"),
-        ({"landmark": {}}, FormatError, '"landmark" is not a key'),
+        ({"landmark": {}}, FormatError, 'unknown key "landmark"'),
     ],
 )
 def test_a_wrong_landmarks_file_is_refused(tmp_path, change, kind, words):

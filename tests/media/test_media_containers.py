@@ -87,7 +87,7 @@ def test_huge_frames_of_sequences_are_refused_before_they_are_decoded(suffix, tm
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes of POSIX")
 def test_headers_of_pipes_are_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "0001.exr")
-    with pytest.raises(CaptureError, match="is not a file"):
+    with pytest.raises(CaptureError, match="is not a regular file"):
         pictures.read_header(tmp_path / "0001.exr")
 
 

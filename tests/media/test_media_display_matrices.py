@@ -43,20 +43,20 @@ def test_turns_are_done(tmp_path, suffix, matrix, turn):
 @pytest.mark.parametrize(
     ("matrix", "said"),
     [
-        ((-1, 0, 0, 1), "mirrored"),
-        ((1, 0, 0, -1), "mirrored"),
-        ((0, 1, 1, 0), "mirrored"),
-        ((0, -1, -1, 0), "mirrored"),
-        ((-1.5, 0, 0, 1.5), "mirrored"),
-        ((0.6, 0.8, 0.8, -0.6), "mirrored"),
-        ((0.8, 0.6, -0.6, 0.8), "only quarter turns"),
-        ((1, 0.3, 0, 1), "only quarter turns"),
-        ((1, 0, 0.2, 1), "only quarter turns"),
+        ((-1, 0, 0, 1), "mirrors"),
+        ((1, 0, 0, -1), "mirrors"),
+        ((0, 1, 1, 0), "mirrors"),
+        ((0, -1, -1, 0), "mirrors"),
+        ((-1.5, 0, 0, 1.5), "mirrors"),
+        ((0.6, 0.8, 0.8, -0.6), "mirrors"),
+        ((0.8, 0.6, -0.6, 0.8), "allowed are multiples of 90"),
+        ((1, 0.3, 0, 1), "allowed are multiples of 90"),
+        ((1, 0, 0.2, 1), "allowed are multiples of 90"),
     ],
 )
 def test_mirrors_and_skews_are_refused(tmp_path, suffix, matrix, said):
     path = write(tmp_path / f"a{suffix}", matrix)
-    with pytest.raises(CaptureError, match=rf"a{suffix}: the file asks .*{said}"):
+    with pytest.raises(CaptureError, match=rf"a{suffix}: the display matrix .*{said}"):
         Video(path)
 
 
@@ -76,7 +76,7 @@ def test_mirrored_photographs_are_refused(tmp_path, orientation):
     exif = Image.Exif()
     exif[0x112] = orientation
     Image.fromarray(PICTURE).save(tmp_path / "0001.jpg", exif=exif)
-    with pytest.raises(CaptureError, match=r"0001\.jpg: the file asks to be shown mirrored"):
+    with pytest.raises(CaptureError, match=r"0001\.jpg: the orientation in the file is mirrored"):
         read_stored(tmp_path / "0001.jpg")
 
 

@@ -112,10 +112,10 @@ def test_footage_named_as_masks_is_refused(tmp_path):
     with VideoWriter(path, SIZE, 24, quality_crf=4) as out:
         for k in range(COUNT):
             out.write(footage(k))
-    with pytest.raises(CaptureError, match=r"cam0\.mp4: picture 0: \d+% of it are gray.*masks and not the footage"):
+    with pytest.raises(CaptureError, match=r"cam0\.mp4: picture 0: \d+% of it is gray.*masks and not the footage"):
         MaskReader(path, SIZE).read(2)
     cv2.imwrite(str(tmp_path / "7.png"), footage(7))
-    with pytest.raises(CaptureError, match=r"7\.png: \d+% of it are gray"):
+    with pytest.raises(CaptureError, match=r"7\.png: \d+% of it is gray"):
         MaskReader(tmp_path / "%d.png", SIZE).read(7)
 
 
@@ -180,9 +180,9 @@ HEAD = (
     [
         ('labels = "l.mkv"', "needs upper_value and lower_value"),
         ('labels = "l.mkv", upper_value = 1, lower_value = 1', "are both 1"),
-        ('labels = "l.mkv", upper = "u.mkv", upper_value = 1, lower_value = 2', "labels beside upper or lower"),
-        ('upper = "u.mkv", lower = "l.mkv", upper_value = 1', "are for labels, one file for both rows"),
-        ('upper = "l.mkv", lower = "l.mkv"', "one file, which needs upper_value and lower_value"),
+        ('labels = "l.mkv", upper = "u.mkv", upper_value = 1, lower_value = 2', "both labels and upper or lower"),
+        ('upper = "u.mkv", lower = "l.mkv", upper_value = 1', "are only for labels, one file for both arches"),
+        ('upper = "l.mkv", lower = "l.mkv"', "the same file, which needs upper_value and lower_value"),
         ('labels = "l.mkv", upper_value = 0, lower_value = 2', "must be 1 or more"),
     ],
 )

@@ -103,7 +103,7 @@ def test_what_most_pictures_hold_counts(tmp_path):
         "002.png reaches only 100, teeth are 255",
         "003.png has",
         "004.png is 255 all over",
-        "005.png is no mask",
+        "005.png is not a mask",
     ]
     for line, start in zip(reader.odd, [*expected, "006.png has 16 bits per channel"], strict=True):
         assert line.startswith(start)
@@ -123,7 +123,7 @@ def test_a_video_cut_out_on_black_is_doubted(tmp_path):
 
 def test_single_teeth_in_levels_of_their_own_are_refused(tmp_path):
     numbers = [cv2.connectedComponents((teeth(k) > 0).astype(np.uint8))[1].astype(np.uint8) for k in range(COUNT)]
-    with pytest.raises(CaptureError, match=r"000\.png: it holds the levels 0, \d, \d; a mask has two"):
+    with pytest.raises(CaptureError, match=r"000\.png: it has the levels 0, \d, \d; a mask has two"):
         written(tmp_path, numbers)
 
 
@@ -137,7 +137,7 @@ def test_survey_says_what_is_taken_and_what_is_not_used(tmp_path):
         ("mask_levels", "note", "left"),
     ]
     assert "the masks of the lower teeth are all black" in found[0].message
-    assert "hold the values 0 and 100: 100 is taken as teeth" in found[1].message
+    assert "have the values 0 and 100: 100 is taken as teeth" in found[1].message
     assert survey_masks(CameraSource(name="right", video="right.mp4"), SIZE)[0].kind == "camera_without_masks"
 
 

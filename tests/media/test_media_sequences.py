@@ -68,7 +68,7 @@ def test_patterns_people_write(images, tmp_path, name):
 def test_patterns_that_cannot_be(images, tmp_path):
     write_sequence(tmp_path, images, "png8")
     for name, said in (
-        ("take.####.exr", "no file of the folder is named like take.####.exr"),
+        ("take.####.exr", "no file in the folder matches take.####.exr"),
         ("take.%04d.%04d.png", "two numbers"),
         ("take.%04x.png", "needs one number such as %06d"),
     ):
@@ -101,7 +101,7 @@ def test_names_are_grouped_by_what_stays():
 def test_pictures_that_do_not_belong_together(images, tmp_path):
     pattern = write_sequence(tmp_path, images[:2], "png8")
     write_picture(tmp_path / "take.1003.png", images[0, :24], "png8")
-    with pytest.raises(CaptureError, match=r"64 x 24 px, the first picture 64 x 48 px"):
+    with pytest.raises(CaptureError, match=r"64 x 24 px, but the first picture is 64 x 48 px"):
         list(open_clip(pattern).frames())
     (tmp_path / "take.1003.png").write_bytes(b"no picture")
     with pytest.raises(CaptureError, match="cannot be read"):
@@ -124,7 +124,7 @@ def test_film_scans_are_shown_by_their_density():
 
 
 def test_a_colour_space_that_nobody_knows(tmp_path):
-    with pytest.raises(CaptureError, match='"Log C" is not known; allowed are display, linear, cineon'):
+    with pytest.raises(CaptureError, match='"Log C" is unknown; allowed are display, linear, cineon'):
         to_display(np.zeros((2, 2), np.uint16), 65535, "Log C", None)
 
 

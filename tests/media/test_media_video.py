@@ -223,7 +223,7 @@ def test_missing_empty_and_foreign_files_are_named(tmp_path: Path) -> None:
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
         frame.sample_rate = 8000
         container.mux(stream.encode(frame))
-    with pytest.raises(CaptureError, match=r"sound\.wav: the file holds no video stream"):
+    with pytest.raises(CaptureError, match=r"sound\.wav: the file has no video stream"):
         Video(sound)
 
 
@@ -256,7 +256,7 @@ def test_a_truncated_stream_ends_where_it_breaks(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     video = Video(path)
     assert 5 < video.count < 15
-    with pytest.raises(CaptureError, match=rf"frames 0 to 19 asked for, the video holds frames 0 to {video.count - 1}"):
+    with pytest.raises(CaptureError, match=rf"19 are requested, but the video has frames 0 to {video.count - 1}"):
         video.frames(0, 20)
 
 

@@ -61,11 +61,11 @@ def test_scans_that_say_nothing_are_refused(scans):
         find_teeth(upper, lower, np.eye(4), lifted(-3.0))
     with pytest.raises(NoContact, match="into each other"):
         find_teeth(upper, lower, np.eye(4), lifted(6.0))
-    with pytest.raises(NoContact, match="upper scan is coarse"):
+    with pytest.raises(NoContact, match="upper scan is too coarse"):
         find_teeth(Mesh(5 * upper.vertices, upper.faces), lower, np.eye(4), np.eye(4))
     flips = np.random.default_rng(0).random(len(upper.faces)) < 0.5
     torn = np.where(flips[:, None], upper.faces[:, ::-1], upper.faces)
-    with pytest.raises(NoContact, match="not wound alike"):
+    with pytest.raises(NoContact, match="not consistently wound"):
         find_teeth(Mesh(upper.vertices, torn), lower, np.eye(4), np.eye(4))
 
 

@@ -238,7 +238,7 @@ def truncated_video(folder):
         pytest.param(masks_of_another_size, CaptureError, "320", marks=pytest.mark.slow),
         pytest.param(calibration_of_another_shape, CaptureError, "another shape", marks=pytest.mark.slow),
         pytest.param(scan_in_metres, CaptureError, "metres", marks=pytest.mark.slow),
-        pytest.param(calibration_without_rotation, CaptureError, "not a rotation", marks=pytest.mark.slow),
+        pytest.param(calibration_without_rotation, CaptureError, "not orthonormal", marks=pytest.mark.slow),
         (pick_outside_its_image, CaptureError, "outside"),
         (truncated_video, CaptureError, "video"),
     ],
@@ -276,7 +276,7 @@ def test_the_program_reports_a_broken_capture_without_a_traceback(capture, tmp_p
     calibration_without_rotation(capture)
     command = [sys.executable, "-m", "jawusd", "build", str(capture), "-o", str(tmp_path / "out")]
     result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert result.returncode == 5 and "not a rotation" in result.stderr and "Traceback" not in result.stderr
+    assert result.returncode == 5 and "not orthonormal" in result.stderr and "Traceback" not in result.stderr
 
 
 def test_build_json_names_every_file_with_its_hash(built):

@@ -158,7 +158,7 @@ SAID = {
     frames_beyond: ("error", "frames_missing", "frames end at 3199"),
     rest_frame_outside: ("warning", "rest_frame", "motion.rest_frame is 12, frames run from 20 to 319"),
     pick_frame_outside: ("error", "bootstrap_frame", "bootstrap.frame is 12"),
-    rate_of_another_take: ("warning", "fps_differs", "30 in the capture, but the clip shows 24"),
+    rate_of_another_take: ("warning", "fps_differs", "30 in the capture, but the clip has 24"),
     offset_beyond: ("error", "offset_wrong", "offset of +4000"),
     calibration_in_metres: ("error", "cameras_together", "in metres"),
     no_calibration: ("error", "no_calibration", "neither"),
@@ -215,7 +215,7 @@ def test_pipes_that_nobody_writes_to_are_named_and_not_waited_for(capture, names
     thread.join(60)
     lines = [f.line() for f in got if f.severity == "error"]
     for name in names:
-        assert any(name in line and "is not a file" in line for line in lines), (name, lines)
+        assert any(name in line and "is not a regular file" in line for line in lines), (name, lines)
 
 
 @pytest.mark.slow

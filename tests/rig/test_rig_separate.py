@@ -146,5 +146,5 @@ def test_prims_and_samples_are_counted(anchored_folder, tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ["a\udcff", "a\nb"])
 def test_names_that_openusd_cannot_follow_are_refused_as_such(name, anchored_folder, tmp_path):
     shutil.copytree(anchored_folder, tmp_path / name)
-    with pytest.raises(RigError, match="OpenUSD cannot follow it"):
+    with pytest.raises(RigError, match="OpenUSD cannot open it"):
         open_stage(tmp_path / name / "actor.usda")

@@ -14,7 +14,7 @@ def in_copy(work):
     child = os.fork()
     if child == 0:
         try:
-            guard._in_hand = mmap.mmap(-1, mmap.PAGESIZE)  # processor time is limited in guarded processes alone
+            guard._current = mmap.mmap(-1, mmap.PAGESIZE)  # processor time is limited in guarded processes alone
             os.write(writing, json.dumps(work()).encode())
             os._exit(0)
         finally:

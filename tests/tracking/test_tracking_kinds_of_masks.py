@@ -164,7 +164,7 @@ def test_black_masks_everywhere_and_masks_of_three_levels_are_refused(drawn, tmp
         return np.maximum(mask, np.roll(mask, 40, axis=0) // 2)
 
     three = rewritten(drawn, tmp_path / "three", two_rows, ["cam1"])
-    with pytest.raises(CaptureError, match=r"cam1/upper/.*png: it holds the levels 0, 127, 255.*upper_value"):
+    with pytest.raises(CaptureError, match=r"cam1/upper/.*png: it has the levels 0, 127, 255.*upper_value"):
         track(make_capture(three, COUNT))
     assert CAMERAS[1].name == "cam1" and FIRST
 

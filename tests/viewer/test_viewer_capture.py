@@ -310,6 +310,6 @@ def test_a_page_with_old_picks_does_not_overwrite_new_ones(viewed, copy, tmp_pat
     other.press(other.page.picks.chosen, "U2")
     other.press(other.page.picks.edit, "pick")
     other.enter(other.page.picks.write, True)
-    assert "changed by somebody else" in other.notices.pop()[1]
+    assert "changed by another program" in other.notices.pop()[1]
     assert len(tomllib.loads((folder / "capture.toml").read_text())["bootstrap"]["upper"]) == 3
     viewer.stop()
