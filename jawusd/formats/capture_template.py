@@ -43,7 +43,7 @@ class CaptureSketch:
     cameras: tuple[CameraSketch, ...] = ()
     calibration: PurePath | None = None
     board: BoardSketch | None = None
-    flashes: bool = True  # False where the clips cannot show any: there are none
+    flashes: bool = True  # False if there are no clips
 
 
 def capture_text(sketch: CaptureSketch) -> str:

@@ -17,11 +17,9 @@ from jawusd.media.pixels import Slices
 MaskImage = NDArray[np.uint8]
 RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as stored in files
 
-# Soft edges are neither teeth nor background, and so is most of a photograph: with a larger share of such pixels the
-# picture is no mask. Masks of three cameras had up to 0.024 after a blur of 8 px, small ones 0.2; their footage 0.39
-# and more.
+# Largest share of intermediate values in a mask. Blurred edges reach 0.2 in small masks; photographs have 0.39 and more.
 MOST_GRAY = 0.2
-MOST_SOFT = 0.35  # of what is not background: reached by the same masks after a blur of 8 px, not of 4 px (0.3)
+MOST_SOFT = 0.35  # largest usual share of intermediate values outside the background, as after a blur of 8 px
 _FAINT = 0.25  # of the contrast: smaller values are noise; a picture with nothing above it shows no teeth
 _DEAD_ZONE = 0.06  # of the contrast: deviation from the levels by lossy coding
 _NEAR = 24  # of 255: closer values belong to one level, after blur or lossy coding
@@ -46,8 +44,8 @@ class MaskLevels:
     teeth: float = 255.0
     deep: bool = False  # 16 bit per channel
     lossy: bool = False  # lossy coding has left noise around the levels
-    doubtful: bool = False  # whether border and area disagree about which level is the background
-    # share of what is not background that lies between the levels
+    ambiguous: bool = False  # whether border and area disagree about which level is the background
+    # share of pixels outside the background that are between the levels
     soft: float = field(default=0.0, compare=False)
 
     @property

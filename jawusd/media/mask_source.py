@@ -16,9 +16,9 @@ from jawusd.media.pictures import has_palette, read_palette_numbers, read_pictur
 from jawusd.media.pixels import Colour
 from jawusd.media.video import Video
 
-_SAMPLED = 10  # pictures of a take that show what its values mean
+_SAMPLED = 10  # sampled pictures per take
 _FEWEST_OF_VIDEO = 4
-_NEUTRAL = 12  # of 255: colour that coding with loss leaves in black, gray and white
+_NEUTRAL = 12  # of 255: colour left in gray by lossy coding
 
 
 @dataclass(frozen=True)

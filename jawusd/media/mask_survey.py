@@ -117,7 +117,7 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
                 hint="Export masks with edges a few pixels wide, not the masked footage.",
             )
         )
-    if levels.doubtful:
+    if levels.ambiguous:
         out.append(
             Finding(
                 "mask_polarity",

@@ -207,7 +207,7 @@ def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -
     if source.count != len(video.numbers):
         frames = f" in {video.count} frames" if video.missing else ""
         raise CaptureError(
-            f"the mask video has {source.count} pictures, the camera's video {len(video.numbers)}{frames}.",
+            f"the mask video has {source.count} pictures, but the camera's video {len(video.numbers)}{frames}.",
             path=path,
             hint="Export the masks again, one picture per picture of the video, from its first one on.",
         )

@@ -25,20 +25,20 @@ Slices: TypeAlias = "tuple[slice[int, int, int], slice[int, int, int]]"
 # ITU-R BT.709 / BT.601 video range: 16 is black, 235 is white.
 _STRETCH = np.clip(np.round((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
 _BYTE_BITS = 8
-# ffmpeg's quick way to RGB is dark by 1.3 of 255 levels and repeats colours over blocks of pixels; this way rounds, and
-# interpolates colours.
+# ffmpeg's fast conversion to RGB is 1.3 of 255 levels too dark and does not interpolate chroma; these flags round and
+# interpolate.
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-_AROUND_PX = 8  # kept around a part of a picture: colours are interpolated
-_STEP_PX = 32  # of its sides
-_ANY_TIME = Fraction(1, 1000)  # filters ask for a unit of time
+_AROUND_PX = 8  # margin around a region, for chroma interpolation
+_STEP_PX = 32  # alignment of its sides
+_ANY_TIME = Fraction(1, 1000)  # filters need a time base
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 _PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
 _PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
-# Planar formats of more than 8 bits in two bytes each, lowest first; p010 and its like have them in the highest.
+# Little-endian planar formats of more than 8 bits; p010 and similar use the highest bits.
 _DEEP = re.compile(r"(yuva?4\d\dp|p0)(10|12|14|16)le")
 
 
-_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])  # counter-clockwise, as display matrices have it: rows map x and y
+_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])  # counter-clockwise, as in display matrices: rows map x and y
 
 
 def turn_deg(frame: av.VideoFrame) -> int:
@@ -170,13 +170,13 @@ def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices
 
 
 def deep_rgb(frame: av.VideoFrame) -> tuple[NDArray[np.uint16], int]:
-    """Return a decoded picture as RGB of two bytes (h, w, 3), not turned, and the value of white in it."""
+    """Return a decoded picture as 16-bit RGB (h, w, 3), not rotated, and its white value."""
     stored = np.asarray(frame.to_ndarray(format="rgb48le", interpolation=TO_RGB), np.uint16)
     if frame.format.is_rgb:
         return stored, 65535
     bits = max(part.bits for part in frame.format.components)
     full = frame.color_range == _FULL_RANGE or len(frame.format.components) == 1
-    # ffmpeg shifts: whites end in zeros.
+    # ffmpeg shifts bits: white ends in zeros.
     return stored, ((1 << bits) - 1) << (16 - bits) if full else 255 << 8
 
 

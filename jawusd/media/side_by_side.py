@@ -30,15 +30,15 @@ from jawusd.media.overlay import (
     draw_overlay,
 )
 
-#: Left, top, width and height of a part of a picture [px].
+#: Left, top, width and height of a region [px].
 Part = tuple[int, int, int, int]
 
 _MOST_IN_ROW = 3
-_MOST_FRAMES, _MOST_POINTS = 200, 300  # of a take and of a scan, that tell where the teeth are
-_STRAYS_PERCENT = 1.0  # frames whose teeth may leave the part that is shown, at each side
-_ROOM = 0.25  # of the teeth's extent, left around them
+_MOST_FRAMES, _MOST_POINTS = 200, 300  # sampled per take and per scan to locate the teeth
+_STRAYS_PERCENT = 1.0  # frames whose teeth may leave the crop, at each side
+_ROOM = 0.25  # margin around the teeth [share of their extent]
 _LEAST_PX = 32
-_SHOW_PARTLY_S = 0.3  # what takes longer is shown as it comes
+_SHOW_PARTLY_S = 0.3  # time after which partial results are shown
 _WHITE: Colour = (240, 240, 240)
 _WIDE_PX = 1200  # narrower bars use one line per piece of text
 _LINE_PX, _LEFT_PX, _GAP_PX, _SWATCH_PX = 26, 10, 34, 14

@@ -26,12 +26,12 @@ from jawusd.media.timeline import Timeline
 
 _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
 _CUT_OFF = "Copy it again from the camera; repair an interrupted recording first."
-# WebM keeps transparency in a second stream, which only these decoders read; announced in the file's meta data.
+# WebM stores alpha in a second stream, which only these decoders read; flagged in the metadata.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
-# Decoders that report damage with any number of threads. Those that conceal it (H.264, MPEG-4) mark a picture when
-# it is finished, after threads have handed it out: with eight, a third of what one thread finds in H.264 was missed.
+# Decoders that report damage with any number of threads. Those with error concealment (H.264, MPEG-4) mark a picture
+# only after threads have returned it: with eight threads, a third of the damage in H.264 was missed.
 _THREADED = ("hevc", "prores", "ffv1")
-_PROGRESSIVE = (0, 1)  # FFmpeg's order of fields: not known, or none
+_PROGRESSIVE = (0, 1)  # FFmpeg's field order: unknown, or progressive
 
 
 class Video(Clip):

@@ -86,7 +86,7 @@ def test_one_side_is_enough_and_frames_do_not_matter(joints):
         (lambda: (skull(40.0), mandible()), "skull has no bone at the condyles"),
         (lambda: (skull(12.0), mandible()), "12.* mm from the skull"),
         (lambda: (skull(-4.0), mandible()), "runs 4.* penetrates the skull"),
-        (lambda: (skull(rounds=3), mandible()), "skull is coarse"),
+        (lambda: (skull(rounds=3), mandible()), "skull is too coarse"),
     ],
 )
 def test_bones_that_show_no_joint_are_told(bones, words):
