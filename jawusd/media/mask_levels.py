@@ -17,7 +17,7 @@ from jawusd.media.pixels import Slices
 MaskImage = NDArray[np.uint8]
 RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as stored in files
 
-# Largest share of intermediate values in a mask. Blurred edges reach 0.2 in small masks; photographs have 0.39 and more.
+# Largest share of intermediate values in a mask. Blurred edges reach 0.2 in small masks; photographs have 0.39 or more.
 MOST_GRAY = 0.2
 MOST_SOFT = 0.35  # largest usual share of intermediate values outside the background, as after a blur of 8 px
 _FAINT = 0.25  # of the contrast: smaller values are noise; a picture with nothing above it shows no teeth
