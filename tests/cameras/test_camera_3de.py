@@ -276,8 +276,8 @@ GOOD = lens_text(RADIAL, (0.04, 0, 0, 0.01, 0, 0, 0, 0))
         (camera_node(translate="{1 2 nan}"), None, "not finite"),
         (camera_node(win_scale="{1 2}"), None, "win_scale or winroll"),
         (camera_node(useMatrix="true"), None, "has useMatrix"),
-        (camera_node(rot_order="XXY"), None, 'the orders "XXY"'),
-        (camera_node() + camera_node(), None, "names camera left twice"),
+        (camera_node(rot_order="XXY"), None, 'rot_order "XXY"'),
+        (camera_node() + camera_node(), None, "two cameras named left"),
         ("Axis {\n inputs 0\n scaling {1 2 1}\n}\n" + camera_node(), None, "has scale"),
         ("", GOOD, "has no Camera node.*Export Project, Nuke"),
         (
@@ -289,8 +289,8 @@ GOOD = lens_text(RADIAL, (0.04, 0, 0, 0.01, 0, 0, 0, 0))
         (camera_node(), lens_text(RADIAL, (0.05, 0.02, 0, 0, 0.01, 0, 0, 0)), "cannot be approximated .*0.05"),
         (camera_node(), GOOD.replace("0.04\n", "much\n"), "must be followed by a number"),
         (camera_node(), GOOD.replace("0.04\n", "inf\n"), "not finite"),
-        (camera_node(), GOOD.replace("U - Degree 2", "U - Degree 3"), 'has no "U - Degree 3", allowed are Distortion'),
-        (camera_node(haperture=24.0), GOOD, r"film back 24 x 20.25 .*its lens lens in left\.txt one of 36 x 20.25"),
+        (camera_node(), GOOD.replace("U - Degree 2", "U - Degree 3"), 'has no parameter "U - Degree 3", allowed are Distortion'),
+        (camera_node(haperture=24.0), GOOD, r"film back 24 x 20.25 .*its lens lens in left\.txt has 36 x 20.25"),
         (camera_node() + lens_node("LD_3DE4_Radial_Fisheye_Degree_8", {}), None, "LD_3DE4_Radial_Fisheye_Degree_8"),
         (
             camera_node() + lens_node("LD_3DE_Classic_LD_Model", {"field_of_view_xa_unit": 0.1}),
@@ -309,7 +309,7 @@ def test_files_that_are_wrong_are_refused(tmp_path, script, lens, words):
 
 def test_sizes_are_needed_and_other_files_named(tmp_path):
     (tmp_path / "shot.nk").write_text(SCRIPT + camera_node())
-    with pytest.raises(CalibrationError, match=r"camera left: .*no footage of that name \(there is: none\)"):
+    with pytest.raises(CalibrationError, match=r"camera left: .*no footage with that name \(available: none\)"):
         load_cameras_file(tmp_path)
     (tmp_path / "shot.3de").write_text("")
     with pytest.raises(CalibrationError, match=r"3DEqualizer's project, which is not supported.*\.nk"):

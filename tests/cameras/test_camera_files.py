@@ -83,7 +83,7 @@ def change(path, old, new):
         ("cameras.txt", "900.0", "-900.0", "focal lengths -900"),
         ("images.txt", "0.9 0.1 -0.3 0.2", "0 0 0 0", "zero quaternion"),
         ("images.txt", "0.9", "nan", "not finite"),
-        ("images.txt", " 1 cam0/", " 7 cam0/", "names camera 7"),
+        ("images.txt", " 1 cam0/", " 7 cam0/", "refers to camera 7"),
         ("images.txt", "cam1/0001.png", "cam0/0002.png", "camera cam0 has different poses"),
         ("images.txt", " cam2/0001.png", "", "is not an image"),
     ],

@@ -121,9 +121,9 @@ LABELS = {
     ("0001.jpg", "0001.png", "0002.png"): ("0001.jpg", "0001.png", "0002"),
     ("front/0001.jpg", "left/0001.jpg", "right/0001.jpg"): ("front_0001", "left_0001", "right_0001"),
     ("D:\\x\\front.tif", "D:\\x\\left.tif", "D:\\x\\right.tif"): ("front", "left", "right"),
-    ("0001", "0001", "0001"): 'labels 3 cameras alike: "0001", "0001", "0001"',
-    ("a.png", "a.png", "b.png"): 'labels 2 cameras alike: "a.png", "a.png"',
-    ("left/1.png", "left/1.png", "right/1.png"): "labels 2 cameras alike",
+    ("0001", "0001", "0001"): 'has 3 cameras with the same label: "0001", "0001", "0001"',
+    ("a.png", "a.png", "b.png"): 'has 2 cameras with the same label: "a.png", "a.png"',
+    ("left/1.png", "left/1.png", "right/1.png"): "has 2 cameras with the same label",
 }
 
 
@@ -170,7 +170,7 @@ def test_two_files_of_one_camera_that_differ_are_named(tmp_path, suffix):
 def test_two_cameras_under_the_same_keys_of_one_file_are_not_one(tmp_path):
     inner = "".join(f"{c.name}:\n" + stored(c, ".yml").split("---\n")[1].replace("\n", "\n   ") for c in CAMERAS)
     (tmp_path / "all.yml").write_text("%YAML:1.0\n---\n" + inner)
-    with pytest.raises(CalibrationError, match=r'all\.yml: holds "camera_matrix" twice'):
+    with pytest.raises(CalibrationError, match=r'all\.yml: has "camera_matrix" twice'):
         load_cameras_file(tmp_path / "all.yml")
 
 

@@ -119,7 +119,7 @@ def test_metashape_files_that_cannot_be_read(tmp_path):
         (metashape_xml({**METASHAPE, "f": "x"}).replace("'x'", "x"), "is not a list of numbers"),
         (metashape_xml(METASHAPE).replace('sensor_id="1"', 'sensor_id="9"'), "refers to a sensor"),
         ('<!DOCTYPE d [<!ENTITY a "b">]><document/>', "document type"),
-        ("<document>", "is not XML"),
+        ("<document>", "cannot be read as XML"),
     ):
         path.write_text(text)
         with pytest.raises(CalibrationError, match=said):

@@ -91,7 +91,7 @@ def test_a_capture_is_read_with_absolute_paths(folder):
         ("frames = [30, 90]", "frames = [90, 30]", FormatError, "one past the last"),
         ('reference = "cam1"', 'reference = "cam7"', FormatError, "allowed are cam0, cam1"),
         ('camera = "cam1", x', 'camera = "cam9", x', FormatError, "cam9"),
-        ('name = "cam1"', 'name = "cam0"', FormatError, "must differ"),
+        ('name = "cam1"', 'name = "cam0"', FormatError, "must be unique"),
         ('video = "cam1.mp4"', "", FormatError, "has neither video nor masks"),
         ('"upper.ply"', '"missing.ply"', CaptureError, "missing.ply"),
         ('masks.upper = "masks/', 'masks.upper = "nomasks/', CaptureError, "there is no folder"),
@@ -112,7 +112,7 @@ def test_a_link_out_of_the_folder_is_refused_unless_allowed(folder):
     outside.write_bytes(b"x")
     (folder / "upper.ply").unlink()
     (folder / "upper.ply").symlink_to(outside)
-    with pytest.raises(CaptureError, match="leads out"):
+    with pytest.raises(CaptureError, match="is outside"):
         load_capture(folder)
     assert load_capture(folder, allow_outside=True).scans.upper_teeth == folder / "upper.ply"
 
@@ -123,7 +123,7 @@ def test_a_mask_that_links_out_of_the_folder_is_refused_unless_allowed(target, f
     (folder / "masks" / "000001.png").symlink_to("000000.png")
     assert load_capture(folder)
     (folder / "masks" / "000007.png").symlink_to(target if target[0] == "/" else f"../{target}")
-    with pytest.raises(CaptureError, match="000007.png leads out"):
+    with pytest.raises(CaptureError, match="000007.png is outside"):
         load_capture(folder)
     assert load_capture(folder, allow_outside=True)
 
@@ -159,7 +159,7 @@ def test_calibration_round_trip(folder, tmp_path):
         ("[2870.0, 0.0, 968.3]", "[-2870.0, 0.0, 968.3]", "fx, fy > 0"),
         ("size = [1920, 1080]", "size = [1920.5, 1080]", "whole numbers"),
         ("distortions = [-0.03, 0.012, 0.0003, -0.0004, 0.0]", 'distortions = ["a"]', "not an array of numbers"),
-        ('name = "right"', 'name = "left"', "twice"),
+        ('name = "right"', 'name = "left"', "duplicate"),
         ("[cam_0]\nname", "[cam_0]\nfisheye = true\nname", "fisheye"),
     ],
 )

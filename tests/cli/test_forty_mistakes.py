@@ -35,7 +35,7 @@ IN_THE_FILE = [
     ("one frame", "name", "frames = [9]\nname", "frames", "too few", "", "frames = [30, 270]"),
     ("frames in words", "name", 'frames = "all"\nname', "frames", '"all"', "a list in brackets", "[30, 270]"),
     ("a name with a slash", 'name = "x"', 'name = "x/y"', "name", '"x/y"', "not allowed", 'name = "anna"'),
-    ("a name twice", 'name = "right"', 'name = "left"', "[[camera]] name", "left, left", "must differ", "of its own"),
+    ("a name twice", 'name = "right"', 'name = "left"', "[[camera]] name", "left, left", "must be unique", "its own"),
     ("no lower row", 'lower_teeth = "l.ply"', "", "lower_teeth", "is missing", "", 'lower_teeth = "scans/lower.ply"'),
     ("a scan that is not there", '"u.ply"', '"u.stl"', "[scans] upper_teeth", '"u.stl"', "does not exist", "u.ply?"),
     ("a clip that is not there", '= "left.mp4"', '= "Left.MP4"', "video", '"Left.MP4"', "does not exist", "left.mp4?"),

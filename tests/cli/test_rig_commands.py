@@ -102,7 +102,7 @@ def test_ik_reaches_a_reachable_target(actor):
         (("pose", "{tmp}/none.usda", "--d", "1", "2", "3"), 8, "none.usda"),
         (("encode", "{actor}", "{tmp}/nan.csv"), 3, 'column "tx" is nan'),
         (("validate", "{actor}", "{tmp}/empty.csv"), 3, "empty"),
-        (("animate", "{actor}", "{tmp}/bad.json"), 3, "must rise"),
+        (("animate", "{actor}", "{tmp}/bad.json"), 3, "must increase"),
         (("animate", "{actor}", "{tmp}/falling.csv"), 3, "frame 2 follows 3"),
         (("animate", "{actor}", "{tmp}/far.csv"), 3, "allowed are +-1e+06 mm"),
         (("animate", "{actor}"), 2, "either a source or --arkit"),

@@ -88,7 +88,7 @@ def test_picks_between_and_without_a_last_line_end():
 def test_forms_that_cannot_be_replaced_are_refused_and_the_file_is_untouched(tmp_path, form):
     path = tmp_path / "capture.toml"
     path.write_text(form)
-    with pytest.raises(OutputError, match="not written as tables"):
+    with pytest.raises(OutputError, match="not written as separate tables"):
         write_bootstrap(path, picks(), Bootstrap(frame=3))
     assert path.read_text() == form and [p.name for p in tmp_path.iterdir()] == ["capture.toml"]
 

@@ -34,9 +34,9 @@ def test_paths_are_relative_to_the_list_and_names_follow_from_them(tmp_path):
         ("anna, x, y\n", "line 1 must be"),
         (", x\n", "line 1 must be"),
         ('"anna\n', "line 1 is not CSV"),
-        ("anna, ../out\n", "no name for a folder"),
-        ("anna, .\n", "no name for a folder"),
-        ("/\n", "no name for a folder"),
+        ("anna, ../out\n", "not a valid folder name"),
+        ("anna, .\n", "not a valid folder name"),
+        ("/\n", "not a valid folder name"),
         ("an\0na\n", "line 1"),
     ],
 )

@@ -94,7 +94,7 @@ def test_each_mistake_of_a_description_is_named(tmp_path, old, new, words):
 
 
 @pytest.mark.parametrize(
-    ("description", "words"), [("1,2", "three or more"), ("0,1,2", "counted from 1"), ("head.rig", "no such")]
+    ("description", "words"), [("1,2", "at least three"), ("0,1,2", "numbered from 1"), ("head.rig", "no such")]
 )
 def test_each_mistake_of_numbers_is_named(description, words):
     with pytest.raises(FormatError, match=words):
@@ -218,10 +218,10 @@ def test_frames_that_a_table_leaves_out_show_no_markers(tmp_path):
         ("a.tsv", qtm(cells()[:4]), "its header declares 6 frames, but it has 4"),
         ("a.trc", trc(cells()[:5]), "its header declares 6 frames, but it has 5"),
         ("a.trc", trc(cells(ZEROS))[:-40], "numbers, 12 are expected"),
-        ("a.trc", trc(cells(), unit="inch"), 'lengths are in "inch", read are mm, cm, m'),
+        ("a.trc", trc(cells(), unit="inch"), 'lengths are in "inch", allowed are mm, cm, m'),
         ("a.trc", trc(cells(), frames=[1, 2, 2, 3, 4, 5]), "must be increasing whole numbers"),
         ("a.tsv", qtm(cells()).replace("\t4\n", "\t5\n", 1), "declares 5 markers but names 4"),
-        ("a.tsv", qtm(cells()).replace("DATA_INCLUDED\t3D", "DATA_INCLUDED\t6D"), "holds 6D data of Qualisys"),
+        ("a.tsv", qtm(cells()).replace("DATA_INCLUDED\t3D", "DATA_INCLUDED\t6D"), "has 6D data of Qualisys"),
         ("a.csv", vicon(cells(), outputs=True).replace("Trajectories", "Joints"), "Model Outputs, Joints, Devices"),
         ("a.csv", vicon(cells()).replace("X,Y,Z", "RX,RY,RZ"), "has no markers"),
         ("a.csv", "Format Version,1.23,Take Name,t\n\n,Type,Marker\n", "OptiTrack Motive, not a supported marker"),

@@ -45,7 +45,7 @@ def test_parameters_round_trip(tmp_path):
         ("frame,d1,d2,d3\n1,2,x,4\n", '"x" is not a number'),
         ("frame,d1,d2\n1,2,3\n", 'no column "d3"'),
         ("time,d1,d2,d3\n1,2,3,4\n", 'no column "frame"'),
-        ("frame,d1,d1,d3\n1,2,3,4\n", "twice"),
+        ("frame,d1,d1,d3\n1,2,3,4\n", "duplicate"),
         ("frame,d1,d2,d3\n1.5,2,3,4\n", "whole numbers"),
     ],
 )
@@ -77,7 +77,7 @@ def test_keys_round_trip_and_faults(tmp_path):
     assert frames.tolist() == [0, 12] and d.shape == (2, 3)
     for text, words in [
         ('{"fps": 24, "keys": []}', "keys"),
-        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 1, "d": [0,0,0]}]}', "must rise"),
+        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 1, "d": [0,0,0]}]}', "must increase"),
         ('{"fps": 0, "keys": [{"frame": 1, "d": [0,0,0]}]}', "fps"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0]}]}', "keys, entry 1: d needs three numbers: opening, "),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [1e300,0,0]}]}', r"entry 1: d needs three.*found 1e\+300"),

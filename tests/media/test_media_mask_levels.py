@@ -100,7 +100,7 @@ def test_what_most_pictures_hold_counts(tmp_path):
     found = [reader.read(k) for k in range(COUNT)]
     assert [k for k in range(COUNT) if found[k] is None] == [2, 3, 4, 5, 6, 7]
     expected = [
-        "002.png reaches only 100, teeth are 255",
+        "002.png reaches only 100, but teeth are 255",
         "003.png has",
         "004.png is 255 all over",
         "005.png is not a mask",

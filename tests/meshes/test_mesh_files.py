@@ -260,10 +260,10 @@ REFUSED_STL = {
     "binary, half": (stl()[: 84 + 50 * 96], "is truncated: it has 96 of 192 triangles"),
     "binary, begins with solid, cut": (stl(b"solid x")[:-60], "is truncated: it has 190 of 192 triangles"),
     "count too large": (stl(said=4_000), "is truncated: it has 192 of 4000 triangles"),
-    "count too small": (stl(said=100), "says that it has 100 triangles, but 92 more follow"),
+    "count too small": (stl(said=100), "declares 100 triangles, but 92 more follow"),
     "count unknown": (stl(said=0xFFFFFFFF), "declares 4,294,967,295 triangles, but has room for 192"),
     "text of another kind": (b"hello, this is no STL file\n" * 20, "has room for 9"),
-    "count zero": (stl(said=0), "says that it has 0 triangles, but 192 more follow"),
+    "count zero": (stl(said=0), "declares 0 triangles, but 192 more follow"),
     "text, cut in a number": (text_stl()[:9000].encode(), "is truncated after .* triangles"),
     "text, cut between triangles": (text_stl().split("endfacet\n")[0].encode() + b"endfacet\n", "truncated after 1"),
     "text, second solid cut": (text_stl().encode() + text_stl("b")[:700].encode(), "is truncated after"),
@@ -442,7 +442,7 @@ def test_a_used_vertex_that_is_not_finite_is_named(tmp_path: Path) -> None:
 def test_counts_are_capped_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     head = ply("<", MIXED).split(b"end_header\n")[0] + b"end_header\n"
     for old, new, words in (
-        (b"element vertex 96", b"element vertex 4000000000", "has 4,000,000,000 vertices, at most 30,000,000 are read"),
+        (b"element vertex 96", b"element vertex 4000000000", "has 4,000,000,000 vertices, at most 30,000,000 are allowed"),
         (b"element face 128", b"element face 20000000", "has 20,000,000 faces, at most 10,000,000 are read"),
     ):
         (tmp_path / "a.ply").write_bytes(head.replace(old, new))

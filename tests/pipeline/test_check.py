@@ -163,7 +163,7 @@ SAID = {
     calibration_in_metres: ("error", "cameras_together", "in metres"),
     no_calibration: ("error", "no_calibration", "neither"),
     truncated_clip: ("error", "clip", "cannot be opened"),
-    damaged_scan: ("error", "mesh", "is cut off"),
+    damaged_scan: ("error", "mesh", "is truncated"),
     scan_in_metres: ("error", "mesh", "metres"),
     scan_apart: ("error", "scans_apart", "mm apart"),
     mandible_elsewhere: ("warning", "bone_elsewhere", "mandible lies"),
@@ -250,7 +250,7 @@ def test_all_faults_are_listed_at_once_and_what_they_hide_is_named(capture):
     damaged_scan(capture)
     rest_frame_outside(capture)
     lines = [f.line() for f in found(capture)]
-    for words in ("skull.ply", "cam2.mp4", "upper_teeth.ply: is cut off", "motion.rest_frame is 12"):
+    for words in ("skull.ply", "cam2.mp4", "upper_teeth.ply: is truncated", "motion.rest_frame is 12"):
         assert sum(words in line for line in lines) == 1, words
     assert any("the bite: not checked" in line for line in lines)
     assert [line.split(":")[0] for line in lines] == sorted(

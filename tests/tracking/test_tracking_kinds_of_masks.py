@@ -152,7 +152,7 @@ def test_one_picture_unlike_the_others_is_excluded_and_reported(drawn, tmp_path)
     tracks = track(make_capture(folder, COUNT))
     assert not tracks.masks_used[2, 0, 1] and tracks.masks_used.sum() == tracks.masks_used.size - 1
     (found,) = findings(tracks, "masks_odd")
-    assert found.camera == "cam1" and f"{odd.name} reaches only 100, teeth are 255" in found.message
+    assert found.camera == "cam1" and f"{odd.name} reaches only 100, but teeth are 255" in found.message
 
 
 def test_black_masks_everywhere_and_masks_of_three_levels_are_refused(drawn, tmp_path):
