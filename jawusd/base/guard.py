@@ -23,13 +23,13 @@ from jawusd.base.errors import ResourceError
 try:
     import resource
 except ImportError:  # on Windows, which has no such limits
-    resource = None  # type: ignore[assignment]
+    resource = None  # type: ignore[assignment]  # a module elsewhere
 
 #: Environment variable: how much memory [GB] a command may use; 0 for no limit.
 SETTING = "JAWUSD_MEMORY_GB"
 
-_SHARE, _LEAST_GB = 0.75, 4.0  # share of the machine's memory; lower bound, which ordinary builds stay below
-_LEAST_SPACE_GB = 1.5  # OpenUSD's libraries take 1.3 GB of address space
+_FRACTION, _MIN_GB = 0.75, 4.0  # share of the machine's memory; lower bound, which ordinary builds stay below
+_MIN_SPACE_GB = 1.5  # OpenUSD's libraries take 1.3 GB of address space
 _CHILD = "_JAWUSD_CHILD"  # environment variable that marks the child where processes cannot fork
 _SI_KERNEL = 0x80  # from Linux's siginfo.h: sent by a terminal, to the child as well
 _PR_SET_PDEATHSIG = 1  # from Linux's prctl.h
@@ -40,7 +40,7 @@ _CRASHES = ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGILL", "SIGFPE", "SIGSYS", "SIGTR
 _current: mmap.mmap | None = None
 
 
-def begin() -> None:
+def run_in_child() -> None:
     """Continue in a child process with limits; the parent waits for it and exits with its status.
 
     Call this before heavy imports and before any thread starts.
@@ -48,13 +48,13 @@ def begin() -> None:
     global _current
     try:
         limit = memory_limit()
-        _check_space()
+        _check_address_space()
     except ResourceError as error:
-        _leave_with(error)
+        _exit_with_error(error)
     if os.environ.pop(_CHILD, None):
         return
     if not hasattr(os, "fork"):
-        _leave_by_subprocess()
+        _run_in_subprocess()
     _current = mmap.mmap(-1, mmap.PAGESIZE)
     passed = {getattr(signal, name) for name in _PASSED}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {*passed, signal.SIGCHLD})
@@ -62,9 +62,9 @@ def begin() -> None:
     gc.freeze()  # a collection would copy the pages that parent and child share
     child = os.fork()
     if child:
-        _leave_as(_wait(child, passed))
+        _exit_like(_wait(child, passed))
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    _die_with(parent)
+    _end_with_parent(parent)
     limit_process(limit)
 
 
@@ -76,7 +76,7 @@ def memory_limit() -> int:
     """
     named = os.environ.get(SETTING)
     if not named:
-        return int(max(_SHARE * machine_memory(), _LEAST_GB * 1e9))
+        return int(max(_FRACTION * machine_memory(), _MIN_GB * 1e9))
     with contextlib.suppress(ValueError):
         if 0 <= (limit := float(named)) < 1e6:
             return int(limit * 1e9)
@@ -95,12 +95,12 @@ def machine_memory() -> int:
     return found
 
 
-def _check_space() -> None:
+def _check_address_space() -> None:
     """Refuse too little address space for OpenUSD's libraries, which would be reported as damaged files later."""
     space = -1 if resource is None else resource.getrlimit(resource.RLIMIT_AS)[0]  # -1: no limit
-    if 0 <= space < _LEAST_SPACE_GB * 1e9:
+    if 0 <= space < _MIN_SPACE_GB * 1e9:
         found = (
-            f"address space is limited to {space / 1e9:.2g} GB (ulimit -v), at least {_LEAST_SPACE_GB:g} GB is needed."
+            f"address space is limited to {space / 1e9:.2g} GB (ulimit -v), at least {_MIN_SPACE_GB:g} GB is needed."
         )
         raise ResourceError(found)
 
@@ -172,7 +172,7 @@ def most_cpu(seconds: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
 
 
-def _die_with(parent: int) -> None:
+def _end_with_parent(parent: int) -> None:
     """Make the system kill this process when its parent ends (Linux only)."""
     if sys.platform == "linux":
         import ctypes
@@ -192,7 +192,7 @@ def _wait(child: int, passed: set[signal.Signals]) -> int:
             continue
         pid, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
         if pid and os.WIFSTOPPED(status):
-            os.kill(os.getpid(), signal.SIGSTOP)  # so that the shell sees a stopped job
+            os.kill(os.getpid(), signal.SIGSTOP)  # the shell then sees a stopped job
         elif pid:
             return status
 
@@ -202,7 +202,7 @@ def _next_signal(awaited: set[signal.Signals]) -> tuple[int, bool]:
     if hasattr(signal, "sigwaitinfo"):
         found = signal.sigwaitinfo(awaited)
         return found.si_signo, found.si_code == _SI_KERNEL
-    number = signal.sigwait(awaited)  # macOS does not say who sent it
+    number = signal.sigwait(awaited)  # macOS does not report the sender
     try:
         in_front = os.tcgetpgrp(0) == os.getpgrp()
     except OSError:
@@ -210,20 +210,20 @@ def _next_signal(awaited: set[signal.Signals]) -> tuple[int, bool]:
     return number, in_front and signal.Signals(number).name in _KEYS
 
 
-def _leave_as(status: int) -> NoReturn:
+def _exit_like(status: int) -> NoReturn:
     """End this process like its child: with its exit code, by its signal, or with a message if it crashed."""
     if os.WIFEXITED(status):
         os._exit(os.WEXITSTATUS(status))
     number = signal.Signals(os.WTERMSIG(status))
     if number.name in (*_CRASHES, "SIGXCPU", "SIGKILL"):
-        _leave_with(_death(number.name))
+        _exit_with_error(_crash(number.name))
     signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
     os.kill(os.getpid(), number)
     os._exit(128 + number)
 
 
-def _death(name: str) -> ResourceError:
+def _crash(name: str) -> ResourceError:
     if name == "SIGXCPU":
         found, hint = "takes too much processor time to read: the file is damaged or malicious.", ""
     elif name == "SIGKILL":
@@ -234,13 +234,13 @@ def _death(name: str) -> ResourceError:
     return ResourceError(found, path=current_file(), hint=hint or None)
 
 
-def _leave_with(error: ResourceError) -> NoReturn:
+def _exit_with_error(error: ResourceError) -> NoReturn:
     with contextlib.suppress(OSError):
         os.write(2, f"jawusd: {error}\n".encode(errors="backslashreplace"))
     os._exit(error.exit_code)
 
 
-def _leave_by_subprocess() -> NoReturn:
+def _run_in_subprocess() -> NoReturn:
     """Run the program in a second Python process and exit with its status, where processes cannot fork."""
     import subprocess
 
@@ -248,5 +248,5 @@ def _leave_by_subprocess() -> NoReturn:
     line = [sys.executable, "-m", "jawusd", *sys.argv[1:]]
     code = subprocess.run(line, env={**os.environ, _CHILD: "1"}, check=False).returncode
     if code < 0 or code >= 0xC0000000:  # Windows exit codes of uncaught exceptions
-        _leave_with(_death(f"{code & 0xFFFFFFFF:#x}"))
+        _exit_with_error(_crash(f"{code & 0xFFFFFFFF:#x}"))
     os._exit(code)

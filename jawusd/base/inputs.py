@@ -40,10 +40,10 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
 def why_unreadable(path: str | os.PathLike[str]) -> tuple[str, str] | None:
     """Return why a file cannot be read, and what to do, if it is empty or a Git LFS pointer; otherwise None."""
     with open(path, "rb") as file:
-        beginning = file.read(len(_LFS))
-    if not beginning:
+        head = file.read(len(_LFS))
+    if not head:
         return "the file is empty.", "Copy it again."
-    if beginning == _LFS:
+    if head == _LFS:
         return "is a Git LFS pointer, not the file itself.", "Fetch it: git lfs pull."
     return None
 

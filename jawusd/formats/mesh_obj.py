@@ -45,9 +45,8 @@ def read_obj(path: Path) -> MeshData:
     places: list[list[str]] = []
     counts: list[int] = []
     corners: list[str] = []
-    relative: list[
-        tuple[int, int, int]
-    ] = []  # per face with negative indices: its first corner, vertices and texture coordinates so far
+    # Per face with negative indices: its first corner, and the vertices and texture coordinates so far.
+    relative: list[tuple[int, int, int]] = []
     for line in text.replace("\\\n", " ").split("\n"):
         words = (line.partition("#")[0] if "#" in line else line).split()
         kind = words[0] if words else ""
@@ -135,9 +134,9 @@ def _uv(path: Path, rows: list[list[str]], texture: Indices | None, placed: Indi
 
 def _check_whole(path: Path, text: str, polygons: int, vertices: Array, faces: Indices) -> None:
     """Raise if a file is truncated within its faces."""
-    said = _COUNTED.findall(text)
-    if len(said) == 1 and int(said[0]) > polygons:
-        raise cut_off(path, polygons, int(said[0]), "faces")
+    declared = _COUNTED.findall(text)
+    if len(declared) == 1 and int(declared[0]) > polygons:
+        raise cut_off(path, polygons, int(declared[0]), "faces")
     used = len(np.unique(faces[(faces >= 0) & (faces < len(vertices))]))
     if not text.endswith("\n") and used < (1 - _LEAST_LOOSE) * len(vertices) and polygons:
         raise CaptureError(

@@ -244,14 +244,14 @@ class Video(Clip):
             return
         decoder = av.CodecContext.create(self._alpha_decoder, "r")
         for packet in container.demux(stream):
-            # PyAV's stub lacks the decoder's class.
-            yield from decoder.decode(packet if packet.size else None)  # type: ignore[attr-defined]
+            found = packet if packet.size else None
+            yield from decoder.decode(found)  # type: ignore[attr-defined]  # PyAV's stub lacks the decoder's class
 
     def _undecodable(self, index: int) -> CaptureError:
         return CaptureError(
             f"frame {index} of {self.count} (at {self.times_s[index]:.3f} s) cannot be decoded.",
             path=self.path,
-            hint="Copy the video again from the camera, or cut it to the part that is whole.",
+            hint="Copy the video again from the camera, or trim it to the intact part.",
         )
 
 

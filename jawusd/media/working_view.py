@@ -22,8 +22,8 @@ _Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
 def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pixel]:
     """Return an image sampled bilinearly at positions (h, w, 2) [px], 0 outside of it."""
-    # cv2's stub requires a second map, which a map of two channels does not need.
-    found = cv2.remap(image, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+    black = cv2.BORDER_CONSTANT
+    found = cv2.remap(image, positions, None, cv2.INTER_LINEAR, borderMode=black)  # type: ignore[call-overload]  # no 2nd map
     return np.asarray(found, image.dtype)
 
 

@@ -32,10 +32,9 @@ class Samples:
 
     Attributes:
         points: in order of the smallest boxes [mm], shape (P, 3).
-        balls: centres of what boxes hold and distances of its farthest points [mm], shape (B, 4); every box is followed
-            by those within it.
-        nodes: of every box that holds no smaller ones, its first point and the one after its last, of others 0 and 0;
-            and the next box that is not within it, shape (B, 3).
+        balls: bounding spheres of the boxes' points, centre and radius [mm], shape (B, 4); in depth-first order.
+        nodes: per box the range of its points (first, one past the last; 0, 0 for boxes with children), and the next
+            box outside it, shape (B, 3).
     """
 
     points: Array
@@ -62,8 +61,8 @@ class Pair:
     def depth(self, T_upper_lower: Array) -> Array:
         """Return the penetration depth of the surfaces [mm], shape (n,), in poses (n, 4, 4).
 
-        The largest distance of a point of one surface inside the other solid to that solid's surface; negative, down to
-        -`FARTHEST_MM`, where they are apart.
+        This is the largest distance to the surface of a solid, over the points of the other surface inside it.
+        Negative, down to -`FARTHEST_MM`, for separate surfaces.
         """
         return self._deepest(T_upper_lower, -FARTHEST_MM, np.inf)
 

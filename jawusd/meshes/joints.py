@@ -36,7 +36,7 @@ class Joints:
 
     Attributes:
         pairs: Skull and condyle as solids, left and right.
-        closed: How deep each condyle runs into the skull in the closed bite [mm], shape (2,); negative if it does not,
+        closed: Penetration depth of each condyle into the skull in the closed bite [mm], shape (2,); negative for gaps,
             down to -`collision.FARTHEST_MM`.
         T_anatomical_skull: Skull to anatomical coordinates, shape (4, 4).
         T_rest: T_skull_mandible of the closed bite, shape (4, 4).
@@ -55,7 +55,7 @@ class Joints:
     def clearances(self, T_skull_mandible: Array) -> Array:
         """Return the smaller clearance of both condyles [mm], shape (n,), in poses (n, 4, 4).
 
-        Below 0 where one runs into the skull, deeper than in the closed bite.
+        Below 0 where one penetrates the skull deeper than in the closed bite.
         """
         A = self.T_anatomical_skull
         T = A @ T_skull_mandible @ se3_inverse(A @ self.T_rest)

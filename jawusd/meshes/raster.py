@@ -1,17 +1,16 @@
 """Rasterise projected triangle meshes on the CPU: silhouettes as bit rows, depth as 1/z.
 
-Everything compiled here releases the GIL and keeps no state, so any number of threads may call it at once. The
-compiled code is cached on disk; the argument types are fixed (C-contiguous float32 / int32 / uint64 arrays), so a
-call with another dtype is a TypeError and never a second compilation.
+The compiled functions release the GIL and have no state, so threads may call them concurrently. The compiled code is
+cached on disk; argument types are fixed (C-contiguous float32 / int32 / uint64 arrays), so that another dtype is a
+TypeError instead of a second compilation.
 
 Conventions: OpenCV pixels, the centre of the top left pixel of the image is (0, 0). A *region* buffer starts at image
 pixel (x0, y0) and its own shape is its size. A silhouette is a (h, words) uint64 array, bit ``x & 63`` of word
 ``x >> 6`` is pixel x of the region; bits beyond the width stay zero.
 
-Edge rule: a pixel is covered iff its centre lies inside a projected triangle or on its border. Each edge is followed
-from its upper end whatever triangle it belongs to, so that neighbours agree to the bit and closed meshes show no
-cracks; a pixel covered twice is harmless both for a union and for a nearest-depth test. (A top-left rule would only
-matter for counting, and would drop centres that lie exactly on the outline.)
+Edge rule: a pixel is covered iff its centre lies inside a projected triangle or on its border. Every edge is evaluated
+from its upper end, so that both of its triangles get equal values and closed meshes have no cracks. Pixels covered
+twice do not affect unions or nearest depths. (A top-left rule would drop centres exactly on the outline.)
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from jawusd.base.arrays import Mask
 _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _ONE = np.uint64(1)
 _LOW6 = 63
-_MIN_DEPTH = np.float32(1e-3)  # mm; a triangle with a corner nearer than this (or behind the camera) is not drawn
+_MIN_DEPTH = np.float32(1e-3)  # mm; a triangles with a corner nearer than this, or behind the camera, are not drawn
 
 
 def _array(dtype: types.Type, mutable: bool = False) -> types.Array:
@@ -53,7 +52,7 @@ def project(vertices: Singles, matrix: Singles, out: Singles) -> None:
     Args:
         vertices: (V, 3) float32, mm, in the frame the matrix takes.
         matrix: (3, 4) float32, K [R | t] @ T; maps homogeneous mm to (u z, v z, z).
-        out: (V, 3) float32, receives u [px], v [px], depth z [mm]. u, v mean nothing where z <= 0.
+        out: (V, 3) float32, receives u [px], v [px], depth z [mm]. u, v are undefined where z <= 0.
     """
     for i in range(vertices.shape[0]):
         x = vertices[i, 0]
@@ -68,7 +67,7 @@ def project(vertices: Singles, matrix: Singles, out: Singles) -> None:
 
 @numba.njit(nogil=True, cache=True)
 def _hidden(points: Singles, a: int, b: int, c: int, cull: bool) -> bool:
-    """Tell whether a triangle is not to be drawn: touches the camera plane, or (cull) is turned away.
+    """Tell whether a triangle is not drawn: it touches the camera plane or, with `cull`, is a back face.
 
     With y down an outward counter-clockwise face seen from the front has negative signed area.
     """
@@ -105,7 +104,7 @@ def _edges(points: Singles, a: int, b: int, c: int) -> _Edges:
 
 @numba.njit(nogil=True, cache=True)
 def _interval(low: float, high: float, first: int, last: int) -> tuple[int, int]:
-    """Return the integers of [low, high] within [first, last] as (i, j); i > j when there is none (or NaN).
+    """Return the integers of [low, high] within [first, last] as (i, j); i > j if there are none, or for NaN.
 
     Clamped as floats first: casting a NaN or a huge coordinate to an integer is undefined.
     """
@@ -160,14 +159,14 @@ def draw_silhouette(
         faces: (F, 3) int32, valid indices into points (not checked).
         x0, y0: image pixel at the buffer's top left corner.
         width: pixels per row; bits.shape[1] must be at least words_for(width).
-        cull: leave out faces turned away; only for closed meshes with outward winding, where it changes nothing.
+        cull: skip back faces; only for closed meshes with outward winding, where it changes nothing.
         bits: (h, words) uint64; clear it before the first call.
 
     Raises:
         ValueError: the buffer's rows are shorter than width.
     """
     if bits.shape[1] * 64 < width:
-        raise ValueError("bits: rows hold fewer than width pixels")
+        raise ValueError("bits: rows have fewer than width pixels")
     for f in range(faces.shape[0]):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         if _hidden(points, a, b, c, cull):
@@ -215,12 +214,12 @@ def draw_depth_labels(
     labels: NDArray[np.uint8],
     label: int,
 ) -> None:
-    """Draw projected triangles into a nearest-surface buffer and note which mesh is seen.
+    """Draw projected triangles into a nearest-surface buffer and record which mesh is visible.
 
     Args:
         points, faces, x0, y0, cull: as for `draw_silhouette`.
-        inverse_depth: (h, w) float32, 1/z [1/mm], 0 = empty; clear it before the first call. Ties keep the earlier.
-        labels: (h, w) uint8, receives label where the mesh is nearest; an empty (0, 0) array stores none.
+        inverse_depth: (h, w) float32, 1/z [1/mm], 0 = empty; clear it before the first call; ties keep it.
+        labels: (h, w) uint8, receives label where the mesh is nearest; an empty (0, 0) array disables this.
 
     Raises:
         ValueError: labels is neither empty nor as large as inverse_depth.

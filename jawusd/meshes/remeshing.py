@@ -36,8 +36,8 @@ def decimated(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Ar
 def proxy_of(mesh: Mesh, count: int) -> Mesh:
     """Return a mesh of about `count` faces, plus one per border edge; crowns and gum stay separate.
 
-    Borders, that between crown and gum among them, stay where they are. Labels say what is crown; colours and texture
-    coordinates are left out.
+    Borders are preserved, including the one between crown and gum. The result has labels of crown and gum, without
+    colours and texture coordinates.
     """
     crown = crown_face_mask(mesh)
     parts = []
@@ -66,7 +66,7 @@ def decimated_scan(
 ) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
     """Return vertices, about `crown_count` crown faces, and gum faces reduced by the same ratio.
 
-    The line between crown and gum stays where it is.
+    The border between crown and gum is preserved.
     """
     share = crown_count / len(crown_faces)
     parts = [decimated(vertices, faces, int(share * len(faces))) for faces in (crown_faces, gum_faces)]

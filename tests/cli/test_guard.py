@@ -17,7 +17,7 @@ from jawusd.base import guard
 from jawusd.base.errors import ResourceError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and limits of Linux")
-BEGIN = "import os, resource, signal, sys, time; from jawusd.base import guard; guard.begin(); "
+BEGIN = "import os, resource, signal, sys, time; from jawusd.base import guard; guard.run_in_child(); "
 
 
 def guarded(code, *words, **settings):

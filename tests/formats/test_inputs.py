@@ -58,7 +58,8 @@ def test_named_pipes_are_no_files(name, tmp_path):
 @pytest.mark.parametrize("name", READERS)
 def test_folders_are_no_files(name, tmp_path):
     (tmp_path / name).mkdir()
-    with pytest.raises(JawusdError, match=r"(?i)not a regular file|no such|no frames|is a folder|directory|capture.toml"):
+    words = r"(?i)not a regular file|no such|no frames|is a folder|directory|capture.toml"
+    with pytest.raises(JawusdError, match=words):
         READERS[name](tmp_path / name)
 
 
