@@ -82,7 +82,7 @@ CONTENTS = [
     ("an empty clip", "left.mp4", b"", "the file is empty", "Copy it again"),
     ("a scan that git has not fetched", "l.ply", LFS, "Git LFS", "git lfs pull"),
     ("a clip that git has not fetched", "left.mp4", LFS, "Git LFS", "pull"),
-    ("text under the name of a scan", "u.ply", b"dear diary", "is no PLY file", "Export it again"),
+    ("text under the name of a scan", "u.ply", b"dear diary", "is not a PLY file", "Export it again"),
 ]
 # The same of what is typed: words; file; found; allowed; what to do.
 TYPED = [

@@ -140,7 +140,7 @@ def test_an_opencolorio_config_is_used(images, tmp_path):
     wanted = read_stored(tmp_path / "take.1001.exr").pixels.astype(np.float32)
     config.getProcessor(transform).getDefaultCPUProcessor().applyRGB(wanted)
     assert np.abs(shown - 255 * np.clip(wanted, 0, 1)).max() <= 0.51
-    with pytest.raises(CaptureError, match="cannot show"):
+    with pytest.raises(CaptureError, match="cannot convert"):
         bad = ClipSource(pattern, colour_space="Nothing", colour_config=tmp_path / "config.ocio")
         next(open_clip(bad).frames())
 

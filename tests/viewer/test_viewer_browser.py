@@ -305,7 +305,7 @@ def test_a_bad_file_is_a_message_and_the_page_lives_on(tab, tmp_path):
     worse = tmp_path / "worse.json"
     worse.write_bytes(b"\xff\xfe\x00rubbish")
     chooser.set_input_files(worse)
-    until(lambda: "none after the last." in tab.web.inner_text("body"))
+    until(lambda: "but not after the last." in tab.web.inner_text("body"))
     huge = tmp_path / "huge.csv"
     huge.write_bytes(b"0" * (MOST_BYTES + 1))
     chooser.set_input_files(huge)
