@@ -74,11 +74,11 @@ def repeated(path, pictures, crf=18):
 @pytest.mark.parametrize(
     ("again", "said"),
     [
-        (range(60, 84), "frames 60 to 83 show"),
-        (range(62, 68), "frames 62 to 67 show"),
-        (range(100, 120), "frames 100 to 119 show"),
-        (range(60, 61), "frames 60 show"),
-        ([*range(12, 20), *range(60, 84)], "frames 12 to 19, 60 to 83 show"),
+        (range(60, 84), "frames 60 to 83 repeat"),
+        (range(62, 68), "frames 62 to 67 repeat"),
+        (range(100, 120), "frames 100 to 119 repeat"),
+        (range(60, 61), "frames 60 repeat"),
+        ([*range(12, 20), *range(60, 84)], "frames 12 to 19, 60 to 83 repeat"),
     ],
 )
 def test_frozen_cameras_and_doubled_pictures_are_named(tmp_path, again, said, crf):

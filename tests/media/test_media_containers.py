@@ -54,7 +54,7 @@ def test_the_whole_of_such_a_playlist_would_be_read(elsewhere):
 
 def test_videos_of_huge_pictures_are_refused(monkeypatch):
     monkeypatch.setattr(video, "MOST_PX", 64 * 64)
-    with pytest.raises(CaptureError, match="at most 4096 in all"):
+    with pytest.raises(CaptureError, match="at most 4096 px in total"):
         Video(VIDEO)
 
 

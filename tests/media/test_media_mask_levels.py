@@ -102,7 +102,7 @@ def test_what_most_pictures_hold_counts(tmp_path):
     expected = [
         "002.png reaches only 100, but teeth are 255",
         "003.png has",
-        "004.png is 255 all over",
+        "004.png is uniformly 255",
         "005.png is not a mask",
     ]
     for line, start in zip(reader.odd, [*expected, "006.png has 16 bits per channel"], strict=True):

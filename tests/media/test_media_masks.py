@@ -154,7 +154,7 @@ def test_wrong_size_names_file_found_and_allowed(pattern: Path, video: Path) -> 
 def test_sources_that_are_not_there(tmp_path: Path, pattern: Path, video: Path) -> None:
     for path, message in {
         tmp_path / "gone" / "%06d.png": "there is no folder .*gone",
-        pattern.parent / "mask_%06d.png": "no file of the folder",
+        pattern.parent / "mask_%06d.png": "no file in the folder",
         pattern.parent / "%06d_%02d.png": "one number",
         pattern.parent / "%s.png": "one number",
         tmp_path / "gone.mkv": "no such video",

@@ -137,5 +137,5 @@ def test_contact_sheet_layout() -> None:
     sheet = overlay.contact_sheet(tiles, 2)
     assert sheet[::4, ::6, 0].tolist() == [[1, 2], [3, 0]]
     for bad in ([], [tiles[0], tiles[1][:2]]):
-        with pytest.raises(ValueError, match="one size"):
+        with pytest.raises(ValueError, match="equal sizes"):
             overlay.contact_sheet(bad, 2)

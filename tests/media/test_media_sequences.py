@@ -70,7 +70,7 @@ def test_patterns_that_cannot_be(images, tmp_path):
     for name, said in (
         ("take.####.exr", "no file in the folder matches take.####.exr"),
         ("take.%04d.%04d.png", "two numbers"),
-        ("take.%04x.png", "needs one number such as %06d"),
+        ("take.%04x.png", "needs a number such as %06d"),
     ):
         with pytest.raises(CaptureError, match=said.replace(".", r"\.")):
             numbered_files(tmp_path / name)

@@ -59,7 +59,7 @@ def test_scans_that_say_nothing_are_refused(scans):
     upper, lower = scans
     with pytest.raises(NoContact, match="leaves more than 1 mm"):
         find_teeth(upper, lower, np.eye(4), lifted(-3.0))
-    with pytest.raises(NoContact, match="into each other"):
+    with pytest.raises(NoContact, match="penetrate each other"):
         find_teeth(upper, lower, np.eye(4), lifted(6.0))
     with pytest.raises(NoContact, match="upper scan is too coarse"):
         find_teeth(Mesh(5 * upper.vertices, upper.faces), lower, np.eye(4), np.eye(4))
