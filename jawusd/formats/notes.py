@@ -1,6 +1,6 @@
-"""What JSON headers of results (`meta`) say: one schema for those who write, check and show them.
+"""Schema of the JSON headers (`meta`) of results, shared by writers, checks and reports.
 
-Every value is optional: other programs and older versions leave values out or add their own.
+Every value is optional: other programs and older versions omit some or add their own.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _STRICT = ConfigDict(strict=True, extra="ignore")
 
 
 class CameraCorrections(TypedDict, total=False):
-    """Camera poses as a take corrects them; tables by camera name."""
+    """Camera poses as refined on a take; tables by camera name."""
 
     corrected: bool
     pivot_mm: list[float]
@@ -32,15 +32,15 @@ class CameraCorrections(TypedDict, total=False):
 
 
 class Registration(TypedDict, total=False):
-    """How far the lower scan is from where the closed bite of the take shows it, in skull (scan) axes.
+    """Registration of the lower scan to the closed bite found in the take, in skull (scan) axes.
 
-    `T` (4, 4) maps the lower scan as it was given to where it belongs; shift and turn are of the same motion about the
-    middle of the lower crowns. Standard deviations follow.
+    `T` (4, 4) maps the lower scan as given to its corrected position; shift and turn describe the same motion about the
+    centre of the lower crowns.
     """
 
-    frames: Required[list[int]]  # with the teeth together
-    named: bool  # the capture names such a frame
-    applied: Required[bool]  # poses and lower scan are those of the corrected registration
+    frames: Required[list[int]]  # frames with the teeth together
+    named: bool  # whether the capture specifies the rest frame
+    applied: Required[bool]  # whether poses and lower scan use the corrected registration
     shift_mm: Required[list[float]]
     turn_deg: Required[list[float]]
     shift_sigma_mm: list[float]
@@ -49,14 +49,14 @@ class Registration(TypedDict, total=False):
 
 
 class TakeNotes(TypedDict, total=False):
-    """Estimates over a whole take, which tracks hold and summaries print; pairs are (upper, lower)."""
+    """Estimates for the whole take, stored in tracks and printed in summaries; pairs are (upper, lower)."""
 
-    outline_bias_px: dict[str, list[float]]  # by camera: how far the masks of both arches extend beyond free edges
+    outline_bias_px: dict[str, list[float]]  # by camera: offset of the masks' outlines at free edges
     gum_bias_px: dict[str, list[float]]  # by camera: the same at the gum line
-    gum_line_mm: list[float]  # distance of the drawn gum line from the scans', towards the gum, along the surface
+    gum_line_mm: list[float]  # offset of the drawn gum line from the scans', along the surface towards the gum
     registration: Registration  # of the lower scan, from frames with the teeth together
     calibration_rescaled_px: dict[str, list[list[int]]]  # by camera: (width, height) calibrated and recorded
-    prior_spread_mm: float  # width of the model's prior that all final poses were weighed with, where they were
+    prior_spread_mm: float  # standard deviation of the model prior used for all final poses, if any
     findings: list[dict[str, str | float | int]]  # `Finding.as_json` of all warnings about the take
 
 
@@ -80,11 +80,11 @@ class TracksMeta(TakeNotes, total=False):
     backend: str
     evaluations_per_row_and_frame: float
     fps: float  # frames per second of a performance
-    tolerance_mm: float  # how far outside the bound the rig allows poses of a performance
+    tolerance_mm: float  # distance outside the bound that the rig allows for a performance
 
 
 class ModelWarning(TypedDict):
-    """What the take lacks for a good model."""
+    """A movement or quality that the take lacks for a good model."""
 
     code: str
     message: str
@@ -92,7 +92,7 @@ class ModelWarning(TypedDict):
 
 @with_config(_STRICT)
 class ModelMeta(TypedDict, total=False):
-    """Header of a model, as far as it is read again."""
+    """Header of a model; keys that are never read are omitted."""
 
     actor: str
     method: str
@@ -117,14 +117,14 @@ class SyncNotes(TypedDict, total=False):
 def check_notes(
     meta: Mapping[str, object], kind: type[TracksMeta] | type[ModelMeta], path: str | os.PathLike[str]
 ) -> None:
-    """Check the types of the values of a header.
+    """Check the types of a header's values.
 
     Raises:
-        FormatError: one has another type than its readers expect.
+        FormatError: a value has the wrong type.
     """
     try:
         TypeAdapter(kind).validate_python(meta)
     except ValidationError as error:
         fault = error.errors()[0]
         name = ".".join(map(str, fault["loc"]))
-        raise FormatError(f'"meta" has no readable "{name}": {fault["msg"]}.', path=path) from error
+        raise FormatError(f'"meta" has an invalid "{name}": {fault["msg"]}.', path=path) from error
