@@ -81,7 +81,7 @@ def exercises():
         ("to the left and right", 5, (0, 1, 0)),
         ("forward", 4, (0, 0, 1)),
         ("half open: left, right, forward", 6, (0.45, 1, 0.7)),
-        ("around the limits", 5, (0.9, 0.8, 0.3)),
+        ("along the limits", 5, (0.9, 0.8, 0.3)),
         ("chew and speak", 5, (0.3, 0.25, 0.1)),
         ("teeth together", 2, (0, 0, 0)),
     ]
@@ -145,7 +145,8 @@ def board():
     for x, y, tilt in ((260, 150, 0), (300, 138, 22), (340, 158, -22), (380, 150, 8)):
         a = math.radians(90 + tilt)
         parts.append(path([(x - 46 * math.cos(a), y - 46 * math.sin(a)), (x + 46 * math.cos(a), y + 46 * math.sin(a))]))
-    parts += [text(320, 232, "the board, where the teeth will be:"), text(320, 252, "near, far, tilted every way")]
+    parts.append(text(320, 232, "the board, where the teeth will be:"))
+    parts.append(text(320, 252, "near, far, tilted in every direction"))
     for i in range(7):
         for j in range(5):
             if (i + j) % 2 == 0:
@@ -216,7 +217,7 @@ def bound():
     parts += [text(430, 182, "d2", "end"), text(240, 32, "d3", "start")]
     parts += [circle(280, 120, 5, "fill3"), text(240, 146, "inside: margin +2.1 mm", "start", "small")]
     parts += [circle(430, 72, 5, "fill2"), text(444, 70, "outside: margin -2.9 mm", "start", "small")]
-    parts += [arrow((430, 72), (362, 104), "two"), text(444, 90, "brought to the nearest valid d", "start", "small")]
+    parts += [arrow((430, 72), (362, 104), "two"), text(444, 90, "moved to the nearest valid d", "start", "small")]
     parts += [text(230, 292, "section of the bound at one opening d1")]
     return svg(680, 304, "A section of the bound in d2 and d3, with one point inside and one outside", parts)
 

@@ -9,10 +9,11 @@ from jawusd.cli.summaries import EXIT_CODES, SUMMARIES
 
 INTRODUCTION = """# Commands
 
-Made from the program: the same text as `jawusd COMMAND --help`. `python -m jawusd` is the same program. Results go to
-stdout, progress to stderr; `--json` prints what a program can read. Nothing is overwritten without `--force` (or
-`--resume` and `--fresh`, where a command goes on with earlier work). Vectors are written `--d 20 2 1` or `--d 20,2,1`.
-Options of `jawusd` itself stand before the command: `jawusd --log build.log build ...`.
+This page is generated from the program and has the same text as `jawusd COMMAND --help`. `python -m jawusd` is the same
+program. Results go to stdout and progress to stderr. `--json` prints machine-readable output. Nothing is overwritten
+without `--force` (or `--resume` and `--fresh`, for commands that continue earlier work). Vectors are written
+`--d 20 2 1` or `--d 20,2,1`. Options of `jawusd` itself come before the command:
+`jawusd --log build.log build ...`.
 
 """
 
@@ -22,7 +23,7 @@ def page():
     program = typer.main.get_command(app)
     parts = [INTRODUCTION, "| command | what it does |\n|---|---|\n"]
     parts += [f"| [`{name}`](#jawusd-{name}) | {escaped(SUMMARIES[name])} |\n" for name in SUMMARIES]
-    parts.append(f"\n{escaped(EXIT_CODES)} [Errors and exit codes](errors.md) names them one by one.\n\n")
+    parts.append(f"\n{escaped(EXIT_CODES)} [Errors and exit codes](errors.md) lists them.\n\n")
     parts.append(section("jawusd", program, "jawusd"))
     parts += [section(f"jawusd {name}", program.commands[name], f"jawusd-{name}") for name in SUMMARIES]
     return "".join(parts)
@@ -39,7 +40,7 @@ def section(title, command, anchor):
         record = parameter.get_help_record(context)
         if record is not None:
             names, meaning = record
-            lines.append(f"`{names}`\n:   {escaped(meaning) or 'As its name says.'}\n\n")
+            lines.append(f"`{names}`\n:   {escaped(meaning) or 'See its name.'}\n\n")
     return "".join(lines)
 
 

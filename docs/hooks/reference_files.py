@@ -50,9 +50,10 @@ FILES = {
 
 FOLDER = f"""# Files
 
-Every file that jawusd reads or writes: a dataclass, a reader and a writer each, made from their docstrings. Readers
-check version, units, shapes and finite numbers, and name the field that is wrong. Writers write beside the target and
-rename: nobody meets half a file. Files of a newer version are refused, of an older one upgraded. There are no pickles.
+This page lists every file that jawusd reads or writes. Each has a dataclass, a reader and a writer. The text comes from
+their docstrings. Readers check version, units, shapes and finite numbers, and name the field that is wrong. Writers
+write a temporary file and rename it, so incomplete files never appear. Files of a newer version are refused, and files
+of an older version are upgraded. There are no pickles.
 
 ## The folder of a rig
 
@@ -69,8 +70,8 @@ rename: nobody meets half a file. Files of a newer version are refused, of an ol
 | `cameras.usda` | the calibrated cameras |
 | `tracks.npz`, `first_pass.npz` | [poses of both arches][jawusd.formats.tracks], final and of the first pass |
 | `model.npz` | the [fitted model][jawusd.formats.model], all that `jawusd.evaluator.load` needs |
-| `report.html` | how good the build is, on one page without other files |
-| `build.json` | which stages are done, from which files, with which versions |
+| `report.html` | the quality of the build, on one self-contained page |
+| `build.json` | finished stages, with their input files and versions |
 
 """
 

@@ -8,25 +8,25 @@ STAGES = (
 
 PAGES = {
     "evaluator": (
-        "Numpy and nothing else: `import jawusd.evaluator` loads no other package. `python -m jawusd.evaluator` "
+        "Needs only numpy: `import jawusd.evaluator` loads no other package. `python -m jawusd.evaluator` "
         "does the same on the command line.",
         ["jawusd.evaluator", "jawusd.fast"],
     ),
-    "solvers": ("The rig in PyTorch, for solvers that follow gradients.", ["jawusd.solvers"]),
+    "solvers": ("The rig in PyTorch, for gradient-based solvers.", ["jawusd.solvers"]),
     "rig": (
         "Reading, checking and animating rigs in OpenUSD.",
         ["jawusd.rig", "jawusd.rig.rebake", "jawusd.rig.publish", "jawusd.rig.glb", "jawusd.rig.cameras"],
     ),
     "library": (
-        "A folder of actors, and motion of one person for another.",
+        "A folder of actors, and retargeting between persons.",
         ["jawusd.library.personal", "jawusd.library.timing"],
     ),
     "pipeline": (
-        "The stages wired together: what the commands call. Heavy packages are loaded by the functions that need them.",
+        "The stages connected, as the commands call them. Heavy packages are loaded by the functions that need them.",
         [f"jawusd.pipeline.{name}" for name in STAGES],
     ),
     "fitting": (
-        "The jaw model from poses, and poses from pictures.",
+        "Fitting the jaw model to poses, and tracking poses in pictures.",
         ["jawusd.fitting", "jawusd.tracking", "jawusd.photographs"],
     ),
     "geometry": ("Rotations, rigid motions, cameras and the anatomical frame.", ["jawusd.geometry"]),
@@ -50,7 +50,7 @@ TOP = """# jawusd
 | [`jawusd.JawRig`][jawusd.evaluator.JawRig] | the rig: pose, encode, margin, validate, ik |
 | [`jawusd.build`][jawusd.pipeline.build.build] | from a capture to a rig in one call |
 | [`jawusd.track`][jawusd.pipeline.track.track] | track both rows of teeth |
-| [`jawusd.JawusdError`][jawusd.base.errors.JawusdError] | what every error of jawusd is |
+| [`jawusd.JawusdError`][jawusd.base.errors.JawusdError] | the base class of all errors |
 | `jawusd.__version__` | the version, as text |
 """
 

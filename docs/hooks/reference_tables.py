@@ -15,18 +15,19 @@ SCHEMA = Path(__file__).resolve().parents[2] / "schemas" / "schema.usda"
 
 CAPTURE = """# capture.toml
 
-Made from the models that read the file: what `jawusd init --reference` prints too. Paths are relative to the file
-and stay below its folder, unless `--allow-outside` is given. [From masks](../guides/masks.md) and
-[From footage alone](../guides/footage.md) say which of the keys a capture needs; `jawusd init FOLDER` writes a file
-with comments from what lies in a folder, and `jawusd check FOLDER` says what is wrong with it.
+This page is generated from the models that read the file. `jawusd init --reference` prints the same text. Paths are
+relative to the file and must stay below its folder, unless `--allow-outside` is given. [From masks](../guides/masks.md)
+and [From footage alone](../guides/footage.md) explain which keys a capture needs. `jawusd init FOLDER` writes a
+commented file from the contents of a folder, and `jawusd check FOLDER` reports errors in it.
 
 """
 
 USD = """# USD attributes
 
-Made from `schemas/schema.usda`. `JawRigAPI` is a codeless, single-apply schema: attributes are read by their names, and
-a program needs the schema only for its documentation and limits. `import jawusd` tells OpenUSD of it, if that comes
-before the first stage is opened; other programs find it by `PXR_PLUGINPATH_NAME`, as `jawusd info --schema` prints.
+This page is generated from `schemas/schema.usda`. `JawRigAPI` is a codeless, single-apply schema. Attributes are read
+by their names, and a program needs the schema only for its documentation and limits. `import jawusd` registers it with
+OpenUSD, if it runs before the first stage is opened. Other programs find it through `PXR_PLUGINPATH_NAME`;
+`jawusd info --schema` prints the value.
 
 Matrices are stored row by row and act on column vectors; a twist is (omega [rad], v [mm]). The column "array" names the
 same values in `model.npz` and in `rig.arrays`. Attributes marked "anchored" or "additive" belong to one kind of
@@ -36,9 +37,9 @@ same values in `model.npz` and in `rig.arrays`. Attributes marked "anchored" or 
 
 ERRORS = """# Errors and exit codes
 
-Every error of jawusd is a `jawusd.JawusdError`. Its message says where (file, camera, frame), what was found, what is
-allowed with its unit, and what to do; the attributes `path`, `camera`, `frame` and `hint` hold the same for programs.
-`jawusd --verbose COMMAND` also prints where in the program an error arose.
+Every error of jawusd is a `jawusd.JawusdError`. Its message states where (file, camera, frame), what was found, what is
+allowed with its unit, and what to do. The attributes `path`, `camera`, `frame` and `hint` hold the same for programs.
+`jawusd --verbose COMMAND` also prints where in the program an error occurred.
 
 """
 
