@@ -29,9 +29,9 @@ from jawusd.media.overlay import placed_scans
 from jawusd.media.writers import VideoWriter
 from jawusd.paper.figures import condyle_figure
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.media import tracked_scans
-from jawusd.pipeline.overlay import open_wall
-from jawusd.pipeline.report import do_experiments
+from jawusd.pipeline.cameras import tracked_scans
+from jawusd.pipeline.pictures import open_wall
+from jawusd.pipeline.report import run_paper_experiments
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import subject_of_build
 from jawusd.pipeline.view import ContactView, open_viewer
@@ -145,7 +145,7 @@ def contacts(out: Path, folder: Path) -> Path:
 
 def condyles(out: Path, folder: Path) -> Path:
     """Draw the path of the left condyle under the skull, after Fig. 5 of the paper."""
-    found = do_experiments(subject_of_build(out), load_tracks(out / "tracks.npz"), 1, no_progress, quick=True)
+    found = run_paper_experiments(subject_of_build(out), load_tracks(out / "tracks.npz"), 1, no_progress, quick=True)
     return save_webp(folder / "condyles.webp", drawn(condyle_figure(found)), 1100)
 
 

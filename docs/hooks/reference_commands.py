@@ -4,8 +4,8 @@ import html
 
 import typer
 
+from jawusd.cli.commands import EXIT_CODES, SUMMARIES
 from jawusd.cli.main import app
-from jawusd.cli.summaries import EXIT_CODES, SUMMARIES
 
 INTRODUCTION = """# Commands
 

@@ -7,7 +7,7 @@ from pxr import Sdf
 from reference_commands import escaped
 
 import jawusd.base.errors
-from jawusd.cli.summaries import EXIT_CODES
+from jawusd.cli.commands import EXIT_CODES
 from jawusd.evaluator import schema as arrays
 from jawusd.formats.capture import capture_keys
 

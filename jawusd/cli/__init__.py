@@ -1,1 +1,4 @@
-"""The command line; every command imports what it needs when it runs."""
+"""The command line: typer commands and the text that they print.
+
+Commands import heavy packages inside their functions, so that `jawusd --help` stays quick. Nothing imports `cli`.
+"""

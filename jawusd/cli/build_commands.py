@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from jawusd.base.errors import naming_file
-from jawusd.cli.command import command_line, stopped_by_signals
+from jawusd.cli.commands import command_line, stopped_by_signals
 from jawusd.cli.options import (
     CaptureArg,
     CaptureOption,
@@ -37,24 +37,24 @@ from jawusd.formats.atomic import refuse_existing
 
 
 class Solver(StrEnum):
-    """Name the trackers."""
+    """Trackers."""
 
     contour = "contour"
     paper = "paper"
 
 
 class Backend(StrEnum):
-    """Name the places where the paper's solver draws."""
+    """Renderers of the paper's solver."""
 
     cpu = "cpu"
     gl = "gl"
 
 
-SolverOption = Annotated[Solver, typer.Option(help="How to track: paper is slower and less accurate, to compare with.")]
-BackendOption = Annotated[Backend, typer.Option(help="Where --solver paper draws; gl needs OpenGL 4.3 (EGL).")]
+SolverOption = Annotated[Solver, typer.Option(help="Tracker; paper is slower and less accurate, for comparison.")]
+BackendOption = Annotated[Backend, typer.Option(help="Renderer of --solver paper; gl needs OpenGL 4.3 (EGL).")]
 
 
-Jobs = Annotated[int, typer.Option(min=1, max=64, help="Threads that draw and compare.")]
+Jobs = Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")]
 
 
 def build(
@@ -67,17 +67,17 @@ def build(
     resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier build in this folder.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Delete an earlier build in this folder first.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say which stages would run, which are kept, and about how long.")
+        bool, typer.Option("--dry-run", help="List the stages that would run or be reused, with estimated times.")
     ] = False,
     jobs: Jobs = 2,
     prim_name: PrimName = None,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Turn a capture into a rig: calibrate if need be, sync, track, fit, track hard frames again, bake."""
+    """Build a rig from a capture: calibrate if needed, sync, track, fit, track uncertain frames again, bake."""
+    from jawusd.base.guard import map_large_arrays
+    from jawusd.cli.text_build import build_lines
     from jawusd.pipeline import build as stages
-    from jawusd.pipeline.build_lines import build_lines
-    from jawusd.pipeline.memory import map_large_arrays
 
     map_large_arrays()
     _check_backend(solver, backend)
@@ -95,7 +95,8 @@ def build(
     if dry_run:
         from dataclasses import asdict
 
-        from jawusd.pipeline.plan import plan_build, plan_lines
+        from jawusd.cli.text_build import plan_lines
+        from jawusd.pipeline.build import plan_build
 
         plan = plan_build(capture, out, options)
         emit({"stages": [asdict(stage) for stage in plan]}, as_json, lambda: plan_lines(plan))
@@ -112,7 +113,7 @@ def track(
     backend: BackendOption = Backend.cpu,
     prior: Annotated[
         Path | None,
-        typer.Option(help="model.npz of this person: a second pass with its help.", show_default=False),
+        typer.Option(help="model.npz of this person, as a prior of a second pass.", show_default=False),
     ] = None,
     overlay: Annotated[
         Path | None,
@@ -126,11 +127,12 @@ def track(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Track both rows of teeth through the masks, or the videos alone."""
+    """Track the teeth of both jaws, by masks or else by the videos."""
+    from jawusd.cli.text_build import track_lines
     from jawusd.formats.model import load_model
     from jawusd.pipeline import track as stage
     from jawusd.pipeline.capture_inputs import open_capture
-    from jawusd.pipeline.overlay import overlay_files
+    from jawusd.pipeline.pictures import overlay_files
 
     _check_backend(solver, backend)
     refuse_existing(out, force)
@@ -152,12 +154,12 @@ def track(
         )
     summary = stage.track_summary(tracks)
     found = {**summary, "file": str(out), "overlay": [str(path) for path in drawn]}
-    emit(found, as_json, lambda: stage.track_lines(summary))
+    emit(found, as_json, lambda: track_lines(summary))
 
 
 def _check_backend(solver: Solver, backend: Backend) -> None:
     if backend is Backend.gl and solver is not Solver.paper:
-        raise typer.BadParameter("--backend gl belongs to --solver paper; the contour solver runs on the CPU.")
+        raise typer.BadParameter("--backend gl needs --solver paper; the contour solver runs on the CPU.")
 
 
 def fit(
@@ -185,9 +187,10 @@ def fit(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Fit a three-parameter jaw model to tracked or given poses."""
+    """Fit a three-parameter jaw model to tracks or other poses."""
+    from jawusd.cli.text_build import fit_lines
     from jawusd.formats.model import save_model
-    from jawusd.pipeline.fit import fit_lines, fit_subject, fit_summary, read_motion
+    from jawusd.pipeline.fit import fit_subject, fit_summary, read_motion
 
     refuse_existing(out, force)
     motion, fps = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group, rigid))
@@ -206,7 +209,7 @@ def bake(
     upper_teeth: UpperOption = None,
     lower_teeth: LowerOption = None,
     mandible: MandibleOption = None,
-    fps: Annotated[float, typer.Option(min=0.001, help="Frames per second of a person without a capture.")] = 24.0,
+    fps: Annotated[float, typer.Option(min=0.001, help="Frames per second, for a person without a capture.")] = 24.0,
     table: Annotated[int, typer.Option(help="Knots per axis of the sampled decoder: 17, 33 or 65.")] = 33,
     prim_name: PrimName = None,
     force: Force = False,
@@ -229,11 +232,11 @@ def bake(
 
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the capture.", show_default=False)],
-    seed: Annotated[int, typer.Option(min=0, help="Another number is another person.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random person.")] = 0,
     frames: Annotated[int, typer.Option(min=24, max=20000, help="Exercise frames.")] = 240,
     force: Force = False,
 ) -> None:
-    """Render a synthetic capture with known truth: a made-up person in front of three cameras."""
+    """Render a synthetic capture with ground truth: a random person in front of three cameras."""
     from functools import partial
 
     from jawusd.base.errors import explain_missing_packages
@@ -252,42 +255,43 @@ def build_many(
     captures: Annotated[
         Path,
         typer.Argument(
-            metavar="LIST", help="Text with one capture a line: PATH, or PATH, NAME of its folder.", show_default=False
+            metavar="LIST",
+            help="Text file with one capture per line: PATH, or PATH, NAME of its output folder.",
+            show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rigs' folders.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the folders of the rigs.", show_default=False)],
     model: Annotated[Method, typer.Option(help="Form of the jaw models.")] = Method.anchored,
     cluster: Annotated[
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Dask scheduler to use, as tcp://host:8786; its workers need jawusd and the same paths. "
-            "Without: processes of this machine.",
+            help="Dask scheduler, as tcp://host:8786; its workers need jawusd and the same paths. "
+            "Default: local processes.",
             show_default=False,
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, max=1024, help="Processes of this machine; one per core else.", show_default=False),
+        typer.Option(min=1, max=1024, help="Number of local processes. Default: one per core.", show_default=False),
     ] = None,
-    retries: Annotated[
-        int, typer.Option(min=0, max=100, help="How often to start over when a process of this machine dies.")
-    ] = 3,
+    retries: Annotated[int, typer.Option(min=0, max=100, help="Retries after a local process died.")] = 3,
     resume: Annotated[bool, typer.Option("--resume", help="Continue earlier builds in this folder.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Delete earlier builds in this folder first.")] = False,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads of each build.")] = 1,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Build many captures, one process each; one that fails stops no other. Exit code 1 if any failed."""
+    """Build many captures, one process each; a failure does not stop the others. Exit code 1 if any failed."""
     from dataclasses import asdict
 
+    from jawusd.cli.text_build import outcome_lines
     from jawusd.formats.capture_list import load_capture_list
     from jawusd.pipeline import many
     from jawusd.pipeline.build import BuildOptions
 
     if cluster is not None and workers is not None:
-        raise typer.BadParameter("--workers are processes of this machine; a --cluster has its own.")
+        raise typer.BadParameter("--workers are local processes and cannot be combined with --cluster.")
     build = BuildOptions(
         model.value,
         jobs=jobs,
@@ -300,6 +304,6 @@ def build_many(
     with stopped_by_signals():
         outcomes = many.build_many(load_capture_list(captures), out, options, lambda line: say(line, err=True))
     data = {"folder": str(out), "builds": [asdict(outcome) for outcome in outcomes]}
-    emit(data, as_json, lambda: many.outcome_lines(outcomes))
+    emit(data, as_json, lambda: outcome_lines(outcomes))
     if any(outcome.status == many.FAILED for outcome in outcomes):
         raise typer.Exit(1)

@@ -1,9 +1,8 @@
-"""Commands on a capture and its footage: check, calibrate, sync, segment, scans and plates."""
+"""Commands on a capture and its footage: check, calibrate, sync, segment, scans, photos and plates."""
 
 from __future__ import annotations
 
 import json
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,16 +13,17 @@ from jawusd.cli.output import emit, plain, progress
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
-    from jawusd.pipeline.calibrate import SyncResult
+    pass
 
 
 def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = False) -> None:
-    """Check a capture in seconds, before any work: scans, masks, clips, calibration, picks, frames, disk space.
+    """Check a capture in seconds: scans, masks, clips, calibration, picks, frames, disk space.
 
-    Prints everything wrong or doubtful at once. Exit code 0 without errors, 5 with.
+    Prints all errors and warnings at once. Exit code 0 without errors, 5 with errors.
     """
     from jawusd.base.errors import CaptureError
-    from jawusd.pipeline.check import check_capture, check_lines, check_summary
+    from jawusd.cli.text_capture import check_lines
+    from jawusd.pipeline.check import check_capture, check_summary
 
     with progress() as report:
         findings = check_capture(capture, allow_outside=allow_outside, progress=report)
@@ -43,9 +43,10 @@ def calibrate(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Calibrate the cameras from clips of a chessboard or ChArUco board, and say how far the result can be trusted."""
+    """Calibrate the cameras from clips of a chessboard or ChArUco board, and report the expected accuracy."""
+    from jawusd.cli.text_capture import calibration_lines
     from jawusd.formats.atomic import write_text_atomic
-    from jawusd.pipeline.calibrate import calibrate_boards, calibration_lines
+    from jawusd.pipeline.calibrate import calibrate_boards
     from jawusd.pipeline.capture_inputs import open_capture
 
     for path in (out, report_file):
@@ -61,15 +62,13 @@ def calibrate(
 
 
 def sync(
-    clips: Annotated[
-        list[Path], typer.Argument(help="A capture (capture.toml or its folder), or two and more videos.")
-    ],
+    clips: Annotated[list[Path], typer.Argument(help="A capture (capture.toml or its folder), or two or more videos.")],
     reference: Annotated[
-        str | None, typer.Option(help="Clip that counts the frames, by its name; the first.", show_default=False)
+        str | None, typer.Option(help="Name of the reference clip. Default: the first.", show_default=False)
     ] = None,
     curves: Annotated[
         Path | None,
-        typer.Option(help="Also write the brightness of every picture of every clip as CSV.", show_default=False),
+        typer.Option(help="Also write the brightness of every picture as CSV.", show_default=False),
     ] = None,
     plot: Annotated[
         Path | None,
@@ -79,8 +78,9 @@ def sync(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Find the frame offsets between cameras from light flashes, else from their sound."""
+    """Estimate the frame offsets between cameras from light flashes, or else from sound."""
     from jawusd.base.errors import SyncError
+    from jawusd.cli.text_capture import sync_lines
     from jawusd.pipeline.calibrate import (
         PLOT_SUFFIXES,
         light_curves,
@@ -98,11 +98,11 @@ def sync(
             refuse_existing(path, force)
     single = len(clips) == 1
     if single and reference is not None:
-        raise typer.BadParameter("--reference is for clips; a capture names its own in [sync].")
+        raise typer.BadParameter("--reference is for clips; a capture names its reference in [sync].")
     capture = open_capture(clips[0], allow_outside=allow_outside) if single else None
     videos = {c.name: c.clip for c in capture.cameras if c.clip} if capture else _named(clips)
     if reference is not None and reference not in videos:
-        raise typer.BadParameter(f"--reference {reference} is none of {', '.join(videos)}.")
+        raise typer.BadParameter(f"--reference {reference} is not one of {', '.join(videos)}.")
     result, failure = None, None
     with progress() as report:
         try:
@@ -111,7 +111,7 @@ def sync(
             else:
                 result = sync_videos(videos, reference or next(iter(videos)), report)
         except SyncError as error:
-            failure = error  # the curves show best why
+            failure = error  # after the curves, which show the reason, are written
         found = light_curves(videos, report) if curves is not None or plot is not None else {}
         if curves is not None:
             write_light_curves(curves, found)
@@ -119,25 +119,16 @@ def sync(
             write_sync_plot(plot, found, result)
     if result is None:
         raise failure or SyncError("the cameras could not be aligned")
-    emit(result, as_json, partial(_sync_lines, result))
+    emit(result, as_json, lambda: sync_lines(result))
 
 
 def _named(clips: list[Path]) -> dict[str, Path]:
-    """Return the clips by their names, with folders where names alone are not enough."""
+    """Return the clips by name, or by path if names are not unique."""
     short = {clip.stem: clip for clip in clips}
     named = short if len(short) == len(clips) else {str(clip): clip for clip in clips}
     if len(named) < len(clips):
         raise typer.BadParameter("a clip is given twice.")
     return named
-
-
-def _sync_lines(result: SyncResult) -> list[str]:
-    exact, sure = result.get("exact_frames", {}), result.get("confidence", {})
-    lines = [f"by {result['method']}:"]
-    for name, offset in result["offsets"].items():
-        more = f" (exactly {exact[name]:+.2f}, confidence {sure[name]:.2f})" if name in exact else ""
-        lines.append(f"  {name}: {offset:+d} frames{more}")
-    return lines + [f"  note: {note}" for note in result.get("notes", [])]
 
 
 def segment(
@@ -146,23 +137,24 @@ def segment(
     keys: Annotated[
         Path | None,
         typer.Option(
-            help="Folder with what you drew for some frames: CAMERA/upper/000123.png, CAMERA/lower/000123.png. "
-            "Finished masks, 255 on teeth and 0 elsewhere, also teach how you draw; "
-            "or strokes: 255 on teeth, 0 on anything else, 128 where you say nothing.",
+            help="Folder of hand-drawn frames: CAMERA/upper/000123.png, CAMERA/lower/000123.png. Finished masks, "
+            "255 on teeth and 0 elsewhere, which also teach your style; "
+            "or strokes, 255 on teeth, 0 on other things, 128 if unknown.",
             show_default=False,
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep the frames finished before.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep finished frames.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing masks.")] = False,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that segment and align.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")] = 2,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Make masks of both rows of teeth from the videos, starting from the picks, or from a search without them."""
+    """Make masks of the teeth of both jaws from the videos, starting from picks or else from a search."""
+    from jawusd.cli.text_capture import segment_lines
     from jawusd.pipeline.calibrate import sync_cameras
     from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.segment import SegmentOptions, segment_teeth
-    from jawusd.pipeline.segment_record import RECORD, segment_lines, write_summary
+    from jawusd.pipeline.segment_record import RECORD, write_summary
 
     if not resume:
         _refuse_masks(out, out / RECORD, force)
@@ -175,18 +167,18 @@ def segment(
 
 
 def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
-    """Refuse a folder that holds anything, unless forced; the masks in it may be drawn by hand.
+    """Refuse a folder that is not empty, unless forced: its masks may be hand-drawn.
 
     Raises:
-        OutputError: it does.
+        OutputError: the folder is not empty.
     """
     from jawusd.base.errors import OutputError
 
     if force or not folder.exists() or not any(folder.iterdir()):
         return
-    hint = "Name another folder, or overwrite with --force."
+    hint = "Choose another folder, or overwrite with --force."
     if record.exists():
-        hint = "Continue with --resume, overwrite with --force, or name another folder."
+        hint = "Continue with --resume, overwrite with --force, or choose another folder."
     raise OutputError("exists and is not empty.", path=folder, hint=hint)
 
 
@@ -197,19 +189,20 @@ def scans(
         typer.Option(
             "-o",
             "--out",
-            help="Folder of labels and picture, by default beside the scans and in the capture's folder. Name it in "
-            "the capture as [scans] labels.",
+            help="Folder of labels and picture; name it in [scans] labels of the capture. Default: beside the "
+            "scans, and the capture's folder.",
             show_default=False,
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Find labels again and overwrite those there are, corrected ones too.")
+        bool, typer.Option("--force", help="Label again, and overwrite existing labels, even reviewed ones.")
     ] = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Tell crown and gum of both teeth scans apart, store the labels, and draw a picture to look at."""
-    from jawusd.pipeline.scans import label_scans, scans_lines
+    """Label crown and gum of both teeth scans, store the labels, and draw a picture for review."""
+    from jawusd.cli.text_capture import scans_lines
+    from jawusd.pipeline.scans import label_scans
 
     with progress() as report:
         summary = label_scans(capture, out, force=force, allow_outside=allow_outside, progress=report)
@@ -218,17 +211,17 @@ def scans(
 
 def plates(
     capture: CaptureArg,
-    rig: Annotated[Path, typer.Argument(help="Folder of the rig built from it.", show_default=False)],
+    rig: Annotated[Path, typer.Argument(help="Folder of the rig built from the capture.", show_default=False)],
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Write the footage without lens distortion where the rig's cameras.usda says, numbered by its time codes."""
+    """Write undistorted footage at the paths in the rig's cameras.usda, numbered by its time codes."""
     from jawusd.base.errors import OutputError
     from jawusd.formats.tracks import load_tracks
     from jawusd.pipeline.calibrate import sync_cameras
     from jawusd.pipeline.capture_inputs import open_capture
-    from jawusd.pipeline.media import write_plates
+    from jawusd.pipeline.pictures import write_plates
 
     if (rig / "plates").exists() and not force:
         raise OutputError("exists already.", path=rig / "plates", hint="Overwrite its pictures with --force.")
@@ -239,3 +232,35 @@ def plates(
         patterns = write_plates(opened, offsets, frames, rig, report)
     found = {"folder": str(rig), "frames": [int(frames[0]), int(frames[-1])], "plates": patterns}
     emit(found, as_json, lambda: [str(rig / pattern) for pattern in patterns])
+
+
+def photos(
+    outlines: Annotated[
+        list[Path],
+        typer.Argument(
+            help="A picture per photograph: tooth outlines as bright lines on black, or filled teeth.",
+            show_default=False,
+        ),
+    ],
+    upper_teeth: Annotated[Path, typer.Option(help="Scan of the upper teeth, in any frame.", show_default=False)],
+    lower_teeth: Annotated[Path, typer.Option(help="Scan of the lower teeth, in any frame.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for photos.json and an overlay per photograph.")
+    ] = Path("photos"),
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Register two scans in occlusion, from outlines drawn in photographs of the closed bite.
+
+    All photographs show the same bite and come from the same camera, whose focal length may be unknown; some may be
+    taken in a mirror. Exit code 6 if the scans do not fit the outlines.
+    """
+    from jawusd.base.errors import TrackingError
+    from jawusd.cli.text_capture import photograph_lines
+    from jawusd.pipeline.photographs import align_photograph_files
+
+    with progress() as report:
+        found = align_photograph_files(outlines, upper_teeth, lower_teeth, out, force=force, progress=report)
+    emit({**found.result.as_json(), "file": str(found.file)}, as_json, lambda: photograph_lines(found))
+    if any(finding.severity == "error" for finding in found.result.findings):
+        raise typer.Exit(TrackingError.exit_code)

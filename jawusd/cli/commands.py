@@ -1,30 +1,169 @@
-"""The commands by name, each loaded with its module when it is first asked for: a run pays for the command it runs."""
+"""The commands by name, loaded when first used, and what they share: -h, vectors, and handling of Ctrl+C."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import re
+import shlex
+import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Protocol, cast
+from types import FrameType
+from typing import NoReturn, Protocol, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from jawusd.cli.command import CONTEXT, Command
-from jawusd.cli.summaries import SUMMARIES
+from jawusd.base.errors import JawusdError
+from jawusd.cli.output import RunLog, say
+
+SUMMARIES = {
+    "init": "Draft a capture.toml from a folder of footage and scans.",
+    "doctor": "Check the installation.",
+    "cameras": "Convert calibrated cameras between programs.",
+    "build": "Build a rig from a capture.",
+    "track": "Track the teeth of both jaws.",
+    "fit": "Fit a jaw model to tracks or other poses.",
+    "bake": "Write the OpenUSD rig of a model.",
+    "demo": "Render a synthetic capture with ground truth.",
+    "build-many": "Build many captures, one process each.",
+    "check": "Check a capture in seconds.",
+    "calibrate": "Calibrate the cameras from clips of a board.",
+    "sync": "Estimate the frame offsets between cameras.",
+    "segment": "Make masks of the teeth from the videos.",
+    "scans": "Label crown and gum of the scans.",
+    "photos": "Register two scans in occlusion from photographs.",
+    "info": "Describe a rig file or tracks.",
+    "pose": "Print the jaw pose of parameters d.",
+    "encode": "Convert poses to the nearest parameters d.",
+    "validate": "Check a rig, or poses against a rig.",
+    "ik": "Find the d that move a point to a target.",
+    "animate": "Write an animation of a rig from keys, poses or ARKit.",
+    "arkit-fit": "Learn the meaning of a person's ARKit jaw weights.",
+    "arkit-table": "Write the jaw joint's offset per ARKit shape.",
+    "rebake": "Make d and mandible of an edited stage agree.",
+    "publish": "Copy a rig under unique names, or pack a shot.",
+    "solve": "Track a performance of a person with a rig.",
+    "live": "Track the jaw in live video.",
+    "retarget": "Retarget a motion to another person's rig.",
+    "library": "Manage many actors and compare their ranges.",
+    "plates": "Write undistorted footage.",
+    "report": "Write the report of a build or a solve again.",
+    "view": "View a rig or a capture in the browser.",
+}
+
+EXIT_CODES = (
+    "Exit codes: 0 done, 1 a negative result (invalid poses, something missing, a failed build of many), "
+    "2 wrong usage, 3 a file is invalid, 4 a package is missing, 5 the capture, 6 tracking, 7 fitting, 8 the rig, "
+    "9 the model, 10 the output, 11 a cluster, 12 out of memory or a library crashed, 130 stopped with Ctrl+C."
+)
+
+
+#: Exit code of a run stopped with Ctrl+C, as shells report it.
+INTERRUPTED = 130
+CONTEXT = {"help_option_names": ["-h", "--help"]}
+
+_WORDS = "jawusd.words"  # context key of the arguments of a command
+_VECTOR = re.compile(r" *[-+]?[\d.eE+-]+((, *| +)[-+]?[\d.eE+-]+){2} *")
+_VECTORS = ("--d", "--point", "--target", "--start")
+
+# What is kept of an interrupted command, and how to resume; other commands write complete files at their end.
+_KEPT = {
+    "build": "finished stages are kept; resume with the same command and --resume, start over with --fresh",
+    "build-many": "finished captures and stages are kept; resume with the same command and --resume",
+    "segment": "finished frames are kept; resume with the same command and --resume",
+    "plates": "the pictures written so far are kept; start over with --force",
+    "demo": "the files written so far are kept, but are incomplete without capture.toml; start over with --force",
+    "bake": "the files written so far are kept, but the rig is incomplete; start over with --force",
+}
+_ELSE = "no incomplete file was written"
+
+
+class Command(TyperCommand):
+    """A command of jawusd."""
+
+    # typer passes its public Context to both methods; the base class declares that of its private copy of click.
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]  # click has its own Context
+        """Accept vectors as `--d 20,2,1`, and keep the arguments for `command_line`."""
+        ctx.meta[_WORDS] = list(args)
+        return super().parse_args(ctx, with_vectors_split(args))
+
+    def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]  # as above
+        """Run; on Ctrl+C, print what is kept."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            interrupted(self.name or "", stop.exit_code if isinstance(stop, _StoppedError) else INTERRUPTED)
+        except (JawusdError, OSError, RuntimeError) as error:
+            if isinstance(ctx.obj, RunLog) and not isinstance(error, typer.Exit):
+                ctx.obj.error(error)
+            raise
+
+
+def command_line(ctx: typer.Context) -> str:
+    """Return the command line of the running command, quoted for a shell."""
+    return shlex.join(["jawusd", str(ctx.info_name), *ctx.meta[_WORDS]])
+
+
+def with_vectors_split(args: list[str]) -> list[str]:
+    """Split the value a,b,c or "a b c" of vector options into three arguments."""
+    out: list[str] = []
+    for word in args:
+        option, sign, value = word.partition("=")
+        if sign and option in _VECTORS and _VECTOR.fullmatch(value):
+            out += [option, *value.replace(",", " ").split()]
+        elif out and out[-1] in _VECTORS and _VECTOR.fullmatch(word):
+            out += word.replace(",", " ").split()
+        else:
+            out.append(word)
+    return out
+
+
+class _StoppedError(KeyboardInterrupt):
+    """A signal other than Ctrl+C that ends a command in the same way."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.exit_code = 128 + number  # as shells report it
+
+
+@contextlib.contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """Make SIGTERM and SIGHUP end the block as Ctrl+C does, with its cleanup."""
+
+    def stop(number: int, _: FrameType | None) -> NoReturn:
+        for other in taken:  # ignore further signals during the cleanup
+            signal.signal(other, signal.SIG_IGN)
+        raise _StoppedError(number)
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    taken = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]  # nohup ignores SIGHUP
+    for number in taken:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def interrupted(command: str, exit_code: int = INTERRUPTED) -> NoReturn:
+    """Print that a command was stopped and what is kept, and exit with the code of the signal."""
+    say(f"jawusd {command}: stopped; {_KEPT.get(command, _ELSE)}.", err=True)
+    raise typer.Exit(exit_code)
+
 
 _NAMES = {
     "start_commands": ("init", "doctor", "cameras"),
     "build_commands": ("build", "track", "fit", "bake", "demo", "build-many"),
-    "capture_commands": ("check", "calibrate", "sync", "segment", "scans", "plates"),
-    "photo_commands": ("photos",),
+    "capture_commands": ("check", "calibrate", "sync", "segment", "scans", "photos", "plates"),
     "rig_commands": ("info", "pose", "validate", "ik"),
     "rebake_command": ("rebake",),
     "stage_commands": ("encode", "publish"),
-    "animate_command": ("animate",),
-    "face_commands": ("arkit-fit", "arkit-table"),
-    "solve_commands": ("solve",),
-    "live_commands": ("live",),
+    "animate_commands": ("animate", "arkit-fit", "arkit-table"),
+    "solve_commands": ("solve", "live"),
     "library_commands": ("retarget", "library"),
     "report_commands": ("report", "view"),
 }
@@ -32,27 +171,27 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 
 class _Formatter(Protocol):
-    """What typer writes help with."""
+    """The formatter of typer's help."""
 
     def section(self, name: str) -> AbstractContextManager[None]: ...
     def write_dl(self, rows: Sequence[tuple[str, str]]) -> None: ...
 
 
 class Commands(TyperGroup):
-    """The group of all commands, which lists them without loading them."""
+    """The group of all commands; listing them does not load their modules."""
 
-    # typer hands its public Context; the base class in its private copy of click declares that one's.
+    # typer passes its public Context; the base class declares that of its private copy of click.
 
     def __init__(self, **settings: object) -> None:
-        super().__init__(**settings)  # type: ignore[arg-type]  # typer passes them on as they are
-        self.commands = _Loaded()  # type: ignore[assignment]  # a mapping that loads what is asked for
+        super().__init__(**settings)  # type: ignore[arg-type]  # passed on unchanged
+        self.commands = _Loaded()  # type: ignore[assignment]  # a mapping that loads on demand
 
     def list_commands(self, ctx: object) -> list[str]:
         """Return the names in the order of `jawusd --help`."""
         return list(SUMMARIES)
 
     def format_commands(self, ctx: object, formatter: _Formatter) -> None:
-        """Write the list of commands with what each does."""
+        """Write the list of commands with their summaries."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, SUMMARIES[name]) for name in SUMMARIES])
 

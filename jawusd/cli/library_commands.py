@@ -1,4 +1,4 @@
-"""Commands on many actors: library, and retarget, from one rig to another or to a person without one."""
+"""Commands on several actors: library; retarget, to another rig or to a person without one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Use(StrEnum):
-    """Name the ways to use a library."""
+    """Ways to use a library."""
 
     average = "average"
     closest = "closest"
@@ -32,15 +32,17 @@ def retarget(
     source: Annotated[
         Path | None, typer.Option("--from", help="Rig the motion was made for.", callback=rig_of_folder)
     ] = None,
-    target: Annotated[Path | None, typer.Option("--to", help="Rig that shall move.", callback=rig_of_folder)] = None,
+    target: Annotated[Path | None, typer.Option("--to", help="Target rig.", callback=rig_of_folder)] = None,
     landmarks: Annotated[
-        Path | None, typer.Option(help="Instead of a motion: landmarks (JSON) of a person without a capture.")
+        Path | None, typer.Option(help="Landmarks (JSON) of a person without a capture, instead of a motion.")
     ] = None,
     library_folder: Annotated[
         Path | None, typer.Option("--library", help="With --landmarks: folder of rigs to learn from.")
     ] = None,
-    use: Annotated[Use, typer.Option(help="With --landmarks: average the library, or take the closest.")] = Use.average,
-    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second; the motion's own else.")] = None,
+    use: Annotated[
+        Use, typer.Option(help="With --landmarks: average the library, or use the closest person.")
+    ] = Use.average,
+    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second. Default: of the motion.")] = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", help="Layer of the motion (retargeted.usdc) or model of the person (model.npz)."),
@@ -50,7 +52,7 @@ def retarget(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Carry a motion to another rig, or make a rig for a person from landmarks and a library."""
+    """Retarget a motion to another rig, or make a rig for a person from landmarks and a library."""
     others = (landmarks, library_folder)
     if anim and source and target and not any(others):
         _retarget_motion(anim, source, target, prim, fps, out or Path("retargeted.usdc"), force, as_json)
@@ -112,30 +114,34 @@ def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, a
 
 def library(
     folder: Annotated[Path, typer.Argument(help="Folder with a subfolder per person.", show_default=False)],
-    search: Annotated[str | None, typer.Option(help="List only names and paths with this in them.")] = None,
-    like: Annotated[Path | None, typer.Option(help="Sort by likeness to these landmarks (JSON).")] = None,
-    compare: Annotated[tuple[str, str] | None, typer.Option(help="Two persons, side by side.")] = None,
+    search: Annotated[str | None, typer.Option(help="List only names and paths that contain this text.")] = None,
+    like: Annotated[Path | None, typer.Option(help="Sort by similarity to these landmarks (JSON).")] = None,
+    compare: Annotated[tuple[str, str] | None, typer.Option(help="Compare two persons side by side.")] = None,
     add: Annotated[
         Path | None,
-        typer.Option(help="Copy this rig (its folder, actor.usda or model.npz) in first.", callback=rig_of_folder),
+        typer.Option(
+            help="First copy this rig (its folder, actor.usda or model.npz) into the library.", callback=rig_of_folder
+        ),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="With --add: name of the person; else as the rig says.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="With --add: name of the person. Default: the name in the rig.")
+    ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Folder for ranges.png and ranges.svg: those listed, side by side.")
+        Path | None, typer.Option(help="Folder for ranges.png and ranges.svg of the persons listed.")
     ] = None,
     force: Force = False,
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Keep many actors: bring the index library.json up to date, list, search, compare and plot."""
+    """Manage many actors: update the index library.json, list, search, compare and plot."""
     from dataclasses import asdict
 
     from jawusd.pipeline.library import add_rig, open_library, plot_ranges
 
     if compare is not None and (search, like, plot) != (None, None, None):
-        raise typer.BadParameter("--compare stands alone; --search, --like and --plot go together.")
+        raise typer.BadParameter("--compare cannot be combined with --search, --like or --plot.")
     if name is not None and add is None:
-        raise typer.BadParameter("belongs to --add.", param_hint="--name")
+        raise typer.BadParameter("needs --add.", param_hint="--name")
     if add is not None:
         add_rig(folder, add, name, force)
     opened = open_library(folder)
@@ -165,7 +171,7 @@ def _library_lines(opened: Library, entries: Sequence[Entry], apart_mm: Mapping[
     for entry in entries:
         (_, opening), (right, left), (back, forward) = (entry.ranges_mm[name] for name in PARAMETERS)
         row = f"{entry.actor[:19]:<20}{opening:9.1f}{right:8.1f}{left:7.1f}{back:7.1f}{forward:9.1f}"
-        alike = f"  unlike by {apart_mm[entry.path]:.1f} mm" if apart_mm else ""
+        alike = f"  differs by {apart_mm[entry.path]:.1f} mm" if apart_mm else ""
         partial = "  lacks a movement" if entry.not_shown else ""
         lines.append(f"{row}{entry.condylar_distance_mm:10.1f}  {entry.path}{alike}{partial}")
     lines.append(f"{len(entries)} rigs, {opened.reread} of the folder's new or changed")

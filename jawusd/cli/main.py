@@ -14,11 +14,8 @@ import typer
 
 from jawusd.base.errors import JawusdError, OutputError, explain_missing_packages
 from jawusd.base.guard import out_of_memory
-from jawusd.cli.command import CONTEXT
-from jawusd.cli.commands import Commands
-from jawusd.cli.log import logged
-from jawusd.cli.output import complain, say
-from jawusd.cli.summaries import EXIT_CODES
+from jawusd.cli.commands import CONTEXT, EXIT_CODES, Commands
+from jawusd.cli.output import complain, logged, say
 
 app = typer.Typer(
     name="jawusd",
@@ -37,12 +34,10 @@ app = typer.Typer(
 def _root(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="With an error, also print where in the program it arose.")
-    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Also print the traceback of an error.")] = False,
     log: Annotated[
         Path | None,
-        typer.Option("--log", metavar="FILE", help="Also write what is printed, with times and versions, to a file."),
+        typer.Option("--log", metavar="FILE", help="Also write the output, with times and versions, to a file."),
     ] = None,
 ) -> None:
     if version:
@@ -50,7 +45,7 @@ def _root(
 
         say(f"jawusd {__version__}")
         raise typer.Exit
-    global _verbose  # errors are printed outside of every context
+    global _verbose  # main prints errors outside the context
     _verbose = verbose
     if verbose:
         import faulthandler
@@ -64,31 +59,31 @@ _verbose = False
 
 
 def main() -> None:
-    """Run the command line and leave with its exit code: 0 ok, 1 a "no", 2 usage, 3 and up one per error family."""
+    """Run the command line and exit: 0 success, 1 a negative result, 2 usage, 3 and up one per error family."""
     if "PXR_WORK_THREAD_LIMIT" not in os.environ:  # before OpenUSD is loaded: rigs are small
         os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
-    # Before numpy is loaded: sums that several threads share differ in their last bits, from which fits end micrometres
-    # apart on other machines. The matrices are so small that more threads save nothing.
+    # Before numpy is loaded: multi-threaded sums differ in their last bits between machines, which moves fits by
+    # micrometres. The matrices are too small to gain from threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for stream in (sys.stdout, sys.stderr):  # letters that the terminal's encoding lacks
+    for stream in (sys.stdout, sys.stderr):  # for characters that the terminal cannot encode
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
         with explain_missing_packages():
             app()
     except JawusdError as error:
-        sys.exit(_told(error))
+        sys.exit(_report(error))
     except MemoryError as error:
-        sys.exit(_told(out_of_memory(), error))
+        sys.exit(_report(out_of_memory(), error))
     except BrokenPipeError:
-        # The reader of the pipe (head, less) has closed it.
+        # The reader of the pipe (head, less) closed it.
         sys.stderr.close()
         sys.exit(0)
     except (OSError, RuntimeError) as error:
         sys.exit(_unwritable(error))
 
 
-def _told(error: JawusdError, cause: BaseException | None = None) -> int:
+def _report(error: JawusdError, cause: BaseException | None = None) -> int:
     """Print an error; return its exit code."""
     if _verbose:
         traceback.print_exception(cause or error)
@@ -97,10 +92,10 @@ def _told(error: JawusdError, cause: BaseException | None = None) -> int:
 
 
 def _unwritable(error: OSError | RuntimeError) -> int:
-    """Print what no command reports by itself, a full disk behind `>` or a name no file can have; return the exit code.
+    """Print errors outside any command, such as a full disk behind `>` or an invalid file name; return the exit code.
 
     Raises:
-        RuntimeError: the error is another one.
+        RuntimeError: any other error.
     """
     if isinstance(error, OSError):
         message = f"{str(error.filename or 'the output'):.200}: {error.strerror or error}."
@@ -109,6 +104,6 @@ def _unwritable(error: OSError | RuntimeError) -> int:
     else:
         raise error
     complain(message)
-    with contextlib.suppress(OSError):  # what could not be printed would be tried again at the end
+    with contextlib.suppress(OSError):  # or Python would try to flush it again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return OutputError.exit_code

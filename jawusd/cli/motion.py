@@ -1,4 +1,4 @@
-"""Read what `jawusd animate` and `jawusd retarget` take, and keep it inside the bound."""
+"""Read, resample and clamp the motions of `jawusd animate` and `jawusd retarget`."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from jawusd.base.inputs import check_input
 from jawusd.cli.options import USD_SUFFIXES
 from jawusd.cli.output import emit
 from jawusd.evaluator.clamping import Inside
+from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.interpolation import monotone_tangents
 from jawusd.formats.keys import FARTHEST_FRAME, FARTHEST_MM, MOST_FRAMES, Key, Keys, load_keys
 from jawusd.formats.poses import read_poses, read_poses_or_parameters
@@ -23,28 +24,29 @@ from jawusd.formats.tracks import load_tracks
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
 
+
 _MOVED_MM = 1e-6
-_FINE = 10  # looks at a curve per frame
-_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # of straight lines between samples of a smooth motion
+_FINE = 10  # samples of a curve per frame
+_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # tolerance and refinements of a piecewise linear curve
 
 
 @dataclass(frozen=True, eq=False)
 class AuthoredMotion:
-    """Hold a motion as it was read."""
+    """A motion as it was read."""
 
     frames: Array  # frame numbers (F,), increasing
     d: Array  # parameters (F, 3) [mm], NaN in frames without parameters
-    fps: float | None  # frames per second, None where the source does not say
-    keys: Keys | None = None  # what it was interpolated from
+    fps: float | None  # frames per second, None if the source does not state it
+    keys: Keys | None = None  # keys that it was interpolated from
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be written out frame by frame."""
+        """Validate frames and parameters."""
         if not len(self.frames):
             raise FormatError("the motion has no frames.")
         falls = np.flatnonzero(np.diff(self.frames) <= 0)
         if falls.size:
             before, after = self.frames[falls[0] : falls[0] + 2]
-            raise FormatError(f"frames must rise: frame {after:g} follows {before:g}.")
+            raise FormatError(f"frames must increase: frame {after:g} follows {before:g}.")
         if (np.abs(self.d) > FARTHEST_MM).any():
             raise FormatError(f"a parameter is {np.nanmax(np.abs(self.d)):g} mm; allowed are +-{FARTHEST_MM:g} mm.")
         first, last = self.frames[0], self.frames[-1]
@@ -56,13 +58,13 @@ class AuthoredMotion:
 
 
 def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
-    """Read keys, parameters or poses. Keys are interpolated to every whole frame; poses are encoded.
+    """Read keys, parameters or poses. Keys are interpolated at every whole frame; poses are encoded.
 
     Args:
         source: keys.json, or a CSV or JSON table of d or of poses.
 
     Raises:
-        FormatError: not such a file.
+        FormatError: the file is invalid.
     """
     check_input(source)
     if source.suffix.lower() == ".json" and source.read_bytes().lstrip()[:1] == b"{":
@@ -81,7 +83,7 @@ def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
     """Return frames (F,) and poses (F, 4, 4) of a table or of tracks.
 
     Raises:
-        FormatError: not such a file.
+        FormatError: the file is invalid.
     """
     if path.suffix == ".npz":
         tracks = load_tracks(path)
@@ -91,14 +93,14 @@ def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
 
 @dataclass(frozen=True)
 class Changes:
-    """Say what was changed in a motion."""
+    """Changes made to a motion."""
 
     figures: dict[str, float]  # counts and sizes [mm]
-    lines: list[str]  # for people; the first continues the line that names the file
+    lines: list[str]  # as text; the first continues the line with the file name
 
 
 def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes, as_json: bool) -> None:
-    """Print which motion was written, and what was changed in it."""
+    """Print the motion written, and its changes."""
     first, last = float(motion.frames[0]), float(motion.frames[-1])
     head, *rest = changes.lines
     result = {"file": str(out), "fps": rate, "frames": [first, last], **changes.figures}
@@ -106,9 +108,9 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
 
 
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
-    """Bring a motion inside the bound, see `JawRig.keep_inside`; frames without parameters stay so.
+    """Project a motion into the bound, see `JawRig.keep_inside`; frames without parameters are kept.
 
-    Where the keys of a smooth motion alone lay outside, they are brought inside and keep their curves.
+    If it suffices, only the keys of a smooth motion are projected, and stay connected by curves.
     """
     known = np.isfinite(motion.d).all(axis=1)
     lost = int((~known).sum())
@@ -133,7 +135,7 @@ def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Ch
         lines.append(f"{clamped} frames lay outside the bound, {moved}")
     if beside.any():
         moved = f"moved by {float(moved_mm[beside].max()):.2f} mm at most"
-        why = "as the way inside is longer" if keys is motion.keys else "with their keys"
+        why = "to stay inside between samples" if keys is motion.keys else "with their keys"
         lines.append(f"{int(beside.sum())} frames beside them {moved}, {why}")
     figures = {"lost": lost, "clamped": clamped, "largest_clamp_mm": largest, "mean_clamp_mm": mean}
     figures |= {"moved_beside": int(beside.sum())}
@@ -144,7 +146,7 @@ def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Ch
 
 
 def _valid_keys(rig: JawRig, motion: AuthoredMotion) -> Keys | None:
-    """Return the keys of a smooth motion brought inside the bound; None where the curves through them leave it."""
+    """Return the keys of a smooth motion projected into the bound; None if curves through them leave it."""
     if motion.keys is None or motion.keys.interpolation != "smooth":
         return None
     frames, d = motion.keys.arrays()
@@ -158,16 +160,16 @@ def _valid_keys(rig: JawRig, motion: AuthoredMotion) -> Keys | None:
 
 
 class Knots(NamedTuple):
-    """What a spline is made of: as many keys as the motion allows."""
+    """Knots of a spline: keys where possible, samples elsewhere."""
 
     frames: Array  # shape (K,)
     d: Array  # [mm], shape (K, 3)
     slopes: Array  # tangents [mm per frame], shape (K, 3)
-    curved: Mask  # pieces that are cubic, shape (K - 1,)
+    curved: Mask  # cubic segments, shape (K - 1,)
 
 
 def knots_of(rig: JawRig, motion: AuthoredMotion) -> Knots:
-    """Return the keys of a motion with their tangents; all samples of a piece that the bound has changed."""
+    """Return the keys of a motion with their tangents, and all samples of segments that the bound has changed."""
     known = np.isfinite(motion.d).all(axis=1)
     frames, d = motion.frames[known], motion.d[known]
     if motion.keys is None:
@@ -191,7 +193,7 @@ def knots_of(rig: JawRig, motion: AuthoredMotion) -> Knots:
 
 
 def follow_curves(rig: JawRig, motion: AuthoredMotion, knots: Knots) -> AuthoredMotion:
-    """Return the motion with samples added where straight lines between samples are off the curves of its keys."""
+    """Return the motion with samples added where linear interpolation departs from the curves of its keys."""
     if motion.keys is None or not knots.curved.any():
         return motion
     key_frames, key_d = motion.keys.arrays()
@@ -209,14 +211,14 @@ def follow_curves(rig: JawRig, motion: AuthoredMotion, knots: Knots) -> Authored
 def carried_over(
     source_rig: Path, source: Path, target: JawRig, prim: str | None = None
 ) -> tuple[AuthoredMotion, Changes]:
-    """Read a motion of one rig and carry it to another, see `pipeline.library.retarget`.
+    """Read a motion of one rig and retarget it to another, see `pipeline.library.retarget`.
 
     Args:
         source: an animation layer, keys, or a table of d or of poses.
-        prim: which rig, where the source is a stage with several.
+        prim: path of the rig's prim, if the source is a stage with several.
 
     Raises:
-        FormatError: no such motion or rig.
+        FormatError: motion or rig cannot be read.
         EvaluatorError: no frame of the motion has parameters.
     """
     from jawusd.pipeline.library import load_any_rig, retarget
@@ -233,18 +235,18 @@ def carried_over(
         lines.append(f"{clamped} samples lay outside the bound at equal shares of the ranges")
     if largest > 0.005:
         moved = f"{mean:.2f} mm on average, {largest:.2f} mm at most"
-        lines.append(f"moved from equal shares by {moved}, to turn where the source turns and stay inside")
+        lines.append(f"moved from equal shares by {moved}, to keep the timing of the source and stay inside")
     figures = {"samples": samples, "lost": lost, "valid": valid, "clamped": clamped}
     sizes = {"mean_move_mm": mean, "largest_move_mm": largest}
     return AuthoredMotion(carried.frames, carried.d, motion.fps), Changes({**figures, **sizes}, lines)
 
 
 def _lost_line(lost: int) -> list[str]:
-    return [f"{lost} frames say nothing and were bridged"] if lost else []
+    return [f"{lost} frames without parameters were interpolated"] if lost else []
 
 
 def _motion_of(rig: JawRig, path: Path, prim: str | None) -> AuthoredMotion:
-    """Return a motion of a rig: samples of d of a stage, its transforms where it has none, or a table."""
+    """Return a motion of a rig: d of a stage, or else its transforms, or a table."""
     from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
     from jawusd.rig.read import open_stage
 
@@ -256,3 +258,36 @@ def _motion_of(rig: JawRig, path: Path, prim: str | None) -> AuthoredMotion:
     frames, poses = read_poses_of_stage(path, prim)
     rate = float(open_stage(path).GetTimeCodesPerSecond())
     return AuthoredMotion(frames.astype(np.float64), rig.encode(poses)[0], rate)
+
+
+def resampled(rig: JawRig, motion: AuthoredMotion, source_fps: float, fps: float) -> AuthoredMotion:
+    """Resample a motion at the whole frames of another rate; frame 0 stays frame 0.
+
+    Samples are interpolated by cubics with finite-difference slopes; keys are moved and keep their curves. A frame is
+    lost if the nearest sample is.
+
+    Args:
+        source_fps: frame rate of the motion.
+        fps: output frame rate.
+    """
+    ratio = fps / source_fps
+    times = motion.frames * ratio
+    at = np.arange(np.ceil(times[0] - 1e-6), np.floor(times[-1] + 1e-6) + 1)
+    if not len(at):
+        at = np.round(times[:1])
+    if motion.keys is not None:
+        keys = tuple(Key(frame=key.frame * ratio, d=key.d) for key in motion.keys.keys)
+        moved = motion.keys.model_copy(update={"keys": keys, "fps": fps})
+        at = np.union1d(at, [key.frame for key in keys])
+        d = rig.interpolate(*moved.arrays(), at, method=moved.interpolation, inside=False)
+        return AuthoredMotion(at, d, fps, moved)
+    known = np.asarray(np.isfinite(motion.d).all(axis=1))
+    seen, values = times[known], motion.d[known]
+    if len(seen) < 3:
+        d = np.stack([np.interp(at, seen, column) for column in values.T], axis=1)
+    else:
+        d = HermiteCurve(seen, values, np.gradient(values, seen, axis=0)).value(np.clip(at, seen[0], seen[-1]))
+    after = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1))
+    nearest = np.where(at - times[after - 1] <= times[after] - at, after - 1, after) if len(times) > 1 else 0 * after
+    d[~known[nearest]] = np.nan
+    return AuthoredMotion(at, d, fps)

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share, and what is read from them."""
+"""Arguments and options shared by several commands."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Method(StrEnum):
-    """Name the jaw models."""
+    """Jaw models."""
 
     anchored = "anchored"
     additive = "additive"
@@ -25,7 +25,7 @@ class Method(StrEnum):
 
 
 class LengthUnit(StrEnum):
-    """Name the units of length that a table may have."""
+    """Length units of tables."""
 
     mm = "mm"
     cm = "cm"
@@ -52,11 +52,11 @@ Allow = Annotated[
     typer.Option(
         "--allow",
         callback=_allow,
-        help="Folder that a rig or shot may name files in, as a library of actors; may be repeated. JAWUSD_ALLOW too.",
+        help="Folder from which a rig or shot may load files, such as a library; repeatable. Also: JAWUSD_ALLOW.",
         show_default=False,
     ),
 ]
-Prim = Annotated[str | None, typer.Option("--prim", help="Which rig, where a stage has several: the path of its prim.")]
+Prim = Annotated[str | None, typer.Option("--prim", help="Path of the rig's prim, if a stage has several rigs.")]
 
 
 def _prim_name(name: str | None) -> str | None:
@@ -70,20 +70,20 @@ PrimName = Annotated[
     typer.Option(
         "--prim-name",
         callback=_prim_name,
-        help="Name of the actor's prim and joints; else after the actor.",
+        help="Name of the actor's prim and joints. Default: derived from the actor's name.",
         show_default=False,
     ),
 ]
 
 
 def rig_of_folder(rig: Path | None) -> Path | None:
-    """Return the rig's file where the folder of a build is given: the callback of every argument that takes a rig."""
+    """Return the rig's file if the folder of a build is given; callback of all rig arguments."""
     from jawusd.rig.layout import actor_in_folder
 
     return None if rig is None else actor_in_folder(rig)
 
 
-_FOLDER = "jawusd.folder"  # key of what was named for a rig in the context of a command
+_FOLDER = "jawusd.folder"  # context key of the path given for a rig
 
 
 def _noted(context: typer.Context, rig: Path | None) -> Path | None:
@@ -92,7 +92,7 @@ def _noted(context: typer.Context, rig: Path | None) -> Path | None:
 
 
 def changed_in_folder(context: typer.Context) -> list[Finding]:
-    """Return which files are not what the build wrote, if the folder of a build was named for the rig."""
+    """Return files modified since the build, if the rig was given as the folder of a build."""
     from jawusd.pipeline.state import changed_files
 
     folder = context.meta[_FOLDER]
@@ -118,10 +118,10 @@ OptionalRigArg = Annotated[
 
 
 def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig:
-    """Load a rig; `--prim` names the one in a stage beside it, or else the one in the rig's own file.
+    """Load a rig; `--prim` refers to the stage given besides, or else to the rig's own file.
 
     Raises:
-        JawusdError: it is no rig.
+        JawusdError: the file is not a rig.
     """
     import jawusd
 
@@ -129,8 +129,8 @@ def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig
     return jawusd.load(rig, prim=None if beside or rig.suffix == ".npz" else prim)
 
 
-# whose jaw it is
-CaptureOption = Annotated[Path | None, typer.Option(help="The capture: gives scans and landmarks.", show_default=False)]
+# the person
+CaptureOption = Annotated[Path | None, typer.Option(help="Capture with scans and landmarks.", show_default=False)]
 UpperOption = Annotated[
     Path | None, typer.Option(help="Scan of the upper teeth, instead of a capture.", show_default=False)
 ]
@@ -142,29 +142,29 @@ LandmarksOption = Annotated[
     Path | None, typer.Option(help="Landmarks (JSON), instead of a capture or scans.", show_default=False)
 ]
 
-# how a file of poses is written
+# conventions of a file of poses
 ColumnsOption = Annotated[
     str | None,
     typer.Option(
-        help="How a table calls its columns: frame=Frame,tx=X,ty=Y,tz=Z,qw=W,... or m00=...,m01=...",
+        help="Column names of a table: frame=Frame,tx=X,ty=Y,tz=Z,qw=W,... or m00=...,m01=...",
         show_default=False,
     ),
 ]
-UnitOption = Annotated[LengthUnit, typer.Option(help="Unit of lengths, where the file does not say it.")]
+UnitOption = Annotated[LengthUnit, typer.Option(help="Length unit, if the file does not state it.")]
 InvertOption = Annotated[bool, typer.Option("--invert", help="The poses map skull to mandible.")]
 RestOption = Annotated[
     int | None,
-    typer.Option(help="A frame with the teeth in occlusion: poses are taken relative to it.", show_default=False),
+    typer.Option(help="Frame with the teeth in occlusion; poses are taken relative to it.", show_default=False),
 ]
 GroupOption = Annotated[str | None, typer.Option(help="Trajectory of an HDF5 file.", show_default=False)]
 RigidOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="BODY=MARKERS",
-        help="The file holds markers; which of them are fixed to jaw=... and, unless it stands still, head=...: their "
-        "numbers or names, as jaw=5,6,7,8 or jaw=JL,JR,JF (with --rest-frame), or a marker description, as "
-        "jaw=jaw.rig. C3D, TRC, QTM (TSV), Vicon CSV, tables of numbers alone and ArtiSynth probes are read, "
-        "marker%d.txt as one. May be repeated.",
+        help="The file contains markers; those fixed to the jaw and, unless the head is still, to the head: numbers or "
+        "names, as jaw=5,6,7,8 or jaw=JL,JR,JF (with --rest-frame), or a marker description, as jaw=jaw.rig. Reads "
+        "C3D, TRC, QTM (TSV), Vicon CSV, plain tables of numbers and ArtiSynth probes, marker%d.txt as one. "
+        "Repeatable.",
         show_default=False,
     ),
 ]
@@ -181,7 +181,7 @@ def trajectory_options(
     """Return the options of a file of poses or markers.
 
     Raises:
-        typer.BadParameter: a column map or rigid bodies that cannot be read.
+        typer.BadParameter: a column map or rigid body is invalid.
     """
     from jawusd.pipeline.fit import TrajectoryOptions
 
@@ -195,7 +195,7 @@ def _rigid_bodies(given: list[str] | None) -> dict[str, str]:
         if not sign or not markers or name not in ("head", "jaw"):
             raise typer.BadParameter(f'"{text}" is not of the form jaw=MARKERS or head=MARKERS.', param_hint="--rigid")
         if name in found:
-            raise typer.BadParameter(f'"{name}" is named twice.', param_hint="--rigid")
+            raise typer.BadParameter(f'"{name}" is given twice.', param_hint="--rigid")
         found[name] = markers
     return found
 
@@ -211,11 +211,11 @@ def _column_map(text: str | None) -> dict[str, str]:
             raise typer.BadParameter(f'"{part}" is not of the form name=column.', param_hint="--columns")
         if ours not in known:
             raise typer.BadParameter(
-                f'"{ours}" is not a column of poses; known are frame, {", ".join(QUATERNION_COLUMNS)}, m00 ... m33.',
+                f'"{ours}" is not a column of poses; allowed are frame, {", ".join(QUATERNION_COLUMNS)}, m00 ... m33.',
                 param_hint="--columns",
             )
         if ours in found:
-            raise typer.BadParameter(f'"{ours}" is named twice.', param_hint="--columns")
+            raise typer.BadParameter(f'"{ours}" is given twice.', param_hint="--columns")
         found[ours] = theirs
     return found
 
@@ -229,14 +229,14 @@ def subject_given(
     landmarks: Path | None,
     allow_outside: bool,
 ) -> Subject:
-    """Return the person that the options describe: by a capture, both scans, or landmarks.
+    """Return the person given by a capture, both scans, or landmarks.
 
     Args:
         name: of a person without a capture.
 
     Raises:
-        typer.BadParameter: none or several of them.
-        JawusdError: what the files raise.
+        typer.BadParameter: none or several of these are given.
+        JawusdError: a file cannot be read.
     """
     from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.subject import subject_of_capture, subject_of_landmarks, subject_of_scans
@@ -250,5 +250,5 @@ def subject_given(
     if landmarks is not None:
         return subject_of_landmarks(landmarks, name)
     if not {"upper_teeth", "lower_teeth"} <= set(scans):
-        raise typer.BadParameter("scans mean both --upper-teeth and --lower-teeth; --mandible may be added.")
+        raise typer.BadParameter("give both --upper-teeth and --lower-teeth; --mandible is optional.")
     return subject_of_scans(scans, name)

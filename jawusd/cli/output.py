@@ -1,16 +1,22 @@
-"""What commands print: results on stdout, progress on stderr, JSON where a machine reads."""
+"""What commands print: results on stdout, as text or JSON, and progress on stderr; and the log of a run."""
 
 from __future__ import annotations
 
 import contextlib
 import math
+import platform
+import re
+import sys
+import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 import typer
 
-from jawusd.base.errors import shown
+from jawusd.base.errors import OutputError, shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def emit(data: Mapping[str, object], as_json: bool, lines: Callable[[], list[str]]) -> None:
-    """Print a result as one JSON object, or as lines for people."""
+    """Print a result as one JSON object, or as lines of text."""
     if as_json:
         import json
 
@@ -29,12 +35,12 @@ def emit(data: Mapping[str, object], as_json: bool, lines: Callable[[], list[str
 
 
 def say(line: object, err: bool = False) -> None:
-    """Print one line; what files say in it cannot control the terminal, see `shown`."""
+    """Print one line, with control characters from files escaped, see `shown`."""
     typer.echo(shown(line), err=err)
 
 
 def complain(text: object) -> None:
-    """Print a message on stderr, which may hold the lines of several findings, after the program's name."""
+    """Print a message on stderr, possibly of several lines, after the program's name."""
     for line in f"jawusd: {text}".split("\n"):
         say(line, err=True)
 
@@ -88,7 +94,7 @@ def progress() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def _plain_progress(console: Console) -> Callable[[str, int, int], None]:
-    """Return a reporter for log files: a line per stage and per tenth of it."""
+    """Return a progress callback for log files: a line per stage and per tenth of it."""
     last: dict[str, int] = {}
 
     def report(stage: str, done: int, total: int) -> None:
@@ -98,3 +104,79 @@ def _plain_progress(console: Console) -> Callable[[str, int, int], None]:
             console.print(f"{stage} {done}/{total}" if total else stage, highlight=False)
 
     return report
+
+
+_CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+
+
+class RunLog:
+    """A log file; each line starts with the seconds since the start."""
+
+    def __init__(self, path: Path, words: list[str]) -> None:
+        """Open the file and write the command line and versions.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        from jawusd.base.version import __version__
+        from jawusd.formats.atomic import destination, is_stream, open_stream
+
+        self._start = time.monotonic()
+        where = destination(path)
+        try:
+            to = open_stream(where) if is_stream(where) else where
+            self._file = open(to, "a", encoding="utf-8")  # noqa: SIM115  # open until the run ends
+        except OSError as error:
+            raise OutputError(f"the log cannot be written: {error.strerror}.", path=path) from error
+        self.line(f"{time.strftime('%Y-%m-%d %H:%M:%S')} jawusd {' '.join(map(shown, words))}")
+        self.line(f"jawusd {__version__}, Python {platform.python_version()}, {platform.platform()}, in {Path.cwd()}")
+
+    def line(self, text: str) -> None:
+        """Write lines."""
+        for part in _CODES.sub("", text).split("\n"):
+            if part.strip():
+                self._file.write(f"{time.monotonic() - self._start:9.2f}  {shown(part.rstrip())}\n")
+        self._file.flush()
+
+    def error(self, error: BaseException) -> None:
+        """Write an error with its traceback."""
+        self.line("".join(traceback.format_exception(error)))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class _Copied:
+    """A stream whose lines are copied to a log."""
+
+    def __init__(self, stream: TextIO, log: RunLog) -> None:
+        self._stream, self._log, self._pending = stream, log, ""
+
+    def write(self, text: str) -> int:
+        self._pending += text
+        *lines, self._pending = self._pending.split("\n")
+        for line in lines:
+            self._log.line(line.rpartition("\r")[2])
+        return self._stream.write(text)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._stream, name)
+
+
+@contextmanager
+def logged(path: Path, words: list[str]) -> Iterator[RunLog]:
+    """Copy stdout and stderr of the block to a log file.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    log = RunLog(path, words)
+    streams = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (_Copied(stream, log) for stream in streams)
+    try:
+        yield log
+    finally:
+        sys.stdout, sys.stderr = streams
+        log.line("ended")
+        log.close()

@@ -1,4 +1,4 @@
-"""The command `rebake`: the jaws of a shot, edited by d or by hand, become one layer in which both agree."""
+"""The command `rebake`: make d and mandible of edited jaws in a shot agree, in one layer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _ORIGINS = {"d": "values of d", "mandible": "mandible's transforms"}
 
 
 class Origin(StrEnum):
-    """Name what a motion can be read from."""
+    """Sources of a motion."""
 
     d = "d"
     mandible = "mandible"
@@ -41,45 +41,42 @@ def rebake(
     rig: Annotated[
         Path,
         typer.Argument(
-            help="The shot; or before a stage that holds copies of a rig's meshes, FBX or glTF: the rig.",
+            help="The shot; or the rig, if STAGE is FBX, glTF or a stage with copies of the rig's meshes.",
             metavar="SHOT | RIG STAGE",
             callback=rig_of_folder,
             show_default=False,
         ),
     ],
     stage: Annotated[
-        Path | None, typer.Argument(help="Shot or animation layer, or what was exported of it.", show_default=False)
+        Path | None, typer.Argument(help="Shot or animation layer, or an export of it.", show_default=False)
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Layer to write; <shot>_baked.usdc if not given.")
-    ] = None,
-    root: Annotated[bool, typer.Option("--root", help="Let the layer be a new root: it sublayers the shot.")] = False,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Layer to write. Default: <shot>_baked.usdc.")] = None,
+    root: Annotated[bool, typer.Option("--root", help="Make the layer a new root that sublayers the shot.")] = False,
     origin: Annotated[
-        Origin | None, typer.Option("--from", help="What counts where d and mandible disagree.", show_default=False)
+        Origin | None, typer.Option("--from", help="Which to use if d and mandible disagree.", show_default=False)
     ] = None,
     mandible: MandiblePrim = None,
     skull: SkullPrim = None,
     prim: Annotated[
         list[str] | None,
-        typer.Option(
-            "--prim", help="Which rigs of the shot: paths of their prims; all if not given.", show_default=False
-        ),
+        typer.Option("--prim", help="Prim paths of the rigs to bake. Default: all.", show_default=False),
     ] = None,
     allow: Allow = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Give the rigs of a shot the d and the mandible that belong together, where only one was keyed or moved.
+    """Make d and mandible of the rigs of a shot agree, after only one of them was edited.
 
-    One layer holds the opinions for all rigs, to be sublayered by the shot. Motions are brought inside the bound; what
-    lay outside is reported with its margin. A stage without the rig, that holds copies of its meshes, moved by
+    One layer contains the opinions for all rigs, to be sublayered by the shot. Motions are projected into the bound,
+    and samples outside are reported with their margin. A stage without the rig but with copies of its meshes, moved by
     transforms, bones or point caches, gives a layer over RIG. FBX and glTF are read through Blender.
     """
     shot = stage or rig
     out = out or shot.with_name(f"{shot.stem}_baked.usdc")
     refuse_existing(out, force)
     taken = [
-        _taken(rig, shot, one, mandible, skull, origin.value if origin else None) for one in _rigs_of(rig, stage, prim)
+        _bake_rig(rig, shot, one, mandible, skull, origin.value if origin else None)
+        for one in _rigs_of(rig, stage, prim)
     ]
     stronger = _write_baked(out, rig, shot, taken, root, prim[0] if prim else None)
     actors = [{"prim": one.found.prim, "from": one.found.origin, **one.judged, **one.changes.figures} for one in taken]
@@ -88,8 +85,8 @@ def rebake(
 
 
 @dataclass(frozen=True)
-class _Taken:
-    """Hold what one rig of a shot is given: as found, inside the bound, and what was changed for that."""
+class _BakedRig:
+    """Motion of one rig of a shot: as read, projected into the bound, and the changes."""
 
     rig: JawRig
     found: StageMotion
@@ -99,7 +96,7 @@ class _Taken:
 
 
 def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str | None]:
-    """Return which rigs are baked: those named, else all of a shot; None for the only one, or for that of RIG."""
+    """Return the prims to bake: those given, or else all of a shot; None for the only one, or that of RIG."""
     if stage is not None and len(prims or ()) > 1:
         raise typer.BadParameter("RIG STAGE bakes one rig; several are baked with the shot alone.", param_hint="--prim")
     if prims or stage is not None:
@@ -111,24 +108,26 @@ def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str
     return [str(prim.GetPath()) for prim in rig_prims(opened)] or [str(find_rig_prim(opened, rig).GetPath())]
 
 
-def _taken(
+def _bake_rig(
     rig: Path,
     shot: Path,
     prim: str | None,
     mandible: str | None,
     skull: str | None,
     origin: Literal["d", "mandible"] | None,
-) -> _Taken:
+) -> _BakedRig:
     from jawusd.cli.motion import AuthoredMotion, kept_inside
 
     loaded = load_named(rig, prim, shot)
     found = read_stage_motion(loaded, rig, shot, prim, mandible, skull, origin)
     motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
-    return _Taken(loaded, found, motion, changes, judged_motion(loaded, found.frames, found.d, found.residual_mm))
+    return _BakedRig(loaded, found, motion, changes, judged_motion(loaded, found.frames, found.d, found.residual_mm))
 
 
-def _write_baked(out: Path, rig: Path, shot: Path, taken: Sequence[_Taken], root: bool, prim: str | None) -> list[str]:
-    """Write the layer; return what is stronger than it in the shot's own layer."""
+def _write_baked(
+    out: Path, rig: Path, shot: Path, taken: Sequence[_BakedRig], root: bool, prim: str | None
+) -> list[str]:
+    """Write the layer; return stronger opinions in the shot's own layer."""
     import numpy as np
 
     from jawusd.rig import write_animation
@@ -136,7 +135,9 @@ def _write_baked(out: Path, rig: Path, shot: Path, taken: Sequence[_Taken], root
 
     first = taken[0]
     motion = first.motion
-    if first.found.fitted and prim is not None and shot.suffix.lower() not in USD_SUFFIXES:  # else it is the shot's
+    if (
+        first.found.fitted and prim is not None and shot.suffix.lower() not in USD_SUFFIXES
+    ):  # otherwise the prim is in the shot
         write_over(out, rig, first.rig, motion.frames, motion.d, first.found.fps, prim)
     elif first.found.fitted:
         write_animation(out, rig, motion.frames, motion.d, first.found.fps, rig=first.rig)
@@ -150,7 +151,7 @@ def _write_baked(out: Path, rig: Path, shot: Path, taken: Sequence[_Taken], root
     return []
 
 
-def _baked_lines(out: Path, shot: Path, taken: Sequence[_Taken], stronger: Sequence[str]) -> list[str]:
+def _baked_lines(out: Path, shot: Path, taken: Sequence[_BakedRig], stronger: Sequence[str]) -> list[str]:
     lines = []
     for one in taken:
         first, last = float(one.motion.frames[0]), float(one.motion.frames[-1])
@@ -161,8 +162,6 @@ def _baked_lines(out: Path, shot: Path, taken: Sequence[_Taken], stronger: Seque
         still = still_lines(one.judged["moved_mm"], len(one.found.d)) if one.found.origin == "mandible" else []
         lines += [*judged_lines(one.judged), *still, *one.changes.lines[1:]]
     if stronger:
-        lines.append(
-            f"{shot} itself says something else of {', '.join(stronger)}: a layer that it sublayers is weaker."
-        )
-        lines.append("Write a root above it with --root, or sublayer both, this layer first")
+        lines.append(f"{shot} itself has stronger opinions on {', '.join(stronger)}: its sublayers are weaker.")
+        lines.append("Write a root above it with --root, or sublayer both with this layer first")
     return lines

@@ -1,4 +1,4 @@
-"""Commands to look at a finished build: its report, the paper's experiments, and the viewer."""
+"""Commands on a finished build: its report, the paper's experiments, and the viewer."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def report(
         ),
     ],
     experiments: Annotated[
-        bool, typer.Option("--experiments", help="The paper's experiments (Figs. 5, 12, 13) and the coverage plot.")
+        bool, typer.Option("--experiments", help="Run the paper's experiments (figs. 5, 12, 13) and plot the coverage.")
     ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
             "-o",
             "--out",
-            help="Folder of the figures, DIR/experiments for a build; of a solve, the page: beside its tracks.",
+            help="Folder of the figures, or page of a solve. Default: DIR/experiments, or beside the tracks.",
             show_default=False,
         ),
     ] = None,
@@ -72,7 +72,7 @@ def report(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Write the report of a finished build again, or of a solve; or repeat the paper's experiments on a take."""
+    """Write the report of a build again, or of a solve; or repeat the paper's experiments on a take."""
     options = trajectory_options(columns, length_unit, invert, rest_frame, group, rigid)
     if not experiments:
         _report_found(source, capture, out, force, allow_outside, as_json)
@@ -92,7 +92,7 @@ def report(
     built = source.is_dir() and not any(given)
     subject = subject_of_build(source) if built else subject_given(source.stem, *given, allow_outside)
     with progress() as tell, naming_file(poses):
-        found = stage.do_experiments(subject, motion, starts, tell)
+        found = stage.run_paper_experiments(subject, motion, starts, tell)
         files = stage.draw_experiments(found, folder)
         if stage.is_build(source):
             files.append(stage.report_build(source, capture, tell, found, allow_outside=allow_outside))
@@ -100,7 +100,7 @@ def report(
 
 
 def _emit_experiments(found: Experiments, files: list[Path], as_json: bool) -> None:
-    from jawusd.pipeline.report import experiment_lines
+    from jawusd.cli.report_commands import experiment_lines
 
     summary = {
         "actor": found.actor,
@@ -116,8 +116,8 @@ def _emit_experiments(found: Experiments, files: list[Path], as_json: bool) -> N
 def _report_found(
     source: Path, capture: Path | None, out: Path | None, force: bool, allow_outside: bool, as_json: bool
 ) -> None:
-    """Write the report of what a solve or a build left behind."""
-    from jawusd.pipeline.memory import map_large_arrays
+    """Write the report of a solve or a build."""
+    from jawusd.base.guard import map_large_arrays
     from jawusd.pipeline.report import report_build
     from jawusd.pipeline.solve_report import check_page, report_solve
 
@@ -148,10 +148,11 @@ def view(
     tracks: Annotated[
         Path | None,
         typer.Option(
-            help="Poses to draw over a capture's footage: the folder of its build, or tracks.npz.", show_default=False
+            help="Poses to draw over the footage of a capture: the folder of its build, or tracks.npz.",
+            show_default=False,
         ),
     ] = None,
-    host: Annotated[str, typer.Option(help="Address to listen on; the default is reached from this machine.")] = (
+    host: Annotated[str, typer.Option(help="Address to listen on; the default accepts only this machine.")] = (
         "127.0.0.1"
     ),
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; the next free one if it is taken.")] = 8080,
@@ -160,7 +161,7 @@ def view(
     prim: Prim = None,
     allow: Allow = None,
 ) -> None:
-    """See a rig in the browser, drag it, key it; or a capture's footage, to judge its poses and to set its picks."""
+    """View a rig in the browser and animate it; or a capture's footage, to inspect poses and to set picks."""
     import webbrowser
 
     from jawusd.pipeline.state import changed_files
@@ -170,14 +171,14 @@ def view(
 
     capture = is_capture(rig)
     if tracks is not None and not capture:
-        raise typer.BadParameter("--tracks belongs to a capture; a rig has its own poses.")
+        raise typer.BadParameter("--tracks needs a capture, not a rig.")
     if prim is not None and capture:
-        raise typer.BadParameter("--prim belongs to a rig; a capture has none.")
+        raise typer.BadParameter("--prim needs a rig, not a capture.")
     if not is_loopback(host):
         may = "write picks into the capture" if capture else "write animations beside the rig"
         say(
-            f"jawusd: warning: listening on {host}: whoever reaches this address sees this person's jaw, without a "
-            f"password, and may {may}. `ssh -L 8080:localhost:8080` works without --host.",
+            f"jawusd: warning: listening on {host}: anyone who reaches this address can see this person's jaw without "
+            f"a password, and {may}. `ssh -L 8080:localhost:8080` works without --host.",
             err=True,
         )
     for folder in (rig, tracks):
@@ -196,3 +197,15 @@ def view(
         viewer.wait()
     except KeyboardInterrupt:
         viewer.stop()
+
+
+def experiment_lines(found: Experiments) -> list[str]:
+    """Return the results of the experiments as text."""
+    heads = ("mean", "median", "p95", "max")
+    lines = [f"{found.actor}: {found.frames} captured poses; distances [mm]"]
+    lines.append(f"{'experiment':<16}{'model':<30}{'quantity':<32}{'count':>6}" + "".join(f"{h:>9}" for h in heads))
+    for row in found.table():
+        figures = "".join(f"{row[f'{head}_mm']:9.3f}" for head in heads)
+        lines.append(f"{row['experiment']:<16}{row['model']:<30}{row['quantity']:<32}{row['count']:>6}{figures}")
+    lines += [f"note: {note}" for note in found.notes]
+    return lines + [f"coverage: {sentence}" for sentence in found.coverage.sentences or ["no exercise is missing."]]

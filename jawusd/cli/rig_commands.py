@@ -1,4 +1,4 @@
-"""Commands on a finished rig: info, pose, encode, validate, ik, animate. They need only the base install."""
+"""Commands on a finished rig: info, pose, validate, ik. They need only the base install."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Triple = tuple[float, float, float]
 
-#: Exit code of a "no": an invalid pose, a rig with errors.
+#: Exit code of a negative result: an invalid pose, a rig with errors.
 NO = 1
 
 
@@ -30,22 +30,24 @@ def info(
     context: typer.Context,
     rig: OptionalRigArg = None,
     schema: Annotated[
-        bool, typer.Option("--schema", help="Say where the USD schema JawRigAPI is, and how other programs find it.")
+        bool,
+        typer.Option("--schema", help="Print the path of the USD schema JawRigAPI, and how other programs find it."),
     ] = False,
-    frame: Annotated[int | None, typer.Option(help="Of tracks.npz: say how this frame was tracked.")] = None,
+    frame: Annotated[int | None, typer.Option(help="Of tracks.npz: describe the tracking of this frame.")] = None,
     prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Say what a rig file or tracks hold."""
+    """Describe a rig file or tracks."""
     if schema:
         _print_schema(as_json)
         return
     if rig is None:
         raise typer.BadParameter("name a file, or give --schema.", param_hint="RIG")
     if rig.suffix == ".npz":
+        from jawusd.cli.text_build import frame_lines, track_lines
         from jawusd.formats.tracks import load_tracks
-        from jawusd.pipeline.track import frame_lines, frame_summary, track_lines, track_summary
+        from jawusd.pipeline.track import frame_summary, track_summary
 
         tracks = load_tracks(rig)
         if frame is None:
@@ -56,7 +58,7 @@ def info(
             emit(one, as_json, lambda: frame_lines(one))
         return
     if frame is not None:
-        raise typer.BadParameter("--frame belongs to tracks.npz.")
+        raise typer.BadParameter("--frame needs tracks.npz.")
     from jawusd.rig import describe
 
     found, changed = describe(rig, prim), changed_in_folder(context)
@@ -77,7 +79,7 @@ def _print_schema(as_json: bool) -> None:
 
 
 def _info_lines(found: Description) -> list[str]:
-    from jawusd.pipeline.contact import contact_words, joint_words
+    from jawusd.cli.text_build import contact_words, joint_words
 
     lines = [
         f"actor {found['actor']}, format {found['format_version']}, prim {found['prim']}",
@@ -99,7 +101,7 @@ def _info_lines(found: Description) -> list[str]:
         )
         lines.append(f"moves: d1, d2, d3 at {speed} mm/s and {acceleration} mm/s^2 (rms over the take)")
     for name, count in found["meshes"].items():
-        mark = ", a placeholder, no anatomy" if name in found["placeholders"] else ""
+        mark = ", a placeholder, not anatomical" if name in found["placeholders"] else ""
         lines.append(f"mesh {name}: {count} points{mark}")
     if found["animation"]:
         shown = found["animation"]
@@ -158,18 +160,20 @@ def validate(
     poses: Annotated[
         Path | None, typer.Argument(help="CSV or JSON of poses or of d, tracks.npz, or an animated USD stage.")
     ] = None,
-    residual_mm: Annotated[float | None, typer.Option(help="Largest distance to the model; the rig's else.")] = None,
+    residual_mm: Annotated[
+        float | None, typer.Option(help="Largest distance from the model. Default: of the rig.")
+    ] = None,
     tolerance_mm: Annotated[
         float | None,
-        typer.Option(min=0.0, help="How far outside the bound a pose may lie; 0 for authored poses; the rig's else."),
+        typer.Option(min=0.0, help="Allowed distance outside the bound, 0 for authored poses. Default: of the rig."),
     ] = None,
     prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Check a rig, or judge poses as measured ones; leaves with exit code 1 when something is invalid.
+    """Check a rig, or poses against a rig; exit code 1 if something is invalid.
 
-    A pose is inside the bound, within the tolerance that measured poses have, or outside.
+    A pose is inside the bound, within the tolerance of measured poses, or outside.
     """
     if poses is None:
         _validate_rig(rig, changed_in_folder(context), as_json)
@@ -211,14 +215,14 @@ def _verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:
 
 
 def _unbaked(rig: JawRig, path: Path, prim: str | None) -> dict[str, list[str] | dict[str, float]]:
-    """Return how far the mandible of a stage is from where its d puts it; nothing where both agree."""
+    """Return the deviation of the mandible of a stage from its d; empty if both agree."""
     from jawusd.rig.rebake import departure
 
     away = departure(path, rig, prim) if path.suffix.lower() in USD_SUFFIXES else None
     if away is None or not away.frames:
         return {}
-    message = f"the mandible is not where d puts it in {away.frames} of {away.of} frames and keys, by up to "
-    message += f"{away.largest_mm:.2f} mm: bake it with `jawusd rebake`"
+    message = f"the mandible deviates from d in {away.frames} of {away.of} frames and keys, by up to "
+    message += f"{away.largest_mm:.2f} mm: run `jawusd rebake`"
     return {"lines": [message], "figures": away._asdict()}
 
 
@@ -246,7 +250,7 @@ def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
     findings = [Finding(one.severity, one.kind, one.path or "", one.message) for one in changed]
     findings += validate_stage(path)
     if not rig_prims(open_stage(path)):
-        words = "holds no active rig (no prim with JawRigAPI): the rules for rigs were not applied."
+        words = "has no active rig (no prim with JawRigAPI): the rules for rigs were not applied."
         findings.append(Finding("info", "Rig", "/", words))
     nvidia = find_nvidia_validator()
     if nvidia is not None:
@@ -268,13 +272,13 @@ def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
 def ik(
     rig: RigArg,
     point: Annotated[Triple, typer.Option(help="Point on the mandible at rest [mm].")],
-    target: Annotated[Triple, typer.Option(help="Where it should go, skull frame [mm].")],
-    start: Annotated[Triple | None, typer.Option(help="Parameters to start from [mm].")] = None,
+    target: Annotated[Triple, typer.Option(help="Target of the point, skull frame [mm].")],
+    start: Annotated[Triple | None, typer.Option(help="Initial parameters [mm].")] = None,
     prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Find the valid parameters that bring a point of the mandible nearest to a target."""
+    """Find the valid parameters that move a point of the mandible closest to a target."""
     import jawusd
     from jawusd.geometry import transform_point
 

@@ -1,27 +1,32 @@
-"""Performances of people whose rigs exist: solve."""
+"""Commands on a person whose rig exists: solve a take, or follow a live feed."""
 
 from __future__ import annotations
 
+import json
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from jawusd.cli.options import Allow, Force, Json, Outside, Prim, RigArg
-from jawusd.cli.output import emit, progress
+from jawusd.cli.output import emit, progress, say
 from jawusd.formats.atomic import refuse_existing
+from jawusd.formats.finding import Finding
+
+if TYPE_CHECKING:
+    from jawusd.pipeline.solve import SolveSummary
 
 
 class Head(StrEnum):
-    """Say whether the head moves before the cameras."""
+    """Motion of the head relative to the cameras."""
 
     free = "free"
     fixed = "fixed"
 
 
 class Focal(StrEnum):
-    """Say whether focal lengths are calibrated."""
+    """Whether focal lengths are calibrated or estimated."""
 
     known = "known"
     free = "free"
@@ -48,22 +53,20 @@ def solve(
     report: Annotated[
         Path | None,
         typer.Option(
-            help="Page (.html) to write: curves with expected errors, what was not seen, findings, pictures.",
+            help="Page (.html) to write: curves with expected errors, unseen frames, findings, pictures.",
             show_default=False,
         ),
     ] = None,
-    head: Annotated[Head, typer.Option(help="fixed: the cameras are worn, and move with the head.")] = Head.free,
-    focal: Annotated[
-        Focal, typer.Option(help="free: the calibration only guesses focal lengths; the take tells them.")
-    ] = Focal.known,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search for the start.")] = 2,
+    head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = Head.free,
+    focal: Annotated[Focal, typer.Option(help="free: estimate focal lengths from the take.")] = Focal.known,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")] = 2,
     force: Force = False,
     allow_outside: Outside = False,
     prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Solve a performance of the person of a rig, from the masks or else the videos of one or more cameras."""
+    """Track a performance of a person with a rig, from masks or else videos of one or more cameras."""
     from jawusd.pipeline import solve as stage
 
     stage.check_output(rig, out, overlay, report)
@@ -86,4 +89,101 @@ def solve(
         )
     summary = stage.solve_summary(found)
     files = [str(path) for path in written]
-    emit({**summary, "file": str(out), "files": files}, as_json, lambda: [*files, *stage.solve_lines(summary)])
+    emit({**summary, "file": str(out), "files": files}, as_json, lambda: [*files, *solve_lines(summary)])
+
+
+_LISTED_RUNS = 20
+
+
+def solve_lines(summary: SolveSummary) -> list[str]:
+    """Return `solve_summary` as text."""
+    lines = [f"solved {summary['solved']} of {summary['frames']} frames with {', '.join(summary['cameras'])}"]
+    for word, runs in (("interpolated from the motion around", summary["carried"]), ("lost", summary["lost"])):
+        if runs:
+            more = "" if len(runs) <= _LISTED_RUNS else f" and {len(runs) - _LISTED_RUNS} more runs"
+            listed = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:_LISTED_RUNS])
+            lines.append(f"  {word}: {sum(b - a + 1 for a, b in runs)} frames ({listed}{more})")
+    if summary["within_tolerance"]:
+        lines.append(f"  outside the rig's bound, within its tolerance: {summary['within_tolerance']} frames")
+    if summary["outside"]:
+        lines.append(f"  outside the rig's bound: {summary['outside']} frames")
+    sigma = ", ".join(f"{name} {value:.3f}" for name, value in summary["sigma_mm"].items())
+    lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")
+    worst = ", ".join(f"{name} {value:.2f}" for name, value in summary["worst_sigma_mm"].items())
+    lines.append(f"  largest: {worst}")
+    for name, (factor, sigma_factor) in summary.get("focal", {}).items():
+        lines.append(f"  focal length of {name}: {factor:.4f} times the calibrated one (+-{sigma_factor:.4f})")
+    lines.append(f"  limited by {summary['limits']}")
+    return [*lines, *(f"  {Finding.from_json(found).line()}" for found in summary.get("findings", []))]
+
+
+def live(
+    rig: RigArg,
+    shot: ShotArg,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Source of a camera: NAME=/dev/video0, NAME=rtsp://..., NAME=FILE. Cameras without a source are not "
+            "used; without any source, the shot's videos are played in real time.",
+            show_default=False,
+        ),
+    ] = None,
+    osc: Annotated[
+        str | None, typer.Option(help="HOST:PORT for OSC messages: /jaw/d, /jaw/sigma, ...", show_default=False)
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Also show the jaw in a page on this machine.")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; the next free one if taken.")] = 8080,
+    head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = Head.free,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Stop after this time [s].", show_default=False)
+    ] = None,
+    silence: Annotated[float, typer.Option(min=0.1, help="Longest wait for a picture of a source [s].")] = 10.0,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")] = 2,
+    allow_outside: Outside = False,
+    prim: Prim = None,
+    allow: Allow = None,
+) -> None:
+    """Track the jaw of a person with a rig in live video: a line of JSON per instant, OSC, a page.
+
+    Frames are dropped if pictures arrive too fast; every line contains the latency.
+    """
+    from jawusd.pipeline.live import OscSender
+    from jawusd.pipeline.live import live as follow
+    from jawusd.pipeline.view import open_viewer
+
+    sources = dict(_named(entry) for entry in source or [])
+    sender = None if osc is None else OscSender(osc)
+    viewer = open_viewer(rig, "127.0.0.1", port, prim) if view else None
+    if viewer is not None:
+        say(f"{viewer.url}  (Ctrl+C stops)", err=True)
+    try:
+        for found in follow(
+            rig,
+            shot,
+            sources,
+            prim=prim,
+            fixed_head=head is Head.fixed,
+            jobs=jobs,
+            seconds=seconds,
+            silence_s=silence,
+            allow_outside=allow_outside,
+        ):
+            if sender is not None:
+                sender.send(found)
+            if viewer is not None:
+                viewer.show(found.d)
+            say(json.dumps(found.as_json()))
+    except KeyboardInterrupt:
+        pass
+    finally:
+        if sender is not None:
+            sender.close()
+        if viewer is not None:
+            viewer.stop()
+
+
+def _named(entry: str) -> tuple[str, str]:
+    name, found, where = entry.partition("=")
+    if not found or not name or not where:
+        raise typer.BadParameter(f"{entry!r} is not NAME=WHERE, for example mid=/dev/video0.")
+    return name, where

@@ -1,4 +1,4 @@
-"""Commands on rigs among other files: stages edited elsewhere come back to d, rigs get names of their own."""
+"""Commands on rigs in stages: encode edited stages as d, publish rigs under unique names."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ if TYPE_CHECKING:
 
 MandiblePrim = Annotated[
     str | None,
-    typer.Option("--mandible", help="Of a stage: prim that holds the mandible's meshes, where names do not tell."),
+    typer.Option("--mandible", help="Of a stage: prim above the mandible's meshes, if names do not identify it."),
 ]
-SkullPrim = Annotated[str | None, typer.Option("--skull", help="The same of skull or upper teeth.")]
+SkullPrim = Annotated[
+    str | None, typer.Option("--skull", help="Of a stage: prim above the meshes of skull or upper teeth.")
+]
 
 
 def encode(
@@ -45,10 +47,10 @@ def encode(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Find the parameters d whose poses are nearest to given ones, and how far these are from the model.
+    """Convert poses to the nearest parameters d, with their distances from the model.
 
-    Of a stage, the mandible may be moved by transforms, bones or a point cache; `jawusd rebake` writes it back. FBX and
-    glTF are read through Blender.
+    In a stage, the mandible may be moved by transforms, bones or a point cache; `jawusd rebake` writes the result back.
+    FBX and glTF are read through Blender.
     """
     import numpy as np
 
@@ -85,31 +87,33 @@ def publish(
         typer.Argument(help="Folder of a rig, with actor.usda, or a shot.", metavar="FOLDER|SHOT", show_default=False),
     ],
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder to write to, or of a shot the .usdz.", show_default=False)
+        Path, typer.Option("-o", "--out", help="Folder to write, or the .usdz of a shot.", show_default=False)
     ],
     prefix: Annotated[
-        str | None, typer.Option(help="Start of every file's name; the actor's name if not given.", show_default=False)
+        str | None, typer.Option(help="Prefix of all file names. Default: the actor's name.", show_default=False)
     ] = None,
     prim_name: PrimName = None,
     force: Force = False,
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Copy a rig under file names of its own, so that actors can be packed together; or pack a whole shot as .usdz."""
+    """Copy a rig under unique file names, so that actors can be packed together; or pack a shot as .usdz."""
     from jawusd.rig.package import write_package
     from jawusd.rig.publish import publish_rig
 
     refuse_existing(out, force)
     if not source.is_dir():
         if out.suffix.lower() != ".usdz" or prefix is not None or prim_name is not None:
-            raise typer.BadParameter("of a shot, name a .usdz, and neither prefix nor prim.", param_hint="--out")
+            raise typer.BadParameter(
+                "for a shot, name a .usdz, and give neither --prefix nor --prim-name.", param_hint="--out"
+            )
         files = [str(write_package(out, source))]
     else:
         files = [str(path) for path in publish_rig(source, out, prefix, prim_name)]
     emit({"files": files}, as_json, lambda: files)
 
 
-_STILL_MM = 0.01  # ten times what single precision does to a jaw that stays still
+_STILL_MM = 0.01  # ten times the rounding of single precision for a jaw at rest
 
 
 def read_stage_motion(
@@ -121,17 +125,17 @@ def read_stage_motion(
     skull: str | None,
     origin: Literal["d", "mandible"] | None,
 ) -> StageMotion:
-    """Read the motion of a jaw from any stage: of the rig it carries, or else of the rig's meshes fitted to it.
+    """Read the motion of a jaw from a stage: of the rig in it, or else by fitting the rig's meshes.
 
     Args:
-        loaded, rig: The rig and its file.
-        stage: A stage, or a file that Blender makes one of.
-        prim: Which rig, where the stage has several, or the rig's file if the stage comes from Blender.
-        mandible, skull: Prims to look below for the meshes.
-        origin: What counts, see `motion_of_stage`.
+        loaded, rig: the rig and its file.
+        stage: a stage, or a file that Blender converts to one.
+        prim: path of the rig's prim in the stage, or in the rig's file if the stage comes from Blender.
+        mandible, skull: prims above the meshes.
+        origin: which to use if d and mandible disagree, see `motion_of_stage`.
 
     Raises:
-        JawusdError: no such motion.
+        JawusdError: there is no such motion.
     """
     from jawusd.plugins.conversion import SUFFIXES, converted
     from jawusd.rig import describe
@@ -153,7 +157,7 @@ def read_stage_motion(
 
 
 def holds_stage(path: Path) -> bool:
-    """Tell whether a file is a stage, or one that Blender makes a stage of."""
+    """Return whether a file is a stage, or one that Blender converts to a stage."""
     from jawusd.plugins.conversion import SUFFIXES
 
     return path.suffix.lower() in (*USD_SUFFIXES, *SUFFIXES)
@@ -167,7 +171,7 @@ def _fitted(
 
     _refuse_model(rig)
     if rig.resolve() == stage.resolve():
-        message = f"meshes of {stage} deform, and are fitted to those of the rig: name the rig before it."
+        message = f"the meshes of {stage} deform and must be fitted to those of the rig: name the rig first."
         raise typer.BadParameter(message, param_hint="RIG")
     found = fit_poses_of_stage(stage, rig, mandible, skull, prim)
     d, residual_mm = loaded.encode(found.T)
@@ -176,11 +180,11 @@ def _fitted(
 
 def _refuse_model(rig: Path) -> None:
     if rig.suffix.lower() not in USD_SUFFIXES:
-        raise typer.BadParameter("must be the rig's USD file here: its meshes are fitted.", param_hint="RIG")
+        raise typer.BadParameter("must be the rig's USD file, because its meshes are needed.", param_hint="RIG")
 
 
 def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> dict[str, float]:
-    """Return how far a motion is from the model and from the bound."""
+    """Return the distances of a motion from the model and from the bound."""
     import numpy as np
 
     known = np.isfinite(d).all(axis=1)
@@ -200,7 +204,7 @@ def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> d
 
 
 def moved_mm(rig: JawRig, d: Array) -> float:
-    """Return how far a landmark of the mandible comes from where it is in the first pose of a motion d (F, 3) [mm]."""
+    """Return the largest distance of a landmark from its position in the first pose of a motion d (F, 3) [mm]."""
     import numpy as np
 
     from jawusd.geometry import transform_points
@@ -210,14 +214,14 @@ def moved_mm(rig: JawRig, d: Array) -> float:
 
 
 def still_lines(largest_mm: float, frames: int) -> list[str]:
-    """Return what is said of a stage whose mandible stays where it is, as it does where only drivers or d moved it."""
+    """Return a warning if the mandible of a stage does not move, as after export of drivers without baking."""
     if largest_mm > _STILL_MM:
         return []
-    return [f"the mandible does not move, in {frames} frames: exported without baking? Bake it to keys first"]
+    return [f"the mandible does not move in {frames} frames: exported without baking? Bake it to keys first"]
 
 
 def judged_lines(judged: dict[str, float]) -> list[str]:
-    """Return the same in words."""
+    """Return `judged_motion` as text."""
     lines = [f"at most {judged['largest_residual_mm']:.3f} mm from the model"]
     if judged["off_model"]:
         lines.append(f"{judged['off_model']} of {judged['frames']} poses are farther from the model than measured ones")

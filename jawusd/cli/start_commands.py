@@ -1,4 +1,4 @@
-"""Commands of a first hour: init, which begins a capture from a folder, doctor, and cameras of other programs."""
+"""Commands to get started: init drafts a capture, doctor checks the installation, cameras converts calibrations."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def init(
         typer.Option(min=0.1, max=200.0, help="Side of the board's squares [mm].", show_default=False),
     ] = None,
     fps: Annotated[
-        float | None, typer.Option(min=0.001, max=10000.0, help="Pictures per second.", show_default=False)
+        float | None, typer.Option(min=0.001, max=10000.0, help="Frames per second.", show_default=False)
     ] = None,
     reference: Annotated[bool, typer.Option("--reference", help="List every key of capture.toml and stop.")] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Begin a capture: look at a folder, write its capture.toml with comments, and say what is missing.
+    """Draft a commented capture.toml from a folder of footage and scans, and list what is missing.
 
     Exit code 1 if something must be filled in.
     """
@@ -36,7 +36,8 @@ def init(
         return
     if folder is None:
         raise typer.BadParameter("name a folder, or give --reference.", param_hint="FOLDER")
-    from jawusd.pipeline.start_capture import start_capture, start_lines, write_start
+    from jawusd.cli.text_capture import start_lines
+    from jawusd.pipeline.start_capture import start_capture, write_start
 
     refuse_existing(folder / "capture.toml", force)
     with progress() as report:
@@ -59,11 +60,12 @@ def _print_reference(as_json: bool) -> None:
 
 
 def doctor(as_json: Json = False) -> None:
-    """Say what is installed and what works here: versions, extras, OpenGL, codecs, cores, the cache of compiled code.
+    """Check the installation: versions, extras, OpenGL, codecs, cores, the cache of compiled code.
 
-    Exit code 1 if something that a build needs does not work.
+    Exit code 1 if something that a build needs is missing.
     """
-    from jawusd.pipeline.doctor import examine, examined_lines
+    from jawusd.cli.text_capture import examined_lines
+    from jawusd.pipeline.doctor import examine
 
     found = examine()
     emit(found, as_json, lambda: examined_lines(found))
@@ -85,13 +87,15 @@ def cameras(
         float, typer.Option(min=1e-6, help="Length of the source's unit: 1000 if it is in metres.")
     ] = 1.0,
     size: Annotated[
-        str | None, typer.Option(help="Size of the pictures, 1920x1080, if the source has none.", show_default=False)
+        str | None,
+        typer.Option(help="Picture size, as 1920x1080, if the source does not state it.", show_default=False),
     ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Carry calibrated cameras from the files of one program to those of another, in mm."""
-    from jawusd.pipeline.camera_convert import camera_lines, convert_cameras
+    """Convert calibrated cameras between the file formats of programs, in mm."""
+    from jawusd.cli.text_capture import camera_lines
+    from jawusd.pipeline.cameras import convert_cameras
 
     given = None
     if size is not None:

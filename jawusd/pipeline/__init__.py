@@ -1,1 +1,4 @@
-"""The stages wired together: sync, track, fit, refine, bake; resumable, one folder per actor."""
+"""Build, track, fit, solve, report and view: each from its inputs to its files.
+
+The algorithms live in the packages below; nothing here prints, and nothing here imports `cli`.
+"""

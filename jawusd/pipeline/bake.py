@@ -1,4 +1,4 @@
-"""Write the rig of a fitted model, and the take beside it."""
+"""Write the rig of a fitted model, the take beside it, and the table of joint deltas for ARKit shapes."""
 
 from __future__ import annotations
 
@@ -8,33 +8,34 @@ import numpy as np
 
 from jawusd.base.errors import RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
+from jawusd.formats.arkit import ArkitMapping, shares_of
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
+from jawusd.formats.poses import JointDelta
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.cameras import load_cameras, tracked_cameras
-from jawusd.pipeline.contact import meeting_joints, meeting_teeth, with_joints, with_teeth
-from jawusd.pipeline.meshes import BONES
+from jawusd.pipeline.contact import condyle_solids, tooth_solids, with_condyle_contact, with_tooth_contact
 from jawusd.pipeline.state import Progress, no_progress
-from jawusd.pipeline.subject import Subject, registered_subject
+from jawusd.pipeline.subject import BONES, Subject, registered_subject
 
 DEFAULT_FPS = 24.0
-_PROXY_FACES = 1500  # of a mesh; those along its borders come on top, see `proxy_of`
-_TEETH_APART_MM = 15.0  # molars are picked by hand in one case and found by rule in the other
+_PROXY_FACES = 1500  # faces per proxy mesh, not counting those along borders; see `proxy_of`
+_TEETH_APART_MM = 15.0  # generous: molar landmarks may be picked by hand or detected
 
 
 def check_same_jaw(subject: Subject, model: JawModel) -> None:
-    """Check that a model and a person's scans are in one frame: their teeth must lie in one place.
+    """Check that a model and a person's scans share one coordinate frame, by their tooth landmarks.
 
     Raises:
-        RigError: naming the distance.
+        RigError: the landmarks are too far apart.
     """
     apart = np.linalg.norm(model.arrays["landmarks"][:3] - subject.landmarks[:3], axis=1)
     if apart.max() > _TEETH_APART_MM:
         raise RigError(
             f"the {LANDMARKS[int(apart.argmax())]} of the model is {apart.max():.1f} mm from that of the scans "
             f"(allowed: {_TEETH_APART_MM:g} mm).",
-            hint="Scans and the landmarks or poses of the model must be given in one frame.",
+            hint="Scans and the landmarks or poses of the model must share one coordinate frame.",
         )
 
 
@@ -49,12 +50,12 @@ def bake_subject(
     table_size: int = 33,
     prim_name: str | None = None,
 ) -> list[Path]:
-    """Write the rig of a person with meshes, and the captured motion if the model has any; return the files.
+    """Write the rig of a person with meshes, and the captured motion if there is any; return the files.
 
     Args:
-        fps: frames per second if the subject has none.
+        fps: frame rate if the subject has none.
         table_size: knots per axis of the sampled decoder, 17, 33 or 65.
-        prim_name: of the actor's prim; None: after the person.
+        prim_name: name of the actor's prim; None: derived from the name of the person.
 
     Raises:
         RigError, OutputError: the rig cannot be written.
@@ -65,12 +66,12 @@ def bake_subject(
     from jawusd.rig.layout import prim_name_of
 
     subject = registered_subject(subject, model.meta)
-    # Bones come from segmented scans with all their faults; teeth scans stay as they are, vertex for vertex.
+    # Bones come from segmented volumes and need cleaning; teeth scans stay as they are, vertex for vertex.
     meshes = {key: manifold(mesh) if key in BONES else mesh for key, mesh in subject.meshes.items()}
     if "contact" not in model.meta:  # fitted without the scans
         axes, landmarks, rest = (model.arrays[name] for name in ("T_anatomical_skull", "landmarks", "T_rest"))
-        model = with_teeth(model, meeting_teeth(subject.meshes, axes, rest), progress, regauge=False)
-        model = with_joints(model, meeting_joints(subject.meshes, axes, landmarks, rest), progress)
+        model = with_tooth_contact(model, tooth_solids(subject.meshes, axes, rest), progress, regauge=False)
+        model = with_condyle_contact(model, condyle_solids(subject.meshes, axes, landmarks, rest), progress)
     if "velocity_covariance" not in model.arrays and subject.fps is not None:
         model = with_speeds(model, subject.fps)
     moving = len(model.frames) > 0
@@ -97,7 +98,7 @@ def bake_subject(
 
 @explain_missing_packages()
 def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
-    """Write the take beside the rig, its cameras and the actor where the head was; return the files.
+    """Write the cameras and the captured head motion beside the rig; return the files.
 
     Raises:
         CalibrationError: a camera of the capture has no calibration.
@@ -114,3 +115,33 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
         capture.fps,
         [camera.name for camera in capture.cameras if camera.clip is not None and camera.clip.is_light],
     )
+
+
+SHAPES = ("JawOpen", "JawLeft", "JawRight", "JawForward")
+_WEIGHTS = (0.5, 1.0)  # the joint does not move linearly with the weight
+
+
+def joint_deltas(rig: JawRig, mapping: ArkitMapping | None = None) -> list[JointDelta]:
+    """Return the offset of the joint midway between the condyles for each shape, at half and full weight.
+
+    The other weights are neutral. d is brought inside the bound, as `jawusd animate` does.
+
+    Args:
+        mapping: the person's own; None for shares of the ranges, whose neutral face is the closed bite.
+    """
+    from jawusd.rig.skel import joint_poses
+
+    neutral = np.zeros(4) if mapping is None else np.array(mapping.neutral)
+    cases = [(i, weight) for i in range(len(SHAPES)) for weight in _WEIGHTS]
+    weights = np.tile(neutral, (1 + len(cases), 1))
+    for row, (i, weight) in enumerate(cases, start=1):
+        weights[row, i] = weight
+    wanted = rig.denormalized(shares_of(weights)) if mapping is None else mapping.d(weights)
+    d = rig.project(wanted)
+    joint = joint_poses(rig, d)
+    moved, turned = joint[1:, :3, 3] - joint[0, :3, 3], joint[1:, :3, :3] @ joint[0, :3, :3].T
+    clamped = np.linalg.norm(d - wanted, axis=1)[1:]
+    return [
+        JointDelta(SHAPES[i], weight, *rest)
+        for (i, weight), *rest in zip(cases, d[1:], moved, turned, clamped.tolist(), strict=True)
+    ]

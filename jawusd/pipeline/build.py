@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,23 +21,22 @@ from jawusd.pipeline.cameras import rescaled_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_subject, fit_summary
-from jawusd.pipeline.origin import origin_now
 from jawusd.pipeline.report import (
     BuildFacts,
     CheckResult,
     ReportSummary,
     missing_packages,
-    place_of,
+    relative_capture_path,
     write_build_report,
 )
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
 from jawusd.pipeline.segment_record import delete_masks
-from jawusd.pipeline.state import CALIBRATION, FIRST_PASS, LABELS, Progress, StageRecord, no_progress
+from jawusd.pipeline.state import CALIBRATION, FIRST_PASS, LABELS, Progress, StageRecord, no_progress, origin_now
 from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
-from jawusd.pipeline.workspace import Stage, Workspace, opened
+from jawusd.pipeline.workspace import DryWorkspace, Stage, StageMissing, Workspace, check_folder, opened
 
-OLD_MASKS = "masks"  # folder in which version 0.1 made masks where the capture named none
+OLD_MASKS = "masks"  # version 0.1 wrote masks here if the capture named none
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class BuildOptions:
         resume: continue an earlier build in the folder.
         fresh: delete an earlier build in the folder first.
         allow_outside: let paths in the capture leave its folder.
-        prim_name: of the actor's prim; None: after the capture's name.
-        command: the command line that asks for it, for the report.
+        prim_name: name of the actor's prim; None: derived from the name of the capture.
+        command: command line of the build, recorded in the report.
     """
 
     model: str = "anchored"
@@ -71,9 +71,9 @@ class BuildSummary(TypedDict):
 
     Attributes:
         files: names of all files written, relative to the folder.
-        seconds: per stage, also of those reused.
-        reused: stages kept from an earlier build.
-        findings: `Finding.as_json` of what the check before the first stage found.
+        seconds: by stage; for a reused one, of its last run.
+        reused: stages reused from an earlier build.
+        findings: `Finding.as_json` of the check before the first stage.
         calibrate: None if the capture names a calibration.
         track: of the final tracks.
     """
@@ -193,7 +193,7 @@ def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], 
 
 
 def _labelled(run: Workspace) -> StageRecord[dict[str, str]]:
-    """Tell crown from gum in scans without paint and without a file of labels."""
+    """Label crown and gum of scans without paint and without a file of labels."""
     folder = run.folder / LABELS
     none: dict[str, str] = {}
     record = run.run(SCANS, ["teeth"], [], lambda: (store_labels(run.capture, folder), none))
@@ -206,7 +206,7 @@ def _calibrated(run: Workspace) -> StageRecord[CalibrationSummary]:
     capture, path = run.capture, run.folder / CALIBRATION
     boards = capture.boards.model_dump(mode="json", exclude={"videos"}) if capture.boards else None
     picks = capture.bootstrap.model_dump(mode="json") if capture.bootstrap else None
-    # Without picks, the stated size of the squares is checked with the masks.
+    # Without picks, the masks verify the stated size of the squares.
     parts = ["boards", "teeth", *([] if picks else ["masks", "videos"])]
     settings = [boards, picks, [camera.name for camera in capture.cameras]]
     record = run.run(CALIBRATE, parts, settings, lambda: ([path], calibrate_boards(capture, path, run.progress)))
@@ -258,9 +258,58 @@ def _bake(run: Workspace, options: BuildOptions) -> tuple[list[Path], dict[str, 
 
 
 def _report(run: Workspace, options: BuildOptions, missing: str | None) -> tuple[list[Path], ReportSummary]:
-    place, origin = place_of(run.capture, run.folder), origin_now(options.command)
+    place, origin = relative_capture_path(run.capture, run.folder), origin_now(options.command)
     if missing is not None:
         # The rig is complete without it; the summary names the missing packages.
         return [], {"capture": place, "origin": asdict(origin), "missing": missing}
     path, verdict = write_build_report(run.folder, BuildFacts(run.state, run.capture, origin), run.progress)
     return [path], {"capture": place, "origin": asdict(origin), "file": path.name, "verdict": verdict}
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """A stage of a planned build."""
+
+    name: str
+    keeps: bool  # the record is reused
+    seconds: float  # duration of a recorded stage, otherwise an estimate
+
+
+@explain_missing_packages()
+def plan_build(capture: Capture | str | os.PathLike[str], out: Path, options: BuildOptions) -> list[PlannedStage]:
+    """Return the stages of a build in order; nothing is written.
+
+    Raises:
+        CaptureError, FormatError: the capture cannot be read.
+        OutputError: the build cannot write to this folder, see `check_folder`.
+    """
+    as_read = open_capture(capture, allow_outside=options.allow_outside)
+    check_folder(out, resume=options.resume, fresh=options.fresh)
+    run = DryWorkspace(out, as_read, lambda: as_read)
+    recorded = dict(run.state.stages)
+    with contextlib.suppress(StageMissing):
+        if not options.fresh:
+            run_stages(run, options, None)
+    pictures = _pictures(as_read)
+    stages = []
+    for stage in _stages(as_read):
+        estimate = stage.seconds + stage.seconds_per_picture * pictures
+        seconds = recorded[stage.name].seconds if stage.name in recorded else estimate
+        stages.append(PlannedStage(stage.name, stage.name in run.reused, seconds))
+    return stages
+
+
+def _stages(capture: Capture) -> list[Stage[Mapping[str, object]]]:
+    before: list[Stage[Mapping[str, object]]] = [CHECK]
+    before += [] if all_labelled(capture) else [SCANS]
+    before += [CALIBRATE] if capture.calibration is None and capture.boards is not None else []
+    return [*before, SYNC, TRACK, FIT, REFINE, BAKE, REPORT]
+
+
+def _pictures(capture: Capture) -> int:
+    """Return the number of pictures of all cameras that are processed."""
+    from jawusd.media.footage import open_clip
+
+    counts = [open_clip(camera.clip).count for camera in capture.cameras if camera.clip is not None]
+    frames = capture.frames[1] - capture.frames[0] if capture.frames else max(counts, default=300)
+    return frames * len(capture.cameras)

@@ -1,8 +1,8 @@
-"""Bring the cameras of a capture together: calibration from its boards, and frame offsets."""
+"""Calibrate the cameras of a capture from its boards, and align them in time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,8 @@ from jawusd.formats.clips import ClipSource, LightCurve
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.text import Frames
 from jawusd.geometry import Camera
-from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.state import Progress
+from jawusd.pipeline.subject import load_meshes
 
 if TYPE_CHECKING:
     from jawusd.capture.scale import ScaleCheck
@@ -27,12 +27,11 @@ if TYPE_CHECKING:
 
 PLOT_SUFFIXES = (".png", ".svg")
 
-_LISTED = 10
-_SIZE_SIGMA = 0.005  # of the teeth's size measured from masks
+_SIZE_SIGMA = 0.005  # standard deviation of the scale estimated from masks
 
 
 class CameraReport(TypedDict):
-    """Say how well one camera is calibrated; picture numbers under `blurred` and `missed`."""
+    """Calibration quality of one camera; `blurred` and `missed` list picture numbers."""
 
     views: int
     rms_px: float
@@ -42,7 +41,7 @@ class CameraReport(TypedDict):
 
 
 class CalibrationSummary(TypedDict):
-    """Hold `capture.calibrate.CalibrationReport` as plain data."""
+    """`capture.calibrate.CalibrationReport` as plain data."""
 
     cameras: dict[str, CameraReport]
     views: int
@@ -56,7 +55,7 @@ class CalibrationSummary(TypedDict):
 
 
 class SyncResult(TypedDict):
-    """Hold the frame offset of every camera to the reference camera [frames], and what the method says of it."""
+    """Frame offset of every camera to the reference camera [frames], with the method's own figures."""
 
     offsets: dict[str, Frames]
     method: str
@@ -71,7 +70,7 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> Calibra
     """Calibrate the cameras from the boards of a capture and write the calibration as aniposelib TOML.
 
     Raises:
-        CalibrationError: the boards do not carry a calibration.
+        CalibrationError: the boards do not suffice for a calibration.
         CaptureError: a clip or scan cannot be read.
         OutputError: the file cannot be written.
     """
@@ -87,62 +86,32 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> Calibra
             lambda cameras, by_picks: _scale_by_masks(capture, meshes, cameras, by_picks, progress),
         )
     save_calibration(out, cameras)
-    return cast(CalibrationSummary, asdict(report))  # asdict forgets the types of fields
+    return cast(CalibrationSummary, asdict(report))  # asdict loses the field types
 
 
 def _scale_by_masks(
     capture: Capture, meshes: Mapping[str, Mesh], cameras: list[Camera], by_picks: ScaleCheck, progress: Progress
 ) -> ScaleCheck:
-    """Return the size of the teeth as the masks show it.
+    """Return the scale of the teeth estimated from the masks, as a check of the board's stated size.
 
     Raises:
-        CalibrationError: the teeth come out with another size than their scans.
+        CalibrationError: the scale contradicts the scans.
     """
     from jawusd.capture.scale import ScaleCheck, checked_scale
     from jawusd.tracking.initialization.scale_search import seen_size
 
     if capture.boards is None or sum(camera.masks is not None for camera in capture.cameras) < 2:
-        return ScaleCheck(None, None, f"{by_picks.reason}, nor masks of two cameras to search the teeth in")
+        return ScaleCheck(None, None, f"{by_picks.reason}, and fewer than two cameras have masks")
     scans = [meshes[f"{jaw}_teeth"] for jaw in ("upper", "lower")]
     progress("size of the teeth", 0, 1)
     try:
         offsets = sync_cameras(capture, progress)["offsets"]
         ratio = seen_size(capture, cameras, offsets, scans)
     except (SyncError, TrackingError) as error:
-        why = f"{by_picks.reason}, and the teeth could not be searched in the masks ({error.statement().rstrip('.')})"
+        why = f"{by_picks.reason}, and the search for the teeth in the masks failed ({error.statement().rstrip('.')})"
         return ScaleCheck(None, None, why)
     progress("size of the teeth", 1, 1)
     return checked_scale(ratio, _SIZE_SIGMA, capture.boards.square_mm)
-
-
-def calibration_lines(report: CalibrationSummary) -> list[str]:
-    """Return a calibration report as text."""
-    lines = [f"calibrated from {report['views']} views of the board"]
-    for name, camera in report["cameras"].items():
-        line = (
-            f"  {name}: {camera['rms_px']:.3f} px rms, {camera['views']} views, {camera['coverage']:.0%} of the picture"
-        )
-        lines.append(line + _listed("blurred", camera["blurred"]) + _listed("missed", camera["missed"]))
-    shape = report["board_shape"]
-    if shape["distances"]:
-        lines.append(
-            f"  distances on the boards near the mouth: wrong by {shape['mean']:.4f} mm (mean), {shape['p95']:.4f} "
-            f"(p95), {shape['max']:.4f} (max)"
-        )
-    lines.append(
-        f"  distances in the mouth, expected from the scatter of the corners: {report['expected_shape_mm']:.4f} mm "
-        f"(mean); middle of the mouth from {report['mouth_from']}"
-    )
-    if (ratio := report["scale"]["ratio"]) is not None:
-        lines.append(f"  the teeth confirm the board's size: seen {ratio:.4f} times (+-{report['scale']['sigma']:.4f})")
-    return lines + [f"  note: {note}" for note in report["notes"]] + [f"  advice: {text}" for text in report["advice"]]
-
-
-def _listed(word: str, numbers: Sequence[int]) -> str:
-    if not numbers:
-        return ""
-    more = f" and {len(numbers) - _LISTED} more" if len(numbers) > _LISTED else ""
-    return f"; {word}: {', '.join(map(str, numbers[:_LISTED]))}{more}"
 
 
 @explain_missing_packages()
@@ -156,7 +125,7 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
     if capture.sync.offsets is not None:
         result = SyncResult(offsets=dict(capture.sync.offsets), method="given in the capture")
     elif len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
-        # Masks alone carry no flash; numbered alike they are taken as simultaneous, and the report says so.
+        # Masks show no flash: equal frame numbers are assumed to be simultaneous, and the report says so.
         result = SyncResult(offsets={camera.name: 0 for camera in capture.cameras}, method="taken as simultaneous")
     else:
         from jawusd.capture.sync import estimate_offsets
@@ -173,7 +142,7 @@ def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progres
 
     Args:
         videos: clips by the names of their cameras.
-        reference: the camera that the others are aligned with.
+        reference: the camera that the others are aligned to.
 
     Raises:
         SyncError, CaptureError: see `capture.sync.align_videos`.
@@ -229,7 +198,7 @@ def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
 
 @explain_missing_packages()
 def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: SyncResult | None) -> None:
-    """Draw the brightness of all clips before and after they were aligned, as .png or .svg.
+    """Draw the brightness of all clips before and after alignment, as .png or .svg.
 
     Args:
         result: None if the cameras could not be aligned.

@@ -1,29 +1,106 @@
-"""Load the cameras of a capture, at the size its pictures were recorded in."""
+"""Cameras and footage of a capture: calibrations of any program, at the recorded size, and the clips."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from jawusd.base.errors import CalibrationError, explain_missing_packages
+from jawusd.base.errors import CalibrationError, CaptureError, FormatError, OutputError, explain_missing_packages
+from jawusd.cameras.calibration import save_calibration
+from jawusd.cameras.colmap import save_colmap
+from jawusd.cameras.files import lacks_sizes, load_cameras_file
 from jawusd.cameras.parts import plain_name
 from jawusd.formats.capture import CameraSource, Capture
+from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
-from jawusd.pipeline.camera_convert import read_calibration
+from jawusd.pipeline.subject import load_meshes, registered_meshes
+
+if TYPE_CHECKING:
+    from jawusd.media.backdrop import Backdrop
+    from jawusd.media.clip import Clip
+
 
 Size = tuple[int, int]
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".abc")
+
+
+def read_calibration(path: Path, unit_mm: float, sizes: Callable[[], Mapping[str, Size]]) -> list[Camera]:
+    """Read cameras of any known kind of file, stages of OpenUSD among them [mm].
+
+    Args:
+        path: the file or folder.
+        unit_mm: length of its unit; ignored for stages, which state theirs.
+        sizes: returns (width, height) [px] of the pictures by camera; called only if the file does not state them.
+
+    Raises:
+        CalibrationError, FormatError, RigError: the file contains no usable cameras.
+    """
+    if path.suffix.lower() in USD_SUFFIXES:
+        from jawusd.rig.cameras import read_cameras
+
+        return read_cameras(path, sizes)
+    return load_cameras_file(path, unit_mm, sizes() if lacks_sizes(path) else None)
+
+
+class SameSize(dict[str, Size]):
+    """A mapping that returns one picture size for every camera name."""
+
+    def __init__(self, size: Size | None) -> None:
+        super().__init__()
+        self._size = size
+
+    def __contains__(self, name: object) -> bool:
+        return self._size is not None
+
+    def __missing__(self, name: str) -> Size:
+        if self._size is None:
+            raise KeyError(name)
+        return self._size
+
+
+def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) -> tuple[list[Camera], list[Path]]:
+    """Read cameras and write them in mm: .toml for aniposelib, .usda for OpenUSD, a folder for COLMAP.
+
+    Args:
+        source: see `cameras.files.load_cameras_file`; or a stage.
+        out: what to write.
+        unit_mm: length of the source's unit.
+        size: (width, height) [px] of the pictures, for formats that do not state it.
+
+    Raises:
+        CalibrationError, FormatError, RigError: the source contains no usable cameras, or OUT cannot represent them.
+        OutputError: the file cannot be written, or has another suffix.
+    """
+    cameras = read_calibration(source, unit_mm, lambda: SameSize(size))
+    suffix = out.suffix.lower()
+    if suffix == ".toml":
+        save_calibration(out, cameras)
+        return cameras, [out]
+    if suffix in USD_SUFFIXES[:3]:
+        from jawusd.rig.cameras import write_camera_stage
+
+        return cameras, [write_camera_stage(out, cameras)]
+    if suffix:
+        raise OutputError(
+            f'cannot write "{suffix}" files.',
+            path=out,
+            hint="Name a .toml (aniposelib), a .usda, or a folder (COLMAP).",
+        )
+    return cameras, save_colmap(out, cameras)
 
 
 @explain_missing_packages()
 def load_cameras(capture: Capture) -> list[Camera]:
     """Return the calibrated cameras in the capture's order, at the size the pictures were recorded in.
 
-    A calibration made at another size of the same shape is scaled; `rescaled_cameras` says of which cameras.
+    A calibration at another size of the same aspect ratio is scaled; see `rescaled_cameras`.
 
     Raises:
-        CalibrationError: there is no calibration, it does not know a camera of the capture, or the pictures have
-            another shape than those it was made from.
+        CalibrationError: there is no calibration, it lacks a camera of the capture, or the aspect ratio of the
+            pictures differs.
         CaptureError: a video or mask cannot be read.
     """
     return [_at_recorded_size(camera, capture, source) for camera, source in _calibrated(capture)]
@@ -48,7 +125,7 @@ def _size(camera: Camera) -> Size:
 
 
 def tracked_cameras(cameras: Sequence[Camera], tracks: Tracks) -> list[Camera]:
-    """Return the cameras that the poses of tracks belong to: the calibrated ones with the take's own corrections."""
+    """Return the calibrated cameras with the corrections estimated while tracking, to which the poses refer."""
     from jawusd.tracking.sequence.extrinsics import corrected_cameras
 
     return corrected_cameras(cameras, tracks.meta)
@@ -60,16 +137,16 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
         raise CalibrationError(
             'has no "calibration".',
             path=capture.folder / "capture.toml",
-            hint="Name a calibration file there; jawusd calibrate makes one from [boards].",
+            hint="Name a calibration file there; `jawusd calibrate` makes one from [boards].",
         )
     found = read_calibration(capture.calibration, capture.calibration_unit_mm, lambda: _recorded_sizes(capture))
-    # names of a capture have no dots; calibrations of other programs may
+    # Camera names in a capture have no dots; those of other programs may.
     plain = {plain_name(camera.name): camera for camera in found}
     known = (plain if len(plain) == len(found) else {}) | {camera.name: camera for camera in found}
     missing = [source.name for source in capture.cameras if source.name not in known]
     if missing:
         raise CalibrationError(
-            f"does not know camera {missing[0]} of the capture; it names {', '.join(camera.name for camera in found)}.",
+            f"lacks camera {missing[0]} of the capture; it contains {', '.join(camera.name for camera in found)}.",
             path=capture.calibration,
         )
     return [(replace(known[source.name], name=source.name), source) for source in capture.cameras]
@@ -97,14 +174,93 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     width, height = _size(camera)
     if tuple(recorded) == (width, height):
         return camera
-    # One pixel is what rounding of a scaled height makes.
+    # The tolerance of one pixel allows for rounding of a scaled height.
     # An anamorphic picture is stored narrower (or, as DV, wider) than it is shown, and may be calibrated either way.
     if min(abs(recorded[0] * share * height / width - recorded[1]) for share in (1.0, aspect)) > 1.0:
         raise CalibrationError(
             f"calibrated for pictures of {width} x {height} px, but {path.name} has "
-            f"{recorded[0]} x {recorded[1]} px, another shape.",
+            f"{recorded[0]} x {recorded[1]} px, another aspect ratio.",
             camera=camera.name,
             path=capture.calibration,
-            hint="Calibrate in the recording's own mode: a crop cannot be told from the sizes alone.",
+            hint="Calibrate in the recording mode of the take: sizes alone do not tell how pictures are cropped.",
         )
     return camera.scaled(recorded)
+
+
+@explain_missing_packages()
+def open_videos(capture: Capture) -> dict[str, Clip]:
+    """Return the videos of a capture by the names of their cameras.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+    """
+    from jawusd.media.footage import open_clip
+
+    sources = {source.name: source.clip for source in capture.cameras if source.clip}
+    if not sources:
+        raise CaptureError(
+            "no camera has a video.",
+            path=capture.folder / "capture.toml",
+            hint="Name the footage there (video = ...).",
+        )
+    return {name: open_clip(clip) for name, clip in sources.items()}
+
+
+def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[str, Camera], dict[str, Clip]]:
+    """Return the calibrated cameras of a capture, and the videos of those that have one, by name.
+
+    Args:
+        tracks: apply the camera corrections of these tracks.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+        CalibrationError: a video has another aspect ratio than its camera's calibration.
+    """
+    cameras = load_cameras(capture)
+    placed = cameras if tracks is None else tracked_cameras(cameras, tracks)
+    return {camera.name: camera for camera in placed}, open_videos(capture)
+
+
+@explain_missing_packages()
+def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Backdrop]:
+    """Return the backdrops for drawn scans, by camera: footage, or else masks.
+
+    Args:
+        offsets: frame offset by camera.
+
+    Raises:
+        CaptureError: no camera has video or masks, or one cannot be decoded.
+    """
+    from jawusd.media.backdrop import Backdrop
+
+    sources = [source for source in capture.cameras if source.video or source.masks]
+    if not sources:
+        raise CaptureError(
+            "no camera has a video or masks to draw over.",
+            path=capture.folder / "capture.toml",
+            hint="Name the footage there (video = ...).",
+        )
+    return {source.name: Backdrop(source, offsets[source.name]) for source in sources}
+
+
+def check_same_cameras(capture: Capture, tracks: Tracks) -> None:
+    """Check that the cameras of tracks exist in a capture, some of whose cameras may be unused.
+
+    Raises:
+        FormatError: the capture lacks a camera.
+    """
+    names = [camera.name for camera in capture.cameras]
+    if not set(tracks.camera_names) <= set(names):
+        raise FormatError(
+            f"the tracks use the cameras {', '.join(tracks.camera_names)}; the capture has {', '.join(names)}."
+        )
+
+
+def tracked_scans(capture: Capture, tracks: Tracks) -> tuple[Mesh, Mesh]:
+    """Return the teeth scans, upper and lower, with the registration that the poses of tracks refer to [mm].
+
+    Raises:
+        CaptureError, FormatError: see `load_meshes`.
+    """
+    meshes = registered_meshes(load_meshes(capture), tracks.meta)
+    return meshes["upper_teeth"], meshes["lower_teeth"]

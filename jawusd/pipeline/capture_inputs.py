@@ -11,13 +11,12 @@ from jawusd.cameras.files import calibration_files
 from jawusd.formats.capture import Capture, load_capture
 from jawusd.formats.file_names import is_pattern, numbered_files
 from jawusd.formats.scan_labels import labels_path
-from jawusd.pipeline.meshes import BONES
-from jawusd.pipeline.scan_labels import TEETH
 from jawusd.pipeline.state import hash_files, hash_value
+from jawusd.pipeline.subject import BONES, TEETH
 
 
 def open_capture(capture: Capture | str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
-    """Return a capture, read if it is given as capture.toml or its folder; see `formats.capture.load_capture`.
+    """Return a capture, loading it from capture.toml or its folder if needed; see `formats.capture.load_capture`.
 
     Args:
         allow_outside: let paths in the capture leave its folder.
@@ -26,7 +25,7 @@ def open_capture(capture: Capture | str | os.PathLike[str], *, allow_outside: bo
 
 
 def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]:
-    """Return the files behind parts of a capture, for hashing, by the part they play.
+    """Return the files behind parts of a capture, for hashing, by part.
 
     Args:
         names: any of "teeth", "mandible", "skull", "boards", "calibration", "masks", "videos".
@@ -59,7 +58,7 @@ def input_hashes(
     """Return the content hashes of parts of a capture; see `input_files`.
 
     Args:
-        hashed: returns the hash of files.
+        hashed: function that returns the hash of files.
 
     Raises:
         CaptureError: a file cannot be read.
@@ -69,7 +68,7 @@ def input_hashes(
         found = {part: hashed(files) for part, files in input_files(capture, names).items()}
     except OSError as error:
         raise CaptureError(f"cannot be read: {error.strerror}.", path=error.filename) from error
-    if "videos" in names:  # how footage is read is part of what it shows
+    if "videos" in names:  # settings that change how footage is decoded
         keys = {"timecode", "start_frame", "fps", "colour_space", "pixel_aspect"}
         found["footage as read"] = hash_value([camera.model_dump(include=keys) for camera in capture.cameras])
         if capture.colour_config is not None:
@@ -78,23 +77,23 @@ def input_hashes(
 
 
 class InputWatch:
-    """Hash inputs, and notice what has changed since; files that look untouched are not read again."""
+    """Hash inputs and detect later changes; files with unchanged size and times are not read again."""
 
     def __init__(self) -> None:
-        self._asked: list[tuple[Capture, list[str], dict[str, str]]] = []
+        self._hashed: list[tuple[Capture, list[str], dict[str, str]]] = []
         self._known: dict[tuple[object, ...], str] = {}
 
     def hashes(self, capture: Capture, names: Iterable[str]) -> dict[str, str]:
-        """Return `input_hashes`, which raises CaptureError, and remember them."""
+        """Return `input_hashes` and remember them; raises CaptureError."""
         names = list(names)
         found = input_hashes(capture, names, self._hash)
-        self._asked.append((capture, names, found))
+        self._hashed.append((capture, names, found))
         return found
 
     def changed(self) -> list[str]:
-        """Return the parts that are not what they were when they were hashed, by the names of `input_files`."""
+        """Return the parts that changed since they were hashed, by the names of `input_files`."""
         parts: set[str] = set()
-        for capture, names, before in self._asked:
+        for capture, names, before in self._hashed:
             now = input_hashes(capture, names, self._hash)
             parts |= {part for part in before.keys() | now.keys() if before.get(part) != now.get(part)}
         return sorted(parts)
@@ -108,10 +107,10 @@ class InputWatch:
 
 
 def _sequence_files(path: Path) -> list[Path]:
-    """Return a video as it is, and the numbered files of a picture pattern; others may lie beside them."""
+    """Return the numbered files of a picture pattern, or the path itself for a video."""
     if not is_pattern(path):
         return [path]
     try:
         return list(numbered_files(path).values())
-    except CaptureError:  # its reader says so
+    except CaptureError:  # reported by its reader
         return []

@@ -1,4 +1,4 @@
-"""Every cheap check of a capture at once, before any work: seconds, a few pictures of each file, no tracking."""
+"""Check a capture in seconds, before any work: a few pictures of each file, no tracking."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from typing import TypedDict
 from jawusd.base.errors import CaptureError, JawusdError
 from jawusd.formats.capture import Capture, read_capture
 from jawusd.formats.finding import Finding, Severity
-from jawusd.pipeline.check_parts import Parts, found_error
-from jawusd.pipeline.check_scans import bone_findings, occlusion, scans
-from jawusd.pipeline.check_views import boards, calibration, clips, frames, masks, picks, synchronisation, views
+from jawusd.pipeline.check_files import Parts, boards, bone_findings, calibration, clips, found_error, occlusion, scans
+from jawusd.pipeline.check_views import frames, masks, picks, synchronisation, views
 from jawusd.pipeline.state import Progress, no_progress
 
-# What the stages from capture to rig cannot do without, and what only the report needs.
+# Packages required by the stages, and those that only the report needs.
 _NEEDED = ("av", "cv2", "numba", "scipy", "torch", "onnx", "shapely", "trimesh", "pyfqmr", "PIL")
 _FOR_REPORT = ("matplotlib", "jinja2")
-# Space that a build fills, rig, tracks and report, and without which it cannot begin [MB].
+# Disk space for rig, tracks and report, and the minimum to start [MB].
 _RIG_MB, _LEAST_MB = 200.0, 20.0
 
 
 class CheckSummary(TypedDict):
-    """Hold what a check of a capture found; findings are `Finding.as_json`."""
+    """Result of a check; findings are `Finding.as_json`."""
 
     capture: str
     findings: list[dict[str, str | float | int]]
@@ -36,7 +35,7 @@ class CheckSummary(TypedDict):
 
 @dataclass(frozen=True)
 class _Check:
-    """One check: what it looks at, the parts it needs, and the function."""
+    """One check: its subject, the parts it needs, and the function."""
 
     what: str
     needs: tuple[str, ...]
@@ -50,7 +49,7 @@ def _packages(parts: Parts) -> Iterator[Finding]:
         message = f"the packages {names} are not installed"
         yield Finding("packages_missing", "error", message, hint="Install them with: pip install 'jawusd[build]'")
     if lacking := [name for name in _FOR_REPORT if find_spec(name) is None]:
-        message = f"the packages {', '.join(lacking)} are not installed: there will be no report"
+        message = f"the packages {', '.join(lacking)} are not installed; no report will be written"
         yield Finding("no_report", "warning", message, hint="Install them with: pip install 'jawusd[build]'")
 
 
@@ -58,7 +57,7 @@ def _disk(parts: Parts) -> Iterator[Finding]:
     place = next(folder for folder in (parts.out, *parts.out.parents) if folder.exists())
     free_mb = shutil.disk_usage(place).free / 1e6
     if free_mb < _RIG_MB:
-        message = f"{free_mb:.0f} MB are free on the disk, a build may need {_RIG_MB:.0f} MB"
+        message = f"{free_mb:.0f} MB of disk space are free; a build may need {_RIG_MB:.0f} MB"
         severity: Severity = "error" if free_mb < _LEAST_MB else "warning"
         yield Finding("disk_space", severity, message, free_mb, _RIG_MB, path=str(place), hint="Free some space.")
 
@@ -87,14 +86,13 @@ def check_capture(
     allow_outside: bool = False,
     progress: Progress | None = None,
 ) -> list[Finding]:
-    """Return everything that can be found wrong or doubtful about a capture in seconds; errors come first.
+    """Return all errors and warnings that can be found in a capture within seconds; errors come first.
 
-    Nothing is raised for what is wrong with the capture. A check that an earlier error leaves nothing to look at is
-    skipped, with a note that says so.
+    Problems with the capture are returned, not raised. A check whose inputs are unreadable is skipped with a note.
 
     Args:
         capture: the capture, its capture.toml or the folder that holds it.
-        out: the rig's folder to be, for the space on its disk; the capture's folder by default.
+        out: future folder of the rig, whose disk space is checked; the capture's folder by default.
         allow_outside: let paths in the capture leave its folder.
         progress: called with (stage, done, total) as work proceeds.
     """
@@ -107,41 +105,43 @@ def check_capture(
         loaded, problems = read_capture(capture, allow_outside=allow_outside)
         findings += [found_error("capture", problem) for problem in problems]
     folder = loaded.folder if loaded is not None else Path(str(capture))
-    # A capture that was read already was allowed its paths then.
+    # The paths of a loaded capture have been checked already.
     with Parts(loaded, Path(out or folder).resolve(), allow_outside or isinstance(capture, Capture)) as parts:
         for done, check in enumerate(_CHECKS):
             progress("check", done, len(_CHECKS))
             findings += _run(check, parts)
     progress("check", len(_CHECKS), len(_CHECKS))
-    if loaded is None:  # one note in place of one for each check
+    if loaded is None:  # a single note instead of one per check
         findings = [finding for finding in findings if finding.kind != "not_checked"]
-        findings.append(Finding("not_checked", "note", "nothing else was checked, as the capture cannot be read"))
+        findings.append(Finding("not_checked", "note", "nothing else was checked, because the capture cannot be read"))
     order = {"error": 0, "warning": 1, "note": 2}
-    return sorted(_told_once(findings), key=lambda finding: order[finding.severity])
+    return sorted(_without_duplicates(findings), key=lambda finding: order[finding.severity])
 
 
 def _run(check: _Check, parts: Parts) -> list[Finding]:
     lacking, capture = [name for name in check.needs if not getattr(parts, name)], parts.capture
     if "samples" in lacking and capture is not None and not any(c.masks for c in capture.cameras):
-        return []  # there are no masks to look at
+        return []  # without masks there is nothing to check
     if lacking:
         boards = capture is not None and capture.calibration is None and capture.boards is not None
         later = boards and lacking == ["cameras"]
-        why = "the cameras are calibrated from the boards first" if later else "what it needs cannot be read"
+        why = "the cameras will be calibrated from the boards first" if later else "its inputs cannot be read"
         return [Finding("not_checked", "note", f"{check.what}: not checked, because {why}")]
     found: list[Finding] = []
     try:
         found.extend(check.run(parts))
     except JawusdError as error:
         found.append(found_error("capture", error))
-    except Exception as error:  # whatever a check stumbles over must not hide what the others found
+    except Exception as error:  # a failing check must not hide the findings of others
         message = f"{check.what} could not be checked ({type(error).__name__}: {error})"
-        found.append(Finding("check_failed", "warning", message, hint="Look at these files; please report this."))
+        found.append(
+            Finding("check_failed", "warning", message, hint="Inspect these files, and please report this as a bug.")
+        )
     return found
 
 
-def _told_once(findings: Sequence[Finding]) -> list[Finding]:
-    """Return findings without those that say of the same place what another one says."""
+def _without_duplicates(findings: Sequence[Finding]) -> list[Finding]:
+    """Return findings without duplicates: same message, same file or camera."""
     unique: dict[tuple[str, str | None, str | None], Finding] = {}
     for finding in findings:
         key = (finding.message, finding.path, None if finding.path else finding.camera)
@@ -153,7 +153,7 @@ def refuse_errors(findings: Sequence[Finding], capture: Capture) -> None:
     """Raise one error that lists all errors among findings.
 
     Raises:
-        CaptureError: there is one.
+        CaptureError: there are errors.
     """
     errors = [finding for finding in findings if finding.severity == "error"]
     if not errors:
@@ -163,21 +163,14 @@ def refuse_errors(findings: Sequence[Finding], capture: Capture) -> None:
         only = errors[0]
         raise CaptureError(only.message, path=only.path or path, camera=only.camera, frame=only.frame, hint=only.hint)
     listed = "".join(f"\n  {finding.line()}" for finding in errors)
-    raise CaptureError(f"{len(errors)} errors were found before any work:{listed}", path=path)
+    raise CaptureError(f"the check found {len(errors)} errors:{listed}", path=path)
 
 
 def check_summary(name: str, findings: Sequence[Finding]) -> CheckSummary:
-    """Return findings as plain data."""
+    """Return findings as plain data, with counts."""
     return {
         "capture": name,
         "findings": [finding.as_json() for finding in findings],
         "errors": sum(finding.severity == "error" for finding in findings),
         "warnings": sum(finding.severity == "warning" for finding in findings),
     }
-
-
-def check_lines(findings: Sequence[Finding]) -> list[str]:
-    """Return findings as text, with a last line that counts them."""
-    counts = [(sum(f.severity == kind for f in findings), kind) for kind in ("error", "warning", "note")]
-    counted = ", ".join(f"{count} {kind}{'' if count == 1 else 's'}" for count, kind in counts)
-    return [*(finding.line() for finding in findings), counted]

@@ -1,4 +1,4 @@
-"""What is installed here, and what works of it."""
+"""Installed packages, and whether they work."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TypedDict
 
-from jawusd.base.guard import SETTING, machine_memory, memory_limit
+from jawusd.base.guard import machine_memory, memory_limit
 from jawusd.base.version import __version__
 
 _NEEDED_TO_BUILD = ("build",)
@@ -20,15 +20,15 @@ _LEAST_FREE_GB = 1.0
 
 
 class Examined(TypedDict):
-    """Hold what was found.
+    """Result of `jawusd doctor`.
 
     Attributes:
-        versions: by package, "" where it is not installed.
-        extras: packages that each extra lacks.
-        graphics: of OpenGL, or why it is not there.
-        codecs: what can be decoded, by name.
-        memory_limit_gb: what a command may use of it, 0 for no limit.
-        problems: what a build cannot do without.
+        versions: by package; "" if not installed.
+        extras: missing packages of each extra.
+        graphics: OpenGL version, or why there is none.
+        codecs: whether each can be decoded.
+        memory_limit_gb: limit of a command, 0 for none.
+        problems: reasons why a build would fail.
     """
 
     jawusd: str
@@ -47,7 +47,7 @@ class Examined(TypedDict):
 
 
 def examine() -> Examined:
-    """Look at versions, extras, OpenGL, codecs, cores and cache."""
+    """Check versions, extras, OpenGL, codecs, cores and cache."""
     extras = _extras()
     names = sorted({name for packages in extras.values() for name in packages} | set(_required("")))
     versions = {name: _version(name) for name in names}
@@ -62,7 +62,7 @@ def examine() -> Examined:
     problems += [f"pictures in {name} cannot be decoded" for name in lost]
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     if free_gb < _LEAST_FREE_GB:
-        problems.append(f"{free_gb:.1f} GB are free here; a build may need {_LEAST_FREE_GB:g}")
+        problems.append(f"{free_gb:.1f} GB of disk space are free; a build may need {_LEAST_FREE_GB:g}")
     return {
         "jawusd": __version__,
         "python": platform.python_version(),
@@ -81,7 +81,7 @@ def examine() -> Examined:
 
 
 def _required(extra: str) -> list[str]:
-    """Return the packages that jawusd, or one of its extras, asks for by name."""
+    """Return the names of the packages required by jawusd, or by one of its extras."""
     out = []
     for line in requires("jawusd") or ():
         name = line.partition(";")[0]
@@ -114,7 +114,7 @@ def _cores() -> int:
 
 def _graphics() -> str:
     if find_spec("moderngl") is None:
-        return "not looked for: moderngl is not installed (extra: demo); only `demo` and `--backend gl` need it"
+        return "not checked: moderngl is not installed (extra: demo); only `demo` and `--backend gl` need it"
     from jawusd.paper.gl import describe_graphics
 
     return describe_graphics()
@@ -129,31 +129,11 @@ def _codecs() -> dict[str, bool]:
 
 
 def _cache() -> str:
-    """Return where numba keeps compiled functions."""
+    """Return where numba caches compiled functions."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     if named:
-        return f"{named}{'' if os.access(named, os.W_OK) else ' (cannot be written: every start compiles again)'}"
+        return f"{named}{'' if os.access(named, os.W_OK) else ' (not writable: every start compiles again)'}"
     package = Path(sys.modules["jawusd"].__file__ or ".").parent
     if os.access(package, os.W_OK):
         return f"{package} (__pycache__)"
-    return f"in the home folder, as {package} cannot be written"
-
-
-def examined_lines(found: Examined) -> list[str]:
-    """Return what was found as text."""
-    memory = "" if found["memory_gb"] is None else f", {found['memory_gb']:g} GB of memory"
-    limit = found["memory_limit_gb"]
-    works = [name for name, ok in found["codecs"].items() if ok]
-    fails = [name for name, ok in found["codecs"].items() if not ok]
-    lines = [
-        f"jawusd {found['jawusd']}, Python {found['python']}, {found['system']}",
-        f"{found['cores']} cores{memory}, {found['free_gb']:g} GB free here",
-        f"a command may use {f'{limit:g} GB of memory' if limit else 'all memory'} (set {SETTING} to change it)",
-        "packages: " + ", ".join(f"{name} {number}" for name, number in found["versions"].items() if number),
-    ]
-    for extra, lacking in found["extras"].items():
-        lines.append(f"extra {extra}: {'complete' if not lacking else 'lacks ' + ', '.join(lacking)}")
-    lines.append(f"OpenGL: {found['graphics']}")
-    lines.append(f"decodes: {', '.join(works) or 'nothing'}{'; not: ' + ', '.join(fails) if fails else ''}")
-    lines.append(f"compiled code: {found['cache']}")
-    return [*lines, *(f"problem: {line}." for line in found["problems"])]
+    return f"in the home folder, because {package} is not writable"

@@ -1,12 +1,12 @@
-"""Fit a jaw model to tracks, or to poses and markers of other programs, brought to T_skull_mandible in mm first.
+"""Fit a jaw model to tracks, or to poses and markers of other programs, converted to T_skull_mandible [mm].
 
 Poses of jaw-tracking-system (PyPI `jaw-tracking-system`, Mueller et al.), an optical marker system, come as HDF5.
 Layout, as its `store_transformations` writes it (version 1.1): one group per trajectory, by default
 `T_model_origin_mand_landmark_t` and, smoothed, `T_model_origin_mand_landmark_t_smooth`, with the data sets
 `translations` (N, 3) and `rotations`, scalar-first quaternions (N, 4) or matrices (N, 3, 3), and the attributes `unit`
 ("mm" or "m", of the translations) and `sample_rate` [Hz]. Files cut by its `split_hdf5_by_sub_experiments` add
-`transformations` (N, 4, 4) and write their `rotations` scalar-last, so `transformations` is read where there is one. A
-trajectory maps the frame of mandibular landmarks, which is digitised on the teeth, to the frame of the upper model.
+`transformations` (N, 4, 4) and write their `rotations` scalar-last, so `transformations` takes precedence. A
+trajectory maps the frame of mandibular landmarks, digitised on the teeth, to the frame of the upper model.
 """
 
 from __future__ import annotations
@@ -31,12 +31,10 @@ from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.pipeline.contact import (
     ContactSummary,
-    contact_words,
-    joint_words,
-    meeting_joints,
-    meeting_teeth,
-    with_joints,
-    with_teeth,
+    condyle_solids,
+    tooth_solids,
+    with_condyle_contact,
+    with_tooth_contact,
 )
 from jawusd.pipeline.markers import LENGTH_UNITS_MM, marker_poses
 from jawusd.pipeline.state import Progress, no_progress
@@ -59,22 +57,22 @@ _MOST_NUMBERS = 16_000_000  # a million 4 x 4 matrices
 
 @dataclass(frozen=True)
 class TrajectoryOptions:
-    """Say how a file of poses is written."""
+    """Conventions of a file of poses."""
 
     # our column names to the file's, see `formats.poses.read_poses`; tables only
     columns: Mapping[str, str] = field(default_factory=dict)
     length_unit: str = "mm"  # a key of `LENGTH_UNITS_MM`, for files that do not name theirs
     invert: bool = False  # the poses map skull to mandible
-    # a frame with the teeth in occlusion: the jaw is measured from there, so that the file's mandible frame may lie
-    # anywhere on the mandible; None: the poses are identity in occlusion
+    # a frame with the teeth in occlusion: poses are taken relative to it, for any mandible frame in the file; None: the
+    # poses are identity in occlusion
     rest_frame: int | None = None
-    group: str | None = None  # the trajectory of an HDF5 file; None: its raw one
-    # the rigid bodies of a table of markers, see `pipeline.markers.marker_poses`; empty: the file holds poses
+    group: str | None = None  # trajectory of an HDF5 file; None: the raw one
+    # the rigid bodies of a table of markers, see `pipeline.markers.marker_poses`; empty: the file contains poses
     rigid: Mapping[str, str] = field(default_factory=dict)
 
 
 class FitSummary(TypedDict, total=False):
-    """Hold what a person should know of a model: its errors [mm], ranges and warnings."""
+    """Key figures of a model: errors [mm], ranges and warnings."""
 
     method: str
     kind: str
@@ -98,11 +96,11 @@ def fit_subject(
     """Fit the jaw model of a person.
 
     Args:
-        fps: frames per second that the file of the poses says; None for the subject's.
+        fps: frame rate stated by the file of poses; None for that of the subject.
         method: "anchored", "additive", "paper" or "pca".
 
     Raises:
-        FittingError: the poses cannot carry a model.
+        FittingError: the poses do not suffice for a model.
     """
     from jawusd.fitting import FittingConfig, fit_model
     from jawusd.fitting.fit import with_speeds
@@ -112,16 +110,16 @@ def fit_subject(
     if registration is not None:
         subject = registered_subject(subject, {"registration": registration})
     axes, rest = subject.T_anatomical_skull, subject.T_rest
-    with ThreadPoolExecutor(1) as pool:  # solids take no model, and little of Python's lock, which a fit holds
-        teeth = pool.submit(meeting_teeth, subject.meshes, axes, rest)
-        joints = pool.submit(meeting_joints, subject.meshes, axes, subject.landmarks, rest)
+    with ThreadPoolExecutor(1) as pool:  # solids do not depend on the model, and mostly release the GIL
+        teeth = pool.submit(tooth_solids, subject.meshes, axes, rest)
+        joints = pool.submit(condyle_solids, subject.meshes, axes, subject.landmarks, rest)
         model = fit_model(
             motion,
             T_anatomical_skull=axes,
             landmarks=subject.landmarks,
             mandible_vertices=subject.measured_points(),
             T_rest=rest,
-            config=FittingConfig(method=cast("Method", method)),  # which checks the name
+            config=FittingConfig(method=cast("Method", method)),  # checked there
             actor=subject.name,
             forms=FORMS,
             progress=partial(progress, "fit"),
@@ -129,8 +127,8 @@ def fit_subject(
         model.meta["inferred"] = list(subject.inferred)
         if registration is not None:
             model.meta["registration"] = registration
-        model = with_teeth(model, teeth.result(), progress)
-        model = with_joints(model, joints.result(), progress)
+        model = with_tooth_contact(model, teeth.result(), progress)
+        model = with_condyle_contact(model, joints.result(), progress)
     fps = fps or subject.fps
     if fps is None:
         return model
@@ -139,41 +137,25 @@ def fit_subject(
 
 
 def fit_summary(model: JawModel) -> FitSummary:
-    """Sum up a model."""
+    """Return the key figures of a model."""
     found = {key: model.meta[key] for key in FitSummary.__annotations__ if key in model.meta}
     return cast(FitSummary, found)  # JSON
-
-
-def fit_lines(summary: FitSummary) -> list[str]:
-    """Return `fit_summary` as text."""
-    lines = [f"model: {summary.get('method')}; largest distance per pose [mm]:  mean  median     p95     max"]
-    for table, places in summary.get("errors", {}).items():
-        for place, figures in places.items():
-            values = "".join(f"{figures[key]:8.3f}" for key in ("mean", "median", "p95", "max"))
-            lines.append(f"  {table:<8} {place:<28}{values}")
-    if contact := summary.get("contact"):
-        lines.append(f"  teeth: {contact_words(contact)}")
-    if joints := summary.get("joints"):
-        lines.append(f"  condyles: {joint_words(joints)}")
-    if frames := summary.get("trimmed_frames"):
-        lines.append(f"  frames left out as outliers: {', '.join(map(str, frames))}")
-    return lines + [f"  warning: {warning['message']}" for warning in summary.get("warnings", [])]
 
 
 def read_motion(
     path: str | os.PathLike[str], options: TrajectoryOptions | None = None
 ) -> tuple[Tracks | Poses, float | None]:
-    """Read tracks from tracks.npz, or poses from any other file with the rate it says; see `read_trajectory`.
+    """Read tracks from tracks.npz, or poses with their frame rate from any other file; see `read_trajectory`.
 
     Raises:
-        FormatError: not such a file, or options given for tracks.
+        FormatError: the file is invalid, or options are given for tracks.
         MissingDependencyError: HDF5 without h5py.
     """
     if Path(path).suffix != ".npz":
         frames, T, fps = read_trajectory(path, options or TrajectoryOptions())
         return (frames, T), fps
     if options not in (None, TrajectoryOptions()):
-        raise FormatError("are tracks; columns, units and rest frame are for poses from elsewhere.", path=path)
+        raise FormatError("contains tracks; columns, units and rest frame are for poses of other programs.", path=path)
     return load_tracks(path), None
 
 
@@ -183,10 +165,10 @@ def read_trajectory(
     """Read poses from a CSV or JSON table, a table of markers, or HDF5 (.h5, .hdf5) of jaw-tracking-system.
 
     Returns frame numbers (F,), T_skull_mandible [mm] (F, 4, 4), NaN where there is no pose, and frames per second,
-    None where the file does not say them.
+    None if the file does not state them.
 
     Raises:
-        FormatError: not such a file; an option that does not suit it; the rest frame is missing or has no pose.
+        FormatError: the file is invalid, an option does not apply to it, or the rest frame is missing or has no pose.
         MissingDependencyError: HDF5 without h5py.
     """
     path, fps = Path(path), None
@@ -229,10 +211,10 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
     """Read a trajectory of jaw-tracking-system: the landmark frame in the model frame, frames numbered from 0.
 
     Args:
-        group: which trajectory; None: the raw one, or the only one.
+        group: name of the trajectory; None: the raw one, or the only one.
 
     Raises:
-        FormatError: not such a file, no such group, data sets of wrong shapes, or poses that are not rigid.
+        FormatError: the file is invalid, lacks the group, has data sets of wrong shapes, or poses that are not rigid.
         MissingDependencyError: h5py is not installed.
     """
     import h5py
@@ -247,12 +229,12 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
             name = _chosen(groups, group, path)
             held = {key: _data(file[name], key, name, path) for key in ("translations", "rotations", "transformations")}
             unit = file[name].attrs.get("unit", "mm")
-    # h5py raises many kinds of errors for damaged files.
+    # h5py raises many kinds of errors for corrupt files.
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
-        raise FormatError(f"is not an HDF5 file that can be read ({error!s:.200}).", path=path) from error
+        raise FormatError(f"is not a readable HDF5 file ({error!s:.200}).", path=path) from error
     unit = unit.decode(errors="replace") if isinstance(unit, bytes) else str(unit)
     if unit not in _HDF5_UNITS_MM:
-        raise FormatError(f'group "{name}": unit is "{unit}", known are {", ".join(_HDF5_UNITS_MM)}.', path=path)
+        raise FormatError(f'group "{name}": unit is "{unit}"; allowed are {", ".join(_HDF5_UNITS_MM)}.', path=path)
     T = _poses(held, name, path)
     T[:, :3, 3] *= _HDF5_UNITS_MM[unit]
     return np.arange(len(T)), _checked(T, name, path)
@@ -279,7 +261,7 @@ def _data(group: h5py.Group, key: str, name: str, path: Path) -> Array | None:
     link = group.get(key, getlink=True)
     held = group[key] if type(link).__name__ == "HardLink" else None
     if held is None or getattr(held, "external", None) or getattr(held, "is_virtual", False):
-        raise FormatError(f'group "{name}": "{key}" lies elsewhere, it must be in the file itself.', path=path)
+        raise FormatError(f'group "{name}": "{key}" is stored outside the file.', path=path)
     if not hasattr(held, "shape") or held.dtype.kind not in "fiu" or not held.shape or held.size > _MOST_NUMBERS:
         raise FormatError(f'group "{name}": "{key}" is not an array of at most {_MOST_NUMBERS} numbers.', path=path)
     return np.asarray(held[()], dtype=np.float64)
@@ -317,7 +299,7 @@ def _checked(T: Array, name: str, path: Path) -> Array:
     if defect.size and defect.max() > _RIGID_TOLERANCE:
         row = int(present[defect.argmax()])
         raise FormatError(
-            f'group "{name}", row {row + 1}: the pose is not rigid (off by {defect.max():.2g}, allowed '
+            f'group "{name}", row {row + 1}: the pose is not rigid (defect {defect.max():.2g}, allowed '
             f"{_RIGID_TOLERANCE:g}).",
             path=path,
         )

@@ -1,4 +1,4 @@
-"""Tell by names what the files of a folder are: footage, clips of a board, masks, scans, calibration."""
+"""Classify the files of a folder by their names: footage, board clips, masks, scans, calibration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jawusd.formats.capture_template import CameraSketch
 from jawusd.formats.file_names import MESHES, PICTURES, VIDEOS, groups
 
 _CALIBRATIONS = (".toml", ".json", ".xml", ".csv", ".yaml", ".yml", ".txt", ".usda", ".usdc", ".usd", ".nk")
-_FEWEST_PICTURES = 5  # fewer numbered pictures are no sequence
+_FEWEST_PICTURES = 5  # minimum length of a picture sequence
 _DEPTH = 4
 
 _BOARD = {"board", "boards", "calib", "calibration", "calibrate", "checker", "checkerboard", "chess", "chessboard"}
@@ -22,34 +22,33 @@ _MASK = {"mask", "masks", "matte", "mattes", "roto", "segmentation", "seg"}
 _UPPER = {"upper", "maxilla", "maxillary", "maxillar", "maxillaire", "maxilar", "oberkiefer", "oben", "superior"}
 _UPPER |= {"superiore", "superieur"}
 _LOWER = {"lower", "mandibular", "mandibulaire", "unterkiefer", "unten", "inferior", "inferiore", "inferieur"}
-# Upper and lower by words that mean other things, too (left, a first name, a camera above): only names that differ in
-# nothing else are taken.
+# Ambiguous words for upper and lower ("u" may mean "unten"): accepted only if two names differ in nothing else.
 _PAIRS = [("u", "l"), ("o", "u"), ("ok", "uk"), ("uj", "lj"), ("max", "mand"), ("mx", "md"), ("sup", "inf")]
 _PAIRS += [("top", "bottom"), ("haut", "bas")]
 _MANDIBLE = {"mandible", "mandibula", "jawbone"}
 _SKULL = {"skull", "cranium", "schaedel", "head"}
 _TEETH = {"teeth", "tooth", "scan", "arch", "dentition", "row", "crowns"}
 _BONE = {"bone", "bones", "jawbone", "knochen"}
-# Words that laboratories write as one, longest first: UPPERJAWSCAN, maxillaryscan.
+# Parts of compound words, longest first: UPPERJAWSCAN, maxillaryscan.
 _PARTS = _UPPER | _LOWER | _MANDIBLE | _TEETH | {word for pair in _PAIRS for word in pair if len(word) > 2}
 _PARTS |= {"jaw", "scan", "model", "cast", "ok", "uk", "ios", "impression", "anatomy", "export"}
 _PART = "|".join(sorted(_PARTS, key=len, reverse=True))
-_SAID = {"video", "videos", "clip", "clips", "footage", "take", "camera", "cameras", "plates", "png", "exr", "dpx"}
+_GENERIC = {"video", "videos", "clip", "clips", "footage", "take", "camera", "cameras", "plates", "png", "exr", "dpx"}
 
 
 @dataclass
 class FoundFiles:
-    """Hold files by what their names say, relative to the folder."""
+    """Files by kind, relative to the folder."""
 
     clips: list[PurePath] = field(default_factory=list)
     boards: list[PurePath] = field(default_factory=list)
-    masks: dict[PurePath, str] = field(default_factory=dict)  # with the row they show
+    masks: dict[PurePath, str] = field(default_factory=dict)  # arch by path
     scans: dict[str, list[PurePath]] = field(default_factory=lambda: defaultdict(list))  # by the keys of [scans], or ""
     calibrations: list[PurePath] = field(default_factory=list)
 
 
 def words(path: PurePath) -> list[str]:
-    """Return the words of a path in lower case: split at signs, at capital letters and before digits' neighbours."""
+    """Return the words of a path in lower case, split at punctuation and before capital letters."""
     plain = path.with_suffix("").as_posix()
     plain = re.sub(r"%0?\d*d", "", plain)
     parts = re.split(r"[^A-Za-z0-9]+", re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", plain))
@@ -57,9 +56,9 @@ def words(path: PurePath) -> list[str]:
 
 
 def find_files(folder: Path) -> FoundFiles:
-    """Sort the files of a folder and those below it; numbered pictures count as one, by their pattern.
+    """Classify the files below a folder; numbered pictures count as one file, named by their pattern.
 
-    Folders of rigs and hidden ones are left out.
+    Folders of rigs and hidden folders are skipped.
     """
     out = FoundFiles()
     files = sorted(_files(folder))
@@ -67,14 +66,14 @@ def find_files(folder: Path) -> FoundFiles:
         [path for path in files if path.suffix.lower() in VIDEOS or "%" in path.name]
     )
     for path in files:
-        suffix, said = path.suffix.lower(), set(words(path))
+        suffix, own_words = path.suffix.lower(), set(words(path))
         if suffix in VIDEOS or "%" in path.name:
-            row = _arch(set(_parted(path))) or paired.get(path, "")
-            if row and (said & _MASK or "%" in path.name):
+            row = _arch(set(_split_words(path))) or paired.get(path, "")
+            if row and (own_words & _MASK or "%" in path.name):
                 out.masks[path] = row
-            elif said & _MASK:
+            elif own_words & _MASK:
                 continue
-            elif said & _BOARD:
+            elif own_words & _BOARD:
                 out.boards.append(path)
             else:
                 out.clips.append(path)
@@ -84,9 +83,8 @@ def find_files(folder: Path) -> FoundFiles:
             out.calibrations.append(path)
     scans = out.scans
     if not scans["lower_teeth"] and scans["upper_teeth"] and len(scans["mandible"]) == 1:
-        scans["lower_teeth"] = scans.pop(
-            "mandible"
-        )  # maxilla.stl and mandible.stl are how clinics call a pair of scans
+        # Clinics name a pair of scans maxilla.stl and mandible.stl.
+        scans["lower_teeth"] = scans.pop("mandible")
     return out
 
 
@@ -106,20 +104,20 @@ def _files(folder: Path) -> Iterable[PurePath]:
         yield from (inside / name for name in names if name not in pictures and not name.startswith("."))
 
 
-def _parted(path: PurePath) -> list[str]:
-    """Return the words of a path, those written as one taken apart."""
+def _split_words(path: PurePath) -> list[str]:
+    """Return the words of a path, with compound words split."""
     whole = rf"(?:{_PART})+\d*"
     return [part for word in words(path) for part in (re.findall(_PART, word) if re.fullmatch(whole, word) else [word])]
 
 
-def _arch(said: set[str]) -> str:
-    upper, lower = said & _UPPER, said & _LOWER
+def _arch(own_words: set[str]) -> str:
+    upper, lower = own_words & _UPPER, own_words & _LOWER
     return "" if bool(upper) == bool(lower) else "upper" if upper else "lower"
 
 
 def _paired(paths: Sequence[PurePath]) -> dict[PurePath, str]:
-    """Return the arches of files whose names differ in one word only, which is one of a pair."""
-    spelt = {tuple(_parted(path)): path for path in paths}
+    """Return the arches of files whose names differ only in one word of a pair."""
+    spelt = {tuple(_split_words(path)): path for path in paths}
     pairs = [
         (path, spelt[other])
         for own, path in spelt.items()
@@ -133,35 +131,37 @@ def _paired(paths: Sequence[PurePath]) -> dict[PurePath, str]:
 
 
 def _part(path: PurePath, paired: str) -> str:
-    """Return the key of [scans] for a mesh, "" if its name does not tell; the file's own name goes before folders.
+    """Return the key of [scans] for a mesh, "" if unknown; the file name takes precedence over folders.
 
     Args:
         path: the mesh.
-        paired: its arch by a word that means one only beside its counterpart.
+        paired: its arch by an ambiguous word, see `_paired`.
     """
-    own, all_said = set(_parted(PurePath(path.name))), set(_parted(path))
-    for said, arch in ((own, ""), (all_said, ""), (all_said, paired)):
-        arch = _arch(said) or arch
-        if said & _UPPER and said & _LOWER:
+    own, all_words = set(_split_words(PurePath(path.name))), set(_split_words(path))
+    for own_words, arch in ((own, ""), (all_words, ""), (all_words, paired)):
+        arch = _arch(own_words) or arch
+        if own_words & _UPPER and own_words & _LOWER:
             return ""
-        if said & _BONE and not said & _TEETH and arch:
+        if own_words & _BONE and not own_words & _TEETH and arch:
             return "mandible" if arch == "lower" else ""
-        if arch and not (said & (_MANDIBLE | _SKULL) and not said & _TEETH and not said & {"upper", "lower"}):
+        if arch and not (
+            own_words & (_MANDIBLE | _SKULL) and not own_words & _TEETH and not own_words & {"upper", "lower"}
+        ):
             return f"{arch}_teeth"
-        if said & _MANDIBLE:
-            return "lower_teeth" if said & _TEETH else "mandible"
-        if said & _SKULL:
+        if own_words & _MANDIBLE:
+            return "lower_teeth" if own_words & _TEETH else "mandible"
+        if own_words & _SKULL:
             return "skull"
     return ""
 
 
 def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
-    """Return a name of its own for each clip: the words in which its path differs from the others."""
-    said = {path: [word for word in words(path)] for path in paths}
-    shared = set.intersection(*(set(own) for own in said.values())) if len(said) > 1 else set()
+    """Return a unique name for each clip: the words in which its path differs from the others."""
+    own_words = {path: [word for word in words(path)] for path in paths}
+    shared = set.intersection(*(set(own) for own in own_words.values())) if len(own_words) > 1 else set()
     out: dict[PurePath, str] = {}
-    for path, own in said.items():
-        telling = [word for word in own if word not in shared | _BOARD | _SAID]
+    for path, own in own_words.items():
+        telling = [word for word in own if word not in shared | _BOARD | _GENERIC]
         unique = list(dict.fromkeys(telling))
         out[path] = "_".join(unique) or "_".join(words(PurePath(path.name))) or "camera"
     stems = [PurePath(path.name).stem for path in paths]
@@ -169,15 +169,15 @@ def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
     if len(set(out.values())) < len(paths) or any(len(name) > 40 for name in out.values()):
         out = {path: f"{name or 'cam'}_{number}" for number, (path, name) in enumerate(zip(paths, plain))}
     elif all(sorted(words(PurePath(name))) == sorted(words(PurePath(out[path]))) for path, name in zip(paths, plain)):
-        out = dict(zip(paths, plain))  # the file's own spelling, where it holds the same words
+        out = dict(zip(paths, plain))  # the spelling of the file name, if the words are the same
     return out
 
 
 def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dict[PurePath, PurePath], bool]:
-    """Return which of the other files belongs to which clip, and whether their names say so (else: their order).
+    """Match other files with clips; the flag is true if by name, false if by order.
 
     Args:
-        names: of the cameras by their clips.
+        names: camera names by clip.
         others: files that belong to one camera each.
     """
     found: dict[PurePath, PurePath] = {}
@@ -194,7 +194,7 @@ def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dic
 
 
 def with_masks(cameras: Sequence[CameraSketch], masks: Mapping[PurePath, str]) -> list[CameraSketch]:
-    """Return cameras with the masks whose paths hold the words of their names."""
+    """Return cameras with the masks whose paths contain the words of their names."""
     out = []
     for camera in cameras:
         telling = set(words(PurePath(camera.name)))

@@ -1,4 +1,4 @@
-"""A folder of actors, and the two ways to give a jaw another's motion: retargeting, and a rig from landmarks alone."""
+"""A library of actors; retargeting of motion between them, and rigs from landmarks alone."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from jawusd.pipeline.fit import fit_summary
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_landmarks
 
-# Smallest step of a motion carried over, as a share of the source's step scaled by the ratio of the ranges.
+# Smallest step of a retargeted motion, relative to the source's step scaled by the ratio of the ranges.
 _SLOWEST = 0.1
-_ROUNDS = 400  # of timing and bound alternating; most motions need fewer than 40
+_ROUNDS = 400  # alternations of timing and bound; most motions need fewer than 40
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -37,7 +37,7 @@ def load_any_rig(path: Path) -> JawRig:
     """Read a rig from `model.npz` with numpy alone, or from any USD layer that carries it.
 
     Raises:
-        JawusdError: it is no rig.
+        JawusdError: the file is not a rig.
         MissingDependencyError: USD without OpenUSD.
     """
     if path.suffix == ".npz":
@@ -48,7 +48,7 @@ def load_any_rig(path: Path) -> JawRig:
 
 
 def open_library(folder: str | os.PathLike[str]) -> Library:
-    """Scan a folder with a subfolder per person and bring its index up to date; see `library.index.scan_library`."""
+    """Scan a folder with a subfolder per person and update its index; see `library.index.scan_library`."""
     return scan_library(folder, load_any_rig)
 
 
@@ -56,23 +56,25 @@ def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, forc
     """Copy a rig into a library, as the model file `NAME/model.npz`, and return that file.
 
     Args:
-        name: of the person and the subfolder; None: as the rig says.
-        force: overwrite a person of that name.
+        name: of the person and the subfolder; None: the name in the rig.
+        force: overwrite a person of the same name.
 
     Raises:
-        FormatError: not a rig, or a name that makes no folder.
+        FormatError: not a rig, or the name is not a valid folder name.
         OutputError: there is such a person already, or the file cannot be written.
     """
     rig = load_any_rig(source)
     called = name or str(rig.meta.get("actor") or "")
     if not _NAME.fullmatch(called):
         raise FormatError(
-            f'"{called}" makes no folder; letters, digits, ".", "_" and "-" do.', path=source, hint="Give --name."
+            f'"{called}" is not a valid folder name; use letters, digits, ".", "_" and "-".',
+            path=source,
+            hint="Give --name.",
         )
     place = Path(folder) / called
-    # The place is inside the library by its name; a link lying there could still lead out of it.
+    # A symbolic link could lead out of the library.
     if place.is_symlink() or (place / MODEL_FILE).is_symlink():
-        raise OutputError("is a link; rigs are written into the library itself.", path=place)
+        raise OutputError("is a symbolic link; rigs are stored in the library itself.", path=place)
     refuse_existing(place / MODEL_FILE, force)
     save_model(place / MODEL_FILE, _as_model(rig, source, called))
     return place / MODEL_FILE
@@ -111,23 +113,23 @@ class PersonalRig:
 
     model: JawModel  # the fitted model
     motion: PersonalMotion  # what it was fitted to
-    left_out: tuple[str, ...]  # library persons not used, their captures lack a movement
-    header: Mapping[str, object]  # what the model's header says of its making
+    left_out: tuple[str, ...]  # library persons not used, as their captures lack a movement
+    header: Mapping[str, object]  # provenance stored in the model's header
 
 
 def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str, progress: Progress) -> PersonalRig:
     """Make a rig for a person without a capture, from landmarks and a library.
 
-    The motion of the library's persons is carried over to the landmarks and averaged (see `library.personal`), and the
-    anchored model is fitted to it. Its header states the error to be expected, from leave-one-out over the library;
-    measured poses may lie as far from the model as that.
+    The motion of the library's persons is transferred to the landmarks and averaged (see `library.personal`), and the
+    anchored model is fitted to it. Its header states the expected error, from leave-one-out over the library; the
+    residual limit of measured poses allows for that error.
 
     Args:
         landmarks: file of format jawusd-landmarks/1.
-        closest: take the motion of the person with the most similar landmarks instead of the average.
+        closest: use the motion of the person with the most similar landmarks instead of the average.
 
     Raises:
-        FormatError: not such a file.
+        FormatError: the file is not of that format.
         FittingError: the library has no usable person, or the landmarks are not those of a jaw.
     """
     subject = subject_of_landmarks(landmarks, name)
@@ -137,12 +139,14 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
     progress("carry", 1, 1)
     model = fit_personal(subject, motion, progress)
     left_out = tuple(entry.path for entry in library.entries if entry.not_shown)
-    return PersonalRig(model, motion, left_out, cast("Mapping[str, object]", model.meta["personal"]))  # of fit_personal
+    return PersonalRig(
+        model, motion, left_out, cast("Mapping[str, object]", model.meta["personal"])
+    )  # set by fit_personal
 
 
 @explain_missing_packages()
 def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
-    """Fit the anchored model to the motion carried over to a person, and state the expected error in its header.
+    """Fit the anchored model to motion transferred to a person, and state the expected error in its header.
 
     Raises:
         FittingError: see `fitting.fit_model`.
@@ -153,7 +157,7 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         (np.arange(len(motion.poses)), motion.poses),
         T_anatomical_skull=subject.T_anatomical_skull,
         landmarks=subject.landmarks,
-        config=FittingConfig(holdout_folds=0),  # frames left out are poses of the library, not of this person
+        config=FittingConfig(holdout_folds=0),  # held-out frames would be poses of the library, not of this person
         actor=subject.name,
         progress=partial(progress, "fit"),
     )
@@ -165,14 +169,14 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         "expected_error_mm": None if expected is None else expected.summary(),
         "fit_to_carried_motion_mm": model.meta["errors"],
     }
-    # The model's error on the motion it was given says nothing about the person, whose motion was not measured.
+    # The training error says nothing about the person, whose motion was not measured.
     model.meta["errors"] = {} if expected is None else {"expected": expected.table()}
     caution = {"code": "personal", "message": _caution(motion)}
     model.meta["warnings"] = [*fit_summary(model)["warnings"], caution]
     if expected is not None:
         limit = np.maximum(model.arrays["residual_limit_mm"], expected.pooled().mean())
         model.arrays["residual_limit_mm"] = limit
-    # The poses carried over are no take of this person: nothing captured goes into the file.
+    # Transferred poses are not a take of this person: the file gets no captured motion.
     none = np.zeros(0)
     return replace(model, frames=none.astype(np.int64), d=np.zeros((0, 3)), residual_mm=none, trained=none.astype(bool))
 
@@ -181,7 +185,7 @@ def _caution(motion: PersonalMotion) -> str:
     persons = f"{len(motion.weights)} library person{'s' if len(motion.weights) > 1 else ''}"
     start = f"Made from landmarks and {persons}, not from a capture;"
     if motion.learned.expected is None:
-        return f"{start} with a single person in the library the error to be expected cannot be stated."
+        return f"{start} the expected error is unknown, as the library has a single person."
     found = motion.learned.expected.summary()
     return f"{start} expected error {found['mean']:.2f} mm, 95 % below {found['p95']:.2f} mm (leave-one-out)."
 
@@ -192,20 +196,20 @@ def _finite(value: float | None) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
-    """Hold a motion carried to another person, and what had to be changed for it."""
+    """A retargeted motion, and how it was changed."""
 
     frames: Array  # frame numbers, shape (G,)
     d: Array  # parameters of the target [mm], inside its bound, NaN where the motion is lost, shape (G, 3)
-    outside: Mask  # samples at which equal shares would leave the bound, shape (G,)
-    moved_mm: Array  # how far each sample is from equal shares, in d, NaN where lost, shape (G,)
+    outside: Mask  # samples at which equal shares of the ranges would leave the bound, shape (G,)
+    moved_mm: Array  # distance of each sample from equal shares, in d, NaN where lost, shape (G,)
 
 
 def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retargeted:
-    """Carry a motion to another person as shares of the ranges of both, in time and inside the bound.
+    """Retarget a motion to another person: equal shares of both ranges, with the timing kept, inside the bound.
 
-    Between two samples a motion is linear in d, and shares are not: whole frames in between become samples too. Equal
-    shares alone would move peaks by some frames and may leave the bound: the motion is made to rise and fall with the
-    source (see `library.timing`) and brought inside, alternately.
+    Motion is linear in d between samples, but shares of the ranges are not; therefore all whole frames become samples.
+    Equal shares alone would shift peaks by some frames and may leave the bound, so the motion is alternately made to
+    rise and fall with the source (see `library.timing`) and projected into the bound.
 
     Args:
         frames: increasing frame numbers, shape (F,).
@@ -216,7 +220,7 @@ def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retarge
     """
     known = np.isfinite(d).all(axis=1)
     if not known.any():
-        raise EvaluatorError("no frame of the motion has parameters; there is nothing to carry over.")
+        raise EvaluatorError("no frame of the motion has parameters; there is nothing to retarget.")
     first, last = frames[known][[0, -1]]
     lost = frames[~known]
     whole = np.setdiff1d(np.arange(np.ceil(first), np.floor(last) + 1), lost)
@@ -232,7 +236,7 @@ def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retarge
 
 
 def _in_time(source: JawRig, target: JawRig, original: Array, carried: Array) -> Array:
-    """Return d (F, 3) [mm] near those carried, inside the bound, rising and falling where the original does."""
+    """Return d (F, 3) [mm] near `carried`, inside the bound, rising and falling where the original does."""
     sizes = [np.ptp(rig.d_range, axis=1) for rig in (source, target)]
     least = _SLOWEST * sizes[1] / np.maximum(sizes[0], SMALLEST_REACH_MM)
     kept = carried.copy()

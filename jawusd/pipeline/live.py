@@ -1,4 +1,4 @@
-"""Follow the jaw of a person whose rig exists in pictures as they come: `jawusd live`."""
+"""Follow the jaw of a person whose rig exists in live video, and send it as OSC: `jawusd live`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 import jawusd
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError, explain_missing_packages, naming_file
+from jawusd.base.errors import CaptureError, OutputError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
@@ -23,11 +23,11 @@ from jawusd.media import live_clock
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.cuts import Cutter
-from jawusd.pipeline.meshes import load_labelled, registered_meshes
+from jawusd.pipeline.follow import Cutter
 from jawusd.pipeline.picture_search import LEAST_FIT, MOST_BRIDGED, masked_cameras
-from jawusd.pipeline.solve_pictures import PreparedTeeth, VideoOptions, VideoShot
+from jawusd.pipeline.solve import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
+from jawusd.pipeline.subject import load_labelled, registered_meshes
 
 if TYPE_CHECKING:
     from jawusd.media.live_source import LiveSource
@@ -35,24 +35,25 @@ if TYPE_CHECKING:
     from jawusd.tracking.performance.attempts import FrameFit
     from jawusd.tracking.performance.coordinates import Pose
 
-_PATIENCE_S = 2.0  # without the teeth after which they are searched again from nothing
+
+_PATIENCE_S = 2.0  # time without teeth before a new search
 _WAIT_S = 0.25
-_MOST_BEHIND_S = 0.15  # the newest pictures, beyond which some are left out
-_BEFORE = 6  # frames of files that are followed before they are played: until the motion is known
+_MOST_BEHIND_S = 0.15  # lag behind the newest pictures above which frames are dropped
+_BEFORE = 6  # frames followed before a file is played, to estimate the motion
 
 
 @dataclass(frozen=True, eq=False)
 class LiveFrame:
-    """Hold what is known of an instant.
+    """Result of one instant.
 
     Attributes:
-        time_s: when its pictures were taken, since the sources were begun; in files, since their first pictures.
+        time_s: capture time of its pictures since the start of the sources; in files, since their first pictures.
         d, sigma: jaw parameters and their standard deviations [mm], shape (3,).
         margin_mm: signed distance to the rig's bound, > 0 inside.
-        verdict: what the rig says of the pose.
+        verdict: verdict of the rig on the pose.
         state: solved or carried.
-        latency_ms: from when the pictures were taken until now.
-        dropped: instants left out since the one before.
+        latency_ms: time since the pictures were captured.
+        dropped: number of instants dropped since the last one.
     """
 
     time_s: float
@@ -65,7 +66,7 @@ class LiveFrame:
     dropped: int
 
     def as_json(self) -> dict[str, object]:
-        """Return the values, rounded to what they are worth."""
+        """Return the values, rounded to significant digits."""
         return {
             "time_s": round(self.time_s, 4),
             "d": [round(value, 3) for value in self.d.tolist()],
@@ -91,24 +92,24 @@ def live(
     silence_s: float = 10.0,
     allow_outside: bool = False,
 ) -> Iterator[LiveFrame]:
-    """Yield what is known of instant after instant; pictures that come too fast are left out.
+    """Yield a result per instant; frames are dropped if pictures arrive too fast.
 
     Args:
         rig: `actor.usda`, another layer of it, or `model.npz`.
-        shot: a capture with these cameras' calibration and the scans of the rig; its videos are played at their own
-            rate where no other source is named.
-        sources: by camera name a device, an address or a file.
-        prim: which rig, where a stage has several.
-        fixed_head: the cameras are worn: the head hardly moves before them.
-        jobs: threads that search and follow the teeth.
-        seconds: after which to end; None goes on until the sources end.
-        silence_s: how long a device or stream may send no picture [s].
+        shot: a capture with the calibration of the cameras and the scans of the rig; without sources, its videos are
+            played in real time.
+        sources: device, address or file by camera name.
+        prim: path of the rig's prim, if a stage has several.
+        fixed_head: the cameras are head-mounted.
+        jobs: number of threads.
+        seconds: stop after this time; None: when the sources end.
+        silence_s: longest time without a picture from a device or stream [s].
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
         FormatError, RigError: the rig cannot be read.
         CaptureError, CalibrationError, SyncError: shot or sources cannot be read.
-        TrackingError: the scans cannot be in occlusion.
+        TrackingError: the scans are not in occlusion.
     """
     capture = open_capture(shot, allow_outside=allow_outside)
     jaw = jawusd.load(rig, prim=prim)
@@ -120,14 +121,14 @@ def live(
 
 
 def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:
-    """Return which instant to look at next, None if there is none yet that all sources have.
+    """Return the next instant to process, None if some source has no picture of it yet.
 
-    It is the first one that is not too old: a search takes as long as a few steps, which are quicker than pictures
-    come and catch up.
+    It is the first one that is not too old: a search takes as long as several frames, and tracking, which is faster
+    than real time, catches up.
 
     Args:
-        times_s: of the pictures kept of each source, rising.
-        after_s: when it is at the earliest.
+        times_s: increasing times of the buffered pictures of each source.
+        after_s: earliest time.
     """
     if not all(len(kept) for kept in times_s):
         return None
@@ -137,20 +138,20 @@ def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | 
 
 
 def _with_sources(capture: Capture, sources: Mapping[str, str]) -> tuple[Capture, dict[str, str]]:
-    """Return the capture with the cameras that take part, files among their sources as its videos, and all sources."""
+    """Return the capture restricted to cameras with a source, and the sources; source files replace the videos."""
     names = [camera.name for camera in capture.cameras]
     if unknown := sorted(set(sources) - set(names)):
         raise CaptureError(
-            f"sources are named for {', '.join(unknown)}, the capture has {', '.join(names)}.",
+            f"sources are given for unknown cameras {', '.join(unknown)}; the capture has {', '.join(names)}.",
             path=capture.folder / "capture.toml",
         )
     videos = {camera.name: str(camera.video) for camera in capture.cameras if camera.video is not None}
     where = dict(sources) or videos
     if not where:
         raise CaptureError(
-            "no camera has a video, and no source is named.",
+            "no camera has a video, and no source is given.",
             path=capture.folder / "capture.toml",
-            hint="Name devices or streams with --source CAMERA=/dev/video0.",
+            hint="Give devices or streams with --source CAMERA=/dev/video0.",
         )
     files = {name: Path(one) for name, one in where.items() if Path(one).is_file()}
     cameras = tuple(
@@ -218,9 +219,9 @@ class _Follower:
             fit = self._take.step(self._cutter.cut(pictures), frames)
             blind_since = 0.0 if fit.found.all() else blind_since or at
             last = at
-            yield self._told(fit, at, begin, round(frames) - 1)
+            yield self._result(fit, at, begin, round(frames) - 1)
 
-    def _told(self, fit: FrameFit, at: float, begin: float, dropped: int) -> LiveFrame:
+    def _result(self, fit: FrameFit, at: float, begin: float, dropped: int) -> LiveFrame:
         verdict = self._jaw.validate_parameters(fit.pose.d[None], tolerance_mm=None)
         return LiveFrame(
             time_s=at - begin,
@@ -234,7 +235,7 @@ class _Follower:
         )
 
     def _begin_in_files(self) -> int:
-        """Search the teeth before the files are played; return the frame on which they were found.
+        """Search for the teeth before the files are played; return the frame at which playback starts.
 
         Raises:
             TrackingError: they were not found.
@@ -250,7 +251,7 @@ class _Follower:
         return after.stop
 
     def _learn(self, pictures: Pictures, near: Pose) -> None:
-        """Learn the colours of pictures near a pose, if teeth are there."""
+        """Learn colours from pictures, given an approximate pose; start following if the teeth fit."""
         from jawusd.tracking.contour.scan import teeth_centre
 
         centre = teeth_centre(self._teeth.scans, self._take.coordinates.arches(near))
@@ -259,7 +260,7 @@ class _Follower:
             self._cutter = cutter
 
     def _begin_in_pictures(self, pictures: Pictures) -> None:
-        """Search the teeth in pictures, if they show the rows apart."""
+        """Search for the teeth in pictures, if the arches are apart in them."""
         from jawusd.segmentation.rows import tooth_rows
 
         rows = {name: tooth_rows(np.asarray(image)) for name, image in pictures.items() if image is not None}
@@ -274,7 +275,7 @@ class _Follower:
             self._learn(pictures, near)
 
     def _next(self, last: float, silence_s: float) -> float | None:
-        """Wait for an instant after the last one that all sources have; return its time, None at the end."""
+        """Wait for the next instant that all sources have; return its time, None at the end."""
         after = last + 0.5 * self._period_s
         while True:
             at = next_instant([source.times_s() for source in self._sources.values()], after)
@@ -285,7 +286,63 @@ class _Follower:
                 source.refuse_silence(silence_s)
 
     def _pictures(self, at: float) -> Pictures:
-        """Return the pictures of an instant, None of sources that have none near it."""
+        """Return the pictures of an instant, None for sources without a picture near it."""
         found = {name: source.at(at) for name, source in self._sources.items()}
         near = self._period_s
         return {n: None if p is None or abs(p.time_s - at) > near else p.rgb for n, p in found.items()}
+
+
+class OscSender:
+    """Sends an OSC bundle per instant over UDP.
+
+    /jaw/d and /jaw/sigma carry three floats [mm], /jaw/margin one [mm], /jaw/time one [s], and /jaw/state 1 for solved
+    or 2 for carried, as `SolveState`.
+    """
+
+    @explain_missing_packages()
+    def __init__(self, address: str) -> None:
+        """Open a socket for HOST:PORT.
+
+        Raises:
+            OutputError: the address has no port, or the host is unknown.
+            MissingDependencyError: python-osc is not installed.
+        """
+        from pythonosc.udp_client import UDPClient
+
+        host, _, port = address.rpartition(":")
+        if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+            raise OutputError(f"{address!r} is not an address.", hint="Give HOST:PORT, for example 127.0.0.1:9000.")
+        try:
+            self._client = UDPClient(host.strip("[]"), int(port))
+        except OSError as error:
+            raise OutputError(f"unknown host {host!r} ({error}).") from error
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._client.close()
+
+    @explain_missing_packages()
+    def send(self, frame: LiveFrame) -> None:
+        """Send one instant; a missing receiver is not an error."""
+        from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+        from pythonosc.osc_message_builder import OscMessageBuilder
+
+        from jawusd.formats.performance import SolveState
+
+        bundle = OscBundleBuilder(IMMEDIATELY)
+        values: dict[str, list[float] | list[int]] = {
+            "d": frame.d.tolist(),
+            "sigma": frame.sigma.tolist(),
+            "margin": [frame.margin_mm],
+            "state": [int(SolveState[frame.state.upper()])],
+            "time": [frame.time_s],
+        }
+        for name, numbers in values.items():
+            message = OscMessageBuilder(f"/jaw/{name}")
+            for number in numbers:
+                message.add_arg(number)
+            bundle.add_content(message.build())
+        try:
+            self._client.send(bundle.build())
+        except OSError:  # the receiver has closed its port, and may open it again
+            return

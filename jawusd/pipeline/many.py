@@ -1,4 +1,4 @@
-"""Many captures: one build each on worker processes or a Dask cluster, and one table of the outcomes."""
+"""Build many captures, on worker processes or a Dask cluster, with one table of the outcomes."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from distributed.comm import connect
 from distributed.utils import silence_logging_cmgr
 
 from jawusd.base.errors import ClusterError, JawusdError
+from jawusd.base.guard import map_large_arrays
 from jawusd.base.version import __version__
 from jawusd.formats.atomic import write_csv_atomic, write_text_atomic
 from jawusd.formats.capture_list import ListedCapture
 from jawusd.pipeline.build import BuildOptions, FitSummary, build
-from jawusd.pipeline.memory import map_large_arrays
 from jawusd.pipeline.state import Progress, make_folder
 from jawusd.pipeline.workspace import check_folder
 
@@ -46,29 +46,28 @@ BUILT, KEPT, FAILED, STOPPED = "built", "kept", "failed", "stopped"
 #: Called with one line of text about every event.
 Notify = Callable[[str], None]
 
-_NOTIFY_SECONDS = 10.0  # between two lines about one stage of one capture
-_STOP_SECONDS = 15.0  # that builds have to end by themselves
+_NOTIFY_SECONDS = 10.0  # least interval between two lines about the same stage of a capture
+_STOP_SECONDS = 15.0  # time for running builds to stop
 CONNECT_SECONDS = 10
 _LOOPBACK = "127.0.0.1"
 
-# Runs that were called off; a worker may serve several.
-_called_off: set[str] = set()
+# Cancelled runs; a worker may serve several.
+_cancelled: set[str] = set()
 
 
-class _CalledOffError(Exception):
-    """End a build from within."""
+class _CancelledError(Exception):
+    """The run of this build was cancelled."""
 
 
 @dataclass(frozen=True)
 class ManyOptions:
-    """Choose how to build many captures.
+    """Options of building many captures.
 
     Attributes:
-        build: how to build each.
-        cluster: address of a Dask scheduler; None: processes of this machine.
-        workers: how many processes of this machine; None: one per core, but no more than captures.
-        retries: how often a capture is given to another process when one died over it; a scheduler that is already
-            there uses its own number.
+        build: options of each build.
+        cluster: address of a Dask scheduler; None: local processes.
+        workers: number of local processes; None: one per core, at most one per capture.
+        retries: how often a capture is retried after its process died; an existing scheduler uses its own setting.
     """
 
     build: BuildOptions
@@ -79,18 +78,18 @@ class ManyOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Hold the outcome of the build of one capture.
+    """Outcome of one build.
 
     Attributes:
-        name: of its folder.
-        capture: its path.
-        status: "built", "kept" (nothing had changed since an earlier build), "failed" or "stopped".
-        frames, tracked: how many, and how many of them with both arches.
-        model_mm: mean over the frames of the largest distance of a mandible vertex from the model.
-        holdout_mm: the same for frames that were left out of the fit.
-        sigma_incisor_mm: expected error of tracking at the incisal point, median.
-        seconds: that its stages took.
-        error: why it failed.
+        name: name of the output folder.
+        capture: path of the capture.
+        status: "built", "kept" (nothing changed since an earlier build), "failed" or "stopped".
+        frames, tracked: number of frames, and of those with both arches tracked.
+        model_mm: mean over frames of the largest error of a mandible vertex.
+        holdout_mm: the same for held-out frames.
+        sigma_incisor_mm: median expected tracking error at the incisal point.
+        seconds: total duration of the stages.
+        error: reason of a failure.
     """
 
     name: str
@@ -106,19 +105,19 @@ class Outcome:
 
 
 def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptions, notify: Notify) -> list[Outcome]:
-    """Build the rig of every capture in a folder of its own; one that fails does not stop the rest.
+    """Build the rig of every capture in its own folder; a failure does not stop the others.
 
-    The table of outcomes is written to builds.json and builds.csv, also when the work is interrupted.
+    The table of outcomes is written to builds.json and builds.csv, even after an interrupt.
 
     Args:
-        root: gets a folder for each, by its name; every worker must see it by the same path.
+        root: folder of the output folders; every worker must see it under the same path.
 
     Returns:
-        The outcomes in the order of the captures.
+        Outcomes in the order of the captures.
 
     Raises:
-        OutputError: the folder of a capture holds a build and neither resume nor fresh is asked for, or cannot be made.
-        ClusterError: the cluster cannot be used.
+        OutputError: an output folder contains a build and neither `resume` nor `fresh` is set, or cannot be created.
+        ClusterError: the cluster is unusable.
     """
     root = root.resolve()
     for item in captures:
@@ -143,24 +142,12 @@ def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptio
     return outcomes
 
 
-def outcome_lines(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return outcomes as a table for people."""
-    width = max(len("capture"), *(len(o.name) for o in outcomes))
-    lines = [f"{'capture':<{width}}  status   frames  tracked  model mm  holdout mm  incisor mm  seconds"]
-    for o in outcomes:
-        figures = [(o.frames, 6, "d"), (o.tracked, 7, "d"), (o.model_mm, 8, ".3f"), (o.holdout_mm, 10, ".3f")]
-        figures += [(o.sigma_incisor_mm, 10, ".3f"), (o.seconds, 7, ".1f")]
-        cells = "  ".join(f"{'-' if value is None else format(value, form):>{w}}" for value, w, form in figures)
-        lines.append(f"{o.name:<{width}}  {o.status:<7}  {cells}")
-    return lines + [line for o in outcomes if o.error for line in f"{o.name}: {o.error}".split("\n")]
-
-
 def _run(
     client: Client, captures: Sequence[ListedCapture], root: Path, options: BuildOptions, notify: Notify
 ) -> Iterator[Outcome]:
-    """Yield outcomes as builds end; when the caller is interrupted, end those under way."""
+    """Yield outcomes as builds end; on an interrupt, cancel the running builds."""
     run = uuid.uuid4().hex
-    # A worker that takes over from one that died meets what that one had finished.
+    # A retry after the death of a worker finds the stages that were finished before.
     options = options if options.fresh else replace(options, resume=True)
     with _listening(client, run, notify):
         items = {
@@ -171,8 +158,8 @@ def _run(
             for future in as_completed(items):
                 yield _outcome(future, items[future])
         except BaseException:
-            notify("stopping; what is finished is kept")
-            client.run(_call_off, run, on_error="ignore")
+            notify("stopping; finished stages are kept")
+            client.run(_cancel, run, on_error="ignore")
             with contextlib.suppress(TimeoutError):
                 wait(list(items), timeout=_STOP_SECONDS)
             raise
@@ -180,7 +167,7 @@ def _run(
 
 @contextlib.contextmanager
 def _listening(client: Client, run: str, notify: Notify) -> Iterator[None]:
-    """Pass on the messages of the workers of a run."""
+    """Forward the messages of the workers of a run."""
     client.subscribe_topic(run, lambda event: notify(event[1]))
     try:
         yield
@@ -188,17 +175,17 @@ def _listening(client: Client, run: str, notify: Notify) -> Iterator[None]:
         client.unsubscribe_topic(run)
 
 
-def _call_off(run: str) -> None:
-    _called_off.add(run)
+def _cancel(run: str) -> None:
+    _cancelled.add(run)
 
 
 def _outcome(future: Future[Outcome], item: ListedCapture) -> Outcome:
     if future.status == "finished":
         return future.result()
     error = future.exception() if future.status == "error" else None
-    reason = f"{type(error).__name__}: {error}" if error else "the cluster went away"
+    reason = f"{type(error).__name__}: {error}" if error else "the connection to the cluster was lost"
     if type(error).__name__ == "KilledWorker":
-        reason = "every process that worked on it died; did the memory last?"
+        reason = "every process that worked on it died, perhaps for lack of memory"
     return Outcome(item.name, str(item.path), FAILED, error=reason)
 
 
@@ -208,11 +195,11 @@ def _build_one(run: str, item: ListedCapture, folder: str, options: BuildOptions
     map_large_arrays()
     try:
         summary = build(item.path, folder, options, _progress(run, item.name))
-    except _CalledOffError:
+    except _CancelledError:
         return replace(outcome, status=STOPPED)
     except JawusdError as error:
         return replace(outcome, error=str(error))
-    except Exception as error:  # a fault in one build must not lose the others
+    except Exception as error:  # an unexpected error in one build must not stop the others
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{Path(place.filename).name}, line {place.lineno}"
         return replace(outcome, error=f"unexpected {type(error).__name__} in {where}: {error}")
@@ -234,13 +221,13 @@ def _mean_mm(fit: FitSummary, table: str) -> float | None:
 
 
 def _progress(run: str, name: str) -> Progress:
-    """Return a reporter for one build on a worker, which also ends the build of a run that was called off."""
+    """Return a progress callback for a build on a worker; it raises if the run was cancelled."""
     worker, stage_before, last = get_worker(), "", 0.0
 
     def report(stage: str, done: int, total: int) -> None:
         nonlocal stage_before, last
-        if run in _called_off:
-            raise _CalledOffError
+        if run in _cancelled:
+            raise _CancelledError
         now = time.monotonic()
         if stage != stage_before or now - last > _NOTIFY_SECONDS:
             stage_before, last = stage, now
@@ -256,9 +243,9 @@ def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
 
 
 class _IgnoreInterrupt(WorkerPlugin):
-    """Leave signals that a terminal or a service sends to all processes to the one that started them.
+    """Ignore signals that a terminal or service sends to all processes; the parent handles them.
 
-    A worker that such a signal ended would be replaced, and the new one would go on with the build.
+    A worker that such a signal ended would be replaced, and the new one would continue the build.
     """
 
     def setup(self, worker: Worker) -> None:
@@ -269,16 +256,16 @@ class _IgnoreInterrupt(WorkerPlugin):
 
 @contextlib.contextmanager
 def local_cluster(workers: int, retries: int) -> Iterator[Client]:
-    """Start worker processes of one thread each that listen to this machine alone, and yield a client of them.
+    """Start single-threaded worker processes on the loopback interface, and yield their client.
 
-    None is left when the block ends.
+    They end with the block.
 
     Args:
-        retries: how often work is given to another worker when one died over it.
+        retries: how often work is retried after its worker died.
     """
     settings = {
         "distributed.scheduler.allowed-failures": retries,
-        # There is no dashboard to show it, and noting all stacks 100 times a second takes 2 to 3 % of the time.
+        # Without a dashboard nothing shows the profile, which costs 2 to 3 % of the time.
         "distributed.worker.profile.enabled": False,
     }
     with (
@@ -289,10 +276,10 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
             threads_per_worker=1,
             processes=True,
             host=_LOOPBACK,
-            # No dashboard; without an address of its own the server for it would insist on one port.
+            # Port 0: without an address, the dashboard's server would require its fixed port.
             dashboard_address=f"{_LOOPBACK}:0",
             scheduler_kwargs={"dashboard": False},
-            memory_limit=0,  # what a build needs does not depend on the share of memory; the system limits it
+            memory_limit=0,  # no limit per worker; the system limits memory
             silence_logs=logging.CRITICAL,
             local_directory=scratch,
         ) as cluster,
@@ -304,16 +291,16 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
 
 @contextlib.contextmanager
 def existing_cluster(address: str) -> Iterator[Client]:
-    """Connect to a scheduler at an address such as "tcp://host:8786", and yield a client of it.
+    """Connect to a scheduler at an address such as "tcp://host:8786", and yield a client.
 
     Raises:
-        ClusterError: nothing answers there, or it has no worker.
+        ClusterError: no scheduler answers, or it has no workers.
     """
     try:
         asyncio.run(_greet(address))
     except (OSError, ValueError, TypeError, MemoryError) as error:
         raise ClusterError(
-            f"no scheduler answers at {address} ({str(error) or 'something listens and says nothing'}).",
+            f"no scheduler answers at {address} ({str(error) or 'connected, but no reply'}).",
             hint="Start one with: dask scheduler, and workers with: dask worker ADDRESS --nthreads 1",
         ) from error
     with silence_logging_cmgr(logging.CRITICAL), Client(address, timeout=CONNECT_SECONDS) as client:
@@ -327,7 +314,7 @@ def existing_cluster(address: str) -> Iterator[Client]:
 
 
 async def _greet(address: str) -> None:
-    """Exchange greetings with a scheduler; a client would wait for ever where something listens but does not answer."""
+    """Do the handshake with a scheduler; a `Client` would wait forever for a server that does not answer."""
     arguments = Security().get_connection_args("client")
     async with asyncio.timeout(CONNECT_SECONDS + 1):
         comm = await connect(address, timeout=CONNECT_SECONDS, **arguments)
@@ -338,17 +325,18 @@ def check_workers(client: Client, folder: Path) -> None:
     """Check that every worker runs this version of jawusd and sees the output folder.
 
     Raises:
-        ClusterError: a worker cannot build here.
+        ClusterError: a worker cannot be used.
     """
     for address, answer in client.run(_look, str(folder), on_error="return").items():
         if isinstance(answer, Exception):
             raise ClusterError(f"worker {address} cannot run jawusd ({type(answer).__name__}: {answer}).")
         version, sees_folder = answer
         if version != __version__:
-            raise ClusterError(f"worker {address} has jawusd {version}, here it is {__version__}.")
+            raise ClusterError(f"worker {address} runs jawusd {version}, this is {__version__}.")
         if not sees_folder:
             raise ClusterError(
-                f"worker {address} does not see {folder}.", hint="Use a folder that all machines share, by one path."
+                f"worker {address} does not see {folder}.",
+                hint="Use a folder that all machines share under the same path.",
             )
 
 

@@ -1,4 +1,4 @@
-"""Photographs of teeth that are together: the bite of scans that nobody registered, and where each was taken."""
+"""Register two scans in occlusion from photographs of the bite, and estimate each camera pose."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from jawusd.pipeline.state import Progress, no_progress
 
 RESULT = "photos.json"
 _COLOURS = np.array([[60, 220, 60], [60, 160, 255]], np.uint8)  # upper, lower; red, green, blue
-# Share of bright pixels above which a picture shows filled areas: lines of 4 px around 20 teeth cover 4 per cent.
+# Share of bright pixels above which a picture is taken to show filled areas: 4 px lines around 20 teeth cover 4 %.
 _FILLED = 0.08
 
 
 @dataclass(frozen=True, eq=False)
 class PhotographFiles:
-    """Hold what was written."""
+    """Result and files of an alignment."""
 
     result: AlignedPhotos
     file: Path
@@ -47,22 +47,24 @@ def align_photograph_files(
     """Align scans with outlines drawn in photographs, and write poses, lenses, bite and overlays.
 
     Args:
-        outlines: a picture per photograph, all of one bite and one camera: bright lines along the outlines of the
-            teeth on black, or areas of the teeth, one value for each.
+        outlines: a picture per photograph, all of one bite and one camera: tooth outlines as bright lines on black, or
+            filled teeth with one gray value each.
         upper_teeth, lower_teeth: scans, each in any frame.
         out: folder of photos.json and an overlay per photograph.
-        force: overwrite what is there.
+        force: overwrite existing files.
 
     Raises:
-        CaptureError: a picture or scan cannot be read, or two pictures have one name.
-        TrackingError: hardly any line in a picture, or hardly any face in a scan.
+        CaptureError: a picture or scan cannot be read, or two pictures have the same name.
+        TrackingError: too few outlines in a picture, or too few faces in a scan.
         OutputError: the output exists already, or cannot be written.
     """
     paths, folder = [Path(path) for path in outlines], Path(out)
     names = [path.stem for path in paths]
     for name in names:
         if names.count(name) > 1:
-            raise CaptureError(f'two pictures are called "{name}".', hint="Photographs go by their file names.")
+            raise CaptureError(
+                f'two pictures are called "{name}".', hint="Photographs are identified by their file names."
+            )
     refuse_existing(folder / RESULT, force)
     pictures = [_read(path) for path in paths]
     drawings = [read_drawing(picture, name) for picture, name in zip(pictures, names, strict=True)]
@@ -80,7 +82,7 @@ def read_drawing(picture: NDArray[np.uint8], name: str) -> Drawing:
     """Return the lines of a gray picture (h, w), or the borders of its areas if it shows areas.
 
     Raises:
-        TrackingError: the picture shows hardly any line.
+        TrackingError: the picture shows too few outlines.
     """
     if np.count_nonzero(picture) > _FILLED * picture.size:
         border = np.zeros(picture.shape, bool)
@@ -105,22 +107,8 @@ def drawn_over(picture: NDArray[np.uint8], found: PhotoAlignment, number: int) -
     return out
 
 
-def photograph_lines(found: PhotographFiles) -> list[str]:
-    """Return the result as lines for people."""
-    lines = ["photograph           focal [px]  mirrored  outlines rms / median [px at 1440]  alone [mm]"]
-    for photo in found.result.photos:
-        lines.append(
-            f"{photo.name:20} {photo.focal_px:10.0f}  {'yes' if photo.mirrored else 'no':>8}  "
-            f"{photo.outline_rms_px:17.1f} / {photo.outline_median_px:<14.1f}  {photo.alone_off_mm:9.2f}"
-        )
-    lines.append("T_upper_lower [mm]")
-    lines += ["  ".join(f"{value:12.6f}" for value in row) for row in found.result.T_upper_lower]
-    lines += [finding.line() for finding in found.result.findings]
-    return [*lines, *map(str, (found.file, *found.overlays))]
-
-
 def _read(path: Path) -> NDArray[np.uint8]:
     picture = read_gray(path)
     if picture is None:
-        raise CaptureError("is no picture that can be read.", path=path, hint="Check the path; save it as PNG, 8 bits.")
+        raise CaptureError("is not a readable picture.", path=path, hint="Check the path; save it as 8-bit PNG.")
     return picture

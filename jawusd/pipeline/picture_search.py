@@ -1,4 +1,4 @@
-"""Search where the teeth are in footage, on frames on which both rows of teeth are apart."""
+"""Search for the teeth in footage, on frames in which the arches are visibly apart."""
 
 from __future__ import annotations
 
@@ -19,26 +19,25 @@ if TYPE_CHECKING:
     from jawusd.segmentation.picture import ColourFootage
     from jawusd.segmentation.rows import Rows
 
-# Frames looked at for rows that are apart: every so-many-th, in parts of the take; starts tried in a part.
+# Frame stride of the search, frames per part of the take, and starts tried per part.
 _EVERY, _PART, _TRIED = 8, 240, 4
-# Starts tried in all. One takes some ten seconds of processor time; where six parts of a take in which rows seem apart
-# have none that fits, scans, cameras or what was taken for teeth are wrong, and the other parts are like them. Work is
-# counted, not time: what is found does not depend on the machine.
+# Starts tried in total, at about ten seconds of CPU time each. If six parts yield none that fits, scans, cameras or
+# the detection are wrong, and more tries would not help. A count, so that results do not depend on the machine.
 _MOST_TRIED = 24
-#: How much rows of teeth may be bridged to count as apart: of 64 pictures of eight mouths, those below were all parted
-#: rightly.
+#: Share of the line between the arches without a gap, below which they count as apart: all such of 64 pictures of eight
+#: mouths were separated correctly.
 MOST_BRIDGED = 0.1
-#: Share of the contour in sight that fits colours, below which a start is none: of 20 starts found in one take, all but
-#: one within half a millimetre, it was 0.19 to 0.48. From the others on, with several cameras and with one, whose depth
-#: may be wrong, it is taken at once.
+#: Share of the visible contour that matches the colours, below which a start is rejected: 20 starts found in one take,
+#: all but one within 0.5 mm, had 0.19 to 0.48. Above the other limits (several cameras, or a single one, whose depth
+#: may be wrong), a start is accepted without further search.
 LEAST_FIT, _CLEAR_FIT, _CLEAR_FIT_SINGLE = 0.15, 0.25, 0.4
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
-class Begin(Generic[T]):
-    """Say where to begin, how much of the contour fits there, and how it was found."""
+class Start(Generic[T]):
+    """A start: frame, pose, share of the contour that fits, and how it was found."""
 
     frame: int
     pose: T
@@ -47,27 +46,27 @@ class Begin(Generic[T]):
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
-    """Hold the rows of teeth that the cameras show on a frame."""
+class _Candidate:
+    """Arches detected by the cameras on a frame."""
 
     frame: int
     rows: Mapping[str, Rows]
 
     @property
     def bridged(self) -> float:
-        """The worst camera's share of line between the rows that is no gap."""
+        """Share of the line between the arches without a gap, in the worst camera."""
         return max(rows.bridged for rows in self.rows.values())
 
 
 @dataclass(frozen=True, eq=False)
 class PictureSearch(Generic[T]):
-    """Search the teeth.
+    """A search for the teeth.
 
     Attributes:
-        capture, footage: pictures of the cameras that have a video.
-        cameras: how many those are.
-        near: returns a pose on a frame by cameras with rough masks, None if there is none.
-        judged: returns a better pose near one on a frame, and the share of the contour in sight that fits, 0 .. 1.
+        capture, footage: the capture, and the pictures of its cameras with a video.
+        cameras: number of these cameras.
+        near: estimates a pose on a frame from cameras with rough masks; None if that fails.
+        judged: refines a pose on a frame, and returns the share of the visible contour that fits, 0 .. 1.
     """
 
     capture: Capture
@@ -76,22 +75,22 @@ class PictureSearch(Generic[T]):
     near: Callable[[Sequence[CameraSource], int], T | None]
     judged: Callable[[int, T], tuple[T, float]]
 
-    def run(self, frames: range, progress: Progress) -> Begin[T]:
+    def run(self, frames: range, progress: Progress) -> Start[T]:
         """Return the first start that fits clearly, or the best one of a part of the take.
 
         Raises:
-            TrackingError: none of those tried fits.
+            TrackingError: no start fits.
             CaptureError: a picture cannot be decoded.
         """
-        best: Begin[T] | None = None
+        best: Start[T] | None = None
         tried: list[int] = []
         seen = 0
         for part in (frames[k : k + _PART] for k in range(0, len(frames), _PART)):
             seen += len(part)
-            looks = sorted(self._looks(part, progress), key=lambda look: look.bridged)
-            for look in looks[:_TRIED]:
-                tried.append(look.frame)
-                found = self._at(look)
+            candidates = sorted(self._candidates(part, progress), key=lambda candidate: candidate.bridged)
+            for candidate in candidates[:_TRIED]:
+                tried.append(candidate.frame)
+                found = self._at(candidate)
                 if found is not None and (best is None or found.fit > best.fit):
                     best = found
                 if best is not None and best.fit >= (_CLEAR_FIT if self.cameras > 1 else _CLEAR_FIT_SINGLE):
@@ -101,13 +100,13 @@ class PictureSearch(Generic[T]):
             if len(tried) >= _MOST_TRIED:
                 break
         raise TrackingError(
-            _tried(tried, best, frames[seen:]),
-            hint="Check that scans, or rig, are of this person; let the footage show both rows of teeth apart and "
-            "upright for a moment, pick teeth in two cameras ([bootstrap]), or draw masks.",
+            _describe_failure(tried, best, frames[seen:]),
+            hint="Check that scans, or rig, belong to this person. Show both arches apart and upright for a moment, "
+            "pick teeth in two cameras ([bootstrap]), or draw masks.",
         )
 
-    def _looks(self, part: range, progress: Progress) -> list[_Look]:
-        """Return the frames of a part of the take on which enough cameras show the rows apart."""
+    def _candidates(self, part: range, progress: Progress) -> list[_Candidate]:
+        """Return the frames of a part of the take on which enough cameras show the arches apart."""
         from jawusd.segmentation.rows import tooth_rows
 
         out, chosen = [], part[::_EVERY]
@@ -115,35 +114,35 @@ class PictureSearch(Generic[T]):
             rows = {name: tooth_rows(np.asarray(image)) for name, image in pictures.items() if image is not None}
             apart = {name: row for name, row in rows.items() if row is not None and row.bridged <= MOST_BRIDGED}
             if len(apart) >= min(2, self.cameras):
-                out.append(_Look(frame, apart))
+                out.append(_Candidate(frame, apart))
             progress("start", done, len(chosen))
         return out
 
-    def _at(self, look: _Look) -> Begin[T] | None:
-        known = {name: self.footage.number(name, look.frame) for name in look.rows}
+    def _at(self, candidate: _Candidate) -> Start[T] | None:
+        known = {name: self.footage.number(name, candidate.frame) for name in candidate.rows}
         numbers = {name: number for name, number in known.items() if number is not None}
         with tempfile.TemporaryDirectory() as folder:
-            masked = masked_cameras(self.capture, look.rows, numbers, Path(folder))
-            near = self.near(masked, look.frame)
-        return None if near is None else Begin(look.frame, *self.judged(look.frame, near), "search")
+            masked = masked_cameras(self.capture, candidate.rows, numbers, Path(folder))
+            near = self.near(masked, candidate.frame)
+        return None if near is None else Start(candidate.frame, *self.judged(candidate.frame, near), "search")
 
 
-def _tried(tried: Sequence[int], best: Begin[T] | None, left: range) -> str:
-    """Return on which frames starts were tried, what came of it, and which frames are left."""
-    found = f"the teeth were not found on {len(tried)} frames that show both rows apart"
+def _describe_failure(tried: Sequence[int], best: Start[T] | None, left: range) -> str:
+    """Describe a failed search: the frames tried, the best fit, and the frames not searched."""
+    found = f"the teeth were not found on {len(tried)} frames that show both arches apart"
     if tried:
         found += f" ({', '.join(map(str, sorted(tried)))})"
     if best is not None:
-        found += f"; at best {best.fit:.0%} of the contour in sight fits, {LEAST_FIT:.0%} is needed"
+        found += f"; at best {best.fit:.0%} of the visible contour fits, {LEAST_FIT:.0%} is needed"
     if left:
-        found += f"; frames {left[0]} to {left[-1]} were not searched, as {_MOST_TRIED} are tried at most"
+        found += f"; frames {left[0]} to {left[-1]} were not searched, because at most {_MOST_TRIED} starts are tried"
     return found
 
 
 def masked_cameras(
     capture: Capture, rows: Mapping[str, Rows], numbers: Mapping[str, int], folder: Path
 ) -> list[CameraSource]:
-    """Return cameras with rows of teeth as masks, which are written to a folder under the cameras' own numbers.
+    """Write detected arches as masks to a folder, numbered by the frames of each camera; return cameras with them.
 
     Raises:
         OutputError: a mask cannot be written.
@@ -156,16 +155,16 @@ def masked_cameras(
     return [camera for camera in with_masks(capture, folder).cameras if camera.name in rows]
 
 
-def unseen_picks(frame: int, fit: float, least: float = LEAST_FIT) -> TrackingError:
-    """Return the error that picks deserve on a frame where too small a share of the contour in sight fits, 0 .. 1."""
+def picks_mismatch(frame: int, fit: float, least: float = LEAST_FIT) -> TrackingError:
+    """Return the error for picks on a frame where too small a share of the visible contour fits, 0 .. 1."""
     return TrackingError(
-        f"the teeth are not seen where they are picked: {fit:.0%} of the contour in sight fits the colours, at least "
+        f"the picks do not match the pictures: {fit:.0%} of the visible contour fits the colours, at least "
         f"{least:.0%} is needed",
         frame=frame,
-        hint="Check the picks, and that scans, rig and calibration are those of this person and these cameras.",
+        hint="Check the picks, and that scans, rig and calibration belong to this person and these cameras.",
     )
 
 
-def outside(frame: int, frames: range) -> TrackingError:
-    """Return the error that picks on a frame outside of those to be tracked deserve."""
-    return TrackingError(f"bootstrap.frame is {frame}, frames run from {frames[0]} to {frames[-1]}")
+def picks_outside(frame: int, frames: range) -> TrackingError:
+    """Return the error for picks on a frame outside the range to be tracked."""
+    return TrackingError(f"bootstrap.frame is {frame}; frames run from {frames[0]} to {frames[-1]}")

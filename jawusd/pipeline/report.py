@@ -1,4 +1,4 @@
-"""Gather what a build found and write its report, and repeat the paper's experiments on a take."""
+"""Write the report of a build, and repeat the paper's experiments on a take."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.contact import contact_pictures
 from jawusd.pipeline.fit import Poses, fit_summary
-from jawusd.pipeline.media import draw_worst_frames, replay_parts
-from jawusd.pipeline.origin import recorded_origin
+from jawusd.pipeline.pictures import draw_worst_frames, replay_parts
 from jawusd.pipeline.scans import with_stored_labels
 from jawusd.pipeline.state import (
     BUILD_FILE,
@@ -37,6 +36,7 @@ from jawusd.pipeline.state import (
     Stages,
     locked,
     no_progress,
+    recorded_origin,
 )
 from jawusd.pipeline.subject import Subject, subject_of_build
 from jawusd.report.verdicts import BuildVerdict
@@ -52,13 +52,13 @@ _NETWORKS = (
 
 
 class CheckResult(TypedDict):
-    """Hold what was found before the first stage."""
+    """Findings of the check before the first stage."""
 
     findings: list[FoundJson]
 
 
 class ReportSummary(TypedDict):
-    """Hold the capture's path relative to the rig, `Origin`, and the report's file, or which package it lacks."""
+    """Path of the capture relative to the rig, `Origin`, and the report's file or the missing package."""
 
     capture: NotRequired[str]
     origin: NotRequired[dict[str, object]]
@@ -69,29 +69,29 @@ class ReportSummary(TypedDict):
 
 @dataclass(frozen=True)
 class BuildFacts:
-    """Say what a finished build left behind."""
+    """A finished build, with its capture if available."""
 
     state: BuildState
-    capture: Capture | None  # the capture it was made from, None where it is not available
+    capture: Capture | None  # None if not available
     origin: Origin
-    why_not: str = ""  # why there is no capture
+    why_not: str = ""  # reason for a missing capture
 
 
 @explain_missing_packages()
 def write_build_report(
     folder: Path, facts: BuildFacts, progress: Progress, experiments: Experiments | None = None
 ) -> tuple[Path, BuildVerdict]:
-    """Write report.html of a finished build; return its path and what it says in short.
+    """Write report.html of a finished build; return its path and the verdict.
 
     Args:
-        experiments: already done in full; without them those that take seconds are done.
+        experiments: complete results; None: run those that take seconds.
 
     Raises:
         MissingDependencyError: matplotlib or jinja2 is not installed.
-        FormatError, RigError: a file of the build is damaged.
+        FormatError, RigError: a file of the build is corrupt.
         OutputError: the file cannot be written.
     """
-    # before the work: they may not be installed
+    # fail before the work if they are not installed
     from jawusd.paper.figures import inline_figures
     from jawusd.report.document import draw_figures, write_document
 
@@ -99,7 +99,7 @@ def write_build_report(
     tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
     subject = subject_of_build(folder)
     unmet, unseen = list[str](), list[str]()
-    # Pictures are decoded, drawn and measured without Python's lock, beside what needs it.
+    # Decoding, drawing and measuring pictures releases the GIL.
     with ThreadPoolExecutor(1) as pool:
         drawn = pool.submit(attempt, "pictures of the footage", unseen, lambda: _overlays(facts, tracks))
         met = pool.submit(attempt, "contacts of the teeth", unmet, lambda: contact_pictures(model, subject))
@@ -119,7 +119,7 @@ def write_build_report(
 def _without_pictures(
     folder: Path, facts: BuildFacts, tracks: Tracks, model: JawModel, subject: Subject, experiments: Experiments | None
 ) -> ReportData:
-    """Return what the report of a build shows, but for the pictures of footage and teeth."""
+    """Return the data of a report without the pictures of footage and teeth."""
     from jawusd.rig.read import describe
 
     left_out: list[str] = []
@@ -127,11 +127,11 @@ def _without_pictures(
         experiments = attempt(
             "experiments",
             left_out,
-            lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, no_progress, quick=True),
+            lambda: run_paper_experiments(subject, load_tracks(fitted_poses(folder)), 1, no_progress, quick=True),
         )
         left_out.append(_NETWORKS)
     if describe(folder / "actor.usda")["placeholders"]:
-        left_out.append("the mandible in 3-D: no mesh of it was given, and the rig's placeholder is no anatomy.")
+        left_out.append("the mandible in 3-D: no mesh was given, and the rig's placeholder is not anatomical.")
     return ReportData(
         actor=subject.name,
         tracks=tracks,
@@ -162,18 +162,18 @@ def report_build(
     """Write the report of a finished build again and return its path.
 
     Args:
-        capture: capture.toml or its folder; without it, where the build says it was.
+        capture: capture.toml or its folder; None: as recorded in the build.
         experiments: as for `write_build_report`.
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
-        FormatError: not the folder of a build, a damaged one, or one whose files are not what the build wrote.
+        FormatError: not the folder of a build, or its files are corrupt or were modified.
         MissingDependencyError, RigError, OutputError: see `write_build_report`.
         CaptureError: the capture named cannot be read.
     """
     if not is_build(folder):
         raise FormatError(
-            f"is not the folder of a build: there is no {BUILD_FILE}.",
+            f"is not the folder of a build: it has no {BUILD_FILE}.",
             path=folder,
             hint="Name the folder that `jawusd build` wrote, or add --experiments for poses.",
         )
@@ -181,32 +181,32 @@ def report_build(
         state = BuildState(folder)
         if changed := [found for found in state.changed() if found.path != REPORT_FILE]:
             listed = "".join(f"\n  {found.line()}" for found in changed)
-            raise FormatError(f"files of this build are not what it wrote:{listed}", path=folder)
+            raise FormatError(f"files of this build were modified:{listed}", path=folder)
         given = open_capture(capture, allow_outside=allow_outside) if capture is not None else None
         facts = build_facts(folder, state, given, allow_outside=allow_outside)
         path, verdict = write_build_report(folder, facts, progress, experiments)
-        # The next --resume must find the file as recorded, or it would write the report again.
+        # Record the new file, or the next --resume would write the report again.
         known = state.stages.get("report")
         result = dict(known.result if known else {}) | {"file": path.name, "verdict": verdict}
         if facts.capture:
-            result["capture"] = place_of(facts.capture, folder)
+            result["capture"] = relative_capture_path(facts.capture, folder)
         state.finish("report", known.inputs if known else "", [path], known.seconds if known else 0.0, result)
     return path
 
 
 def is_build(folder: Path) -> bool:
-    """Tell whether a path is the folder of a build."""
+    """Return whether a path is the folder of a build."""
     return (folder / BUILD_FILE).is_file()
 
 
 def fitted_poses(folder: Path) -> Path:
-    """Return the tracks of a build that its model was fitted to: the first pass, without the model as a prior."""
+    """Return the tracks that the model of a build was fitted to: the first pass, without the model as a prior."""
     first = folder / FIRST_PASS
     return first if first.is_file() else folder / "tracks.npz"
 
 
 def missing_packages() -> str | None:
-    """Return what keeps a report from being written, None if nothing does."""
+    """Return the message about packages missing for a report, None if it can be written."""
     try:
         with explain_missing_packages():
             import jawusd.report.document  # noqa: F401
@@ -216,10 +216,10 @@ def missing_packages() -> str | None:
 
 
 def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, allow_outside: bool = False) -> BuildFacts:
-    """Return what a build left behind, with the capture it came from if that is where it was.
+    """Return the facts of a build, with its capture if it can be found.
 
     Args:
-        capture: None to look where it was.
+        capture: None: use the path recorded in the build.
         allow_outside: let paths in the capture leave its folder.
     """
     record = state.stages.get("report")
@@ -228,24 +228,24 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
     if capture is not None:
         return BuildFacts(state, as_built(capture, folder), origin)
     if not place:
-        return BuildFacts(state, None, origin, "the build does not say where its capture is: name it with --capture.")
+        return BuildFacts(state, None, origin, "the build does not record its capture: name it with --capture.")
     path = folder / str(place)
     try:
         return BuildFacts(state, as_built(open_capture(path, allow_outside=allow_outside), folder), origin)
     except JawusdError as error:
-        return BuildFacts(state, None, origin, f"the capture is not at hand ({error}): name it with --capture.")
+        return BuildFacts(state, None, origin, f"the capture cannot be read ({error}): name it with --capture.")
 
 
 def as_built(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with what the build found for it: the calibration from its boards, labels of its scans."""
+    """Return the capture with the calibration and the scan labels that the build made."""
     made = folder / CALIBRATION
     if capture.calibration is None and made.is_file():
         capture = capture.model_copy(update={"calibration": made, "calibration_unit_mm": 1.0})
     return with_stored_labels(capture, folder / LABELS)
 
 
-def place_of(capture: Capture, folder: Path) -> str:
-    """Return the path of a capture seen from the rig's folder; absolute where there is no way between them."""
+def relative_capture_path(capture: Capture, folder: Path) -> str:
+    """Return the path of a capture relative to the rig's folder; absolute on another drive."""
     try:
         return os.path.relpath(capture.folder, folder.resolve())
     except ValueError:  # another drive
@@ -253,7 +253,7 @@ def place_of(capture: Capture, folder: Path) -> str:
 
 
 def attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
-    """Do a part of the report; what cannot be done is named in the report instead of stopping it."""
+    """Run a part of the report; on failure, list it as left out and return None."""
     try:
         with explain_missing_packages():
             return work()
@@ -269,10 +269,10 @@ def _overlays(facts: BuildFacts, tracks: Tracks) -> tuple[Overlay, ...]:
 
 
 def recorded_offsets(state: BuildState) -> dict[str, int]:
-    """Return the frame offset of every camera as a build found it; empty if it did not come that far.
+    """Return the frame offset of every camera recorded by a build; empty if it has not been synchronised.
 
     Raises:
-        FormatError: build.json is damaged.
+        FormatError: build.json is corrupt.
     """
     return (state.result("sync", SyncNotes) or {}).get("offsets", {})
 
@@ -284,7 +284,7 @@ def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:
 
 
 def camera_facts(capture: Capture) -> tuple[CameraFacts, ...]:
-    """Return what each camera of a capture has.
+    """Return the footage, masks and picture size of each camera.
 
     Raises:
         CalibrationError, CaptureError: see `load_cameras`.
@@ -310,7 +310,7 @@ def _rig_facts(folder: Path) -> RigFacts:
 
 
 def _check_findings(state: BuildState) -> tuple[Finding, ...]:
-    """Return what the check before the first stage found."""
+    """Return the findings of the check before the first stage."""
     found = state.result("check", CheckResult)
     return tuple(Finding.from_json(one) for one in found["findings"]) if found else ()
 
@@ -321,17 +321,17 @@ def _hashes(stages: Stages) -> dict[str, str]:
 
 
 @explain_missing_packages()
-def do_experiments(
+def run_paper_experiments(
     subject: Subject, motion: Tracks | Poses, starts: int, progress: Progress, *, quick: bool = False
 ) -> Experiments:
-    """Do the paper's experiments.
+    """Run the paper's experiments.
 
     Args:
         starts: random starts of the paper's networks.
-        quick: leave out what takes minutes: the networks and the paper's model.
+        quick: skip the networks and the paper's model, which take minutes.
 
     Raises:
-        FittingError: the poses cannot carry a model.
+        FittingError: the poses do not suffice for a model.
     """
     from jawusd.fitting import FittingConfig
     from jawusd.fitting.data import SubjectAnatomy
@@ -352,7 +352,7 @@ def do_experiments(
 
 @explain_missing_packages()
 def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
-    """Write the figures and the table of the experiments into a folder, which is made if missing; return the files.
+    """Write the figures and the table of the experiments to a folder; return the files.
 
     Raises:
         OutputError: a file cannot be written.
@@ -370,15 +370,3 @@ def experiment_files(folder: Path) -> list[Path]:
     from jawusd.paper.figures import FIGURES
 
     return [folder / f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")] + [folder / TABLE_FILE]
-
-
-def experiment_lines(found: Experiments) -> list[str]:
-    """Return the results of the experiments as text."""
-    heads = ("mean", "median", "p95", "max")
-    lines = [f"{found.actor}: {found.frames} captured poses; distances [mm]"]
-    lines.append(f"{'experiment':<16}{'model':<30}{'quantity':<32}{'count':>6}" + "".join(f"{h:>9}" for h in heads))
-    for row in found.table():
-        figures = "".join(f"{row[f'{head}_mm']:9.3f}" for head in heads)
-        lines.append(f"{row['experiment']:<16}{row['model']:<30}{row['quantity']:<32}{row['count']:>6}{figures}")
-    lines += [f"note: {note}" for note in found.notes]
-    return lines + [f"coverage: {sentence}" for sentence in found.coverage.sentences or ["no exercise is missing."]]

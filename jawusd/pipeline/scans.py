@@ -17,32 +17,31 @@ from jawusd.formats.mesh import Mesh, painted_labels, tooth_labels
 from jawusd.formats.scan_labels import ScanLabels, labels_path, save_scan_labels
 from jawusd.geometry import anatomical_frame
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.meshes import labelled_teeth, read_files
-from jawusd.pipeline.scan_labels import TEETH, LabelledScan
 from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.subject import TEETH, LabelledScan, labelled_teeth, read_files
 
 PICTURE = "scan_labels.png"
 
 
 class ScanSummary(TypedDict):
-    """Hold what is known about one scan."""
+    """Figures of one scan."""
 
     arch: str
     scan: str
     labels_by: str  # "file", "paint" or "shape"
-    labels_file: str | None  # None where nothing was written or read
+    labels_file: str | None  # None if none was read or written
     faces: int
     pieces: int
-    merged_vertices: int  # at the place of another one
+    merged_vertices: int  # duplicates of another vertex
     empty_faces: int
     repeated_faces: int
     crown_percent: float  # of the vertices
-    weak_border_percent: float | None  # of the line between crown and gum, that the shape hardly shows
+    weak_border_percent: float | None  # share of the crown border without a crease
     findings: list[dict[str, str | float | int]]
 
 
 class ScansSummary(TypedDict):
-    """Hold both scans and the picture."""
+    """Both scans, and the picture of their labels."""
 
     picture: str
     scans: list[ScanSummary]
@@ -57,14 +56,14 @@ def label_scans(
     allow_outside: bool = False,
     progress: Progress = no_progress,
 ) -> ScansSummary:
-    """Label both teeth scans of a capture, store what the shape says, and draw a picture of the labels.
+    """Label both teeth scans of a capture, store labels found by shape, and draw a picture of the labels.
 
-    Painted scans and those with labels keep them.
+    Paint and existing labels are kept.
 
     Args:
-        out: folder of labels and picture; without it the labels lie where the capture has them, else beside the
-            scans, and the picture in the capture's folder.
-        force: find the labels again and overwrite those there are.
+        out: folder of labels and picture; None: labels go to the labels folder of the capture or beside the scans, the
+            picture to the capture's folder.
+        force: label again, and overwrite existing labels.
 
     Raises:
         FormatError, CaptureError: the capture, a scan or its labels cannot be read.
@@ -84,7 +83,7 @@ def label_scans(
 
 
 def all_labelled(capture: Capture) -> bool:
-    """Tell whether paint or files say of both teeth scans what is crown; raises as `meshes.load_meshes`."""
+    """Return whether both teeth scans are labelled by paint or files; raises as `load_meshes`."""
     scans = capture.scans
     files = {name: getattr(scans, name) for name in TEETH.values()}
     open_ones = {name: path for name, path in files.items() if not labels_path(path, scans.labels).is_file()}
@@ -92,9 +91,9 @@ def all_labelled(capture: Capture) -> bool:
 
 
 def store_labels(capture: Capture, folder: Path) -> list[Path]:
-    """Write labels of the teeth scans to a folder if the shape has to tell one of them; return the files written.
+    """Write the labels of both teeth scans to a folder if one is labelled by shape; return the files written.
 
-    Labels that an earlier call left there are deleted.
+    Labels of an earlier call are deleted.
 
     Raises:
         FormatError, CaptureError: a scan or its labels cannot be read.
@@ -113,7 +112,7 @@ def store_labels(capture: Capture, folder: Path) -> list[Path]:
 
 
 def with_stored_labels(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the labels that `store_labels` left in a folder, unless it has labels of its own."""
+    """Return the capture with the labels that `store_labels` wrote to a folder, unless it has its own."""
     scans = capture.scans
     teeth = (scans.upper_teeth, scans.lower_teeth)
     own = any(labels_path(path, scans.labels).is_file() for path in teeth)
@@ -123,7 +122,7 @@ def with_stored_labels(capture: Capture, folder: Path) -> Capture:
 
 
 def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: NDArray[np.uint8]) -> Path:
-    """Write labels (V,) that a person has seen where the capture looks for them; return the file.
+    """Write reviewed labels (V,) to the label file of the capture; return the file.
 
     Args:
         scans: of the capture.
@@ -138,7 +137,7 @@ def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: N
 
 
 def _stored(scan: LabelledScan, folder: Path | None) -> ScanSummary:
-    """Write the labels that the shape gave, and sum up."""
+    """Store labels found by shape, and return the figures of the scan."""
     from jawusd.meshes.scan_surface import ScanSurface
 
     file = labels_path(scan.path, folder)
@@ -177,26 +176,3 @@ def _draw(scans: Sequence[LabelledScan], summaries: Sequence[ScanSummary], captu
         for s in summaries
     ]
     save_png(picture, label_sheet(shown, T, captions))
-
-
-def scans_lines(summary: ScansSummary) -> list[str]:
-    """Return `label_scans` as text."""
-    from jawusd.formats.finding import Finding
-
-    lines = []
-    for scan in summary["scans"]:
-        lines.append(
-            f"{scan['arch']}: {scan['faces']} faces in {scan['pieces']} pieces, {scan['crown_percent']} % crown "
-            f"(by {scan['labels_by']})"
-        )
-        cleaned = (
-            (scan["merged_vertices"], "vertices at the same place merged"),
-            (scan["empty_faces"], "empty faces"),
-            (scan["repeated_faces"], "repeated faces"),
-        )
-        found = [f"{count} {what}" for count, what in cleaned if count]
-        lines += [f"  {', '.join(found)}"] if found else []
-        if scan["labels_file"]:
-            lines.append(f"  labels: {scan['labels_file']}")
-        lines += [f"  {Finding.from_json(finding).line()}" for finding in scan["findings"]]
-    return [*lines, f"picture: {summary['picture']}"]

@@ -1,4 +1,4 @@
-"""Make masks from footage: colours show where the teeth are in every frame, masks are made there and aligned."""
+"""Make masks from footage: follow the teeth by their colours, segment around them, and align the masks."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from jawusd.base.errors import CaptureError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
+from jawusd.pipeline.cameras import open_footage
 from jawusd.pipeline.capture_inputs import input_hashes
-from jawusd.pipeline.follow import Follower
-from jawusd.pipeline.media import open_footage
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.picture_search import outside
+from jawusd.pipeline.follow import Follower, searched_start
+from jawusd.pipeline.picture_search import picks_outside
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.segment_record import (
     LEARNED,
@@ -30,8 +29,7 @@ from jawusd.pipeline.segment_record import (
     Journal,
 )
 from jawusd.pipeline.state import Progress, hash_files, hash_value
-from jawusd.pipeline.subject import subject_of_capture
-from jawusd.pipeline.track_pictures import searched_start
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 
 if TYPE_CHECKING:
     from jawusd.segmentation.camera import CameraSegmenter, Segment
@@ -44,10 +42,10 @@ ARCHES = ("upper", "lower")
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    """Choose how to segment."""
+    """Options of the segmentation."""
 
-    keys: Path | None = None  # folder with masks or strokes a person drew for some frames, or None
-    resume: bool = False  # keep the frames that were finished before
+    keys: Path | None = None  # folder with hand-drawn masks or strokes for some frames
+    resume: bool = False  # keep finished frames
     jobs: int = 2  # threads
 
 
@@ -58,16 +56,16 @@ def segment_teeth(
     """Write masks of both arches for every frame and camera of a capture.
 
     Args:
-        capture: its videos, calibration, scans, picks and frame range are used, its masks are not.
+        capture: provides videos, calibration, scans, picks and frame range; its masks are ignored.
         offsets: frame offset by camera.
-        folder: where the masks go, as CAMERA/upper/000123.png numbered by the camera's own frames.
+        folder: output folder of masks CAMERA/upper/000123.png, numbered by the camera's own frames.
 
     Returns:
-        What is known about every frame.
+        The record of every frame.
 
     Raises:
         CaptureError: fewer than two cameras have a video, or one cannot be decoded.
-        TrackingError: the teeth are not found, where picks say they are or, without picks, in the footage.
+        TrackingError: the teeth are not found at the picks or, without picks, in the footage.
         OutputError: a file cannot be written.
     """
     with ThreadPoolExecutor(options.jobs) as pool:
@@ -76,7 +74,7 @@ def segment_teeth(
 
 @dataclass(eq=False)
 class _OpenFrame:
-    """Hold a frame that is being tracked: its pictures, and the latest masks of each, None without a picture."""
+    """A frame being tracked: its pictures, and the latest masks by camera, None without a picture."""
 
     pictures: Pictures
     segments: dict[str, Segment | None] = field(default_factory=dict)
@@ -103,7 +101,7 @@ class _Segmentation:
         cameras, videos = open_footage(capture)
         if len(videos) < 2:
             raise CaptureError(
-                f"{len(videos)} of {len(capture.cameras)} cameras have a video; masks are made from two at least.",
+                f"{len(videos)} of {len(capture.cameras)} cameras have a video; segmentation needs at least two.",
                 path=capture.folder / "capture.toml",
             )
         self._cameras = {name: camera for name, camera in cameras.items() if name in videos}
@@ -131,10 +129,10 @@ class _Segmentation:
         return hash_value([files, drawn, described, offsets])
 
     def run(self) -> dict[int, FrameEntry]:
-        """Segment all frames that are not finished, and again those that drawn masks improve."""
+        """Segment all unfinished frames, and repeat all of them after learning from drawn masks."""
         from jawusd.segmentation.colours import state_files
 
-        start, poses = self._begun()
+        start, poses = self._find_start()
         if not self._guide:
             self._follow(start, poses)
         if start not in self._journal.entries:
@@ -153,17 +151,17 @@ class _Segmentation:
         return self._journal.entries
 
     def _follow(self, start: int, poses: Array) -> None:
-        """Find the teeth in all frames by their colours, from poses on one of them."""
+        """Follow the teeth through all frames by their colours, from poses on one of them."""
         follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
-        follower.begun(start, poses)
+        follower.start_at(start, poses)
         self._guide = follower.run(range(self._first, self._stop), self._progress)
         save_guide(self._folder, self._guide_inputs, self._guide)
 
-    def _begun(self) -> tuple[int, Array]:
-        """Return the frame to begin on and the poses there, shape (2, 4, 4): by picks, or else by search.
+    def _find_start(self) -> tuple[int, Array]:
+        """Return the start frame and the poses there, shape (2, 4, 4), by picks or else by search.
 
         Raises:
-            TrackingError: the picks cannot be, or the teeth were not found.
+            TrackingError: the picks are inconsistent, or the teeth were not found.
         """
         from jawusd.tracking.region.picture_start import ArchStart
 
@@ -171,11 +169,11 @@ class _Segmentation:
         frames = range(self._first, self._stop)
         if picks is not None:
             if picks.frame not in frames:
-                raise outside(picks.frame, frames)
+                raise picks_outside(picks.frame, frames)
             self._start = picks.frame
             return picks.frame, self._tracker.picked(picks, self._cameras)
         if self._journal.entries and self._guide:
-            self._start = next(iter(self._journal.entries))  # frames are recorded in the order of the work
+            self._start = next(iter(self._journal.entries))  # the first recorded frame is the start
             return self._start, self._guide[self._start].poses
         follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
         upper, lower = self._tracker.scans
@@ -190,7 +188,7 @@ class _Segmentation:
 
     @contextlib.contextmanager
     def _opened(self, frame: int, pictures: Pictures) -> Iterator[_OpenFrame]:
-        """Let the tracker see the pictures of a frame, and collect the masks made of them."""
+        """Make the pictures of a frame available to the tracker, and collect their masks."""
         self._open[frame] = _OpenFrame(pictures)
         try:
             yield self._open[frame]
@@ -205,7 +203,7 @@ class _Segmentation:
         }
 
     def _track_to(self, start: int, end: int, step: int) -> None:
-        """Track from the frame of the picks to one end of the take; frames finished before are skipped."""
+        """Track from the start frame to one end of the take, skipping finished frames."""
         from jawusd.segmentation.colours import ColourStates
 
         done = start
@@ -219,7 +217,7 @@ class _Segmentation:
         state = ColourStates(self._folder, colours)
         before = state.restore(done, step)
         self._journal.drop(range(before + step if before is not None else start + step, done + step, step))
-        if before is None:  # colours come from the poses found in the first frame
+        if before is None:  # learn colours from the poses of the start frame
             before = start
             with self._opened(start, self._footage.at(start)):
                 self._see(start, poses, 0)
@@ -231,7 +229,7 @@ class _Segmentation:
             known = {name: model.counts() for name, model in colours.items()}
             with self._opened(frame, pictures) as shown:
                 _, record = next(follow)
-            if (record.status == LOST).any():  # colours from where no teeth are would spoil all that follows
+            if (record.status == LOST).any():  # do not learn colours from a wrong place
                 for name, model in colours.items():
                     model.restore(*known[name])
             state.keep(frame, step)
@@ -239,7 +237,7 @@ class _Segmentation:
             self._advance("segment", len(self._journal.entries))
 
     def _past(self, frame: int) -> FrameSummary:
-        """Return what the tracker needs to know about a finished frame."""
+        """Return the tracker's summary of a finished frame."""
         from jawusd.tracking.contour.frame_record import FrameSummary
 
         poses, status = self._journal.known(frame)
@@ -264,7 +262,7 @@ class _Segmentation:
         ]
 
     def _learn_and_repeat(self, keyed: Sequence[int]) -> None:
-        """Learn colours and numbers from what a person drew, and segment all frames again where the teeth are."""
+        """Learn colours and parameters from drawn masks, and segment all frames again at the known poses."""
         from jawusd.segmentation.learn import learn_numbers
 
         self._new_segmenters(self._journal.known(self._start)[0])
@@ -290,7 +288,7 @@ class _Segmentation:
             self._advance("segment again", frame + 1 - self._first)
 
     def _see(self, frame: int, poses: Array, turn: int) -> list[View]:
-        """Segment all cameras' pictures of an open frame and return them as the tracker's views."""
+        """Segment the pictures of an open frame, and return them as views for the tracker."""
         from jawusd.tracking.contour.views import View
 
         shown = self._open[frame]
@@ -300,7 +298,7 @@ class _Segmentation:
             if image is None or own is None:
                 return None
             found = self._segmenters[name].segment(image, poses, turn, self._keys.of(name, own))
-            # A mask made where colours do not show the arch would confirm a wrong pose.
+            # Skip arches that colours do not show: a mask there would confirm a wrong pose.
             return None if found is None else found.only(self._guide[frame].found)
 
         shown.segments = dict(zip(self._cameras, self._pool.map(one, self._cameras), strict=True))
@@ -313,7 +311,7 @@ class _Segmentation:
         return views
 
     def _write(self, frame: int, record: FrameRecord, segments: dict[str, Segment | None], again: bool = False) -> None:
-        """Write the masks of a frame and what is known about it."""
+        """Write the masks and the record of a frame."""
         from jawusd.tracking.contour.frame_record import FrameSummary
         from jawusd.tracking.contour.quality import view_residual_px
 

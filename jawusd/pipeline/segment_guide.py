@@ -1,4 +1,4 @@
-"""What colours alone show of the teeth, kept beside the masks that were made around it, and compared with them."""
+"""Poses tracked by colour alone, stored beside the masks that were made around them, and compared with tracks."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import relative_pose, se3_inverse, transform_points
-from jawusd.pipeline.meshes import registration_of
 from jawusd.pipeline.segment_record import auto_masks_folder
+from jawusd.pipeline.subject import registration_of
 
 if TYPE_CHECKING:
     from jawusd.tracking.region.tracker import RegionPose
 
-# Distance of the jaw by masks and by colours from which one is wrong [mm]: right ones of three takes were at most 0.9
-# apart. Shares of such frames, or lost ones, from which a take is doubtful, and not usable.
+# Distance between jaw poses by masks and by colours above which one must be wrong [mm]; correct ones of three takes
+# differed by at most 0.9. Shares of such or lost frames above which a take is questionable, and unusable.
 _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 
 
 def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> None:
-    """Write what was followed, with the hash of everything it depends on.
+    """Write poses tracked by colour, with the hash of their inputs.
 
     Raises:
         OutputError: the file cannot be written.
@@ -48,7 +48,7 @@ def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> No
 
 
 def known_guide(folder: Path, inputs: str) -> dict[int, RegionPose]:
-    """Return what was followed from the same inputs; nothing if there is none, or it cannot be read."""
+    """Return the stored poses if they have the same inputs; empty if missing or unreadable."""
     try:
         guide, made_from = _read(folder / GUIDE)
     except JawusdError:
@@ -57,10 +57,10 @@ def known_guide(folder: Path, inputs: str) -> dict[int, RegionPose]:
 
 
 def _read(path: Path) -> tuple[dict[int, RegionPose], str]:
-    """Return a guide and the hash of what it was made from; nothing if it is missing.
+    """Return the stored poses and the hash of their inputs; empty if missing.
 
     Raises:
-        FormatError: it is damaged.
+        FormatError: the file is corrupt.
     """
     from jawusd.tracking.region.tracker import RegionPose
 
@@ -75,18 +75,18 @@ def _read(path: Path) -> tuple[dict[int, RegionPose], str]:
     return {int(frame): RegionPose(*row) for frame, *row in rows}, str(meta.get("inputs"))
 
 
-def take_up_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[Tracks, list[Finding]]:
-    """Return tracks with poses that colours alone gave taken in, and what to say of both; other masks change nothing.
+def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[Tracks, list[Finding]]:
+    """Combine tracks of automatic masks with the poses tracked by colour; return also findings on their agreement.
 
-    Kinds: "footage_doubtful" [%], for frames that are lost or in which both differ by more than a millimetre, and
-    "footage_unchecked" where there are no such poses. Masks made around a wrong pose confirm it, and borders of colours
-    err otherwise than masks do, so that both seldom agree on it.
+    Tracks of other masks are returned as they are. Masks made around a wrong pose confirm it, but colour edges have
+    independent errors, so a disagreement reveals it. Findings: "footage_doubtful" [%] for frames that are lost or in
+    which both differ by more than a millimetre, "footage_unchecked" if there are no such poses.
 
     Args:
         landmarks: lower teeth, then condyles, mandible coordinates [mm], shape (5, 3).
 
     Raises:
-        FormatError: the file of the poses is damaged.
+        FormatError: the file of the poses is corrupt.
     """
     from jawusd.tracking.sequence.smoothing import combine
 
@@ -96,7 +96,9 @@ def take_up_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[T
     guide = _read(folder / GUIDE)[0]
     rows = [k for k, frame in enumerate(tracks.frames.tolist()) if frame in guide]
     if not rows:
-        message = "no poses by colours lie beside these masks: whether masks were made around wrong poses is not known"
+        message = (
+            "the colour-tracked poses of these masks are missing: masks made around wrong poses cannot be detected"
+        )
         hint = "Run `jawusd segment` again, and keep its guide.npz beside the masks."
         return tracks, [Finding("footage_unchecked", "warning", message, path=str(folder / GUIDE), hint=hint)]
     poses, covariance = np.full((len(tracks.frames), 2, 4, 4), np.nan), np.full((len(tracks.frames), 2, 6, 6), np.nan)
@@ -110,7 +112,7 @@ def take_up_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[T
 
 
 def _disagreement(tracks: Tracks, poses: Array, points: Array) -> list[Finding]:
-    """Return what to say if masks and colours place points of the lower teeth (N, 3) apart too often."""
+    """Return a finding if masks and colours disagree on points of the lower teeth (N, 3) in too many frames."""
     relative = np.full((len(poses), 4, 4), np.nan)
     both = np.isfinite(poses).all((1, 2, 3))
     relative[both] = relative_pose(poses[both, 0], poses[both, 1])
@@ -120,17 +122,17 @@ def _disagreement(tracks: Tracks, poses: Array, points: Array) -> list[Finding]:
     share = float(bad.mean())
     if share <= _FEW:
         return []
-    judgement = "is not usable as it is" if share > _MANY else "is doubtful in parts"
+    judgement = "is unusable" if share > _MANY else "is partly unreliable"
     worst = int(np.nanargmax(apart_mm)) if np.isfinite(apart_mm).any() else int(np.flatnonzero(bad)[0])
     return [
         Finding(
             "footage_doubtful",
             "warning",
             f"the footage {judgement}: in {bad.sum()} of {len(bad)} frames the jaw is lost, or masks and colours "
-            f"place it more than {_APART_MM:g} mm apart; at most {_FEW:.0%} of the frames is usual",
+            f"disagree on it by more than {_APART_MM:g} mm; at most {_FEW:.0%} of the frames is usual",
             value=round(100 * share, 1),
             limit=100 * _FEW,
             frame=int(tracks.frames[worst]),
-            hint="Look at the overlay, draw masks of some frames (`jawusd segment --keys`), or light the mouth better.",
+            hint="Inspect the overlay, draw masks for some frames (`jawusd segment --keys`), or improve the lighting.",
         )
     ]

@@ -1,7 +1,7 @@
-"""What segmentation leaves beside its masks: a line per finished frame, and which masks can be trusted.
+"""Records of a segmentation: a journal with a line per finished frame, and a summary with confidences.
 
-The record grows by one line per frame, so that interrupted work can be resumed. The summary holds a confidence per
-frame and camera, and the frames to be looked at, worst first.
+The journal allows interrupted work to be resumed. The summary has a confidence per frame and camera, and lists the
+masks to inspect, worst first.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from jawusd.pipeline.state import hash_value
 RECORD, SUMMARY, SHEET, LEARNED = "segment.jsonl", "segment.json", "look_at_these.png", "learned.json"
 FORMAT = "jawusd-segment/1"
 _MAX_LEARNED_BYTES = 1 << 20
-# Below this confidence a mask is to be looked at: a symptom at twice its usual spread.
+# Masks below this confidence need inspection.
 _DOUBTFUL = 0.5
-# Symptoms of a bad mask and the sign that makes more worse; each is judged by its distance from the take's usual value.
+# Symptoms of a bad mask, with the sign of worse; each is compared with its median over the take.
 _SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
 _LEAST_SPREAD = {"contrast": 0.03, "unexpected": 0.01, "residual_px": 0.05, "uncovered": 0.01}
-_USUAL_OFF = 3.0  # spreads at which a symptom alone brings the confidence to one half
-# How far off an outline may well be [px of the working picture] where it shows in the picture, where it does not, and
-# between the arches; over the mask's area that gives the share of the mask that may be wrong. Small masks and masks
-# without edges in the picture stand out in all cameras alike, so all are judged together, and more strictly.
+_USUAL_OFF = 3.0  # deviation, in robust sigmas, at which a single symptom halves the confidence
+# Likely outline error [px of the working picture] with a picture edge, without one, and between the arches; divided by
+# the mask's area, it gives the share of the mask that may be wrong. This symptom is comparable across cameras, so all
+# are pooled, with a stricter limit.
 _OUTLINE_PX = (0.4, 2.0, 0.6)
 _OUTLINE, _OUTLINE_SPREAD, _OUTLINE_OFF = "outline", 0.01, 1.5
 _SHEET_FRAMES = 12
@@ -44,7 +44,7 @@ Pair = list[float | None]
 
 
 class CameraEntry(TypedDict):
-    """Hold what is known about one camera's masks of a frame; pairs are (upper, lower), None without a mask."""
+    """One camera's masks of a frame; pairs are (upper, lower), None without a mask."""
 
     frame: int
     contrast: Pair
@@ -56,7 +56,7 @@ class CameraEntry(TypedDict):
 
 
 class TrackEntry(TypedDict):
-    """Hold the fields of `FrameSummary` that show how well a frame was tracked."""
+    """Fields of `FrameSummary` on the quality of tracking."""
 
     used: list[list[bool]]
     coverage: list[Pair]
@@ -65,7 +65,7 @@ class TrackEntry(TypedDict):
 
 
 class FrameEntry(TypedDict):
-    """Hold what is known about a finished frame: T_world_upper and T_world_lower, their status, masks and tracking."""
+    """A finished frame: T_world_upper and T_world_lower, their status, masks and tracking."""
 
     poses: list[list[list[float]]]
     status: list[int]
@@ -75,7 +75,7 @@ class FrameEntry(TypedDict):
 
 
 class MaskConfidence(TypedDict):
-    """Hold the confidence 0 .. 1 in the worse of the two masks of a picture, and the reason."""
+    """Confidence 0 .. 1 in the worse of the two masks of a picture, with the reason."""
 
     frame: int
     camera: str
@@ -86,14 +86,14 @@ class MaskConfidence(TypedDict):
 
 
 class Learned(TypedDict):
-    """Hold what drawn masks taught: pictures drawn, and the disagreement with them before and after."""
+    """Result of learning from drawn masks: their number, and the disagreement with them before and after."""
 
     pictures: int
     disagreement: list[float]
 
 
 class SegmentSummary(TypedDict):
-    """Hold segment.json."""
+    """Contents of segment.json."""
 
     format: str
     capture: str
@@ -106,10 +106,7 @@ class SegmentSummary(TypedDict):
 
 
 def auto_masks_folder(capture: Capture) -> Path | None:
-    """Return the folder in which all masks of a capture lie as `jawusd segment` wrote them, CAMERA/upper/000123.png.
-
-    None for other masks.
-    """
+    """Return the folder of a capture's masks if `jawusd segment` wrote all of them, else None."""
     masks = [path for camera in capture.cameras if camera.masks for path in (camera.masks.upper, camera.masks.lower)]
     folders = {path.parents[2] if len(path.parents) > 2 else None for path in masks}
     folder = folders.pop() if len(folders) == 1 else None
@@ -117,17 +114,17 @@ def auto_masks_folder(capture: Capture) -> Path | None:
 
 
 class Journal:
-    """Hold what is known about finished frames, in memory and in a file of JSON lines."""
+    """The record of finished frames, in memory and in a file of JSON lines."""
 
     def __init__(self, folder: Path, inputs: str, resume: bool) -> None:
-        """Start with no frames, or with those finished from the same inputs.
+        """Start empty, or with the frames finished from the same inputs.
 
         Args:
-            inputs: hash of everything the work depends on.
-            resume: keep what is there if it came from these inputs.
+            inputs: hash of all inputs.
+            resume: keep existing frames if their inputs are the same.
 
         Raises:
-            OutputError: the folder cannot be written, or the file not read.
+            OutputError: the folder cannot be written, or the file cannot be read.
         """
         self._path = folder / RECORD
         self.entries: dict[int, FrameEntry] = {}
@@ -152,7 +149,7 @@ class Journal:
             raise OutputError(f"cannot be written: {error.strerror}.", path=self._path) from error
 
     def drop(self, frames: Iterable[int]) -> None:
-        """Forget frames.
+        """Remove frames.
 
         Raises:
             OutputError: the file cannot be written.
@@ -189,7 +186,7 @@ def _without_nan(value: object) -> object:
 
 
 def _entry(line: str) -> tuple[int, FrameEntry] | None:
-    """Return a line's frame and entry; None for a line that was cut short when the work was stopped, or damaged."""
+    """Return the frame and entry of a line; None if it is truncated or corrupt."""
     try:
         data = json.loads(line)
         known = data.pop("sha256")
@@ -244,7 +241,7 @@ def _outline_doubt(found: Sequence[CameraEntry]) -> Array:
 
 
 def _off(values: Array, groups: NDArray[np.str_], least_spread: float) -> Array:
-    """Return how many spreads values, shape (N, 2), lie above the median of their group and arch, shape (N, 2)."""
+    """Return by how many robust sigmas values (N, 2) exceed the median of their group and arch, shape (N, 2)."""
     out = np.zeros_like(values)
     for group in np.unique(groups):
         of = groups == group
@@ -259,14 +256,14 @@ def _off(values: Array, groups: NDArray[np.str_], least_spread: float) -> Array:
 
 @explain_missing_packages()
 def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: Path) -> SegmentSummary:
-    """Write segment.json, and thumbnails of the worst masks if any are to be looked at.
+    """Write segment.json, and thumbnails of the worst masks if any need inspection.
 
     Args:
-        folder: holds the masks.
+        folder: folder of the masks.
 
     Raises:
         CaptureError: a picture or mask cannot be read.
-        FormatError: what was learned from drawn masks cannot be read.
+        FormatError: the file of learned parameters is corrupt.
         OutputError: a file cannot be written.
     """
     rows = summarise(entries)
@@ -292,7 +289,7 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
 
 
 def _learned(path: Path) -> Learned | None:
-    """Return what was learned from drawn masks, None if nothing was."""
+    """Return the result of learning from drawn masks, None without."""
     if not path.exists():
         return None
     try:
@@ -300,15 +297,15 @@ def _learned(path: Path) -> Learned | None:
         first, last = (float(value) for value in learned["disagreement"])
         return {**learned, "pictures": int(learned["pictures"]), "disagreement": [first, last]}
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-        hint = "Segment again without --resume, or build with --fresh."
+        hint = "Run `jawusd segment` again without --resume."
         raise FormatError(f"is not what `jawusd segment` wrote ({error}).", path=path, hint=hint) from error
 
 
 @explain_missing_packages()
 def delete_masks(folder: Path) -> None:
-    """Delete the masks that were made in a folder, what was said of them, and folders left empty.
+    """Delete the masks and records that segmentation wrote to a folder, and folders left empty.
 
-    Files of other names stay, and so does everything in a folder that segmentation did not write to.
+    Other files are kept, and so are folders that segmentation did not write.
     """
     if not (folder / RECORD).is_file():
         return
@@ -317,27 +314,12 @@ def delete_masks(folder: Path) -> None:
     for path in (*state_files(folder), *(folder / name for name in (RECORD, SUMMARY, SHEET, LEARNED))):
         path.unlink(missing_ok=True)
     for path in [*folder.glob("*/upper/*.png"), *folder.glob("*/lower/*.png")]:
-        # A link may lead out of the folder.
+        # Symbolic links may lead out of the folder.
         if path.stem.isdigit() and path.resolve().is_relative_to(folder.resolve()):
             path.unlink()
     for path in [*folder.glob("*/upper"), *folder.glob("*/lower"), *folder.glob("*"), folder]:
-        with contextlib.suppress(OSError):  # not empty, or no folder
+        with contextlib.suppress(OSError):  # not empty, or not a folder
             path.rmdir()
-
-
-def segment_lines(summary: SegmentSummary) -> list[str]:
-    """Return the summary for people."""
-    doubtful = summary["look_at"]
-    lines = [f"{summary['frames']} frames segmented in {len(summary['masks'])} cameras"]
-    if learned := summary.get("learned"):
-        before, after = (f"{100 * value:.1f} %" for value in learned["disagreement"])
-        lines.append(f"learned from {learned['pictures']} drawn pictures: disagreement {before} before, {after} after")
-    if doubtful:
-        lines.append(f"{len(doubtful)} masks to look at, worst first (thumbnails in {summary['sheet']}):")
-    for row in doubtful[:_SHEET_FRAMES]:
-        where = f"  {row['camera']} frame {row['own_frame']:>5}  {row['row']:<5}"
-        lines.append(f"{where}  confidence {row['confidence']:.2f}  {row['reason']}")
-    return lines
 
 
 def with_masks(capture: Capture, folder: Path) -> Capture:

@@ -3,51 +3,193 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 
 import numpy as np
 
 import jawusd
+from jawusd.base.arrays import Array
 from jawusd.base.errors import OutputError, RigError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import is_inside
-from jawusd.formats.capture import Capture
-from jawusd.formats.finding import Finding
+from jawusd.formats.capture import Bootstrap, CameraSource, Capture
+from jawusd.formats.mesh import Mesh
 from jawusd.formats.performance import Performance, SolveState, write_performance
 from jawusd.formats.tracks import save_tracks
+from jawusd.geometry import Camera
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.cameras import load_cameras, open_videos
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.meshes import load_labelled, registered_meshes
-from jawusd.pipeline.overlay import VIDEO, write_overlay
-from jawusd.pipeline.segment_guide import take_up_guide
-from jawusd.pipeline.solve_pictures import VideoOptions, solve_videos
+from jawusd.pipeline.follow import Cutter
+from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch, Start, picks_mismatch, picks_outside
+from jawusd.pipeline.pictures import VIDEO, write_overlay
+from jawusd.pipeline.segment_guide import combine_guide
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
 from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.subject import load_labelled, registered_meshes, subject_of_capture
 from jawusd.pipeline.track import tracking_config
 
-#: What a performance can be written as, by the suffix of the file.
+if TYPE_CHECKING:
+    from jawusd.tracking.config import Mapper
+    from jawusd.tracking.performance.coordinates import Pose
+    from jawusd.tracking.region.appearance import Cut
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """Options of `solve` for shots without masks."""
+
+    fixed_head: bool = False
+    free_focal: bool = False
+    jobs: int = 2
+
+
+class PreparedTeeth:
+    """The scans of a person, prepared for tracking.
+
+    Attributes:
+        scans: upper and lower teeth.
+        axes: rotation from scan to anatomical axes (left, up, front), shape (3, 3).
+        search: finds the teeth in pictures.
+    """
+
+    def __init__(self, capture: Capture, meshes: Mapping[str, Mesh], jaw: JawRig, map_: Mapper) -> None:
+        """Prepare the scans of a capture, registered as in the rig; `map_` runs the search in parallel.
+
+        Raises:
+            TrackingError: the scans are not in occlusion.
+        """
+        from jawusd.tracking.contour.scan import prepare_scan
+        from jawusd.tracking.region.picture_start import PictureStart
+
+        teeth = meshes["upper_teeth"], meshes["lower_teeth"]
+        self.scans = prepare_scan(teeth[0], "upper"), prepare_scan(teeth[1], "lower")
+        self.axes = subject_of_capture(capture, meshes).T_anatomical_skull[:3, :3]
+        self.search = PictureStart(teeth, self.scans, jaw, capture.anatomy.T_anatomical_skull, map_)
+
+
+class VideoShot:
+    """A shot, opened from the videos of its cameras.
+
+    Attributes:
+        cameras: calibrated cameras with a video, by name.
+        footage: their pictures.
+        take: follows the teeth.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        cameras: Mapping[str, Camera],
+        offsets: Mapping[str, int],
+        teeth: PreparedTeeth,
+        jaw: JawRig,
+        options: VideoOptions,
+    ) -> None:
+        """Open the videos of calibrated cameras, by name.
+
+        Raises:
+            CaptureError: no camera has a video, or one cannot be decoded.
+        """
+        from jawusd.segmentation.picture import ColourFootage
+        from jawusd.tracking.region.performance import PictureShot, PictureTake
+
+        videos = open_videos(capture)
+        self._capture, self._offsets, self._teeth = capture, offsets, teeth
+        self.cameras = {name: camera for name, camera in cameras.items() if name in videos}
+        self.footage = ColourFootage(videos, offsets)
+        shot = PictureShot(
+            cuts=self._cuts,
+            cameras=tuple(self.cameras.values()),
+            frames=range(*(capture.frames or self.footage.range())),
+            fps=capture.fps,
+            fixed_head=options.fixed_head,
+            free_focal=options.free_focal,
+        )
+        self._frames = shot.frames
+        self.take = PictureTake(jaw, teeth.scans, teeth.axes, shot)
+
+    def _cuts(self, placed: Sequence[Camera], centre: Array, frames: range) -> Iterator[Cut]:
+        table = {camera.name: camera for camera in placed}
+        return Cutter(table, self._teeth.scans, centre).walk(self.footage, frames)
+
+    def begin(self, progress: Progress) -> Start[Pose]:
+        """Return a start, from picks in at least two cameras, or from a frame on which the arches are apart.
+
+        Raises:
+            TrackingError: the teeth were not found.
+            CaptureError: a picture cannot be decoded.
+        """
+        if self._capture.bootstrap is not None and len(self.cameras) > 1:
+            return self._picked(self._capture.bootstrap)
+
+        def near(sources: Sequence[CameraSource], frame: int) -> Pose | None:
+            return self._teeth.search.at(sources, self.cameras, self._offsets, frame)
+
+        search = PictureSearch(self._capture, self.footage, len(self.cameras), near, self.take.begun)
+        return search.run(self._frames, progress)
+
+    def _picked(self, bootstrap: Bootstrap) -> Start[Pose]:
+        """Return a start from the picks."""
+        if bootstrap.frame not in self._frames:
+            raise picks_outside(bootstrap.frame, self._frames)
+        pose, fit = self.take.begun(bootstrap.frame, self._teeth.search.picked(bootstrap, self.cameras))
+        if fit < LEAST_FIT:
+            raise picks_mismatch(bootstrap.frame, fit)
+        return Start(bootstrap.frame, pose, fit, "picks")
+
+
+def solve_videos(
+    capture: Capture,
+    cameras: Mapping[str, Camera],
+    offsets: dict[str, int],
+    meshes: Mapping[str, Mesh],
+    jaw: JawRig,
+    options: VideoOptions,
+    progress: Progress,
+) -> Performance:
+    """Solve a shot from the videos of its cameras, calibrated and by name; see `solve`.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+        TrackingError: the teeth were not found.
+    """
+    with ThreadPoolExecutor(options.jobs) as pool:
+        teeth = PreparedTeeth(capture, meshes, jaw, pool.map)
+        shot = VideoShot(capture, cameras, offsets, teeth, jaw, options)
+        begin = shot.begin(progress)
+        found = shot.take.solve(begin.frame, begin.pose, partial(progress, "solve"))
+    found.notes["start"] = {"by": begin.by, "frame": begin.frame, "fit": begin.fit}
+    found.notes["findings"] = [finding.as_json() for finding in teeth.search.findings]
+    return found
+
+
+#: Suffixes of the files that a performance can be written to.
 SUFFIXES = (".csv", ".npz", ".usdc", ".usda")
 _USD = (".usd", ".usda", ".usdc", ".usdz")
-_LISTED_RUNS = 20
 
 
 class SolveSummary(TypedDict):
-    """Hold what a person should know of a performance; counts are numbers of frames."""
+    """Key figures of a performance; counts are numbers of frames."""
 
     frames: int
     solved: int
-    carried: list[tuple[int, int]]  # runs of frames, first and last, in which an arch is out of sight
-    lost: list[tuple[int, int]]  # the same in which nothing fits the pictures
-    within_tolerance: int  # outside the bound, but no farther than measured poses may
-    outside: int  # beyond what the rig allows
+    carried: list[tuple[int, int]]  # runs of frames, first and last, in which an arch is occluded
+    lost: list[tuple[int, int]]  # runs in which no pose fits the pictures
+    within_tolerance: int  # outside the bound, within the tolerance of measured poses
+    outside: int  # beyond the tolerance
     cameras: list[str]
     sigma_mm: dict[str, float]  # median standard deviation of d1, d2, d3 over solved frames
     worst_sigma_mm: dict[str, float]  # the largest over all frames
-    limits: str  # what the result is worth, in words
-    focal: NotRequired[dict[str, tuple[float, float]]]  # found over calibrated, with sigma, by camera
+    limits: str  # what limits the accuracy, in words
+    focal: NotRequired[
+        dict[str, tuple[float, float]]
+    ]  # ratio of estimated to calibrated focal length, with sigma, by camera
     findings: NotRequired[list[dict[str, str | float | int]]]
 
 
@@ -70,15 +212,15 @@ def solve(
 
     Args:
         rig: `actor.usda`, another layer of it, or `model.npz`.
-        shot: the capture of the shot, its capture.toml or the folder that holds it. If no camera has masks, the
-            videos themselves are followed by their colours.
+        shot: the capture of the shot, its capture.toml or folder. Without any masks, the teeth are followed in the
+            videos by their colours.
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
-        prim: which rig, where a stage has several; an animation layer then goes over the stage.
+        prim: path of the rig's prim, if a stage has several; an animation layer then targets the stage.
         overlay: video to write (.mp4) of the solved scans over all cameras side by side.
-        report: page to write (.html): d with sigma, what could not be seen, verdicts, findings and pictures.
-        fixed_head: the cameras are worn, as on a helmet: the head does not move before them.
-        free_focal: the focal lengths of the calibration are guesses, good to a tenth.
-        jobs: threads that search for the start, and make masks; the result does not depend on it.
+        report: page to write (.html): d with sigma, unseen frames, verdicts, findings and pictures.
+        fixed_head: the cameras are head-mounted.
+        free_focal: estimate focal lengths; those of the calibration are good to 10 %.
+        jobs: number of threads; the result does not depend on it.
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
@@ -114,7 +256,7 @@ def solve(
                 threads=jobs,
                 progress=solving,
             )
-            findings += take_up_guide(capture, tracks_of(found, jaw), jaw.landmarks)[1]
+            findings += combine_guide(capture, tracks_of(found, jaw), jaw.landmarks)[1]
         else:
             table = {camera.name: camera for camera in cameras}
             options = VideoOptions(fixed_head, free_focal, jobs)
@@ -139,7 +281,7 @@ def write_solved(
     fps: float,
     prim: str | None = None,
 ) -> None:
-    """Write a performance as the suffix of the file says; see `solve`.
+    """Write a performance to a file of the kind given by its suffix; see `solve`.
 
     Raises:
         OutputError: the file cannot be written.
@@ -169,29 +311,27 @@ def check_output(
     overlay: str | os.PathLike[str] | None = None,
     report: str | os.PathLike[str] | None = None,
 ) -> None:
-    """Check, before any work, that a performance, its overlay and its report can be written to files of these names.
+    """Check, before any work, the suffixes of a performance, its overlay and its report.
 
     Raises:
-        OutputError: a suffix says nothing, or something else.
-        RigError: an animation layer needs a rig in USD.
-        MissingDependencyError: the packages that draw a report are not installed.
+        OutputError: a suffix is not supported.
+        RigError: an animation layer needs a USD rig.
+        MissingDependencyError: packages of the report are not installed.
     """
     if report is not None:
         check_page(report)
     if overlay is not None and Path(overlay).suffix.lower() != VIDEO:
-        raise OutputError("is no name of an overlay, which is one video.", path=overlay, hint=f"End it in {VIDEO}.")
+        raise OutputError("an overlay is a single video.", path=overlay, hint=f"Name a file ending in {VIDEO}.")
     if out is None:
         return
     if Path(out).suffix.lower() in _USD and Path(rig).suffix.lower() not in _USD:
-        raise RigError("is no USD rig, which an animation layer needs.", path=rig, hint="Name actor.usda of the rig.")
+        raise RigError("is not a USD rig, which an animation layer needs.", path=rig, hint="Name the rig's actor.usda.")
     if Path(out).suffix.lower() not in SUFFIXES:
-        raise OutputError(
-            "its suffix does not say what to write.", path=out, hint=f"Name a file ending in {', '.join(SUFFIXES)}."
-        )
+        raise OutputError("has an unsupported suffix.", path=out, hint=f"Name a file ending in {', '.join(SUFFIXES)}.")
 
 
 def solve_summary(performance: Performance) -> SolveSummary:
-    """Sum up a performance."""
+    """Return the key figures of a performance."""
     p = performance
     solved = p.state == SolveState.SOLVED
     sigma = p.sigma_d
@@ -224,25 +364,3 @@ def _runs(p: Performance, state: SolveState) -> list[tuple[int, int]]:
         else:
             runs.append((frame, frame))
     return runs
-
-
-def solve_lines(summary: SolveSummary) -> list[str]:
-    """Return `solve_summary` as text."""
-    lines = [f"solved {summary['solved']} of {summary['frames']} frames with {', '.join(summary['cameras'])}"]
-    for word, runs in (("carried by the motion around", summary["carried"]), ("lost", summary["lost"])):
-        if runs:
-            more = "" if len(runs) <= _LISTED_RUNS else f" and {len(runs) - _LISTED_RUNS} more runs"
-            listed = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:_LISTED_RUNS])
-            lines.append(f"  {word}: {sum(b - a + 1 for a, b in runs)} frames ({listed}{more})")
-    if summary["within_tolerance"]:
-        lines.append(f"  outside the rig's bound, within its tolerance: {summary['within_tolerance']} frames")
-    if summary["outside"]:
-        lines.append(f"  outside the rig's bound: {summary['outside']} frames")
-    sigma = ", ".join(f"{name} {value:.3f}" for name, value in summary["sigma_mm"].items())
-    lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")
-    worst = ", ".join(f"{name} {value:.2f}" for name, value in summary["worst_sigma_mm"].items())
-    lines.append(f"  largest: {worst}")
-    for name, (factor, sigma_factor) in summary.get("focal", {}).items():
-        lines.append(f"  focal length of {name}: {factor:.4f} times the calibrated one (+-{sigma_factor:.4f})")
-    lines.append(f"  limited by {summary['limits']}")
-    return [*lines, *(f"  {Finding.from_json(found).line()}" for found in summary.get("findings", []))]

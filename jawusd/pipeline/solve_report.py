@@ -15,20 +15,19 @@ from jawusd.formats.performance import SolveState
 from jawusd.formats.report import Overlay, SolveReportData
 from jawusd.formats.tracks import Tracks, load_tracks, worst_frames
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.cameras import load_cameras, tracked_cameras
+from jawusd.pipeline.cameras import check_same_cameras, load_cameras, open_backdrops, tracked_cameras, tracked_scans
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.media import check_same_cameras, draw_frames, open_backdrops, tracked_scans
-from jawusd.pipeline.origin import package_versions
+from jawusd.pipeline.pictures import draw_frames
 from jawusd.pipeline.report import attempt, camera_facts
-from jawusd.pipeline.state import Progress, make_folder
+from jawusd.pipeline.state import Progress, make_folder, package_versions
 
 PAGE = ".html"
-_MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # frames shown for each reason; one typical one is added
+_MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # frames shown for each reason, besides a typical one
 
 
 @explain_missing_packages()
 def check_page(path: str | os.PathLike[str]) -> None:
-    """Check, before any work, that a report can be written to a file of that name.
+    """Check, before any work, that a report can be written to a file of this name.
 
     Raises:
         OutputError: its suffix is not .html.
@@ -37,22 +36,22 @@ def check_page(path: str | os.PathLike[str]) -> None:
     import jawusd.report.solve_page  # noqa: F401
 
     if Path(path).suffix.lower() != PAGE:
-        raise OutputError("is no name of a report, which is a page.", path=path, hint=f"End it in {PAGE}.")
+        raise OutputError("a report is an HTML page.", path=path, hint=f"Name a file ending in {PAGE}.")
 
 
 def report_solve(
     tracks: Path, capture: str | os.PathLike[str] | None, page: Path, progress: Progress, *, allow_outside: bool = False
 ) -> Path:
-    """Write the report of a solve from the tracks it wrote, and return its path.
+    """Write the report of a solve from its tracks, and return its path.
 
     Args:
         tracks: the .npz that `solve` wrote.
-        capture: the shot, its capture.toml or folder; without it there are no pictures and nothing about the cameras.
+        capture: the shot, its capture.toml or folder; None: a report without pictures and cameras.
         page: file to write.
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
-        FormatError: not the tracks of a solve.
+        FormatError: the tracks do not come from a solve.
         CaptureError, SyncError: the shot cannot be read.
         OutputError: the page cannot be written.
     """
@@ -61,7 +60,7 @@ def report_solve(
         found = load_tracks(tracks)
         if found.solved is None:
             raise FormatError(
-                "holds tracks that no solve made.",
+                "contains tracks that do not come from a solve.",
                 hint="Name the .npz that `jawusd solve` wrote, or the folder of a build.",
             )
         if capture is None:
@@ -98,7 +97,7 @@ def _write(
     left_out: list[str] = []
     overlays: tuple[Overlay, ...] | None = None
     if capture is None:
-        left_out.append("pictures and cameras: no shot was named (--capture).")
+        left_out.append("pictures and cameras: no shot was given (--capture).")
     else:
         shot = capture
         overlays = attempt("pictures", left_out, lambda: _overlays(shot, offsets, tracks))
@@ -121,7 +120,7 @@ def _write(
 def _rate(tracks: Tracks) -> float:
     rate = tracks.meta.get("fps")
     if not isinstance(rate, float) or not 0 < rate < math.inf:
-        raise FormatError("does not say its frames per second.", hint="Name the shot with --capture.")
+        raise FormatError("does not state its frame rate.", hint="Name the shot with --capture.")
     return rate
 
 
@@ -136,21 +135,21 @@ def _overlays(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> t
 
 
 def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return rows of frames to look at, each with the reason: unseen, outside, uncertain, and a usual one.
+    """Return rows of frames to inspect, each with the reason: unseen, outside, uncertain, or typical.
 
     Raises:
-        ValueError: the tracks are not those of a solve.
+        ValueError: the tracks do not come from a solve.
     """
     solved = tracks.solved
     if solved is None:
-        raise ValueError("the tracks hold no solved performance")
+        raise ValueError("the tracks have no solved performance")
     sigma, seen = solved.sigma_mm.max(axis=1), solved.state == SolveState.SOLVED
     found: list[tuple[int, str]] = []
     for has, badness, most, words in (
         (solved.state == SolveState.LOST, sigma, _MOST_UNSEEN, "lost, expected error up to {:.2f} mm"),
-        (solved.state == SolveState.CARRIED, sigma, _MOST_UNSEEN, "out of sight, expected error up to {:.2f} mm"),
+        (solved.state == SolveState.CARRIED, sigma, _MOST_UNSEEN, "occluded, expected error up to {:.2f} mm"),
         (~solved.valid, -solved.margin_mm, _MOST_OUTSIDE, "{:.2f} mm outside the rig's bound, more than its tolerance"),
-        (seen, sigma, _MOST_UNCERTAIN, "solved, but with one of the largest expected errors, {:.2f} mm"),
+        (seen, sigma, _MOST_UNCERTAIN, "solved, with one of the largest expected errors, {:.2f} mm"),
     ):
         values = np.where(has, badness, np.nan)
         rows = worst_frames(values, tracks.frames, fps, most, [row for row, _ in found])
@@ -158,12 +157,12 @@ def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
     if seen.any():
         rows_seen = np.flatnonzero(seen)
         usual = int(rows_seen[np.argsort(sigma[rows_seen])[len(rows_seen) // 2]])
-        found.append((usual, f"a usual one, expected error {sigma[usual]:.2f} mm"))
+        found.append((usual, f"a typical frame, expected error {sigma[usual]:.2f} mm"))
     return found
 
 
 def solve_limits(cameras: Sequence[str]) -> str:
-    """Say what limits the accuracy of a solve from these cameras."""
+    """Return what limits the accuracy of a solve from these cameras, in words."""
     if len(cameras) == 1:
-        return "having one camera: errors lie along its line of sight, which a second camera shows"
-    return "the rig: its own error at the condyles is larger than that of the outlines"
+        return "having a single camera: errors are largest along its line of sight"
+    return "the rig: its error at the condyles exceeds that of the outlines"

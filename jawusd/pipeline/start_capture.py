@@ -1,4 +1,4 @@
-"""Look at a folder of footage and scans, and write a capture.toml for it that says what is missing."""
+"""Draft a capture.toml from a folder of footage and scans, and list what is missing."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import numpy as np
 from jawusd.base.errors import CaptureError, JawusdError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture_template import BoardSketch, CameraSketch, CaptureSketch, capture_text
-from jawusd.pipeline.camera_convert import SameSize, read_calibration
+from jawusd.pipeline.cameras import SameSize, read_calibration
 from jawusd.pipeline.folder_files import FoundFiles, camera_names, find_files, pair, with_masks, words
 from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:
     from jawusd.media.clip import Clip
 
-_PICTURES = 5  # of a board clip that are looked at
+_PICTURES = 5  # number of pictures of a board clip that are examined
 _USUAL_RATES = tuple(Fraction(n, d) for d in (1, 1001) for n in (24 * d, 25 * d, 30 * d, 50 * d, 60 * d, 120 * d)) + (
     *(Fraction(n * 1000, 1001) for n in (24, 30, 60, 120)),
 )
@@ -30,7 +30,7 @@ _RATE_TOLERANCE = 2e-4  # 24 and 23.976 differ by 1e-3
 
 @dataclass
 class CaptureStart:
-    """Hold a capture begun from a folder: its description, what was found, and what is missing or to be looked at."""
+    """A draft capture: its description, what was found, what is missing, and notes."""
 
     path: Path
     sketch: CaptureSketch
@@ -41,19 +41,19 @@ class CaptureStart:
 
 @explain_missing_packages()
 def start_capture(folder: Path, square_mm: float | None, fps: float | None, progress: Progress) -> CaptureStart:
-    """Look at a folder and return the capture begun from it; nothing is written.
+    """Return a draft capture of a folder; nothing is written.
 
     Args:
-        folder: with footage, scans, and clips of a board or a calibration.
-        square_mm: side of the board's squares, which no picture tells [mm].
-        fps: rate of the clips; theirs if None.
+        folder: folder with footage, scans, and board clips or a calibration.
+        square_mm: side of the board's squares, which pictures do not show [mm].
+        fps: frame rate; None: that of the clips.
 
     Raises:
-        CaptureError: it is no folder.
+        CaptureError: the path is not a folder.
     """
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "there is no such folder"
-        raise CaptureError(f"{what}.", path=folder, hint="Name the folder that holds footage and scans.")
+        raise CaptureError(f"{what}.", path=folder, hint="Name the folder of footage and scans.")
     files = find_files(folder)
     name = re.sub(r"[^A-Za-z0-9_\-. ]+", "_", folder.resolve().name).strip() or "capture"
     out = CaptureStart(folder / "capture.toml", CaptureSketch(name))
@@ -68,32 +68,19 @@ def start_capture(folder: Path, square_mm: float | None, fps: float | None, prog
         out.missing.append("a calibration of the cameras, or a clip of a chessboard per camera")
     fps = fps or rate
     if fps is None and cameras:
-        out.missing.append("fps, the rate of the pictures: no file says it")
+        out.missing.append("fps, the frame rate: no file states it")
     out.sketch = CaptureSketch(name, fps, scans, tuple(cameras), calibration, board)
     progress("look", 3, 3)
     return out
 
 
 def write_start(start: CaptureStart) -> None:
-    """Write the capture.toml of a capture begun.
+    """Write capture.toml.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     write_text_atomic(start.path, capture_text(start.sketch))
-
-
-def start_lines(start: CaptureStart) -> list[str]:
-    """Return what was found and what is missing as text."""
-    folder = start.path.parent
-    lines = [f"{start.path}", *(f"  {line}" for line in start.found), *(f"note: {line}." for line in start.notes)]
-    if start.missing:
-        return [
-            *lines,
-            *(f"missing: {line}." for line in start.missing),
-            f"Fill in {start.path}, then: jawusd check {folder}",
-        ]
-    return [*lines, f"next: jawusd check {folder}"]
 
 
 def _scans(files: FoundFiles, out: CaptureStart) -> dict[str, PurePath]:
@@ -104,16 +91,16 @@ def _scans(files: FoundFiles, out: CaptureStart) -> dict[str, PurePath]:
             found[key] = paths[0]
             out.found.append(f"{key}: {paths[0]}")
         elif len(paths) > 1:
-            out.missing.append(f"{key}: {_listed(paths)} may all be it; name one (one folder is one person)")
+            out.missing.append(f"{key}: {_listed(paths)} are all candidates; name one (a folder is for one person)")
         elif what:
             unknown = files.scans.get("", [])
-            more = f"; {_listed(unknown)} may be it, but the name does not say" if unknown else ""
+            more = f"; perhaps {_listed(unknown)}, but the name does not show it" if unknown else ""
             out.missing.append(f"{key}, the scan of the {what} (PLY, STL or OBJ){more}")
     return found
 
 
 def _calibration(folder: Path, files: FoundFiles, out: CaptureStart) -> tuple[PurePath | None, list[str]]:
-    """Return the file that holds cameras, and their names."""
+    """Return the calibration file, and the names of its cameras."""
     readable: dict[PurePath, list[str]] = {}
     for path in files.calibrations:
         if path.name == "images.txt":
@@ -125,7 +112,7 @@ def _calibration(folder: Path, files: FoundFiles, out: CaptureStart) -> tuple[Pu
         except JawusdError:
             continue
     if len(readable) > 1:
-        out.notes.append(f"{_listed(list(readable))} hold cameras; the first is taken")
+        out.notes.append(f"{_listed(list(readable))} contain cameras; the first is used")
     for path, names in readable.items():
         out.found.append(f"calibration: {path} ({', '.join(names)})")
         return path, names
@@ -135,7 +122,7 @@ def _calibration(folder: Path, files: FoundFiles, out: CaptureStart) -> tuple[Pu
 def _cameras(
     folder: Path, files: FoundFiles, calibrated: Sequence[str], out: CaptureStart
 ) -> tuple[list[CameraSketch], float | None]:
-    """Return the cameras with footage, masks and board clips, and the rate of the clips."""
+    """Return the cameras with footage, masks and board clips, and the frame rate of the clips."""
     opened = _opened(folder, files.clips, out)
     names = camera_names(list(opened))
     if calibrated:
@@ -143,7 +130,7 @@ def _cameras(
     boards, by_name = pair(names, files.boards)
     if boards and not by_name:
         listed = ", ".join(f"{names[clip]}: {board}" for clip, board in boards.items())
-        out.notes.append(f"the names do not say which board clip is whose; taken in order ({listed})")
+        out.notes.append(f"the names do not show which camera each board clip belongs to; matched in order ({listed})")
     cameras = [
         CameraSketch(names[clip], clip, board=boards.get(clip), remark=_remark(video)) for clip, video in opened.items()
     ]
@@ -155,9 +142,9 @@ def _cameras(
         if files.boards and not camera.board and not calibrated:
             out.missing.append(f"the board clip of camera {camera.name}")
     if len(cameras) < 2:
-        out.missing.append(f"footage of two cameras or more; found {len(cameras)}")
+        out.missing.append(f"footage of at least two cameras; found {len(cameras)}")
     if 0 < sum(bool(camera.masks) for camera in cameras) < len(cameras):
-        out.notes.append("some cameras have masks and some have none; those without are not tracked with")
+        out.notes.append("only some cameras have masks; the others are not used for tracking")
     return cameras, _rate(opened, out)
 
 
@@ -169,13 +156,13 @@ def _opened(folder: Path, clips: Sequence[PurePath], out: CaptureStart) -> dict[
         try:
             found[clip] = open_clip(folder / clip)
         except JawusdError as error:
-            out.notes.append(f"{clip} is left out: {error.statement().rstrip('.')}")
+            out.notes.append(f"{clip} is skipped: {error.statement().rstrip('.')}")
     return found
 
 
 def _remark(video: Clip) -> str:
     width, height = video.size_px
-    return f"{width} x {height} px, {video.count} pictures, {video.timeline.rate:.5g} per second"
+    return f"{width} x {height} px, {video.count} frames, {video.timeline.rate:.5g} fps"
 
 
 def _rate(opened: Mapping[PurePath, Clip], out: CaptureStart) -> float | None:
@@ -185,7 +172,7 @@ def _rate(opened: Mapping[PurePath, Clip], out: CaptureStart) -> float | None:
     found = float(np.median(list(rates.values())))
     for path, rate in rates.items():
         if abs(rate / found - 1) > 5e-3:
-            out.notes.append(f"{path} has {rate:.5g} pictures per second, the others {found:.5g}")
+            out.notes.append(f"{path} has {rate:.5g} fps, the others {found:.5g}")
     usual = min(_USUAL_RATES, key=lambda rate: abs(float(rate) / found - 1))
     return round(float(usual) if abs(float(usual) / found - 1) < _RATE_TOLERANCE else found, 5)
 
@@ -193,7 +180,7 @@ def _rate(opened: Mapping[PurePath, Clip], out: CaptureStart) -> float | None:
 def _named_as_calibrated(
     names: dict[PurePath, str], calibrated: Sequence[str], out: CaptureStart
 ) -> dict[PurePath, str]:
-    """Return the calibration's names for the cameras, by the words they share with the clips."""
+    """Return the camera names of the calibration, matched by the words of the clips' paths."""
     fits: dict[PurePath, str] = {}
     for clip in names:
         own = set(words(clip))
@@ -203,8 +190,8 @@ def _named_as_calibrated(
     if len(fits) == len(names):
         return fits
     out.missing.append(
-        f"the cameras' names: the calibration has {', '.join(calibrated)}, the clips are {_listed(list(names))}; "
-        "give each [[camera]] the calibration's name"
+        f"the camera names: the calibration has {', '.join(calibrated)}, the clips are {_listed(list(names))}; "
+        "give each [[camera]] its name in the calibration"
     )
     return names
 
@@ -230,13 +217,13 @@ def _board(
         out.missing.append("[boards] cols and rows: no chessboard was found in the board clips")
     elif board.pattern == "charuco":
         out.missing.append(
-            "[boards] cols and rows, one less than the ChArUco board has squares, and marker_mm, the side of a marker"
+            "[boards] cols and rows, one less than the squares of the ChArUco board, and marker_mm, the marker's side"
         )
     if seen:
         size = f"{board.cols} x {board.rows} inner corners" if board.cols else f"markers of {board.dictionary}"
         out.found.append(f"board: {board.pattern}, {size}")
     if square_mm is None:
-        out.missing.append("[boards] square_mm, the side of a square: measure the printed board (or give --square-mm)")
+        out.missing.append("[boards] square_mm, the side of a square: measure the printed board (or use --square-mm)")
     return sketch
 
 

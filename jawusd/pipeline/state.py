@@ -9,19 +9,24 @@ import json
 import logging
 import math
 import os
+import platform
 import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib import metadata
 from pathlib import Path, PurePosixPath
 from typing import Generic, TypeVar
 
 from jawusd.base.errors import FormatError, OutputError
 from jawusd.base.inputs import check_input, check_path
 from jawusd.base.npz import check_format
+from jawusd.base.version import __version__
 from jawusd.formats.atomic import ELSEWHERE, clear_unfinished, destination, write_text_atomic
 from jawusd.formats.finding import Finding
+from jawusd.formats.report import Origin
 from jawusd.formats.text import parse_json, read_text
 
 FAMILY, VERSION = "jawusd-build", 1
@@ -31,12 +36,12 @@ CALIBRATION = "calibration.toml"  # made from the boards when the capture names 
 LABELS = "labels"  # folder of the labels of scans that are neither painted nor labelled
 FIRST_PASS = "first_pass.npz"  # tracks without the model's help: what the model is fitted to
 _CHUNK_BYTES = 1 << 20
-_ENDING_S = 2.0  # a killed build holds its lock until the system has taken back its memory
+_ENDING_S = 2.0  # a killed build keeps its lock until the system has freed its memory
 _MOST_BYTES = 64 << 20  # of build.json, which names the masks of the longest takes
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-# What a lock that another process holds is reported as; all others mean that there are no locks.
+# Error numbers of a lock held by another process; any other means that the file system has no locks.
 _HELD = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
-_MAKE_AGAIN = "Make it again with `jawusd build ... --resume`, or put back the file that the build wrote."
+_MAKE_AGAIN = "Run `jawusd build ... --resume` to make it again, or restore the file that the build wrote."
 _AGAIN = "Delete it, or build with --fresh into a new folder."
 
 #: Called with (stage, done, total) as work proceeds; total is 0 when unknown.
@@ -44,7 +49,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def no_progress(stage: str, done: int, total: int) -> None:
-    """Ignore the progress of work."""
+    """Ignore progress."""
 
 
 def hash_files(paths: Iterable[Path]) -> str:
@@ -71,7 +76,7 @@ R_co = TypeVar("R_co", bound=Mapping[str, object], covariant=True)
 
 @dataclass(frozen=True)
 class StageRecord(Generic[R_co]):
-    """Record one finished stage."""
+    """One finished stage."""
 
     inputs: str  # hash of everything the stage read: files, configuration, results of earlier stages
     outputs: dict[str, str]  # hash by file name, relative to the folder
@@ -84,7 +89,7 @@ Stages = Mapping[str, StageRecord[Mapping[str, object]]]
 
 
 class BuildState:
-    """Keep the record of finished stages of one output folder."""
+    """The record of finished stages of one output folder, kept in build.json."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -114,17 +119,17 @@ class BuildState:
         try:
             if not path.is_file():
                 return "is missing"
-            return "" if hash_files([path]) == expected else "was changed or exchanged"
+            return "" if hash_files([path]) == expected else "was modified or replaced"
         except OSError as error:
             return f"cannot be read ({error.strerror})"
 
     def result(self, stage: str, kind: type[R]) -> R | None:
-        """Return the result of a stage, checked to be of a kind; None if the stage has not ended.
+        """Return the result of a stage, checked against its type; None if the stage is not recorded.
 
         Raises:
-            FormatError: it is of another kind.
+            FormatError: it has another type.
         """
-        from jawusd.formats.text import of_kind  # which few commands need
+        from jawusd.formats.text import of_kind  # rarely needed
 
         record = self.stages.get(stage)
         return None if record is None else of_kind(record.result, kind, stage, self.folder / BUILD_FILE, _AGAIN)
@@ -159,11 +164,11 @@ def _read(path: Path) -> dict[str, StageRecord[Mapping[str, object]]]:
     try:
         data = parse_json(read_text(path, _MOST_BYTES), path)
         if not isinstance(data, dict):
-            raise ValueError("is no object")
+            raise ValueError("it is not a JSON object")
         check_format(data.get("format"), FAMILY, VERSION, path)
-        # The hash shows that results are what jawusd wrote, unless somebody forged it: see `BuildState.result`.
+        # The hash detects accidental edits, not forgery; types are checked in `BuildState.result`.
         if data["sha256"] != hash_value(data["stages"]):
-            raise ValueError("changed since it was written")
+            raise ValueError("it was modified after it was written")
         return {str(name): _record(found) for name, found in data["stages"].items()}
     except (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError) as error:
         raise FormatError(f"is damaged ({error}).", path=path, hint=_AGAIN) from error
@@ -172,18 +177,18 @@ def _read(path: Path) -> dict[str, StageRecord[Mapping[str, object]]]:
 def _record(found: Mapping[str, object]) -> StageRecord[Mapping[str, object]]:
     inputs, outputs, seconds, result = (found[name] for name in ("inputs", "outputs", "seconds", "result"))
     if not (isinstance(inputs, str) and isinstance(outputs, dict) and isinstance(result, dict)):
-        raise ValueError("inputs are no text, or outputs or result no table")
+        raise ValueError("inputs must be text, outputs and result must be tables")
     for name, value in outputs.items():
         place = PurePosixPath(name)
         if place.is_absolute() or ".." in place.parts or not _SHA256.fullmatch(str(value)):
-            raise ValueError(f'outputs hold "{name}", which is no file of the folder with its hash')
+            raise ValueError(f'outputs name "{name}", which is not a file inside the folder with a hash')
     if not isinstance(seconds, int | float) or not math.isfinite(float(seconds)):
-        raise ValueError("seconds are no number")
+        raise ValueError("seconds must be a finite number")
     return StageRecord(inputs, outputs, float(seconds), result)
 
 
 def changed_files(folder: Path) -> list[Finding]:
-    """Return what is wrong with the files of a build, nothing for a folder that no build wrote; see `BuildState`."""
+    """Return the files of a build that are missing or modified; an empty list for any other folder."""
     try:
         return BuildState(folder).changed()
     except FormatError as error:
@@ -205,12 +210,12 @@ def make_folder(path: Path) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the output folder for one build; the system releases the lock when the process ends, however it ends.
+    """Lock the output folder for one build; the system releases the lock when the process ends, even if it is killed.
 
-    What a killed build left unfinished is deleted. Where the file system has no locks, a warning says so.
+    Temporary files of a killed build are deleted. A file system without locks gets a warning.
 
     Raises:
-        OutputError: the folder cannot be written, another build holds it, or its labels would go elsewhere by a link.
+        OutputError: the folder cannot be written, another build holds the lock, or its labels folder is a link.
     """
     make_folder(folder)
     try:
@@ -219,7 +224,7 @@ def locked(folder: Path) -> Iterator[None]:
         raise OutputError(f"cannot write here: {error.strerror}.", path=folder, hint=ELSEWHERE) from error
     try:
         if (folder / LABELS).is_symlink():
-            raise OutputError("is a link; a build writes into its own folder only.", path=folder / LABELS)
+            raise OutputError("is a symbolic link; a build only writes inside its own folder.", path=folder / LABELS)
         if _lock(handle, folder):
             clear_unfinished(folder)
         yield
@@ -228,7 +233,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _lock(handle: int, folder: Path) -> bool:
-    """Take the operating system's lock on an open file; return False, with a warning, where there are no locks.
+    """Lock an open file; return False, with a warning, if the file system has no locks.
 
     Raises:
         OutputError: another process holds it.
@@ -240,12 +245,12 @@ def _lock(handle: int, folder: Path) -> bool:
             return True
         except OSError as error:
             if error.errno not in _HELD:
-                message = f"there are no locks here ({error.strerror}); start no second build in this folder"
+                message = f"the file system has no locks ({error.strerror}); do not start a second build in this folder"
                 logging.getLogger(__name__).warning(Finding("no_lock", "warning", message, path=str(folder)).line())
                 return False
             if time.monotonic() > deadline:
-                hint = "Wait for it, or name another one."
-                raise OutputError("another jawusd build is working in this folder.", path=folder, hint=hint) from error
+                hint = "Wait until it ends, or choose another folder."
+                raise OutputError("another jawusd build is running in this folder.", path=folder, hint=hint) from error
         time.sleep(0.05)
 
 
@@ -258,3 +263,32 @@ def _take(handle: int) -> None:
         import fcntl
 
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+_PACKAGES = ("numpy", "scipy", "numba", "usd-core", "opencv-contrib-python-headless", "av")
+
+
+def origin_now(command: str) -> Origin:
+    """Return the current time and package versions, with the command line ("" if none)."""
+    return Origin(datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"), command, package_versions())
+
+
+def recorded_origin(result: Mapping[str, object]) -> Origin:
+    """Return the origin recorded by the report stage; empty for builds of earlier versions."""
+    found = result.get("origin")
+    if not isinstance(found, dict):
+        return Origin("", "", {})
+    versions = found.get("versions")
+    named = {str(name): str(version) for name, version in versions.items()} if isinstance(versions, dict) else {}
+    return Origin(str(found.get("finished", "")), str(found.get("command", "")), named)
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of this package, of Python and of the packages that results depend on."""
+    found = {"jawusd": __version__, "Python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found

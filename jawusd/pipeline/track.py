@@ -1,8 +1,7 @@
-"""Track the teeth of a capture: the first pass, the pass with the fitted model as a prior, and what to say of both."""
+"""Track the teeth of a capture: the first pass, the second pass with the fitted model as a prior, and summaries."""
 
 from __future__ import annotations
 
-import math
 import os
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,6 @@ from typing_extensions import TypedDict
 from jawusd.base.errors import TrackingError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
-from jawusd.formats.finding import Finding
 from jawusd.formats.model import JawModel
 from jawusd.formats.notes import TakeNotes
 from jawusd.formats.tracks import (
@@ -31,22 +29,19 @@ from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.meshes import load_labelled, load_meshes, registered_meshes
-from jawusd.pipeline.overlay import write_overlay
-from jawusd.pipeline.segment_guide import take_up_guide
+from jawusd.pipeline.follow import track_videos
+from jawusd.pipeline.pictures import write_overlay
+from jawusd.pipeline.segment_guide import combine_guide
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress, no_progress
-from jawusd.pipeline.subject import subject_of_capture
-from jawusd.pipeline.track_pictures import track_videos
+from jawusd.pipeline.subject import load_labelled, load_meshes, registered_meshes, subject_of_capture
 
 if TYPE_CHECKING:
     from jawusd.tracking import TrackingConfig
 
-_LISTED_FRAMES = 20
-
 
 class TrackSummary(TakeNotes):
-    """Hold what a person should know of tracks; numbers of frames, unless the name says otherwise."""
+    """Key figures of tracks; counts are numbers of frames."""
 
     frames: int
     tracked: int
@@ -55,13 +50,13 @@ class TrackSummary(TakeNotes):
     recovered: int
     without_a_camera: int
     prior_aided: int
-    sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if not known
-    coverage_error_percent: float | None  # share of the masks used that is left uncovered, None without any
-    frames_used: NotRequired[dict[str, int]]  # frames that a camera took part in, by camera
+    sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if unknown
+    coverage_error_percent: float | None  # uncovered share of the masks used, None without masks
+    frames_used: NotRequired[dict[str, int]]  # number of frames that used a camera, by camera
 
 
 class ArchSummary(TypedDict):
-    """Hold how one arch was tracked in a frame; cameras by name, and of a lost arch the figure found and its limit."""
+    """Tracking of one arch in a frame; of a lost arch also the figure that failed, and its limit."""
 
     status: str
     masks_used: list[str]
@@ -75,7 +70,7 @@ class ArchSummary(TypedDict):
 
 
 class FrameTrackSummary(TypedDict):
-    """Hold how one frame was tracked."""
+    """Tracking of one frame."""
 
     frame: int
     prior_aided: bool
@@ -94,24 +89,24 @@ def track(
     allow_outside: bool = False,
     progress: Progress | None = None,
 ) -> Tracks:
-    """Track both arches of a capture through its masks, and write the tracks if a file is named.
+    """Track both arches of a capture, by its masks or else its videos, and optionally write the tracks.
 
     Args:
-        capture: the capture, its capture.toml or the folder that holds it.
+        capture: the capture, its capture.toml or its folder.
         out: `tracks.npz` to write.
-        solver: "contour", or "paper" for the paper's own method, to compare with.
+        solver: "contour", or "paper" for the paper's method, for comparison.
         backend: where the paper's method draws, "cpu" or "gl".
-        model: jaw model of this person: uncertain frames are tracked again with it as a prior.
-        overlay: folder, or .mp4 file, for videos with the tracked scans over the footage; see `overlay.write_overlay`.
-        jobs: threads of the tracker; the result does not depend on it.
+        model: jaw model of this person, used as a prior to track uncertain frames again.
+        overlay: folder, or .mp4 file, for videos with the tracked scans over the footage; see `write_overlay`.
+        jobs: number of threads; the result does not depend on it.
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
         FormatError, CaptureError: the capture cannot be read, or a mask or video in it.
         SyncError: the cameras cannot be aligned in time.
-        TrackingError: the teeth cannot be found in the masks.
+        TrackingError: the teeth are not found.
         OutputError: a file cannot be written.
-        MissingDependencyError: the extra `build` is not installed, or there is no OpenGL for the GL backend.
+        MissingDependencyError: the extra `build` is not installed, or OpenGL is missing for the GL backend.
     """
     progress = progress or no_progress
     capture = open_capture(capture, allow_outside=allow_outside)
@@ -168,7 +163,7 @@ def first_pass(
             tracks = track_capture(
                 capture, cameras, offsets, upper, lower, landmarks, config, threads=jobs, progress=report
             )
-            tracks, doubts = take_up_guide(capture, tracks, landmarks)
+            tracks, doubts = combine_guide(capture, tracks, landmarks)
             if auto_masks_folder(capture) is not None:
                 tracks = widen_strained(tracks, landmarks, subject.T_anatomical_skull[:3, :3])
             findings = [*findings, *doubts]
@@ -182,7 +177,7 @@ def first_pass(
 def model_pass(
     capture: Capture, offsets: dict[str, int], tracks: Tracks, model: JawModel, jobs: int, progress: Progress
 ) -> Tracks:
-    """Track uncertain frames again with the fitted model as a prior, or weigh poses of colours with it.
+    """Track uncertain frames again with the fitted model as a prior, or combine colour-tracked poses with it.
 
     Parameters and errors as `track`.
 
@@ -213,14 +208,14 @@ def model_pass(
 
 
 def tracking_config(capture: Capture) -> TrackingConfig:
-    """Return the tracker's numbers for the masks of a capture."""
+    """Return the tracker configuration for drawn or automatic masks."""
     from jawusd.tracking.config import FOR_AUTO_MASKS, FOR_TAKES
 
     return FOR_TAKES if auto_masks_folder(capture) is None else FOR_AUTO_MASKS
 
 
 def track_summary(tracks: Tracks) -> TrackSummary:
-    """Sum up tracks: counts, uncertainty at the landmarks, coverage error."""
+    """Return the key figures of tracks: counts, uncertainty at the landmarks, coverage error."""
     lost = tracks.frames[tracks.status.min(1) == LOST]
     tracked = tracks.tracked()
     sigma = np.median(tracks.sigma_mm[tracked], axis=0) if tracked.any() else np.full(len(LANDMARKS), np.nan)
@@ -252,14 +247,14 @@ def lost_reasons(tracks: Tracks) -> dict[str, dict[str, int]]:
 
 
 def frame_summary(tracks: Tracks, frame: int) -> FrameTrackSummary:
-    """Return what is known about the tracking of one frame; of lost arches the reason.
+    """Return how one frame was tracked.
 
     Raises:
-        TrackingError: the tracks do not hold the frame.
+        TrackingError: the tracks do not contain the frame.
     """
     if frame not in tracks.frames:
         raise TrackingError(
-            f"the tracks do not hold it; they go from {tracks.frames[0]} to {tracks.frames[-1]}",
+            f"the tracks do not contain it; they run from {tracks.frames[0]} to {tracks.frames[-1]}",
             frame=frame,
         )
     k = int(np.searchsorted(tracks.frames, frame))
@@ -285,75 +280,5 @@ def frame_summary(tracks: Tracks, frame: int) -> FrameTrackSummary:
     return {"frame": frame, "prior_aided": bool(tracks.prior_aided[k]), "arches": arches}
 
 
-def frame_lines(summary: FrameTrackSummary) -> list[str]:
-    """Return `frame_summary` as text."""
-    lines = []
-    for name, arch in summary["arches"].items():
-        line = f"frame {summary['frame']}, {name} arch: {arch['status']}"
-        if "explanation" in arch:
-            start = ": " if arch["status"] == "lost" else "; the masks alone: "
-            line += start + arch["explanation"]
-        if arch["masks_left_out"]:
-            line += f"; mask left out: {', '.join(arch['masks_left_out'])}"
-        lines.append(line)
-    if summary["prior_aided"]:
-        lines.append("the jaw model helped to find these poses")
-    return lines
-
-
 def _rounded(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
-
-
-def track_lines(summary: TrackSummary) -> list[str]:
-    """Return `track_summary` as text."""
-    lost = summary["lost"]
-    lines = [f"tracked {summary['tracked']} of {summary['frames']} frames"]
-    if lost:
-        more = "" if len(lost) <= _LISTED_FRAMES else f" and {len(lost) - _LISTED_FRAMES} more"
-        lines.append(f"  lost: {', '.join(map(str, lost[:_LISTED_FRAMES]))}{more}")
-    for name, counts in summary.get("lost_reasons", {}).items():
-        lines.append(f"  {name} arch lost by: " + ", ".join(f"{reason} {count}" for reason, count in counts.items()))
-    lines.append(f"  recovered {summary['recovered']}, without one of the cameras {summary['without_a_camera']}")
-    for name, (was, now) in summary["calibration_rescaled_px"].items():
-        lines.append(
-            f"  {name} is calibrated at {was[0]} x {was[1]} px and recorded at {now[0]} x {now[1]}: taken as the same "
-            "picture, scaled"
-        )
-    if summary["prior_aided"]:
-        lines.append(f"  {summary['prior_aided']} uncertain frames tracked again with the fitted model's help")
-    if "prior_spread_mm" in summary:
-        lines.append(f"  final poses weighed with the fitted model, {summary['prior_spread_mm']:.2f} mm from it (rms)")
-    known = {name: value for name, value in summary["sigma_mm"].items() if value is not None}
-    sigma = ", ".join(f"{name} {value}" for name, value in known.items()) or "not known"
-    lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")
-    uncovered = summary["coverage_error_percent"]
-    if uncovered is not None:
-        lines.append(f"  mask left uncovered: {uncovered} %")
-    if "frames_used" in summary:
-        used = ", ".join(f"{name} {count}" for name, count in summary["frames_used"].items())
-        lines.append(f"  frames that cameras took part in: {used}")
-    lines += _take_lines(summary)
-    return [*lines, *(f"  {Finding.from_json(found).line()}" for found in summary.get("findings", []))]
-
-
-def _take_lines(summary: TrackSummary) -> list[str]:
-    """Return what was estimated from all frames together: where outlines lie, and the scans' registration."""
-    lines = []
-    reaches = (("free edges", summary.get("outline_bias_px")), ("gum line", summary.get("gum_bias_px")))
-    for what, found in reaches:
-        if found is not None:
-            reach = ", ".join(f"{name} {upper:+.2f} {lower:+.2f}" for name, (upper, lower) in found.items())
-            lines.append(f"  outlines reach beyond the {what}, upper and lower arch [px]: {reach}")
-    if "gum_line_mm" in summary:
-        upper, lower = summary["gum_line_mm"]
-        lines.append(
-            f"  gum line drawn towards the gum, along the surface [mm]: upper {upper:+.2f}, lower {lower:+.2f}"
-        )
-    if "registration" in summary:
-        bite = summary["registration"]
-        shift, turn = math.hypot(*bite["shift_mm"]), math.hypot(*bite["turn_deg"])
-        sigmas = math.hypot(*bite["shift_sigma_mm"]), math.hypot(*bite["turn_sigma_deg"])
-        what = "lower scan moved to the closed bite by" if bite["applied"] else "lower scan off the closed bite by"
-        lines.append(f"  {what} {shift:.2f} +- {sigmas[0]:.2f} mm, {turn:.2f} +- {sigmas[1]:.2f} degrees")
-    return lines

@@ -1,4 +1,4 @@
-"""Give the viewer an actor, with its motions."""
+"""Show an actor and its motions in the viewer."""
 
 from __future__ import annotations
 
@@ -24,17 +24,14 @@ if TYPE_CHECKING:
     from jawusd.meshes.contact import ContactMap
     from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import Viewer
-    from jawusd.viewer.viewed import Look, ViewedActor
+    from jawusd.viewer.viewed import ViewedActor
 
-CAPTURE_FILE = "capture.toml"
 #: Name of the captured motion among the motions of an actor.
 CAPTURED = "captured take"
 
 _TRACKS = "tracks.npz"
 _ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
-_MOST_FACES = 8_000  # per mesh: what a browser without a graphics card still turns smoothly
-_SPECKS_PERCENT = 0.5
-_FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
+_MOST_FACES = 8_000  # per mesh; smooth in a browser without a graphics card
 
 
 @explain_missing_packages()
@@ -43,7 +40,7 @@ def open_viewer(path: str | os.PathLike[str], host: str, port: int, prim: str | 
 
     Raises:
         MissingDependencyError: the viewer is not installed.
-        OutputError: the address cannot be listened on.
+        OutputError: the server cannot listen on the address.
     """
     from jawusd.viewer.server import Viewer
 
@@ -51,11 +48,11 @@ def open_viewer(path: str | os.PathLike[str], host: str, port: int, prim: str | 
 
 
 def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> ViewedActor:
-    """Read what the viewer shows of a rig.
+    """Load a rig for the viewer.
 
     Args:
-        path: `actor.usda`, another layer or package that carries the rig, or the folder of a build.
-        prim: which rig, where a stage has several; motions are then those of layers over the stage.
+        path: `actor.usda`, another layer or package with the rig, or the folder of a build.
+        prim: path of the rig's prim, if a stage has several; motions are then layers over the stage.
 
     Raises:
         FormatError: not a rig, or one without geometry.
@@ -84,7 +81,7 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
 
 
 class ContactView:
-    """Draw the contacts of a rig's teeth; the scans are read when the first picture is wanted."""
+    """Draws the contacts of a rig's teeth; the scans are loaded with the first picture."""
 
     def __init__(self, path: Path, rig: JawRig, prim: str) -> None:
         self._path, self._rig, self._prim = path, rig, prim
@@ -108,10 +105,10 @@ class ContactView:
 
 
 def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
-    """Return the meshes of a rig by the viewer's names, teeth and gum apart, decimated; placeholders too.
+    """Return decimated meshes of a rig by the viewer's names, with separate gum, including placeholders.
 
     Raises:
-        RigError: there is no mesh that moves.
+        RigError: there is no mandible and no lower teeth.
     """
     from jawusd.rig.geo import read_geometry, read_gum
     from jawusd.viewer.viewed import for_view
@@ -119,7 +116,7 @@ def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
     meshes = read_geometry(path, prim) | read_geometry(path, prim, placeholders=True)
     gum = read_gum(path, prim)
     if not {"mandible", "lower_teeth"} & set(meshes):
-        raise RigError("has no mandible to look at.", path=path)
+        raise RigError("has no mandible to show.", path=path)
     parted: dict[str, Mesh] = {}
     for name, mesh in meshes.items():
         if name in gum:
@@ -131,7 +128,7 @@ def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
 
 
 def part_of(mesh: Mesh, chosen: Mask) -> Mesh:
-    """Return the chosen faces, a mask of shape (F,), of a mesh with the vertices they use."""
+    """Return the chosen faces of a mesh, a mask of shape (F,), with the vertices they use."""
     used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
     return Mesh(
         mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), None if mesh.colors is None else mesh.colors[used]
@@ -139,21 +136,21 @@ def part_of(mesh: Mesh, chosen: Mask) -> Mesh:
 
 
 def motion_names(folder: Path) -> tuple[str, ...]:
-    """Return the motions there are in the folder of an actor: the take, and layers called anim..."""
+    """Return the motions in the folder of an actor: the take, and layers named anim*."""
     layers = sorted(path.name for path in folder.iterdir() if _ANIMATION.fullmatch(path.name) and path.is_file())
     return ((CAPTURED,) if (folder / _TRACKS).is_file() else ()) + tuple(layers)
 
 
 def load_motion(folder: Path, rig: JawRig, fps: float, name: str, *, prim: str | None = None) -> Clip:
-    """Read one of `motion_names`, as the nearest parameters of its poses.
+    """Read one of `motion_names`, with its poses encoded as parameters.
 
     Args:
-        fps: frames per second of the take.
-        prim: which rig, where layers have several.
+        fps: frame rate of the take.
+        prim: path of the rig's prim, if layers have several.
 
     Raises:
         FormatError: there is no such motion, or it cannot be read.
-        RigError: it is not USD.
+        RigError: the file is not USD.
     """
     from jawusd.rig.motion_read import read_poses_of_stage
     from jawusd.rig.read import describe
@@ -175,7 +172,7 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
     """Write a motion as an animation layer beside an actor, or beside a stage for one of its rigs.
 
     Args:
-        name: of the file, anim... .usda or .usdc, without a folder.
+        name: file name without a folder, anim*.usda or anim*.usdc.
 
     Raises:
         OutputError: the name is not allowed or taken, or the file cannot be written.
@@ -184,9 +181,7 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
     from jawusd.rig.rebake import write_over
 
     if not _ANIMATION.fullmatch(name):
-        raise OutputError(
-            f'"{name}" is no name for an animation: anim, then letters, digits, _ or -, then .usdc or .usda.'
-        )
+        raise OutputError(f'"{name}" is not a valid name: use anim, then letters, digits, _ or -, then .usdc or .usda.')
     target = actor.parent / name
     refuse_existing(target, overwrite)
     if prim is not None:

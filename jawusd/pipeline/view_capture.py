@@ -1,4 +1,4 @@
-"""Give the viewer a capture: footage or masks, the teeth drawn over them, and what pages read and write of it."""
+"""Show a capture in the viewer: footage or masks with the teeth drawn over them, picks and labels."""
 
 from __future__ import annotations
 
@@ -20,14 +20,12 @@ from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.cameras import load_cameras, tracked_cameras
+from jawusd.pipeline.cameras import check_same_cameras, load_cameras, open_backdrops, tracked_cameras
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.media import check_same_cameras, open_backdrops
-from jawusd.pipeline.meshes import load_meshes, registered_meshes
 from jawusd.pipeline.report import as_built, is_build, recorded_offsets
 from jawusd.pipeline.scans import save_reviewed
 from jawusd.pipeline.state import BuildState, Progress
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, registered_meshes, subject_of_capture
 
 if TYPE_CHECKING:
     from jawusd.media.backdrop import Backdrop
@@ -39,12 +37,12 @@ if TYPE_CHECKING:
 CAPTURE_FILE = "capture.toml"
 _TRACKS = "tracks.npz"
 _SPECKS_PERCENT = 0.5
-_TILE_PX = (480, 360)  # of each camera among all: three of them are as wide as the page
+_TILE_PX = (480, 360)  # size of each camera's tile; three fill the width of the page
 _FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
 
 
 def is_capture(path: Path) -> bool:
-    """Tell whether a path is a capture, and not a rig."""
+    """Return whether a path is a capture, not a rig."""
     return path.suffix == ".toml" or (path / CAPTURE_FILE).is_file()
 
 
@@ -71,15 +69,15 @@ def open_capture_viewer(
 def viewed_capture(
     path: str | os.PathLike[str], tracks: Path | None, progress: Progress, *, allow_outside: bool = False
 ) -> ViewedCapture:
-    """Read what the viewer shows of a capture.
+    """Load a capture for the viewer.
 
     Args:
         path: capture.toml or its folder.
-        tracks: folder of a build made from it, or its tracks.npz; None shows the footage alone.
+        tracks: folder of a build of the capture, or tracks.npz; None: the footage alone.
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
-        FormatError: the capture or the tracks cannot be read, or the tracks are of other cameras.
+        FormatError: the capture or the tracks cannot be read, or the tracks belong to other cameras.
         CaptureError: there is no footage, or a file cannot be decoded.
         SyncError: the cameras cannot be aligned in time.
     """
@@ -137,7 +135,7 @@ def viewed_capture(
 
 
 def _tile_px(backdrops: Mapping[str, Backdrop], cut: bool) -> tuple[int, int]:
-    """Return the size of each camera's part of the wall; whole pictures keep the shape of the first."""
+    """Return the tile size of each camera; whole pictures keep the aspect ratio of the first camera."""
     if cut:
         return _TILE_PX
     width, height = next(iter(backdrops.values())).size_px
@@ -155,7 +153,7 @@ def _poses(capture: Capture, tracks: Path | None) -> Tracks | None:
 
 
 def _offsets(capture: Capture, build: Path | None, progress: Progress) -> dict[str, int]:
-    """Return the frame offsets the build found, else find them."""
+    """Return the frame offsets recorded by the build, or estimate them."""
     if build is not None:
         found = recorded_offsets(BuildState(build))
         if found:
@@ -166,12 +164,12 @@ def _offsets(capture: Capture, build: Path | None, progress: Progress) -> dict[s
 def _frames(
     capture: Capture, poses: Tracks | None, backdrops: Mapping[str, Backdrop], offsets: Mapping[str, int]
 ) -> tuple[int, int]:
-    """Return the first and the last frame of the reference camera to step through."""
+    """Return the first and the last frame to show, of the reference camera."""
     if poses is not None and len(poses.frames):
         return int(poses.frames[0]), int(poses.frames[-1])
     if capture.frames is not None:
         return capture.frames[0], capture.frames[1] - 1
-    # From the first picture of any camera to the last.
+    # from the first picture of any camera to the last
     return (
         max(0, min(offsets[name] for name in backdrops)),
         max(offsets[name] + backdrop.count - 1 for name, backdrop in backdrops.items()),
@@ -180,7 +178,7 @@ def _frames(
 
 @dataclass(frozen=True, eq=False)
 class _Footage:
-    """Provide pictures, regions and poses of a capture to pages; safe to use from several threads."""
+    """Pictures, regions and poses of a capture for the pages of the viewer; thread-safe."""
 
     capture: Capture
     backdrops: Mapping[str, Backdrop]
@@ -210,7 +208,7 @@ class _Footage:
         look: Look,
         partly: Callable[[NDArray[np.uint8]], None] | None = None,
     ) -> NDArray[np.uint8]:
-        """Return the pictures of all cameras side by side, teeth drawn over them; `partly` as in `CameraWall.draw`."""
+        """Return the pictures of all cameras side by side with the teeth; `partly` as in `CameraWall.draw`."""
         return self.wall.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0), partly=partly)
 
     def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:
@@ -238,12 +236,12 @@ class _Footage:
                 seen.append(np.column_stack([x, y]))
         if not any(map(len, seen)):
             return None
-        # Specks far from the teeth do not count.
+        # Percentiles ignore specks far from the teeth.
         low, high = np.percentile(np.vstack(seen), (_SPECKS_PERCENT, 100 - _SPECKS_PERCENT), axis=0)
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
     def poses_of_picks(self, picks: Bootstrap) -> tuple[tuple[Array, Array], list[str]]:
-        """Return the poses that agree with picks, and the names of those that do not fit."""
+        """Return the poses estimated from picks, and the names of outlier picks."""
         from jawusd.tracking.initialization.bootstrap import pose_from_picks
 
         poses, wrong = [], []

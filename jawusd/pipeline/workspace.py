@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from jawusd.base.errors import CaptureError, JawusdError, OutputError
+from jawusd.base.guard import trim_memory
 from jawusd.base.version import __version__
 from jawusd.formats.capture import Capture
 from jawusd.pipeline.capture_inputs import InputWatch
-from jawusd.pipeline.memory import give_back_memory
 from jawusd.pipeline.state import (
     BUILD_FILE,
     LOCK_FILE,
@@ -47,7 +47,7 @@ class Stage(Generic[R_co]):
 
 
 class StageMissing(Exception):
-    """Signal that a stage would have to run in a workspace that runs none."""
+    """Signal that a stage of a dry run would have to run."""
 
 
 class Workspace:
@@ -110,11 +110,11 @@ class Workspace:
         start = time.perf_counter()
         outputs, result = work()
         self._refuse_changes(stage.name)
-        give_back_memory()
+        trim_memory()
         return self.state.finish(stage.name, inputs, outputs, time.perf_counter() - start, result)
 
     def _refuse_changes(self, stage: str) -> None:
-        """Refuse to record a stage whose inputs were edited while it ran: which version it read is not known.
+        """Refuse to record a stage whose inputs were edited while it ran, as the version it read is unknown.
 
         Edits of capture.toml that change no value are ignored.
         """
@@ -128,7 +128,7 @@ class Workspace:
                 f"changed while the stage {stage} ran: {', '.join([*changed, *([] if same else ['capture.toml'])])}. "
                 "The stage is not recorded.",
                 path=self._opened.folder,
-                hint="Run the same command again with --resume: stages that do not read it are kept.",
+                hint="Run the same command again with --resume: stages that do not depend on it are reused.",
             )
 
 
@@ -166,15 +166,15 @@ def check_folder(folder: Path, *, resume: bool, fresh: bool) -> None:
     """Check that a build may write to a folder.
 
     Raises:
-        OutputError: it is a file, or holds other files, or a build that is neither to be continued nor deleted.
+        OutputError: it is a file, is not empty, or contains a build and neither `resume` nor `fresh` is set.
     """
     if folder.is_file():
-        raise OutputError("is a file; the rig needs a folder.", path=folder, hint="Name a new folder.")
+        raise OutputError("is a file; the rig needs a folder.", path=folder, hint="Choose a new folder.")
     if not folder.is_dir() or resume or fresh:
         return
     if (folder / BUILD_FILE).exists():
         raise OutputError(
-            "holds an earlier build.", path=folder, hint="Continue it with --resume, or start over with --fresh."
+            "contains an earlier build.", path=folder, hint="Continue it with --resume, or start over with --fresh."
         )
     if any(entry.name != LOCK_FILE for entry in folder.iterdir()):
-        raise OutputError("exists and is not empty.", path=folder, hint="Name a new folder.")
+        raise OutputError("exists and is not empty.", path=folder, hint="Choose a new folder.")

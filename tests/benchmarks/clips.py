@@ -30,8 +30,8 @@ from jawusd.formats.capture import Capture, load_capture
 from jawusd.geometry import relative_pose, transform_points
 from jawusd.media.video import Video
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth
+from jawusd.pipeline.subject import load_meshes
 
 _AFTER = 2  # pictures after the last frame, so that clips end behind it
 _GAP = 2  # place of the picture that is missing in sequences

@@ -39,10 +39,9 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_exp, se3_inverse, transform_points
-from jawusd.pipeline.contact import meeting_joints, meeting_teeth, with_joints, with_teeth
+from jawusd.pipeline.contact import condyle_solids, tooth_solids, with_condyle_contact, with_tooth_contact
 from jawusd.pipeline.fit import fit_subject
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import Subject, _measured, subject_of_capture
+from jawusd.pipeline.subject import Subject, _measured, load_meshes, subject_of_capture
 from jawusd.rig.author import decoder_layer
 from jawusd.rig.sampling import sample_valid
 from jawusd.rig.table import DecoderTable
@@ -179,8 +178,8 @@ def measure(case: Case, count: int) -> str:
     print(f"  fitted after {time.process_time():.0f} s", file=sys.stderr)
     start = time.process_time()
     axes, landmarks, rest = (plain.arrays[name] for name in ("T_anatomical_skull", "landmarks", "T_rest"))
-    model = with_teeth(plain, meeting_teeth(case.subject.meshes, axes, rest))
-    model = with_joints(model, meeting_joints(case.subject.meshes, axes, landmarks, rest))
+    model = with_tooth_contact(plain, tooth_solids(case.subject.meshes, axes, rest))
+    model = with_condyle_contact(model, condyle_solids(case.subject.meshes, axes, landmarks, rest))
     bake_s = time.process_time() - start
     rig, old = JawRig(model.arrays, model.meta), JawRig(plain.arrays, plain.meta)
     if rig.contact is None:

@@ -19,8 +19,7 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import LANDMARKS, mandible_metric, relative_pose, transform_point, transform_points
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.tracking import TrackingConfig
 from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance, residual_px, twist_covariance
 from jawusd.tracking.contour.scan import prepare_scan

@@ -37,8 +37,7 @@ from jawusd.formats.tracks import load_tracks  # noqa: E402
 from jawusd.geometry import LANDMARKS, make_transform, se3_exp, se3_log, so3_exp, transform_point  # noqa: E402
 from jawusd.paper.model import fit_paper  # noqa: E402
 from jawusd.paper.nlpca import train_nlpca  # noqa: E402
-from jawusd.pipeline.meshes import load_meshes  # noqa: E402
-from jawusd.pipeline.subject import subject_of_capture  # noqa: E402
+from jawusd.pipeline.subject import load_meshes, subject_of_capture  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402
 
 ALL_SHOWN = np.ones(3, dtype=bool)

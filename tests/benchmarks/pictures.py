@@ -25,8 +25,7 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import se3_inverse, se3_log, transform_points
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.fit import fit_subject
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.track import first_pass, model_pass
 
 _WRONG_MM, _SAYS_SO_MM = 1.0, 0.5

@@ -21,8 +21,7 @@ from jawusd.geometry import (
     transform_points,
 )
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.track import track
 from jawusd.tracking.contour.scan import prepare_scan
 

@@ -29,8 +29,7 @@ from jawusd.formats.mesh import tooth_labels
 from jawusd.formats.tracks import TRACKED, Tracks, load_tracks, save_tracks
 from jawusd.geometry import LANDMARKS, mandible_metric, transform_points
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.tracking import track_capture
 
 LARGE_SIGMA_MM = 0.25  # half of what no unflagged frame may miss by

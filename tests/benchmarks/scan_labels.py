@@ -24,7 +24,7 @@ from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.meshes.meshio import load_mesh
 from jawusd.meshes.scan_labels import Labelling, label_scan
 from jawusd.meshes.scan_surface import ScanSurface
-from jawusd.pipeline.scan_labels import _WEAK_SHARE
+from jawusd.pipeline.subject import _WEAK_SHARE
 
 NEVER_MM = 20.0  # counted for a line that was not found
 

@@ -16,8 +16,7 @@ from jawusd.formats.mesh import tooth_labels
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import LANDMARKS, se3_inverse, se3_log, transform_points
 from jawusd.meshes.meshio import load_mesh
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 
 
 def row(name: str, distance_mm: np.ndarray) -> str:

@@ -20,10 +20,9 @@ from jawusd.geometry import LANDMARKS, se3_inverse, transform_point
 from jawusd.media.masks import MaskReader
 from jawusd.media.video import Video
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth
 from jawusd.pipeline.segment_record import with_masks, write_summary
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.track import first_pass
 
 

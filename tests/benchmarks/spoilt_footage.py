@@ -30,8 +30,7 @@ from jawusd.base.errors import JawusdError
 from jawusd.cameras.calibration import load_calibration, save_calibration
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import transform_point
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.track import track
 
 DARK, NOISE, FLICKER, FOCAL = 0.2, 25.0, 0.5, 1.15

@@ -25,7 +25,7 @@ from jawusd.geometry import transform_point, transform_points
 from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.meshes import load_meshes
+from jawusd.pipeline.subject import load_meshes
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver

@@ -94,8 +94,7 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
     from jawusd.paper import take as paper_take
     from jawusd.paper.solver import PaperConfig
     from jawusd.pipeline.cameras import load_cameras
-    from jawusd.pipeline.meshes import load_meshes
-    from jawusd.pipeline.subject import subject_of_capture
+    from jawusd.pipeline.subject import load_meshes, subject_of_capture
     from jawusd.tracking import track_capture
     from jawusd.tracking.contour.solver import ContourSolver
 

@@ -64,7 +64,7 @@ def test_a_capture_names_cameras_whose_labels_have_dots_in_its_own_letters(tmp_p
     same(capture_cameras.load_cameras(capture), ("cam_01", "cam_02", "cam_03"))
     sources[0].name = "cam_09"
     with pytest.raises(
-        CalibrationError, match=r"does not know camera cam_09 of the capture; it names cam\.01, cam\.02"
+        CalibrationError, match=r"lacks camera cam_09 of the capture; it contains cam\.01, cam\.02"
     ):
         capture_cameras.load_cameras(capture)
 

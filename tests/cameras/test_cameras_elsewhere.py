@@ -355,7 +355,7 @@ def test_the_command(tmp_path):
         (tmp_path / "xmp" / f"{name}.xmp").write_text(xmp(R, centre))
     metres = ["cameras", str(tmp_path / "xmp"), "-o", str(tmp_path / "m"), "--size", "1920x1080"]
     close = CliRunner().invoke(app, metres)
-    assert "all cameras lie within 0.918 mm; if the source is in metres, give --unit-mm 1000" in close.stdout
+    assert "all cameras are within 0.918 mm; if the source is in metres, use --unit-mm 1000" in close.stdout
     words = ["cameras", str(tmp_path / "xmp"), "-o", str(tmp_path / "c.toml"), "--unit-mm", "1000"]
     assert isinstance(CliRunner().invoke(app, words).exception, JawusdError)
     assert CliRunner().invoke(app, [*words, "--size", "1920x1080"]).exit_code == 0

@@ -44,7 +44,7 @@ MISTAKES = [
     ("text that is no TOML", ["check", "spaces in.toml"], ["is not valid TOML"]),
     ("no output folder", ["build", "."], ["--out"]),
     ("an output that is a file", ["build", ".", "-o", "u.ply"], ["is a file; the rig needs a folder"]),
-    ("an output with other files", ["build", ".", "-o", "full"], ["exists and is not empty", "Name a new folder"]),
+    ("an output with other files", ["build", ".", "-o", "full"], ["exists and is not empty", "Choose a new folder"]),
     ("a calibration that lacks all", ["build", ".", "-o", "out"], ['[cam_0] has no "size"']),
     ("a capture in place of a rig", ["info", "."], ["without actor.usda", "jawusd build"]),
     (
@@ -63,7 +63,7 @@ MISTAKES = [
     ("a folder for init that is none", ["init", "nowhere"], ["there is no such folder"]),
     ("a video for init", ["init", "left.mp4"], ["is a file", "Name the folder"]),
     ("a second init", ["init", "."], ["exists already", "--force"]),
-    ("two people in one folder", ["init", "two"], ["anna_upper.stl, bob_upper.stl", "one folder is one person"]),
+    ("two people in one folder", ["init", "two"], ["anna_upper.stl, bob_upper.stl", "a folder is for one person"]),
     ("one clip to align", ["sync", "left.mp4"], ["left.mp4"]),
     ("clips without a flash", ["sync", "left.mp4", "right.mp4"], ["shows no light flash"]),
     ("a clip twice", ["sync", "left.mp4", "left.mp4"], ["given twice"]),

@@ -76,7 +76,7 @@ def test_validate_of_a_folder_names_the_file_and_leaves_with_1(builds, folder, n
     damaged(folder, builds[1], name, how)
     done = run("validate", folder)
     assert done.exit_code == 1
-    assert f"build_changed: {name}: {'is missing' if how == 'missing' else 'was changed or exchanged'}" in done.output
+    assert f"build_changed: {name}: {'is missing' if how == 'missing' else 'was modified or replaced'}" in done.output
 
 
 @pytest.mark.parametrize(("name", "how"), CASES)

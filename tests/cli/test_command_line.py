@@ -16,11 +16,9 @@ from typer.testing import CliRunner
 
 from jawusd import __version__
 from jawusd.base import errors
-from jawusd.cli.command import with_vectors_split
+from jawusd.cli.commands import EXIT_CODES, SUMMARIES, with_vectors_split
 from jawusd.cli.main import app
-from jawusd.cli.summaries import EXIT_CODES, SUMMARIES
-from jawusd.pipeline.build_lines import _verdict_lines
-from jawusd.pipeline.plan import about
+from jawusd.cli.text_build import _verdict_lines, rounded_duration
 
 COMMANDS = typer.main.get_command(app).commands
 WIDTH = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
@@ -139,7 +137,7 @@ def test_a_dry_run_writes_nothing(tmp_path):
     ("seconds", "words"), [(1, "5 seconds"), (61, "60 seconds"), (600, "10 minutes"), (9000, "2.5 hours")]
 )
 def test_times_in_words(seconds, words):
-    assert about(seconds) == words
+    assert rounded_duration(seconds) == words
 
 
 def test_a_build_is_told_its_command_line_for_the_report(monkeypatch):
@@ -154,7 +152,7 @@ def test_a_build_ends_with_its_verdict():
     file = {"capture": "x", "file": "report.html"}
     assert _verdict_lines({**file, "verdict": {"grade": "good", "because": []}}) == ["verdict: good"]
     assert _verdict_lines({**file, "verdict": {"grade": "bad", "because": because}}) == [
-        "verdict: not usable as it is, because of:",
+        "verdict: not usable, because of:",
         *(f"  {one}" for one in because[:4]),
         "  and 2 more",
     ]

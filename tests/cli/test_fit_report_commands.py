@@ -103,7 +103,7 @@ def test_rigid_bodies_that_cannot_be_read_are_refused(given):
     whose = ("--landmarks", given / "landmarks.json")
     assert "jaw=MARKERS" in run("fit", given / "markers.asc", *whose, "--rigid", "tongue=1,2,3", code=2)
     twice = ("--rigid", "jaw=1,2,3", "--rigid", "jaw=1,2,4")
-    assert "named twice" in run("fit", given / "markers.asc", *whose, *twice, code=2)
+    assert "given twice" in run("fit", given / "markers.asc", *whose, *twice, code=2)
 
 
 @pytest.mark.slow
@@ -129,7 +129,7 @@ def test_scans_take_the_place_of_a_capture(given, tmp_path, poses):
         (["--upper-teeth", "u.ply"], 2, "both --upper-teeth and --lower-teeth"),
         (["--landmarks", "landmarks.json", "--columns", "tx"], 2, "not of the form name=column"),
         (["--landmarks", "landmarks.json", "--columns", "x=X"], 2, '"x" is not a column of poses'),
-        (["--landmarks", "landmarks.json", "--columns", "tx=X,tx=Y"], 2, '"tx" is named twice'),
+        (["--landmarks", "landmarks.json", "--columns", "tx=X,tx=Y"], 2, '"tx" is given twice'),
         (["--landmarks", "landmarks.json", "--columns", "tx=X"], 3, 'no column "X" to read as "tx"'),
         (["--landmarks", "landmarks.json", "--rest-frame", "999"], 3, "has no frame 999"),
         (["--landmarks", "nothing.json"], 3, "there is no such file"),

@@ -90,8 +90,8 @@ TYPED = [
     ("a folder's name misspelt", ["check", "emty"], "emty", "no such file", "Did you mean empty?", "jawusd init"),
     ("a path from another folder", ["check", "shots/anna"], "shots/anna", "no such file", "the current folder", ""),
     ("a clip for a capture", ["check", "left.mp4"], "left.mp4", '".mp4" is not a capture', "a folder", "jawusd init"),
-    ("an output with files", ["build", ".", "-o", "full"], "full", "not empty", "", "Name a new folder"),
-    ("an output that is a file", ["build", ".", "-o", "u.ply"], "u.ply", "is a file", "needs a folder", "Name a new"),
+    ("an output with files", ["build", ".", "-o", "full"], "full", "not empty", "", "Choose a new folder"),
+    ("an output that is a file", ["build", ".", "-o", "u.ply"], "u.ply", "is a file", "needs a folder", "Choose a new"),
     ("an output out of reach", ["build", ".", "-o", "/dev/null/out"], "out", "cannot write here", "", "Choose a"),
     ("a rig for a capture", ["check", "rig"], "rig", "no such file", "", "That folder contains a rig; name"),
     ("a capture for a rig", ["info", "."], ".", "without actor.usda", "", "jawusd build"),
@@ -177,7 +177,7 @@ def test_a_mistake_in_a_file(place, tmp_path, row):
 def test_a_copy_of_a_clip(place, tmp_path):
     (tmp_path / "right.mp4").write_bytes((place / "left.mp4").read_bytes())
     errors = check_of(tmp_path, place)
-    parts = ("right.mp4", "camera right", "is a copy of left.mp4, the clip of camera left", "Copy the clip")
+    parts = ("right.mp4", "camera right", "is identical to left.mp4, the clip of camera left", "Copy the clip")
     assert sum(all(part in line for part in parts) for line in errors) == 1, errors
 
 

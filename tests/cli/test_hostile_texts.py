@@ -12,9 +12,8 @@ from report_data import report_data
 from typer.testing import CliRunner
 
 from jawusd.base.errors import FormatError, shown
-from jawusd.cli.log import logged
 from jawusd.cli.main import app
-from jawusd.cli.output import complain, emit, say
+from jawusd.cli.output import complain, emit, logged, say
 from jawusd.formats.atomic import write_csv_atomic
 from jawusd.formats.finding import Finding
 from jawusd.report.document import document

@@ -16,7 +16,7 @@ from report_data import report_data
 from run_jawusd import face_csv
 from short_example import write_short
 
-from jawusd.cli.summaries import SUMMARIES
+from jawusd.cli.commands import SUMMARIES
 from jawusd.formats.keys import load_keys
 from jawusd.formats.model import save_model
 from jawusd.formats.poses import write_parameters

@@ -76,7 +76,7 @@ def test_info_says_how_a_frame_was_tracked(tmp_path):
     save_tracks(tmp_path / "tracks.npz", tracks)
     text = run("info", tmp_path / "tracks.npz", "--frame", 31).splitlines()
     assert text == [
-        "frame 31, upper arch: tracked; mask left out: b",
+        "frame 31, upper arch: tracked; mask not used: b",
         "frame 31, lower arch: lost: matched contour 31% of the usual, at least 60% is needed",
     ]
     found = json.loads(run("info", tmp_path / "tracks.npz", "--frame", 31, "--json"))["arches"]["lower"]

@@ -13,7 +13,7 @@ import pytest
 from doc_blocks import ELLIPSIS, blocks, command_lines, missing, pages, steps, unknown
 from package_copy import ROOT
 
-from jawusd.pipeline.build_lines import build_lines
+from jawusd.cli.text_build import build_lines
 
 PAGES = pages()
 BLOCKS = [block for page in PAGES for block in blocks(page)]

@@ -186,7 +186,7 @@ def test_writing_is_found(line):
 def test_no_other_place_of_the_package_replaces_or_makes_files():
     """All outputs go through `formats.atomic`; what writes files by itself is listed here with its reason."""
     allowed = {
-        "jawusd/cli/log.py",  # adds lines to a file that `destination` allows
+        "jawusd/cli/output.py",  # adds lines to a log that `destination` allows
         "jawusd/pipeline/segment_record.py",  # adds lines to its own record
         "jawusd/viewer/motion_panel.py",  # in a folder of its own, as is the next one
         "jawusd/plugins/extension.py",

@@ -4,7 +4,7 @@ import numpy as np
 from report_data import report_data
 
 from jawusd.formats.tracks import uncovered_percent, worst_frames
-from jawusd.pipeline.media import chosen_frames
+from jawusd.pipeline.pictures import chosen_frames
 from jawusd.viewer.take_plots import frames_to_inspect
 
 
@@ -22,7 +22,7 @@ def test_masks_that_were_not_used_do_not_count():
     tracks.coverage_error[60] = 0.05
     np.testing.assert_allclose(uncovered_percent(tracks)[30], 0.5)
     assert frames_to_inspect(tracks, 24.0)[0] == tracks.frames[60]
-    assert chosen_frames(tracks, 24.0)[0] == (60, "5.00 % of the worse arch's masks left uncovered")
+    assert chosen_frames(tracks, 24.0)[0] == (60, "5.00 % of the worse arch's masks uncovered")
 
 
 def test_a_frame_without_used_masks_is_never_chosen():

@@ -9,7 +9,7 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import make_transform
 from jawusd.pipeline.follow import _follow_back, _jumps
-from jawusd.pipeline.segment_guide import GUIDE, save_guide, take_up_guide
+from jawusd.pipeline.segment_guide import GUIDE, combine_guide, save_guide
 from jawusd.pipeline.segment_record import SUMMARY, auto_masks_folder, with_masks
 from jawusd.pipeline.track import tracking_config
 from jawusd.tracking.config import FOR_TAKES
@@ -73,7 +73,7 @@ def _shifted(count, mm):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "lost", "words"), [(0, 0, None), (1, 0, None), (2, 3, "in parts"), (9, 2, "not usable")]
+    ("wrong", "lost", "words"), [(0, 0, None), (1, 0, None), (2, 3, "partly unreliable"), (9, 2, "unusable")]
 )
 def test_masks_and_colours_that_disagree_make_footage_doubtful(tmp_path, wrong, lost, words):
     frames = np.arange(10, 50)
@@ -81,7 +81,7 @@ def test_masks_and_colours_that_disagree_make_footage_doubtful(tmp_path, wrong, 
     poses[:wrong, 0, 3] = 1.5  # mm
     poses[wrong : wrong + lost] = np.nan
     tracks = _take(frames, poses)
-    _, found = take_up_guide(_guided(tmp_path, frames), tracks, LANDMARKS)
+    _, found = combine_guide(_guided(tmp_path, frames), tracks, LANDMARKS)
     if words is None:
         assert found == []
     else:
@@ -91,14 +91,14 @@ def test_masks_and_colours_that_disagree_make_footage_doubtful(tmp_path, wrong, 
 def test_drawn_masks_have_no_guide():
     given = load_capture(ROOT / "examples" / "capture" / "capture.toml")
     tracks = _take(np.arange(5), _shifted(5, 0.3))
-    assert take_up_guide(given, tracks, LANDMARKS) == (tracks, [])
+    assert combine_guide(given, tracks, LANDMARKS) == (tracks, [])
 
 
 def test_masks_and_colours_are_weighted_by_their_covariance(tmp_path):
     frames = np.arange(10, 50)
     poses = _shifted(len(frames), 0.3)
     poses[7] = np.nan
-    tracks, _ = take_up_guide(_guided(tmp_path, frames), _take(frames, poses), LANDMARKS)
+    tracks, _ = combine_guide(_guided(tmp_path, frames), _take(frames, poses), LANDMARKS)
     moved = tracks.raw_T_upper_lower[:, 0, 3]
     assert moved[[0, 7]] == pytest.approx([0.3 * 0.8, 0.0], abs=1e-9)
     assert tracks.status[7].tolist() == [TRACKED, RECOVERED] and np.isfinite(tracks.T_upper_lower).all()
@@ -110,7 +110,7 @@ def test_masks_and_colours_that_contradict_each_other_widen_sigma(tmp_path):
     frames = np.arange(10, 50)
     poses = _shifted(len(frames), 0.0)
     poses[20, 0, 3] = 2.0  # mm: 8.9 standard deviations of the difference, square 80 over 6 degrees of freedom
-    tracks, _ = take_up_guide(_guided(tmp_path, frames), _take(frames, poses), LANDMARKS)
+    tracks, _ = combine_guide(_guided(tmp_path, frames), _take(frames, poses), LANDMARKS)
     assert tracks.covariance_lower[20, 3, 3] / tracks.covariance_lower[0, 3, 3] == pytest.approx(80 / 6)
 
 
@@ -118,11 +118,11 @@ def test_masks_without_their_guide_are_told(tmp_path):
     tracks = _take(np.arange(5), _shifted(5, 0.3))
     capture = _guided(tmp_path, np.arange(5))
     (tmp_path / GUIDE).unlink()
-    kept, found = take_up_guide(capture, tracks, LANDMARKS)
+    kept, found = combine_guide(capture, tracks, LANDMARKS)
     assert kept is tracks and found[0].kind == "footage_unchecked"
     (tmp_path / GUIDE).write_bytes(b"damaged")
     with pytest.raises(FormatError, match=GUIDE):
-        take_up_guide(capture, tracks, LANDMARKS)
+        combine_guide(capture, tracks, LANDMARKS)
 
 
 def _followed(frames, mm, objective_px=900.0):

@@ -13,10 +13,11 @@ from jawusd.base.errors import CalibrationError
 from jawusd.cameras.calibration import load_calibration
 from jawusd.capture.boards import find_boards
 from jawusd.cli.main import app
+from jawusd.cli.text_build import build_lines
+from jawusd.cli.text_capture import calibration_lines
 from jawusd.geometry import triangulate
 from jawusd.pipeline.build import BuildOptions, build
-from jawusd.pipeline.build_lines import build_lines
-from jawusd.pipeline.calibrate import calibrate_boards, calibration_lines
+from jawusd.pipeline.calibrate import calibrate_boards
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import input_files, open_capture
 

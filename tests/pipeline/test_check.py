@@ -333,4 +333,4 @@ def test_what_boards_will_tell_is_said_to_come_later(capture):
     described(capture, 'calibration = "calibration.toml"\n', "")
     (capture / "calibration.toml").unlink()
     said = [finding.message for finding in found(capture) if finding.kind == "not_checked"]
-    assert said and all("the cameras are calibrated from the boards first" in message for message in said)
+    assert said and all("the cameras will be calibrated from the boards first" in message for message in said)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jawusd.formats.arkit import ArkitMapping
 from jawusd.formats.poses import save_joint_table
-from jawusd.pipeline.joint_table import SHAPES, joint_deltas
+from jawusd.pipeline.bake import SHAPES, joint_deltas
 from jawusd.rig.skel import write_skel
 
 OWN = ArkitMapping(

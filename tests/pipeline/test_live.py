@@ -21,14 +21,12 @@ from jawusd.formats.performance import SolveState
 from jawusd.geometry import transform_point
 from jawusd.media import live_clock
 from jawusd.media.live_source import LiveSource
-from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.cameras import load_cameras, open_videos
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.cuts import Cutter
-from jawusd.pipeline.live import LiveFrame, live, next_instant
-from jawusd.pipeline.media import open_videos
-from jawusd.pipeline.meshes import load_labelled, registered_meshes
-from jawusd.pipeline.osc import OscSender
-from jawusd.pipeline.solve_pictures import PreparedTeeth
+from jawusd.pipeline.follow import Cutter
+from jawusd.pipeline.live import LiveFrame, OscSender, live, next_instant
+from jawusd.pipeline.solve import PreparedTeeth
+from jawusd.pipeline.subject import load_labelled, registered_meshes
 from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.region.live import LiveTake
 
@@ -155,7 +153,7 @@ def test_instants_are_taken_in_turn_and_left_out_when_too_old():
 
 
 def test_sources_of_unknown_cameras_are_refused(rig):
-    with pytest.raises(CaptureError, match="named for nobody"):
+    with pytest.raises(CaptureError, match="unknown cameras nobody"):
         next(live(rig, EXAMPLE, {"nobody": "/dev/video0"}))
 
 
@@ -164,7 +162,7 @@ def test_one_of_several_rigs_is_followed(rig, tmp_path):
     (tmp_path / "two.usda").write_text(f"#usda 1.0\n{references}")
     with pytest.raises(FormatError, match="several jaw rigs: /a, /b"):
         next(live(tmp_path / "two.usda", EXAMPLE, {"nobody": "/dev/video0"}))
-    with pytest.raises(CaptureError, match="named for nobody"):
+    with pytest.raises(CaptureError, match="unknown cameras nobody"):
         next(live(tmp_path / "two.usda", EXAMPLE, {"nobody": "/dev/video0"}, prim="/b"))
 
 
@@ -199,7 +197,7 @@ def test_nobody_need_listen_to_osc():
 
 @pytest.mark.parametrize("address", ["9000", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:http", ":9000"])
 def test_addresses_that_are_none_are_refused(address):
-    with pytest.raises(OutputError, match="no address"):
+    with pytest.raises(OutputError, match="not an address"):
         OscSender(address)
 
 

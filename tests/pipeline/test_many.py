@@ -20,10 +20,11 @@ from typer.testing import CliRunner
 
 from jawusd.base.errors import CaptureError, ClusterError, OutputError
 from jawusd.cli.main import app
+from jawusd.cli.text_build import outcome_lines
 from jawusd.formats.capture_list import ListedCapture
 from jawusd.pipeline import many
 from jawusd.pipeline.build import BuildOptions, build
-from jawusd.pipeline.many import Outcome, build_many, outcome_lines
+from jawusd.pipeline.many import Outcome, build_many
 
 FRAMES = 16  # a model needs 15
 WAIT_SECONDS = 400
@@ -243,7 +244,7 @@ def test_a_scheduler_without_workers_is_one_clear_error(monkeypatch):
 
 def test_workers_of_another_version_are_refused(here, monkeypatch):
     monkeypatch.setattr(many, "_look", lambda folder: ("0.0.1", True))
-    with many.existing_cluster(here) as client, pytest.raises(ClusterError, match=r"has jawusd 0\.0\.1"):
+    with many.existing_cluster(here) as client, pytest.raises(ClusterError, match=r"runs jawusd 0\.0\.1"):
         many.check_workers(client, ROOT)
 
 

@@ -105,9 +105,9 @@ def test_fit_reads_markers_in_centimetres_relative_to_a_rest_frame(tmp_path, mar
 @pytest.mark.parametrize(
     ("rigid", "rest", "words"),
     [
-        ({"head": "1,2,3"}, 0, "jaw is needed"),
-        ({"jaw": "5,6,7", "tongue": "1,2,3"}, 0, "jaw is needed"),
-        ({"jaw": "7,8,9"}, 0, "has 8 markers; the rigid body of the jaw names marker 9"),
+        ({"head": "1,2,3"}, 0, "jaw is required"),
+        ({"jaw": "5,6,7", "tongue": "1,2,3"}, 0, "jaw is required"),
+        ({"jaw": "7,8,9"}, 0, "has 8 markers; the rigid body of the jaw uses marker 9"),
         ({"jaw": "5,6,7"}, None, "--rest-frame"),
         ({"jaw": "5,6,7"}, 12, "has no frame 12; it has 0 to 11"),
         ({"jaw": "5,6,7"}, 2, "frame 2 does not show all markers of the jaw"),
@@ -121,13 +121,13 @@ def test_each_mistake_of_rigid_bodies_is_named(tmp_path, markers, rigid, rest, w
 
 def test_a_body_whose_markers_are_exchanged_is_refused(tmp_path, markers, bodies):
     markers[:, [4, 5]] = markers[:, [5, 4]]
-    with pytest.raises(FormatError, match=r"markers 5, 6, 7, 8 lie .* mm from their places"):
+    with pytest.raises(FormatError, match=r"markers 5, 6, 7, 8 are .* mm from their positions"):
         marker_poses(write(tmp_path, markers), bodies)
 
 
 def test_markers_on_a_line_give_no_pose(tmp_path):
     line = np.tile(np.array([[1.0, 0, 0], [2, 0, 0], [3, 0, 0]]), (3, 1, 1))
-    with pytest.raises(FormatError, match="do not lie on one line"):
+    with pytest.raises(FormatError, match="are not collinear"):
         marker_poses(write(tmp_path, line), {"jaw": "1,2,3"}, 0)
 
 
@@ -206,10 +206,10 @@ def test_each_mistake_of_a_c3d_is_named(tmp_path, markers):
     whole = path.read_bytes()
     for size in (0, 100, 511, 700, 1100, len(whole) - 1500):
         path.write_bytes(whole[:size])
-        with pytest.raises(FormatError, match="is not a C3D file that can be read" if size < 512 else "is cut off"):
+        with pytest.raises(FormatError, match="is not a readable C3D file" if size < 512 else "is truncated"):
             read_c3d(path)
     path.write_text("frame,x,y,z\n" * 100)
-    with pytest.raises(FormatError, match="is not a C3D file that can be read"):
+    with pytest.raises(FormatError, match="is not a readable C3D file"):
         read_c3d(path)
     write_c3d(path, markers, unit="in")
     with pytest.raises(FormatError, match='lengths are in "in", allowed are mm, cm, m'):
@@ -221,9 +221,9 @@ def test_each_mistake_of_a_c3d_is_named(tmp_path, markers):
 @pytest.mark.parametrize(
     ("names", "rigid", "words"),
     [
-        (NAMES, "JL,JR,JX", "HL, HR, .*, JB; the rigid body of the jaw names marker JX"),
-        (("JL", *NAMES[1:]), "JL,JR,JF", "names marker JL 2 times"),
-        (("8", "7", "6", "5", "4", "3", "2", "1"), "5,6,7", '"5" is the name of marker 4 and the number of another'),
+        (NAMES, "JL,JR,JX", "HL, HR, .*, JB; the rigid body of the jaw uses marker JX"),
+        (("JL", *NAMES[1:]), "JL,JR,JF", "uses marker JL 2 times"),
+        (("8", "7", "6", "5", "4", "3", "2", "1"), "5,6,7", '"5" is ambiguous: the name of marker 4 and the number'),
     ],
 )
 def test_names_that_do_not_tell_the_marker_are_refused(tmp_path, markers, names, rigid, words):
@@ -234,13 +234,13 @@ def test_names_that_do_not_tell_the_marker_are_refused(tmp_path, markers, names,
 
 def test_a_marker_hidden_at_rest_is_named(tmp_path, markers):
     markers[0, 6] = 0.0
-    with pytest.raises(FormatError, match="all markers of the jaw: 7 is out of sight"):
+    with pytest.raises(FormatError, match="all markers of the jaw: 7 is occluded"):
         marker_poses(write(tmp_path, markers), {"jaw": "5,6,7,8"}, rest_frame=0)
 
 
 def test_a_unit_that_contradicts_the_file_is_refused(tmp_path, markers):
     path = write_c3d(tmp_path / "take.c3d", markers, "m", 1e-3)
-    with pytest.raises(FormatError, match="lengths are in m, --length-unit says cm"):
+    with pytest.raises(FormatError, match="is in m, but --length-unit is cm"):
         marker_poses(path, {"jaw": "5,6,7,8"}, rest_frame=0, unit="cm")
 
 

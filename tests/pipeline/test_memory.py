@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from jawusd.pipeline.memory import give_back_memory
+from jawusd.base.guard import trim_memory
 
 GLIBC = sys.platform == "linux" and hasattr(ctypes.CDLL(None), "malloc_trim")
 LARGE_ARRAYS = """
 import re
 from pathlib import Path
-from jawusd.pipeline.memory import map_large_arrays
+from jawusd.base.guard import map_large_arrays
 
 def resident_mb():
     return int(re.search(r"VmRSS:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
@@ -47,6 +47,6 @@ def test_what_lies_below_memory_in_use_is_given_back():
     kept = pieces[-1]
     pieces.clear()
     before = resident_mb()
-    give_back_memory()
+    trim_memory()
     assert before - resident_mb() > 0.5 * PIECES * PIECE_BYTES / 2**20
     assert len(kept) == PIECE_BYTES

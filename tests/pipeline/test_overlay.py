@@ -16,7 +16,7 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform, relative_pose
 from jawusd.media.writers import VideoWriter
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.overlay import TILE_PX, overlay_files, write_overlay
+from jawusd.pipeline.pictures import TILE_PX, overlay_files, write_overlay
 
 SIZE = (240, 180)
 K = np.array([[300.0, 0, 120], [0, 300, 90], [0, 0, 1]])
@@ -157,7 +157,7 @@ def test_what_cannot_be_drawn_is_refused(capture, tmp_path):
         (tmp_path / "file").write_text("")
         write_overlay(opened, OFFSETS, some_tracks(), tmp_path / "file" / "out", quiet)
     save_calibration(capture / "calibration.toml", [CAMERAS[0].scaled((480, 300)), CAMERAS[1]])
-    with pytest.raises(CalibrationError, match="camera left: calibrated for .* another shape"):
+    with pytest.raises(CalibrationError, match="camera left: calibrated for .* another aspect ratio"):
         write_overlay(open_capture(capture), OFFSETS, some_tracks(), tmp_path / "out", quiet)
     assert not (tmp_path / "out").exists()
 

@@ -53,13 +53,13 @@ def searched(monkeypatch):
 def test_a_long_take_without_teeth_ends_and_says_what_was_tried(searched):
     words, tried, footage = searched(lambda frame: None)
     assert len(tried) == 24 and max(footage.looked_at) < 10 + 6 * 240
-    assert "not found on 24 frames that show both rows apart (10, 18," in words
-    assert words.endswith("frames 1450 to 2409 were not searched, as 24 are tried at most")
+    assert "not found on 24 frames that show both arches apart (10, 18," in words
+    assert words.endswith("frames 1450 to 2409 were not searched, because at most 24 starts are tried")
 
 
 def test_the_best_poor_fit_is_told(searched):
     words, _, _ = searched(lambda frame: 0.5 * LEAST_FIT if frame == 18 else 0.01)
-    assert f"at best {0.5 * LEAST_FIT:.0%} of the contour in sight fits" in words
+    assert f"at best {0.5 * LEAST_FIT:.0%} of the visible contour fits" in words
 
 
 def test_teeth_in_a_later_part_are_found(searched):

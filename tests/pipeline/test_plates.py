@@ -12,7 +12,7 @@ from jawusd.cameras.calibration import save_calibration
 from jawusd.geometry import Camera, make_transform
 from jawusd.media.writers import VideoWriter
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.media import write_plates
+from jawusd.pipeline.pictures import write_plates
 from jawusd.rig.cameras import PLATE
 
 SIZE = (320, 240)

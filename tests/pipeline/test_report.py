@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from jawusd.base.errors import FormatError
 from jawusd.cli.main import app
+from jawusd.cli.text_build import build_lines
 from jawusd.evaluator import JawRig
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
-from jawusd.pipeline.build_lines import build_lines
-from jawusd.pipeline.media import chosen_frames
+from jawusd.pipeline.pictures import chosen_frames
 from jawusd.pipeline.report import missing_packages, report_build
 from jawusd.pipeline.state import BuildState
 from jawusd.rig.bake import bake_rig
@@ -51,7 +51,7 @@ def test_a_report_without_its_capture_says_what_it_lacks(built):
     path = report_build(built, None, quiet)
     text = (built / "report.html").read_text()
     assert path.stat().st_size == len(text.encode()) < 6e6
-    assert "example: jaw rig report" in text and "the capture is not at hand" in text
+    assert "example: jaw rig report" in text and "the capture cannot be read" in text
     assert "report DIR --experiments" in text and "replay-data" in text
     record = BuildState(built).valid("report", "as built")  # what --resume asks
     assert record is not None and list(record.outputs) == ["report.html"]
@@ -72,12 +72,12 @@ def test_a_report_written_again_tells_of_the_build_as_it_was_made(built):
 @pytest.mark.slow
 def test_a_placeholder_is_not_shown_as_a_mandible(built):
     report_build(built, None, quiet)
-    assert "placeholder is no anatomy" not in (built / "report.html").read_text()
+    assert "placeholder is not anatomical" not in (built / "report.html").read_text()
     scans = {name: mesh for name, mesh in example_meshes().items() if name != "mandible"}
     files = baked(built, load_model(built / "model.npz"), scans)
     BuildState(built).finish("bake", "", files, 1.0, {})
     report_build(built, None, quiet)
-    assert "the rig&#39;s placeholder is no anatomy" in (built / "report.html").read_text()
+    assert "the rig&#39;s placeholder is not anatomical" in (built / "report.html").read_text()
 
 
 @pytest.mark.slow

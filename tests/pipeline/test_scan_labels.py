@@ -17,9 +17,8 @@ from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh, crown_face_mask, tooth_l
 from jawusd.formats.scan_labels import ScanLabels, labels_path, load_scan_labels, save_scan_labels
 from jawusd.meshes.meshio import load_mesh
 from jawusd.pipeline.capture_inputs import input_hashes
-from jawusd.pipeline.meshes import load_labelled, load_meshes
-from jawusd.pipeline.scan_labels import label_teeth
 from jawusd.pipeline.scans import all_labelled, label_scans, save_reviewed, store_labels, with_stored_labels
+from jawusd.pipeline.subject import label_teeth, load_labelled, load_meshes
 
 ARCHES = ("upper", "lower")
 
@@ -72,7 +71,7 @@ def test_the_command_writes_labels_and_a_picture(bare) -> None:
     assert isinstance(again.exception, OutputError) and "scan_labels.png" in str(again.exception)
     assert "(by file)" in CliRunner().invoke(app, ["scans", str(bare), "-o", str(bare / "scans")]).stdout
     text = CliRunner().invoke(app, ["scans", str(bare), "--force"]).stdout
-    assert "(by shape)" in text and "vertices at the same place merged" in text
+    assert "(by shape)" in text and "duplicate vertices merged" in text
 
 
 def test_labels_in_a_folder_of_their_own(bare, tmp_path) -> None:
@@ -94,7 +93,7 @@ def test_a_file_goes_before_paint_and_an_old_one_is_refused(painted) -> None:
     meshes, findings = load_labelled(capture)
     np.testing.assert_array_equal(tooth_labels(meshes["upper_teeth"]), np.where(labels == TOOTH, TOOTH, GUM))
     assert [finding.kind for finding in findings] == ["scan_labels_from_file"]
-    assert "not by its paint" in findings[0].message
+    assert "its paint is ignored" in findings[0].message
     older = Mesh(mesh.vertices[1:], mesh.faces[:1])
     save_scan_labels(labels_path(capture.scans.upper_teeth), ScanLabels(labels[1:], "reviewed"), older)
     with pytest.raises(FormatError, match="another version of the scan"):

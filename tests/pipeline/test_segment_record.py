@@ -7,18 +7,10 @@ import pytest
 from package_copy import ROOT
 
 from jawusd.base.errors import FormatError
+from jawusd.cli.text_capture import segment_lines
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, TRACKED
-from jawusd.pipeline.segment_record import (
-    LEARNED,
-    RECORD,
-    SUMMARY,
-    Journal,
-    delete_masks,
-    segment_lines,
-    summarise,
-    write_summary,
-)
+from jawusd.pipeline.segment_record import LEARNED, RECORD, SUMMARY, Journal, delete_masks, summarise, write_summary
 
 POSES = np.stack([np.eye(4)] * 2).tolist()
 

@@ -135,7 +135,7 @@ def test_pictures_that_do_not_show_this_person_are_refused(rig):
     picks = shot.bootstrap
     moved = picks.model_copy(update={"frame": picks.frame + 40})
     far = shot.model_copy(update={"bootstrap": moved, "frames": (moved.frame, moved.frame + 2)})
-    with pytest.raises(TrackingError, match="not seen where they are picked"):
+    with pytest.raises(TrackingError, match="picks do not match the pictures"):
         solve(rig, far)
     with pytest.raises(TrackingError, match="frames run from"):
         solve(rig, shot.model_copy(update={"bootstrap": moved}))
@@ -212,14 +212,15 @@ def test_a_performance_is_drawn_and_reported(rig, shot, tmp_path):
     np.testing.assert_allclose(jawusd.load(rig).pose(tracks.solved.d), tracks.T_upper_lower, atol=1e-9)
     again = tmp_path / "again.html"
     run("report", files[0], "-o", again)
-    assert "no shot was named" in again.read_text()
+    assert "no shot was given" in again.read_text()
     run("report", files[0], "--capture", shot, "-o", again, "--force")
     assert again.read_text() == page
 
 
 def test_files_with_other_names_are_refused_before_any_work(rig, shot, tmp_path):
     for option, name in (("--overlay", "take.avi"), ("--report", "take.pdf")):
-        assert "End it in" in run("solve", rig, shot, "-o", tmp_path / "take.csv", option, tmp_path / name, code=10)
+        said = run("solve", rig, shot, "-o", tmp_path / "take.csv", option, tmp_path / name, code=10)
+        assert "Name a file ending in" in said
     (tmp_path / "take.mp4").write_text("precious")
     assert "--force" in run("solve", rig, shot, "-o", tmp_path / "t.csv", "--overlay", tmp_path / "take.mp4", code=10)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["take.mp4"]

@@ -7,10 +7,11 @@ from typer.testing import CliRunner
 
 from jawusd.base.errors import CaptureError
 from jawusd.cli.main import app
+from jawusd.cli.text_capture import start_lines
 from jawusd.formats.capture import read_capture
 from jawusd.media.writers import VideoWriter
 from jawusd.pipeline.folder_files import camera_names, find_files, pair
-from jawusd.pipeline.start_capture import start_capture, start_lines, write_start
+from jawusd.pipeline.start_capture import start_capture, write_start
 
 
 def quiet(stage, done, total):
@@ -62,7 +63,7 @@ def test_a_charuco_board_is_told_by_its_markers_and_the_rest_asked_for(folder):
                 writer.write(photograph(camera, T, texture, to_texture))
     start = start_capture(folder, 9.0, None, quiet)
     (line,) = start.missing
-    assert "cols and rows, one less than the ChArUco board has squares" in line and "marker_mm" in line
+    assert "cols and rows, one less than the squares of the ChArUco board" in line and "marker_mm" in line
     write_start(start)
     text = (folder / "capture.toml").read_text()
     assert 'dictionary = "DICT_5X5_50"' in text and "FILL IN: cols" in text
@@ -87,7 +88,7 @@ def test_what_is_missing_is_said(tmp_path):
     clip(tmp_path / "front.mp4")
     start = start_capture(tmp_path, None, None, quiet)
     said = "\n".join(start.missing)
-    for words in ("upper_teeth", "lower_teeth", "footage of two cameras", "a calibration of the cameras"):
+    for words in ("upper_teeth", "lower_teeth", "footage of at least two cameras", "a calibration of the cameras"):
         assert words in said
     write_start(start)  # a template all the same
     text = (tmp_path / "capture.toml").read_text()
@@ -98,7 +99,7 @@ def test_what_is_missing_is_said(tmp_path):
 def test_scans_of_two_people_are_not_guessed(folder):
     (folder / "bob_upper.stl").touch()
     start = start_capture(folder, 8.0, None, quiet)
-    assert len(start.missing) == 1 and "bob_upper.stl, upper.stl may all be it" in start.missing[0]
+    assert len(start.missing) == 1 and "bob_upper.stl, upper.stl are all candidates" in start.missing[0]
 
 
 @pytest.mark.slow

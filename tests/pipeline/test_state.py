@@ -101,7 +101,7 @@ def test_a_file_system_without_locks_is_a_warning(tmp_path, monkeypatch, caplog,
     with locked(tmp_path):
         # another build may be at work: what is unfinished may be its own
         assert (tmp_path / ".jawusd-tmp-of-another").exists()
-    assert "there are no locks here" in caplog.text and os.strerror(number) in caplog.text
+    assert "the file system has no locks" in caplog.text and os.strerror(number) in caplog.text
 
 
 @pytest.mark.parametrize("name", [".jawusd-lock", LABELS])
@@ -109,7 +109,7 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path, name):
     folder, outside = tmp_path / "out", tmp_path / "outside"
     folder.mkdir()
     (folder / name).symlink_to(outside)
-    with pytest.raises(OutputError, match="is a link"), locked(folder):
+    with pytest.raises(OutputError, match="is a symbolic link"), locked(folder):
         pass
     assert not outside.exists()
 

@@ -65,7 +65,7 @@ def test_loose_scans_say_the_same_as_the_capture_they_belong_to():
     assert len(loose.measured_points()) == len(capture.measured_points())
     without = subject_of_scans(SCANS, "someone")
     np.testing.assert_array_equal(without.measured_points(), without.meshes["lower_teeth"].vertices)
-    assert any("mean adult places" in text for text in without.inferred)
+    assert any("mean adult positions" in text for text in without.inferred)
 
 
 def test_a_scan_that_is_none_is_named():

@@ -11,10 +11,11 @@ import trimesh
 from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks, vertex_error_mm
 
 from jawusd.cameras.calibration import save_calibration
+from jawusd.cli.text_build import track_lines
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point
-from jawusd.pipeline.track import track_lines, track_summary
+from jawusd.pipeline.track import track_summary
 
 ROWS = ("upper", "lower")
 CAMERAS = make_cameras((30.0, -30.0))

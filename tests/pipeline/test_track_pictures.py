@@ -7,15 +7,16 @@ import pytest
 from package_copy import ROOT
 
 from jawusd.base.errors import CaptureError, TrackingError
+from jawusd.cli.text_build import track_lines
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import se3_exp, transform_points
-from jawusd.pipeline import track_pictures
-from jawusd.pipeline.media import open_footage
-from jawusd.pipeline.meshes import load_meshes
+from jawusd.pipeline import follow
+from jawusd.pipeline.cameras import open_footage
+from jawusd.pipeline.follow import track_videos
 from jawusd.pipeline.state import no_progress
-from jawusd.pipeline.track import first_pass, track_lines, track_summary
-from jawusd.pipeline.track_pictures import track_videos
+from jawusd.pipeline.subject import load_meshes
+from jawusd.pipeline.track import first_pass, track_summary
 from jawusd.tracking.region.take import footage_doubts
 
 EXAMPLE = ROOT / "examples" / "capture"
@@ -87,7 +88,7 @@ def test_wrong_cameras_and_scans_are_named(offsets, monkeypatch, spoil, size, ki
         cameras, videos = open_footage(capture)
         return {name: spoil(one) if spoil and name == camera else one for name, one in cameras.items()}, videos
 
-    monkeypatch.setattr(track_pictures, "open_footage", opened)
+    monkeypatch.setattr(follow, "open_footage", opened)
     start = load_capture(EXAMPLE).bootstrap.frame
     capture = unmasked((start - 3, start + 9))
     meshes = {
@@ -125,7 +126,7 @@ def test_picks_beside_the_teeth_are_refused(offsets):
         return tuple(pick.model_copy(update={"views": views}) for pick, views in zip(picked, moved, strict=True))
 
     wrong = picks.model_copy(update={"upper": shifted(picks.upper), "lower": shifted(picks.lower)})
-    with pytest.raises(TrackingError, match="not seen where they are picked"):
+    with pytest.raises(TrackingError, match="picks do not match the pictures"):
         first_pass(unmasked((picks.frame, picks.frame + 2), bootstrap=wrong), offsets, 1, no_progress)
     away = unmasked((picks.frame + 5, picks.frame + 9))
     with pytest.raises(TrackingError, match="frames run from"):

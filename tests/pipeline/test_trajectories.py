@@ -135,7 +135,7 @@ def test_each_mistake_of_an_hdf5_file_is_told(tmp_path, poses, change, words):
 
 def test_what_is_no_hdf5_is_told(tmp_path):
     (tmp_path / "jaw.h5").write_text("frame,d1\n")
-    with pytest.raises(FormatError, match="not an HDF5 file"):
+    with pytest.raises(FormatError, match="not a readable HDF5 file"):
         read_hdf5(tmp_path / "jaw.h5")
     with pytest.raises(FormatError, match="no such file"):
         read_hdf5(tmp_path / "other.h5")
@@ -156,5 +156,5 @@ def test_without_h5py_the_command_that_installs_it_is_named(tmp_path, poses, mon
 
 
 def test_tracks_take_no_options(tmp_path):
-    with pytest.raises(FormatError, match="are tracks"):
+    with pytest.raises(FormatError, match="contains tracks"):
         read_motion(tmp_path / "tracks.npz", TrajectoryOptions(invert=True))

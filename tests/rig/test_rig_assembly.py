@@ -261,7 +261,7 @@ def test_a_file_without_a_rig_says_that_it_was_not_checked(anchored_folder):
     path = assembled(anchored_folder, lambda stage, actor: actor.SetActive(False))
     assert validate_stage(path) == []
     said = CliRunner().invoke(app, ["validate", str(path)])
-    assert said.exit_code == 0 and "holds no active rig" in said.stdout
+    assert said.exit_code == 0 and "has no active rig" in said.stdout
 
 
 def place(stage, actor):

@@ -148,7 +148,7 @@ def test_d_keyed_over_a_skeleton_is_found_and_mended(anchored_folder):
 
     file = shot(anchored_folder, key_d)
     assert "Mandible" in run("validate", file, code=1)
-    assert "bake it with" in run("validate", anchored_folder / "actor.usda", file, code=1)
+    assert "run `jawusd rebake`" in run("validate", anchored_folder / "actor.usda", file, code=1)
     out = anchored_folder / "mended.usda"
     run("rebake", anchored_folder / "actor.usda", file, "--root", "-o", out)
     assert_valid_usd(out)

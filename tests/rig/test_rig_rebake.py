@@ -379,7 +379,7 @@ def test_what_a_sublayer_cannot_change_is_said(anchored_folder):
 
     path, out = shot(anchored_folder, move), anchored_folder / "jaws.usdc"
     said = run("rebake", path, "-o", out, "--from", "d")
-    assert "/Shot/Person/geo/Mandible.xformOp:translate: a layer that it sublayers is weaker" in said
+    assert "/Shot/Person/geo/Mandible.xformOp:translate: its sublayers are weaker" in said
     assert "jaw:d1" not in said, "keys of d that stay as they are"
     assert farthest_mm(inserted(path, out), "/Shot/Person", example_rig(), keyed(np.arange(1, 26.0))) > 1
     above = Usd.Stage.CreateInMemory()

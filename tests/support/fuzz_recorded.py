@@ -103,7 +103,7 @@ def motion_reader(rig):
 
 def face_reader(rig):
     def read(place, path):
-        from jawusd.cli.face_commands import read_face
+        from jawusd.cli.animate_commands import read_face
 
         _animated(rig, place, read_face(rig, path, None, None))
 

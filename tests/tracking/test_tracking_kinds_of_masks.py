@@ -10,9 +10,10 @@ from PIL import Image
 from small_take import CAMERAS, FIRST, OFFSETS, ROWS, errors_mm, make_capture, png, source, track, write_masks
 
 from jawusd.base.errors import CaptureError, TrackingError
+from jawusd.cli.text_build import track_lines
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import Tracks
-from jawusd.pipeline.track import track_lines, track_summary
+from jawusd.pipeline.track import track_summary
 
 COUNT = 4
 

@@ -11,11 +11,10 @@ from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import relative_pose
+from jawusd.pipeline.cameras import open_footage
 from jawusd.pipeline.follow import Follower
-from jawusd.pipeline.media import open_footage
-from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment_guide import known_guide, save_guide
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
@@ -182,7 +181,7 @@ def test_the_example_is_followed_by_its_colours(tmp_path):
     done = []
     footage, subject = Counted(videos, offsets), subject_of_capture(capture, meshes)
     follower = Follower(footage, cameras, prepared(teeth), subject)
-    assert follower.begun(start, picked)[1] > 0.3
+    assert follower.start_at(start, picked)[1] > 0.3
     guide = follower.run(chosen, lambda *step: done.append(step))
     assert 1 <= footage.most <= 2  # otherwise long takes exhaust the memory
     assert sorted(guide) == list(chosen) and done[-1] == ("follow", len(chosen), len(chosen))
@@ -296,7 +295,7 @@ def test_teeth_are_found_again_when_lips_open_over_an_open_jaw():
     start = capture.bootstrap.frame
     picked = GuidedTracker(*teeth, lambda *_: [], 1).picked(capture.bootstrap, cameras)
     follower = Follower(Covered(videos, offsets), cameras, prepared(teeth), subject_of_capture(capture, meshes))
-    follower.begun(start, picked)
+    follower.start_at(start, picked)
     guide = follower.run(range(20, 25), lambda *_: None)
     assert not guide[22].found.any()
     exact = {frame: relative[Covered.SHOWN[frame] - first] for frame in (23, 24)}

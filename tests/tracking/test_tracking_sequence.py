@@ -22,8 +22,9 @@ from small_take import (
 )
 
 from jawusd.base.errors import TrackingError
+from jawusd.cli.text_build import track_lines
 from jawusd.formats.tracks import LOST, load_tracks, save_tracks
-from jawusd.pipeline.track import track_lines, track_summary
+from jawusd.pipeline.track import track_summary
 from jawusd.tracking import track_capture
 from jawusd.tracking.sequence import history
 from jawusd.tracking.sequence.frame_tracker import FrameTracker

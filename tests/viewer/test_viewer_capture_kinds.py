@@ -46,7 +46,7 @@ def test_bad_captures_and_foreign_tracks_are_clear_errors(copy, tmp_path):
     with pytest.raises(CaptureError):
         viewed_capture(path, None, quiet)
     result = CliRunner().invoke(app, ["view", str(tmp_path), "--tracks", str(tracks)])
-    assert result.exit_code == 2 and "--tracks belongs to a capture" in result.output
+    assert result.exit_code == 2 and "--tracks needs a capture" in result.output
 
 
 def test_a_capture_of_masks_alone_is_shown(tmp_path):

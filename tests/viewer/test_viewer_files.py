@@ -95,7 +95,7 @@ def test_a_written_animation_is_valid_and_moves_as_the_clip(folder):
 def test_only_animations_beside_the_rig_are_written(folder, name):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     clip = Clip("keys", np.array([0.0]), np.zeros((1, 3)), 24.0)
-    with pytest.raises(OutputError, match="no name for an animation"):
+    with pytest.raises(OutputError, match="not a valid name"):
         viewed_actor(folder).save_layer(name, clip, True)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 

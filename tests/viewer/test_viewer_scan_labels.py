@@ -12,8 +12,8 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh, crown_face_mask, tooth_labels
 from jawusd.formats.scan_labels import labels_path, load_scan_labels
 from jawusd.geometry import transform_point
-from jawusd.pipeline.meshes import load_labelled
 from jawusd.pipeline.state import no_progress
+from jawusd.pipeline.subject import load_labelled
 from jawusd.pipeline.view_capture import viewed_capture
 from jawusd.viewer.scan_labels import ScanBrush, surface_near
 from jawusd.viewer.server import CaptureViewer

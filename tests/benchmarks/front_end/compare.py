@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import LANDMARKS, transform_points
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.tracking.region.appearance import LearnedColours
 from jawusd.tracking.region.view import RegionView
 

@@ -13,8 +13,7 @@ from report import Origin, table, title
 from jawusd.formats.capture import Capture, load_capture
 from jawusd.geometry import Camera, se3_inverse, transform_point, transform_points
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 
 Array = np.ndarray
 SAMPLES = 40  # frames spread over the take

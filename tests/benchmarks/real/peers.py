@@ -19,8 +19,7 @@ from jawusd.geometry import Camera, make_transform, rigid_fits, se3_inverse, tra
 from jawusd.paper.solver import PaperConfig
 from jawusd.paper.take import track_capture_paper
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.meshes import load_meshes
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.tracking import track_capture
 
 Array = np.ndarray

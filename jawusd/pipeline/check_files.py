@@ -1,0 +1,279 @@
+"""Checks of the files of a capture, each by itself: scans, bones, clips, calibration, boards."""
+
+from __future__ import annotations
+
+import contextlib
+import filecmp
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from jawusd.base.errors import JawusdError
+from jawusd.formats.capture import CameraSource, Capture
+from jawusd.formats.file_names import is_pattern
+from jawusd.formats.finding import Finding, Severity
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import LANDMARKS, Camera
+from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
+from jawusd.pipeline.subject import BONES, MESHES, TEETH, label_teeth, subject_of_capture
+
+if TYPE_CHECKING:
+    from jawusd.media.clip import Clip
+    from jawusd.media.mask_survey import MaskSamples
+    from jawusd.tracking.contour.scan import Scan
+
+
+Size = tuple[int, int]
+
+
+@dataclass
+class Parts:
+    """The parts of a capture that the checks have loaded; empty if unreadable. A context manager that closes masks."""
+
+    capture: Capture | None
+    out: Path  # folder whose disk the rig will fill
+    allow_outside: bool
+    meshes: dict[str, Mesh] = field(default_factory=dict)
+    scans: tuple[Scan, ...] = ()  # upper and lower, if both can be used
+    videos: dict[str, Clip] = field(default_factory=dict)
+    cameras: dict[str, Camera] = field(default_factory=dict)
+    samples: dict[str, MaskSamples] = field(default_factory=dict)
+    open_files: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+
+    @property
+    def description(self) -> str:
+        """Return the path of capture.toml."""
+        return str(self.given.folder / "capture.toml")
+
+    @property
+    def given(self) -> Capture:
+        """Return the capture, for checks that need it.
+
+        Raises:
+            ValueError: it could not be read.
+        """
+        if self.capture is None:
+            raise ValueError("there is no capture")
+        return self.capture
+
+    def usable(self, path: Path) -> bool:
+        """Return whether a file, or the folder of a picture pattern, exists and lies in an allowed folder."""
+        place = path.parent if is_pattern(path) else path
+        try:
+            inside = self.allow_outside or place.resolve().is_relative_to(self.given.folder)
+            return inside and place.exists()
+        except (OSError, ValueError, RuntimeError):
+            return False
+
+    def clip_read(self, camera: CameraSource) -> bool:
+        """Return whether the clip of a camera could be opened; true without a clip."""
+        return camera.video is None or camera.name in self.videos
+
+    def offsets(self) -> Mapping[str, int] | None:
+        """Return the frame offsets if `sync_cameras` needs no clips to find them, else None."""
+        capture = self.given
+        if capture.sync.offsets is not None:
+            return capture.sync.offsets
+        if len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
+            return {camera.name: 0 for camera in capture.cameras}
+        return None
+
+    def offset_guesses(self) -> list[Mapping[str, int]]:
+        """Return the offsets, or two guesses: zero, and those that align the first masks of all cameras."""
+        if (known := self.offsets()) is not None:
+            return [known]
+        capture = self.given
+        guesses: list[Mapping[str, int]] = [{camera.name: 0 for camera in capture.cameras}]
+        first = {name: sample.first_frame for name, sample in self.samples.items()}
+        begin = first.get(capture.reference)
+        if begin is not None:
+            guesses.append({name: begin - own for name, own in first.items() if own is not None})
+        return guesses
+
+    def __enter__(self) -> Parts:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.open_files.close()
+
+
+def found_error(kind: str, error: JawusdError, severity: Literal["error", "warning"] = "error") -> Finding:
+    """Convert an exception to a finding."""
+    return Finding(
+        kind, severity, error.message, path=error.path, camera=error.camera, frame=error.frame, hint=error.hint
+    )
+
+
+# Median distance of crown vertices from their bone: larger ones mean another coordinate frame [mm].
+_TEETH_TO_BONE_MM = 20.0
+_CONDYLES_MM = (75.0, 140.0)  # plausible distance of the condyle centres; adults have about 100
+
+
+def scans(parts: Parts) -> Iterator[Finding]:
+    """Read every mesh, label the scans and prepare them."""
+    from jawusd.meshes.meshio import load_mesh
+    from jawusd.tracking.contour.scan import ARCH_NAMES, prepare_scan
+
+    given = parts.given.scans
+    files = {name: path for name in MESHES if (path := getattr(given, name)) is not None and parts.usable(path)}
+    for name, path in files.items():
+        try:
+            parts.meshes[name] = load_mesh(path, kind="bone" if name in BONES else "scan")
+        except JawusdError as error:
+            yield found_error("mesh", error)
+    labelled = label_teeth(parts.meshes, files, given.labels)
+    for arch, scan in labelled.items():
+        parts.meshes[TEETH[arch]] = scan.mesh
+        yield from scan.findings
+    prepared = []
+    for arch in ARCH_NAMES:
+        mesh = parts.meshes.get(f"{arch}_teeth")
+        if mesh is None:
+            continue
+        try:
+            prepared.append(prepare_scan(mesh, arch))
+        except JawusdError as error:
+            yield found_error("scan", error)
+    parts.scans = tuple(prepared) if len(prepared) == len(ARCH_NAMES) else ()
+
+
+def occlusion(parts: Parts) -> Iterator[Finding]:
+    """Check that the two scans are in occlusion."""
+    from jawusd.tracking.initialization.scan_checks import occlusion_findings
+
+    yield from occlusion_findings(parts.scans, parts.given.anatomy.T_anatomical_skull)[1]
+
+
+def bone_findings(parts: Parts) -> Iterator[Finding]:
+    """Check the position of bones and landmarks against the teeth."""
+    for bone, arch in zip(BONES, ("lower", "upper"), strict=True):
+        if bone not in parts.meshes:
+            continue
+        crowns = parts.scans[("upper", "lower").index(arch)].crown_vertices(300)
+        vertices = parts.meshes[bone].vertices
+        apart = float(np.median([np.linalg.norm(vertices - point, axis=1).min() for point in crowns]))
+        if apart > _TEETH_TO_BONE_MM:
+            yield Finding(
+                "bone_elsewhere",
+                "warning",
+                f"the {bone} is {apart:.0f} mm from the {arch} teeth; at most {_TEETH_TO_BONE_MM:g} mm is plausible",
+                apart,
+                _TEETH_TO_BONE_MM,
+                path=str(getattr(parts.given.scans, bone)),
+                hint="Export it in the coordinate frame of the scans, in mm.",
+            )
+    landmarks = dict(zip(LANDMARKS, subject_of_capture(parts.given, parts.meshes).landmarks, strict=True))
+    width = float(np.linalg.norm(landmarks["condyle_left"] - landmarks["condyle_right"]))
+    if not _CONDYLES_MM[0] <= width <= _CONDYLES_MM[1]:
+        yield Finding(
+            "condyles",
+            "warning",
+            f"the condyles are {width:.0f} mm apart; {_CONDYLES_MM[0]:g} to {_CONDYLES_MM[1]:g} mm is plausible",
+            width,
+            _CONDYLES_MM[width > _CONDYLES_MM[1]],
+            path=parts.description,
+            hint="Check the mandible mesh, or give the condyles in [anatomy.landmarks].",
+        )
+
+
+def clips(parts: Parts) -> Iterator[Finding]:
+    """Open every clip and decode it; of long clips only parts."""
+    from jawusd.media.clip_checks import decoded_findings, rate_findings
+    from jawusd.media.footage import open_clip
+
+    for camera in parts.given.cameras:
+        if camera.clip is None or not parts.usable(camera.clip.path):
+            continue
+        try:
+            video = open_clip(camera.clip)
+        except JawusdError as error:
+            yield replace(found_error("clip", error), camera=camera.name)
+            continue
+        parts.videos[camera.name] = video
+    with ThreadPoolExecutor() as pool:
+        for found in pool.map(lambda item: list(decoded_findings(item[1], item[0])), parts.videos.items()):
+            yield from found
+    yield from _copies({name: video.path for name, video in parts.videos.items()})
+    yield from rate_findings(parts.videos, parts.given.fps, parts.description)
+
+
+def _copies(clips: Mapping[str, Path]) -> Iterator[Finding]:
+    """Find clips with identical contents: two cameras never record the same bytes."""
+    for one, other in combinations(clips, 2):
+        paths = clips[one], clips[other]
+        if not all(path.is_file() for path in paths) or not filecmp.cmp(*paths, shallow=False):
+            continue
+        message = f"its clip {paths[1].name} is identical to {paths[0].name}, the clip of camera {one}"
+        hint = "Copy the clip of this camera again."
+        yield Finding("clips_alike", "error", message, path=str(paths[1]), camera=other, hint=hint)
+
+
+def calibration(parts: Parts) -> Iterator[Finding]:
+    """Read and check the calibration."""
+    from jawusd.capture.camera_checks import camera_findings
+
+    capture = parts.given
+    if capture.calibration is None:
+        if capture.boards is None:
+            message = 'has neither "calibration" nor [boards] to make one from'
+            hint = "Name a calibration file, or clips of a calibration board."
+            yield Finding("no_calibration", "error", message, path=parts.description, hint=hint)
+        return
+    if not parts.usable(capture.calibration) or not all(parts.clip_read(camera) for camera in capture.cameras):
+        return  # the recorded size of a camera is unknown without its clip
+    if len(capture.cameras) < 2:
+        message = "has one camera; tracking in 3-D needs at least two"
+        yield Finding("one_camera", "error", message, 1, 2, path=parts.description)
+    parts.cameras = {camera.name: camera for camera in load_cameras(capture)}
+    yield from camera_findings(list(parts.cameras.values()), str(capture.calibration))
+    yield from _rescaled(parts)
+
+
+def _rescaled(parts: Parts) -> Iterator[Finding]:
+    """Report calibrations at another picture size; if only some cameras differ, it is likely a mistake."""
+    found = rescaled_cameras(parts.given)
+    for name, (was, now) in found.items():
+        every = len(found) == len(parts.cameras)
+        message = f"calibrated at {was[0]} x {was[1]} px, but its pictures or masks have {now[0]} x {now[1]} "
+        message += "px; assumed to be scaled, not cropped" + ("" if every else "; the sizes of the other cameras match")
+        hint = "Check that its masks were not drawn at a reduced size; picks refer to the pixels of the calibration."
+        severity: Severity = "note" if every else "warning"
+        yield Finding("calibration_rescaled", severity, message, camera=name, hint=hint)
+
+
+def boards(parts: Parts) -> Iterator[Finding]:
+    """Open the board clips if a calibration must be made from them."""
+    from jawusd.media.clip_checks import decoded_findings
+    from jawusd.media.footage import open_clip
+
+    capture = parts.given
+    if capture.boards is None or capture.calibration is not None:
+        return
+    for path, camera in zip(capture.boards.videos, capture.cameras, strict=True):
+        if not parts.usable(path):
+            continue
+        try:
+            video = open_clip(path)
+        except JawusdError as error:
+            yield replace(found_error("board_clip", error), camera=camera.name)
+            continue
+        yield from decoded_findings(video, camera.name)
+        own = parts.videos.get(camera.name)
+        if own is not None and abs(video.size_px[0] * own.size_px[1] / own.size_px[0] - video.size_px[1]) > 1.0:
+            yield Finding(
+                "board_shape",
+                "error",
+                f"its board clip is {video.size_px[0]} x {video.size_px[1]} px, its video {own.size_px[0]} x "
+                f"{own.size_px[1]} px, another aspect ratio",
+                path=str(path),
+                camera=camera.name,
+                hint="Record the boards in the recording mode of the take.",
+            )
