@@ -1,4 +1,4 @@
-"""`jawusd animate` of keys and tables, run as a user runs it."""
+"""`jawusd animate` of keys and tables, run as a program."""
 
 import json
 import subprocess
@@ -48,7 +48,7 @@ def test_animate_writes_keys_as_splines_when_asked(actor, tmp_path):
 
 
 def samples(path, times):
-    """Return the d (n, 3) that a reader of a layer finds at times."""
+    """Return d (n, 3) as OpenUSD evaluates it in a layer at these times."""
     stage = Usd.Stage.Open(str(path))
     prim = stage.GetPrimAtPath("/Actor")
     return np.array([[prim.GetAttribute(f"jaw:d{i}").Get(time) for i in (1, 2, 3)] for time in times.tolist()])
@@ -64,7 +64,7 @@ def samples(path, times):
     ],
 )
 def test_animate_pops_nowhere_and_stays_inside(actor, tmp_path, keys, interpolation):
-    """As readers see it, ten times a frame: inside, never beyond the keys, no step longer than the keys' own."""
+    """Ten samples per frame: inside the bound, between the keys, with no larger step than the keys."""
     file = {"fps": 24, "interpolation": interpolation, "keys": [{"frame": f, "d": d} for f, d in keys.items()]}
     (tmp_path / "keys.json").write_text(json.dumps(file))
     name = f"anim_pops_{max(keys)}_{interpolation}"
@@ -82,7 +82,7 @@ def test_animate_pops_nowhere_and_stays_inside(actor, tmp_path, keys, interpolat
         inside = rig.margin(own).min() > 0
         if inside:
             np.testing.assert_allclose(found[::10], own[::10], atol=1e-6)
-    if inside:  # the spline is the keys themselves
+    if inside:  # the spline consists of the keys alone
         stage = Usd.Stage.Open(str(splines))
         knots = stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline().GetKnots()
         assert sorted(knots.keys()) == frames.tolist()
@@ -107,7 +107,7 @@ def test_animate_writes_glb(actor, tmp_path):
     early.write_text(keys.read_text().replace('"frame": 1,', '"frame": -8,'))
     assert "frame -8 is at 0 s" in run("animate", actor, early, "-o", tmp_path / "early.glb")
     assert glb.read_bytes()[:4] == b"glTF" and b'"animations"' in glb.read_bytes()
-    run("animate", actor, keys, "-o", glb, code=10)  # it exists
+    run("animate", actor, keys, "-o", glb, code=10)  # the output exists
     for option, value in (("--splines", tmp_path / "s.usda"), ("--prim", "/Actor")):
         assert option in run("animate", actor, keys, "-o", tmp_path / "b.glb", option, value, code=2)
 

@@ -1,4 +1,4 @@
-"""Face captures: `jawusd animate --arkit`, `arkit-fit` and `arkit-table`, run as a user runs them."""
+"""Face captures: `jawusd animate --arkit`, `arkit-fit` and `arkit-table`, run as programs."""
 
 import json
 
@@ -20,7 +20,7 @@ def test_animate_refuses_arkit_weights_in_percent(actor, tmp_path):
 
 
 def test_animate_takes_arkit_weights_as_shares_of_the_persons_ranges(actor, tmp_path):
-    """The ends are measured with `ranges`: 1 is the edge of the bound, so opening halfway and then to either side."""
+    """A weight of 1 reaches the end of `ranges`: half opening, then each side at that opening."""
     rig = jawusd.load(actor)
     d1 = 0.5 * rig.d_range[0, 1]
     d2_min, d2_max, _, d3_max = rig.ranges(d1)
@@ -50,7 +50,7 @@ def test_animate_says_how_far_arkit_weights_were_clamped(actor, tmp_path):
 
 @pytest.mark.slow
 def test_arkit_fit_learns_the_actors_own_mapping(actor, tmp_path):
-    """Weights that mean d by gains of this actor, 0.5 s apart; `animate --mapping` gives d back."""
+    """Weights made from d with an actor's gains and a delay of 0.5 s; `animate --mapping` recovers d."""
     rig, phase = jawusd.load(actor), 2 * np.pi * np.arange(720) / 24
     wanted = np.stack([9 - 9 * np.cos(0.31 * phase), 4 * np.sin(0.47 * phase), 2 - 2 * np.cos(0.23 * phase)], axis=1)
     d = rig.project(wanted)
@@ -61,7 +61,7 @@ def test_arkit_fit_learns_the_actors_own_mapping(actor, tmp_path):
     found = json.loads(run("arkit-fit", actor, csv, tmp_path / "d.csv", "-o", mapping, "--jaw-fps", 24, "--json"))
     assert found["offset_s"] == pytest.approx(0.5, abs=0.005)
     assert found["error_mm"] < 0.2 < found["shares_error_mm"]
-    run("arkit-fit", actor, csv, tmp_path / "d.csv", "-o", mapping, "--jaw-fps", 24, code=10)  # it exists
+    run("arkit-fit", actor, csv, tmp_path / "d.csv", "-o", mapping, "--jaw-fps", 24, code=10)  # the output exists
     run("animate", actor, "--arkit", csv, "--mapping", mapping, "-o", out)
     stage = Usd.Stage.Open(str(out))
     prim = stage.GetPrimAtPath("/Actor")
@@ -82,14 +82,14 @@ def test_arkit_table_lists_shapes(actor, tmp_path):
     assert json.loads(run("arkit-table", actor, "-o", out, "--json"))["rows"] == 8
     lines = out.read_text().splitlines()
     assert lines[0].startswith("shape,weight,d1") and lines[2].startswith("JawOpen,1,")
-    run("arkit-table", actor, "-o", out, code=10)  # it exists
+    run("arkit-table", actor, "-o", out, code=10)  # the output exists
     (tmp_path / "bad.json").write_text("{}")
     assert "arkit-fit" in run("arkit-table", actor, "-o", out, "--mapping", tmp_path / "bad.json", "--force", code=3)
 
 
 @pytest.mark.parametrize("lost", [False, True])
 def test_face_takes_come_to_the_rate_of_the_scene(actor, tmp_path, lost):
-    """60 to 24 frames per second: on the motion at the new frames, peaks where they were."""
+    """From 60 to 24 frames per second, samples lie on the motion, and peaks stay at their times."""
     rig = jawusd.load(actor)
     opening = 0.25 - 0.25 * np.cos(2 * np.pi * np.arange(301) / 60 * 1.3)
     weights = [(x, 0, 0, 0) for x in opening]
@@ -111,7 +111,7 @@ def test_face_takes_come_to_the_rate_of_the_scene(actor, tmp_path, lost):
 
 
 def test_peaks_of_speech_keep_their_time_and_height(actor, tmp_path):
-    """60 to 24 frames per second: a chewed sentence, looked at between the frames for where it peaks."""
+    """From 60 to 24 frames per second, peaks of chewing stay at their times, also between frames."""
     rig = jawusd.load(actor)
 
     def d_at(seconds):

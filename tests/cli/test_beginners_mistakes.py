@@ -1,6 +1,6 @@
-"""What a newcomer gets wrong at the shell, as opposed to in the file (tests/formats/test_capture_errors.py).
+"""Mistakes of a beginner in the shell; those in capture.toml are in tests/formats/test_capture_errors.py.
 
-Each is one message, without a traceback, that names what was given and what to do.
+Each gives one message without a traceback, with the wrong argument and a remedy.
 """
 
 import subprocess
@@ -15,7 +15,7 @@ CAPTURE = f'{HEAD}calibration = "cal.toml"\n{TABLES}'
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """Return a folder with a capture, clips, a rig's folder that is none, and files of other kinds."""
+    """Return a folder with a capture, clips, an empty folder of a rig, and files of other kinds."""
     folder = tmp_path_factory.mktemp("newcomer")
     write_media(folder)
     (folder / "capture.toml").write_text(CAPTURE)

@@ -1,4 +1,4 @@
-"""The commands calibrate and sync, on clips small enough to film here."""
+"""The commands calibrate and sync on small clips written by the tests."""
 
 import csv
 import json
@@ -48,9 +48,9 @@ def test_sync_draws_the_clips_before_and_after(tmp_path):
     drawn = (tmp_path / "sync.svg").read_text()
     for words in ("A +0, B +5 frames", "as recorded, first flash", "aligned, last flash", "light off"):
         assert words in drawn
-    assert run("sync", *clips, "--plot", tmp_path / "sync.svg").exit_code != 0  # exists
+    assert run("sync", *clips, "--plot", tmp_path / "sync.svg").exit_code != 0  # the output exists
     assert run("sync", *clips, "--plot", tmp_path / "sync.pdf").exit_code == 2
-    # A clip that cannot be aligned is drawn all the same.
+    # The plot is drawn even if a clip cannot be aligned.
     dim = [film(tmp_path / "dim" / name, start=200) for name in ("C.mp4", "D.mp4")]
     result = run("sync", *dim, "--plot", tmp_path / "dim.png")
     assert isinstance(result.exception, SyncError) and "shows no light flash" in str(result.exception)

@@ -1,4 +1,4 @@
-"""Files of a build that were exchanged, changed or cut are named by every command that is given the folder."""
+"""Every command on the folder of a build names files that were replaced, modified or truncated."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ from jawusd.viewer.server import PageServer
 
 
 def made(folder, seed):
-    """A folder as a build leaves it, of one of two persons."""
+    """A folder as written by a build, for one of two persons."""
     data = report_data(count=60)
     model = data.model
     model.meta["actor"] = f"person {seed}"

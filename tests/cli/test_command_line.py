@@ -1,4 +1,4 @@
-"""What people expect of a program in a shell: help, versions, completion, logs, Ctrl+C, plans, exit codes."""
+"""Conventions of a command-line program: help, versions, completion, logs, Ctrl+C, plans, exit codes."""
 
 import json
 import os
@@ -101,7 +101,7 @@ def test_a_log_holds_what_was_printed_and_where_an_error_arose(tmp_path):
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(tmp_path):
     capture = write_short(tmp_path / "capture", 40)
     words = [sys.executable, "-m", "jawusd", "build", str(capture), "-o", str(tmp_path / "out"), "--jobs", "1"]
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell's child has
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a child process of a shell
     try:
         process = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     finally:
@@ -117,7 +117,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on(tmp_path):
     assert process.returncode == 130
     assert told.splitlines()[-1].startswith("jawusd build: stopped; finished stages are kept") and "--resume" in told
     assert "Traceback" not in told
-    # What it says is true: a plan keeps what was finished, and runs the rest.
+    # The message is true: a plan reuses the finished stages and runs the others.
     plan = json.loads(run("build", capture, "-o", tmp_path / "out", "--resume", "--dry-run", "--json").stdout)
     kept = {stage["name"]: stage["keeps"] for stage in plan["stages"]}
     assert kept["check"] and not kept["report"]
@@ -169,7 +169,7 @@ def test_the_doctor_looks_at_what_a_build_needs():
 
 
 def test_linear_algebra_has_one_thread_unless_told_otherwise():
-    """With two, a fit ended 5 micrometres elsewhere; it counts only before numpy is loaded."""
+    """With two threads, a fit differed by 5 micrometres; the setting has effect only before numpy is loaded."""
     shown = "print(os.environ['OPENBLAS_NUM_THREADS'], 'numpy' in sys.modules)"
     code = f"import os, sys, jawusd.cli.main as m\nm.app = lambda: {shown}\nm.main()"
     rest = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}

@@ -1,4 +1,4 @@
-"""`jawusd fit` with poses and anatomy from elsewhere, and `jawusd report`: run as a user runs them."""
+"""`jawusd fit` with poses and anatomy of other programs, and `jawusd report`, run as programs."""
 
 import json
 import re
@@ -27,7 +27,7 @@ SCANS = EXAMPLE / "scans"
 
 
 def run(*arguments, code=0):
-    """Run the program in a process of its own; return its standard output, or its complaint."""
+    """Run the program in a new process; return its standard output, or its error message."""
     command = [sys.executable, "-m", "jawusd", *map(str, arguments)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert result.returncode == code, result.stdout + result.stderr
@@ -47,7 +47,7 @@ def poses(person):
 
 @pytest.fixture(scope="module")
 def given(person, poses, tmp_path_factory):
-    """The same poses as our CSV, as a foreign table in metres, and as HDF5; and the person's landmarks."""
+    """The same poses as a CSV of jawusd, another table in metres, and HDF5; and the person's landmarks."""
     folder = tmp_path_factory.mktemp("given")
     frames = np.arange(FRAMES)
     write_poses(folder / "poses.csv", frames, poses)
@@ -94,7 +94,7 @@ def test_the_same_poses_give_the_same_model_however_they_are_written(given, tmp_
     run("fit", tmp_path / "qtm.tsv", *whose, *rest, "-o", tmp_path / "e.npz")
     named = load_model(tmp_path / "e.npz")
     assert named.meta["fps"] == 120 and "fps" not in ours.meta
-    # A fit of few poses at five landmarks magnifies the last digits of the poses; HDF5 has one pose more, the first.
+    # A fit of few poses at five landmarks amplifies rounding of the poses; HDF5 has one more pose, the first.
     np.testing.assert_allclose(foreign.d, ours.d, atol=0.05)
     assert np.median(np.abs(hdf5.d[1:] - ours.d)) < 0.05
 
@@ -110,7 +110,7 @@ def test_rigid_bodies_that_cannot_be_read_are_refused(given):
 def test_scans_take_the_place_of_a_capture(given, tmp_path, poses):
     scans = ["--upper-teeth", SCANS / "upper_teeth.ply", "--lower-teeth", SCANS / "lower_teeth.ply"]
     scans += ["--mandible", SCANS / "mandible.ply"]
-    text = (EXAMPLE / "capture.toml").read_text().replace('skull = "scans/skull.ply"\n', "")  # what scans lack, too
+    text = (EXAMPLE / "capture.toml").read_text().replace('skull = "scans/skull.ply"\n', "")  # the scans lack it, too
     (tmp_path / "capture.toml").write_text(re.sub(r'"(\w+/[^"]+\.\w+|calibration.toml)"', rf'"{EXAMPLE}/\1"', text))
     capture = ["--capture", tmp_path, "--allow-outside"]
     run("fit", given / "poses.csv", *scans, "-o", tmp_path / "scans.npz")
@@ -143,7 +143,7 @@ def test_each_mistake_is_one_clear_error(given, tmp_path, arguments, code, words
 
 @pytest.mark.slow
 def test_report_draws_and_prints_the_experiments(given, tmp_path, monkeypatch):
-    """In this process, so that networks can be trained for a tenth of their time."""
+    """Run in this process, so that the networks' training can be cut to a tenth."""
     train = nlpca.train_nlpca
     monkeypatch.setattr(nlpca, "train_nlpca", lambda *a, **k: train(*a, **(k | {"stages": 2})))
     monkeypatch.setattr(synthesis, "POSES", 200)

@@ -1,6 +1,6 @@
-"""Forty mistakes of a beginner and more: each is one message with file, key, what was found, is allowed, and is to do.
+"""More than forty beginner's mistakes: each gives one message with file, key, value found, allowed values and remedy.
 
-What a mistake has not, as a misspelt folder has no key, is left out of its row.
+Parts that do not apply are empty, such as the key of a misspelt folder.
 """
 
 import pytest
@@ -20,7 +20,7 @@ CAMERA = (
 )
 CAMERAS = f'[cam_0]\nname = "left"\n{CAMERA}[cam_1]\nname = "right"\n{CAMERA}'
 
-# What is wrong in words; what is written instead of what in capture.toml; key; found; allowed; what to do.
+# The mistake; the replacement and the replaced text in capture.toml; key; found; allowed; remedy.
 IN_THE_FILE = [
     ("a misspelt key", "video = ", "vidoe = ", '[[camera]] 1 ("left")', '"vidoe"', "allowed are name", '"video"'),
     ("a misspelt table", "[scans]", "[scan]", "", '"scan"', "fps, frames, calibration", 'mean "scans"'),
@@ -72,11 +72,11 @@ IN_THE_FILE = [
     ("an accent", 'name = "x"', 'name = "J\u00f6rg"', "name", '"J\u00f6rg"', "A-Z a-z 0-9 _ - . spaces", '"anna"'),
 ]
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
-# How the file is stored: words; encoding; what is allowed; what to do.
+# Encodings of the file: description; encoding; what is allowed; remedy.
 STORED = [
     ("an accent of Windows", "cp1252", "line 2 has the byte 0xf6", "Save it as UTF-8"),
 ]
-# Files that are there and hold something else: words; name; bytes; found; what to do.
+# Existing files with wrong contents: description; name; bytes; found; remedy.
 CONTENTS = [
     ("an empty scan", "u.ply", b"", "the file is empty", "Copy it again"),
     ("an empty clip", "left.mp4", b"", "the file is empty", "Copy it again"),
@@ -84,7 +84,7 @@ CONTENTS = [
     ("a clip that git has not fetched", "left.mp4", LFS, "Git LFS", "pull"),
     ("text under the name of a scan", "u.ply", b"dear diary", "is not a PLY file", "Export it again"),
 ]
-# The same of what is typed: words; file; found; allowed; what to do.
+# Mistakes in arguments: description; arguments; file; found; allowed; remedy.
 TYPED = [
     ("a folder without capture", ["check", "empty"], "empty", "no such file", "", "jawusd init"),
     ("a folder's name misspelt", ["check", "emty"], "emty", "no such file", "Did you mean empty?", "jawusd init"),
@@ -126,7 +126,7 @@ def place(tmp_path_factory):
 
 
 def told(words):
-    """Return what the program says of a mistake, on one line."""
+    """Return the program's message about a mistake, on one line."""
     done = CliRunner().invoke(app, words)
     assert done.exit_code != 0
     assert done.exception is None or isinstance(done.exception, JawusdError | SystemExit), done.exception
@@ -144,7 +144,7 @@ def test_a_mistake_in_the_file(place, tmp_path, row):
 
 
 def check_of(folder, place, text=TEXT, encoding="utf-8"):
-    """Return the errors of a capture, one a line; files that the folder has already stay."""
+    """Return the errors of a capture, one per line; existing files of the folder are kept."""
     for name in ("u.ply", "l.ply", "left.mp4", "right.mp4"):
         if not (folder / name).exists():
             (folder / name).write_bytes((place / name).read_bytes())

@@ -1,4 +1,4 @@
-"""The process that guards a command: what ends the command, what passes through, and what it may use."""
+"""The process that guards a command: how commands end, what is passed on, and memory limits."""
 
 import contextlib
 import os
@@ -29,7 +29,7 @@ def guarded(code, *words, **settings):
 
 @contextlib.contextmanager
 def started(code):
-    """Start code in a guarded process; yield it and the number of the child, which the code prints."""
+    """Start code in a guarded process; yield it and the process id of the child, which the code prints."""
     line = [sys.executable, "-c", BEGIN + "print(os.getpid(), flush=True); " + code]
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         yield process, int(process.stdout.readline())
@@ -76,7 +76,7 @@ def test_the_limit_is_a_share_of_the_machine_that_can_be_set(monkeypatch):
 
 @pytest.mark.parametrize("most_mb", [60, 300, 900])
 def test_too_little_address_space_is_one_message(most_mb):
-    """Libraries crash there, or call good files damaged."""
+    """Without memory, libraries crash, or report good files as damaged."""
     limited = f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({most_mb} << 20,) * 2); "
     line = [sys.executable, "-c", limited + "from jawusd.__main__ import main; main()", "check", "capture.toml"]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
@@ -145,7 +145,7 @@ print("status", os.waitstatus_to_exitcode(status), flush=True)
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="process groups of subprocess")
 def test_keys_of_a_terminal_reach_the_command_once():
-    """Ctrl+Z stops the whole job, fg continues it, Ctrl+C is one interrupt, and the terminal is seen."""
+    """Ctrl+Z stops the whole job, fg continues it, Ctrl+C interrupts once, and the command has the terminal."""
     code = BEGIN + "seen = []\nsignal.signal(signal.SIGINT, lambda *_: seen.append(1))\n"
     code += "print('ready', sys.stderr.isatty(), flush=True)\n"
     code += "while not seen: time.sleep(.05)\ntime.sleep(.5); sys.exit(40 + len(seen))"

@@ -1,4 +1,4 @@
-"""Names and texts of files that would control a terminal are printed as escapes: terminal, pipe, log, report, CSV."""
+"""Control characters in names and texts of files are printed as escapes: terminal, pipe, log, report, CSV."""
 
 import csv
 import io
@@ -20,7 +20,7 @@ from jawusd.report.document import document
 from jawusd.report.style import figure_bytes, new_figure
 from jawusd.rig.bake import bake_rig
 
-#: Each with what must not be printed of it.
+#: Each with the part that must not be printed.
 HOSTILE = {
     "clears the screen": "Anna\x1b[2J\x1b[31m",
     "C1 control": "Anna\x9b31m",
@@ -116,7 +116,7 @@ def test_commands_on_a_rig_of_a_hostile_name_are_harmless(tmp_path, command):
 
 
 def test_one_place_prints():
-    """All printing of the command line goes through `output`, which shows what would control a terminal."""
+    """All printing of the command line goes through `output`, which escapes control characters."""
     for path in (ROOT / "jawusd" / "cli").glob("*.py"):
         text = path.read_text()
         assert path.name == "output.py" or not re.search(r"typer\.(echo|secho)\(|\bprint\(", text), path

@@ -1,4 +1,4 @@
-"""The commands on many actors: retarget and library, from the shell's side."""
+"""The commands on many actors, retarget and library, run as programs."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ FPS = 30.0
 
 @pytest.fixture(scope="module")
 def actors(tmp_path_factory):
-    """Two persons; the second opens less and reaches less far."""
+    """Two persons; the second has smaller ranges."""
     folder = tmp_path_factory.mktemp("actors")
     for name, rig in (("a", person("A")), ("b", person("B", ranges=0.6, opening=0.8, wider_mm=3.0))):
         bake_rig(folder / name, rig, example_meshes(), name=name, fps=24, table_size=17)
@@ -37,7 +37,7 @@ def actors(tmp_path_factory):
 
 @pytest.fixture
 def animation(actors, tmp_path):
-    frames, d = example_motion(65)  # every peak of opening and side is a frame
+    frames, d = example_motion(65)  # every peak of opening and laterotrusion lies on a frame
     return write_animation(tmp_path / "anim.usdc", actors[0], frames, d, FPS), frames, d
 
 
@@ -49,7 +49,7 @@ def run(*arguments):
 
 
 def peaks(curve):
-    """Frames at which a curve turns."""
+    """Frames of a curve's local extrema."""
     steps = np.sign(np.diff(curve))
     return np.flatnonzero(steps[:-1] * steps[1:] < 0) + 1
 
@@ -148,7 +148,7 @@ def test_animate_takes_motion_of_another_rig(actors, animation, tmp_path):
 
 
 def test_the_folder_of_a_build_stands_for_its_rig(actors, animation, tmp_path):
-    """In every option that takes a rig, of a build and as published under another name."""
+    """Every option for a rig accepts its folder, of a build or published under another name."""
     path, *_ = animation
     a, b = (actor.parent for actor in actors)
     CliRunner().invoke(app, ["publish", str(b), "-o", str(tmp_path / "hero"), "--prefix", "hero"])
@@ -194,7 +194,7 @@ def face(path, wider_mm=0.0):
 
 
 def incisor_travel(rig, opening_mm):
-    """How far the incisal point has gone [mm] at an opening on the habitual path."""
+    """Displacement of the incisal point [mm] at an opening on the habitual path."""
     return np.linalg.norm((rig.pose([opening_mm, 0, 0]) - rig.T_rest) @ [*rig.landmarks[0], 1.0])
 
 

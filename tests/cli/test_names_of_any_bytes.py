@@ -1,4 +1,4 @@
-"""Every command in a folder of every kind of name: it works, or ends in one plain message."""
+"""Every command in folders with unusual names: it works, or fails with one plain message."""
 
 import json
 import os
@@ -33,16 +33,16 @@ NAMES = {
     "255 bytes": b"n" * 255,
     "signs": b"%d #* $x'\"`{}",
 }
-#: C alone makes Python use UTF-8; without that it takes names for ASCII.
+#: With locale C, Python uses UTF-8 unless told not to; then names are ASCII.
 LOCALES = {"UTF-8": {"LC_ALL": "C"}, "ASCII": {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}}
-# What works whatever the name: only OpenUSD, and texts that would have to say the name, cannot do with all of them.
+# Commands that work with any name; only OpenUSD, and texts that contain the name, do not support all of them.
 ALWAYS = {"doctor", "pose of a model", "fit", "sync"}
 KNOWN_CODES = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12}
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, actor):
-    """A folder with an input of every kind."""
+    """A folder with inputs of every kind."""
     folder = tmp_path_factory.mktemp("files")
     shutil.copytree(actor.parent, folder / "rig")
     data = report_data(count=90)

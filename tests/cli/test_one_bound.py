@@ -1,7 +1,7 @@
-"""One bound: everything that says inside or outside says the same, margin >= 0, of 5,000 parameters in and around it.
+"""One bound: all tests for inside agree on margin >= 0, for 5,000 parameters in and around the bound.
 
 The oracle is the definition of the bound, with scipy; points nearer to it than 1e-6 mm may fall to either side. The rig
-has a tolerance for measured poses of 1 mm, which no surface but the verdicts on measured poses may use.
+has a tolerance of 1 mm for measured poses, which only the verdicts on measured poses may use.
 """
 
 import importlib
@@ -53,7 +53,7 @@ RIG = JawRig(ARRAYS, example_meta())
 
 
 def oracle_margin(d):
-    """The margin from its definition: supports by scipy's Hermite spline, joined by scipy's soft maximum."""
+    """The margin from its definition: supports by scipy's Hermite spline, combined by scipy's soft maximum."""
     knots, support = ARRAYS["slice_d1"], ARRAYS["slice_support"]
     slopes = np.zeros_like(support)
     slopes[1:-1] = (support[2:] - support[:-2]) / (knots[2:] - knots[:-2])[:, None]
@@ -65,7 +65,7 @@ def oracle_margin(d):
 
 
 def in_and_around():
-    """Parameters all over, and as many moved along the gradient to margins from 1e-5 to 2 mm on either side."""
+    """Random parameters, and as many moved along the gradient to margins from 1e-5 to 2 mm on either side."""
     rng = np.random.default_rng(0)
     d = rng.uniform([-3, -11, -3], [46, 12, 9], (COUNT, 3))
     near, wanted = d[COUNT // 2 :], rng.choice([-1, 1], COUNT // 2) * 10 ** rng.uniform(-5, np.log10(2), COUNT // 2)
@@ -88,7 +88,7 @@ def disagreements(inside):
 
 
 def words_of_measured(margin):
-    """What a verdict on a measured pose must say."""
+    """The expected verdict on a measured pose."""
     if margin >= 0:
         return "inside"
     return f"within tolerance {-margin:.2f} of 1.00 mm" if margin >= -TOLERANCE_MM else "outside"
@@ -116,7 +116,7 @@ def test_the_sample_is_on_both_sides_and_near():
 def test_functions():
     assert disagreements(RIG.is_inside(D)) == 0
     assert disagreements(RIG.margin(D) >= 0) == 0
-    assert disagreements([RIG.is_inside(d) for d in D]) == 0  # one at a time: another way through the code
+    assert disagreements([RIG.is_inside(d) for d in D]) == 0  # one at a time: another code path
     authored = RIG.validate_parameters(D)
     assert disagreements(authored.valid) == 0
     assert disagreements([words == "inside" for words in authored.words()]) == 0
@@ -215,7 +215,7 @@ def test_viewer():
     kept = []
     for d in D[:1000]:
         session.set_pose(d)
-        session.set_keep_valid(True)  # moves what is outside, and nothing else
+        session.set_keep_valid(True)  # moves only parameters outside
         kept.append(session.work.d == tuple(d))
         session.set_keep_valid(False)
     np.testing.assert_array_equal(kept, INSIDE[:1000])
@@ -260,7 +260,7 @@ def test_usd_rule(actor, tmp_path):
 
 @pytest.mark.slow
 def test_plain_reader_and_add_on(actor, tmp_path, monkeypatch):
-    """As shipped: the packed reader, and the panel of the Blender add-on with the evaluator it carries."""
+    """The packed reader and the panel of the Blender add-on, with its own evaluator, as shipped."""
     extension.copy_scripts(tmp_path / "scripts")
     monkeypatch.syspath_prepend(tmp_path / "scripts")
     reader = importlib.import_module("jawusd_reader")
@@ -270,7 +270,7 @@ def test_plain_reader_and_add_on(actor, tmp_path, monkeypatch):
     built = extension.build_extension(tmp_path / "jaw.zip")
     package = tmp_path / "shipped"
     zipfile.ZipFile(built).extractall(package)
-    (package / "__init__.py").write_text("")  # that of the add-on registers it with Blender
+    (package / "__init__.py").write_text("")  # the add-on's own module registers with Blender
     labels = _stand_in_for_blender(monkeypatch)
     monkeypatch.syspath_prepend(tmp_path)
     panel = importlib.import_module("shipped.panel")
@@ -289,7 +289,7 @@ def test_plain_reader_and_add_on(actor, tmp_path, monkeypatch):
     drawn.layout = _Layout(labels)
     render = types.SimpleNamespace(fps=FPS, fps_base=1.0)
     context = types.SimpleNamespace(scene=types.SimpleNamespace(render=render))
-    said, some = [], slice(None, None, 5)  # both of those all over and of those near; the panel draws slowly
+    said, some = [], slice(None, None, 5)  # both random and near parameters; the panel draws slowly
     for d in D[some].tolist():
         labels.clear()
         shown.update(dict(zip(("d1", "d2", "d3"), d)))
@@ -300,7 +300,7 @@ def test_plain_reader_and_add_on(actor, tmp_path, monkeypatch):
 
 
 class _Layout:
-    """What of a Blender layout the panel uses."""
+    """The parts of a Blender layout that the panel uses."""
 
     def __init__(self, labels):
         self._labels = labels

@@ -1,4 +1,4 @@
-"""The command photos: pictures of closed teeth in, bite and overlays out."""
+"""The command photos: from pictures of closed teeth to bite and overlays."""
 
 import json
 

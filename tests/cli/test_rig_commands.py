@@ -1,4 +1,4 @@
-"""The commands on a finished rig, run as a user runs them: output, JSON and exit codes."""
+"""The commands on a finished rig, run as programs: output, JSON and exit codes."""
 
 import json
 import subprocess
@@ -133,7 +133,7 @@ def test_names_that_no_file_can_have_are_one_line(command, out, actor, tmp_path)
     line = [sys.executable, "-m", "jawusd", command, *map(str, given), "-o", str(tmp_path / out)]
     done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
     assert "Traceback" not in done.stderr
-    if command != "encode" or "\n" not in out:  # a table may lie anywhere
+    if command != "encode" or "\n" not in out:  # a table may be in any folder
         assert done.returncode >= 2 and "jawusd: " in done.stderr
 
 

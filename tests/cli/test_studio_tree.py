@@ -1,4 +1,4 @@
-"""A studio: two actors in a library, shots elsewhere that reference their motion, several rigs in one stage."""
+"""A studio's folders: two actors in a library, shots elsewhere that reference their motion, several rigs per stage."""
 
 import json
 import shutil
@@ -30,7 +30,7 @@ def run(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
-    """Return a folder with two published actors, each with file names of its own."""
+    """Return a folder with two published actors under different file names."""
     folder = tmp_path_factory.mktemp("studio") / "lib"
     frames, d = example_motion(COUNT)
     for name, kind in KINDS.items():
@@ -43,7 +43,7 @@ def library(tmp_path_factory):
 
 @pytest.fixture
 def shot(library, tmp_path):
-    """Return a shot in cm with both actors, moved, one of them later, and a crowd of instances."""
+    """Return a shot in cm with both actors at other places, one with a time offset, and a crowd of instances."""
     shutil.copytree(library, tmp_path / "lib")
     (tmp_path / "shots").mkdir()
     stage = Usd.Stage.CreateNew(str(tmp_path / "shots" / "sh010.usda"))
@@ -83,7 +83,7 @@ def test_a_library_is_refused_until_it_is_allowed(shot, monkeypatch):
 
 
 def overridden(shot):
-    """Write a layer over a shot that moves one actor, hides the other's skull and gives a mesh another colour."""
+    """Write a layer over a shot that moves one actor, hides the other's skull and recolours a mesh."""
     path = shot.with_name("sh010_light.usda")
     stage = Usd.Stage.CreateNew(str(path))
     stage.GetRootLayer().subLayerPaths.append("./sh010.usda")
@@ -103,7 +103,7 @@ def overridden(shot):
 
 
 def packed(shot):
-    """Pack a shot, and take away all it was made of."""
+    """Pack a shot, and delete its sources."""
     refused = CliRunner().invoke(app, ["publish", str(shot), "-o", str(shot.with_name("sh010.usdz"))])
     assert "--allow" in refused.exception.hint
     run("publish", shot, "-o", shot.with_name("sh010.usdz"), "--allow", shot.parents[1] / "lib")

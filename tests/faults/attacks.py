@@ -1,8 +1,8 @@
-"""Attack the program as hostile files, systems and users do: python tests/faults/attacks.py [NAME ...].
+"""Attack the program with hostile files, systems and signals: python tests/faults/attacks.py [NAME ...].
 
-Prints a line for each attack: whether it was held off, exit code, time [s], resident memory of the largest process
-[MB], and the last line that was said. An attack is held off if the command ends in time, with the exit code and the
-words that are stated, without a traceback and without more memory than is stated.
+Prints a line per attack: whether it was held off, exit code, time [s], resident memory of the largest process
+[MB], and the last line of output. An attack is held off if the command ends in time, with the expected exit code and
+words, without a traceback and within the memory limit.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ MOST_S = 300
 
 @dataclass(frozen=True)
 class Attack:
-    """Hold what is attacked and what has to come of it.
+    """An attack and its expected outcome.
 
     Attributes:
-        words: makes files in an empty folder, and returns the words after `jawusd`.
+        words: makes files in an empty folder, and returns the arguments of `jawusd`.
         code: exit code, negative for a signal.
-        says: what has to be in the output.
-        most_mb: resident memory that is allowed.
-        limit: run in the process before the program.
-        act: called with the process while it runs.
-        env: variables of the environment.
+        says: text required in the output.
+        most_mb: limit of resident memory.
+        limit: called in the process before the program starts.
+        act: called with the running process.
+        env: environment variables.
     """
 
     words: Callable[[Path], list[str]]
@@ -53,7 +53,7 @@ class Attack:
 
 
 def rig(folder: Path) -> Path:
-    """Copy a rig, without the checksums that find accidents."""
+    """Copy a rig without its checksums."""
     from example_rig import forget_checksums
 
     there = Path(shutil.copytree(GOLDEN, folder / "actor"))
@@ -88,7 +88,7 @@ def doubling(levels: int) -> str:
 
 
 def linked(folder: Path) -> list[str]:
-    """Let a rig take a layer from outside its folder, by a link."""
+    """Make a rig load a layer from outside its folder through a link."""
     there = rig(folder)
     (there / "rig.usdc").rename(folder / "rig.usdc")
     (there / "rig.usdc").symlink_to(folder / "rig.usdc")
@@ -96,12 +96,12 @@ def linked(folder: Path) -> list[str]:
 
 
 def named(name: str, folder: Path) -> list[str]:
-    """Ask for a rig in a folder of any name."""
+    """Describe a rig in a folder of a given name."""
     return ["info", str(shutil.copytree(rig(folder), folder / name) / "actor.usda")]
 
 
 def escapes(folder: Path) -> list[str]:
-    """Give an actor a name that would clear the terminal."""
+    """Give an actor a name with control characters that clear the terminal."""
     there = rig(folder) / "actor.usda"
     text = there.read_text()
     there.write_text(text.replace('over "Actor"', 'over "Actor"', 1))
@@ -128,7 +128,7 @@ def pictures(folder: Path) -> list[str]:
 
 
 def archive(folder: Path) -> list[str]:
-    """Ask for tracks that unpack to 4 GB."""
+    """Describe tracks that unpack to 4 GB."""
     packed = zipfile.ZipFile(folder / "a.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1)
     with packed, packed.open("a.npy", "w", force_zip64=True) as member:
         for _ in range(64):
@@ -137,13 +137,13 @@ def archive(folder: Path) -> list[str]:
 
 
 def cut(folder: Path) -> list[str]:
-    """Ask for tracks that were cut off."""
+    """Describe truncated tracks."""
     (folder / "a.npz").write_bytes(b"PK\x03\x04 and no more")
     return ["info", str(folder / "a.npz")]
 
 
 def device(folder: Path) -> list[str]:
-    """Check a capture whose scan is a device without an end."""
+    """Check a capture whose scan is an endless device."""
     there = Path(shutil.copytree(CAPTURE, folder / "capture"))
     scan = next((there / "scans").iterdir())
     scan.unlink()
@@ -152,13 +152,13 @@ def device(folder: Path) -> list[str]:
 
 
 def forged(folder: Path) -> list[str]:
-    """Report on a build whose record is a list."""
+    """Write the report of a build whose record is a list."""
     (folder / "build.json").write_text('{"format": "jawusd-build/1", "stages": [], "sha256": ""}')
     return ["report", str(folder)]
 
 
 def over_device(folder: Path) -> list[str]:
-    """Write over a pipe with --force."""
+    """Overwrite a pipe with --force."""
     there = rig(folder)
     os.mkfifo(folder / "out.usda")
     (folder / "keys.json").write_text(
@@ -184,7 +184,7 @@ def space(most_mb: int) -> None:
 
 
 def without_proc() -> None:
-    """Take /proc away from the program, as root may."""
+    """Hide /proc from the program; needs root."""
     import ctypes
 
     libc = ctypes.CDLL(None, use_errno=True)
@@ -241,7 +241,7 @@ def run(attack: Attack, folder: Path) -> tuple[bool, str]:
     """Return whether an attack was held off, and the rest of its line."""
     from forked import in_copy
 
-    words = in_copy(partial(attack.words, folder))  # whose memory is not this process's
+    words = in_copy(partial(attack.words, folder))  # memory of other processes only
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **dict(attack.env)}
     begun = time.monotonic()
     with open(folder / "said", "w+b") as said:
@@ -271,7 +271,7 @@ def run(attack: Attack, folder: Path) -> tuple[bool, str]:
 
 
 def main() -> None:
-    """Run the attacks and print what held."""
+    """Run the attacks and print the outcomes."""
     chosen = sys.argv[1:] or list(ATTACKS)
     print(f"{'attack':<28}{'held':<5}{'code':>5} {'s':>6} {'MB':>6}  said")
     held = []

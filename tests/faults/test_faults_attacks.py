@@ -1,4 +1,4 @@
-"""The attacks of `attacks.py`, which prints what held."""
+"""The attacks of `attacks.py` are all held off."""
 
 import os
 import sys

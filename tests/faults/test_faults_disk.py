@@ -1,4 +1,4 @@
-"""A disk that is full or read-only is one clear error, and what was there before stays."""
+"""A full or read-only disk gives one clear error, and existing files are kept."""
 
 import os
 import resource
@@ -71,7 +71,7 @@ def test_a_file_that_does_not_fit_leaves_the_one_before(tmp_path, suffix):
 
 @pytest.fixture
 def disk(tmp_path):
-    """A disk of 1 MB of its own; only the super-user can have one."""
+    """A file system of 1 MB; only root can mount it."""
     place = tmp_path / "disk"
     place.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", place]

@@ -1,6 +1,6 @@
-"""Builds that are killed and resumed end with the same files as one that was left alone.
+"""Builds that are killed and resumed write the same files as an undisturbed one.
 
-The stages only write what a seed gives, so that kills hit the writing; tests/benchmarks/faults.py kills whole builds.
+The stages only write random data by seed, so that kills hit the writing; tests/benchmarks/faults.py kills whole builds.
 """
 
 import json
@@ -60,7 +60,7 @@ def end(process):
 
 @pytest.fixture(scope="module")
 def left_alone(tmp_path_factory):
-    """A finished build, and how long it took."""
+    """A finished build, and its duration."""
     folder = tmp_path_factory.mktemp("left") / "alone"
     begun = time.perf_counter()
     assert end(start(folder)) == 0
@@ -80,7 +80,7 @@ def test_killed_builds_end_as_one_that_was_left_alone(left_alone, tmp_path):
         os.killpg(process.pid, signal.SIGKILL)
         end(process)
         there = digests(out) if out.exists() else {}
-        assert {name: exact[name] for name in there} == there  # nothing half written
+        assert {name: exact[name] for name in there} == there  # no incomplete files
     assert killed >= 1
     assert end(start(out)) == 0
     assert digests(out) == exact and records(out) == records(alone) and unfinished(out) == []

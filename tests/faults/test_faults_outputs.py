@@ -1,4 +1,4 @@
-"""What an output may replace: files alone, and links only within their folder; pipes and devices are written to."""
+"""Outputs may replace only files, and links within their folder; pipes and devices are written to."""
 
 import ast
 import os
@@ -24,7 +24,7 @@ def write_video(path):
         writer.write(np.zeros((48, 64), np.uint8))
 
 
-#: One of every kind of writer, with the suffix it needs.
+#: One writer of every kind, with its suffix.
 WRITERS = {
     ".bin": lambda path: write_bytes_atomic(path, b"new"),
     ".html": lambda path: write_text_atomic(path, "<p>new</p>"),
@@ -69,12 +69,12 @@ def test_a_pipe_gets_the_whole_content_and_stays(tmp_path, suffix):
             os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
             break
         threading.Event().wait(0.01)
-    held = os.open(pipe, os.O_WRONLY)  # the reader sees no end before all is written
+    held = os.open(pipe, os.O_WRONLY)  # the reader gets everything before the end
     WRITERS[suffix](pipe)
     os.close(held)
     got, _ = reader.communicate(timeout=60)
     WRITERS[suffix](plain)
-    assert len(got) == plain.stat().st_size and got[:16] == plain.read_bytes()[:16]  # videos have numbers of their own
+    assert len(got) == plain.stat().st_size and got[:16] == plain.read_bytes()[:16]  # encodes of a video differ
     assert stat.S_ISFIFO(pipe.lstat().st_mode)
     assert {path.name for path in tmp_path.iterdir()} == {pipe.name, plain.name}
 
@@ -166,7 +166,7 @@ def test_a_file_system_without_modes_and_fsync_is_written_to(tmp_path, monkeypat
 
 
 def writes(source):
-    """Tell whether a module opens files for writing, writes whole ones, or moves them."""
+    """Return whether a module opens files for writing, writes whole ones, or moves them."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call):
             name = ast.unparse(node.func)
@@ -184,11 +184,11 @@ def test_writing_is_found(line):
 
 
 def test_no_other_place_of_the_package_replaces_or_makes_files():
-    """All outputs go through `formats.atomic`; what writes files by itself is listed here with its reason."""
+    """All outputs go through `formats.atomic`; exceptions are listed here with their reasons."""
     allowed = {
         "jawusd/cli/output.py",  # adds lines to a log that `destination` allows
         "jawusd/pipeline/segment_record.py",  # adds lines to its own record
-        "jawusd/viewer/motion_panel.py",  # in a folder of its own, as is the next one
+        "jawusd/viewer/motion_panel.py",  # in its own folder, as is the next one
         "jawusd/plugins/extension.py",
         "jawusd/rig/reader_process.py",  # pipes to its own child
     }

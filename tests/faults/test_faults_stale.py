@@ -1,4 +1,4 @@
-"""A changed input or setting makes exactly those stages stale that depend on it."""
+"""A changed input or setting invalidates exactly the stages that depend on it."""
 
 import os
 import shutil
@@ -19,7 +19,7 @@ OFFSETS = {"cam0": 0, "cam1": 2, "cam2": -1}
 
 @pytest.fixture
 def capture(tmp_path):
-    """A copy of the example; files are links until a test replaces them."""
+    """A copy of the example; its files are links until a test replaces them."""
     folder = tmp_path / "capture"
     same_disk = EXAMPLE.stat().st_dev == tmp_path.stat().st_dev
     shutil.copytree(EXAMPLE, folder, copy_function=os.link if same_disk else shutil.copy)
@@ -28,7 +28,7 @@ def capture(tmp_path):
 
 @pytest.fixture
 def rebuilt(monkeypatch, tmp_path, capture):
-    """Return a function that builds with stages that only write what they depend on, and says which ones ran."""
+    """Return a function that builds with stages that only write what they depend on, and returns those that ran."""
     ran, meanwhile = [], {}
 
     def stub(name, write):
@@ -45,12 +45,12 @@ def rebuilt(monkeypatch, tmp_path, capture):
         stub(name, lambda *_: "always the same")
     stub("fit", lambda run, options: f"{run.capture.name} {run.capture.fps} {options.model}")
     monkeypatch.setattr(build, "build_summary", dict, raising=False)
-    # files are changed, not made to be read
+    # the changed files need not be readable
     monkeypatch.setattr(build, "check_capture", lambda *_, **__: [])
     monkeypatch.setattr(build, "all_labelled", lambda _: True)
 
     def run(during=None, change=None, **options):
-        """Build; make a change of the capture while a stage runs."""
+        """Build, and change the capture while a stage runs."""
         ran.clear()
         meanwhile.clear()
         if during:
@@ -62,14 +62,14 @@ def rebuilt(monkeypatch, tmp_path, capture):
 
 
 def replace(path, change):
-    """Write a changed file, never through a link."""
+    """Write a modified file without writing through a link."""
     data = change(path.read_bytes())
     path.unlink()
     path.write_bytes(data)
 
 
 def edit(old, new):
-    """Return a change of capture.toml."""
+    """Return a function that changes capture.toml."""
 
     def change(folder):
         def swapped(data):
@@ -82,7 +82,7 @@ def edit(old, new):
 
 
 def grow(name):
-    """Return a change of a file's content that its reader need not notice."""
+    """Return a function that changes a file's content in a way that its reader may ignore."""
     return lambda folder: replace(folder / name, lambda data: data + b"\n")
 
 

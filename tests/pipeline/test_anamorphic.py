@@ -33,7 +33,7 @@ def cameras(folder, camera, more=""):
 
 
 def test_a_calibration_of_the_widened_picture_fits_the_clip(folder):
-    """A point of the world is where it was, in pixels half as wide."""
+    """A world point projects to the same place, at half the pixel width."""
     widened = STORED.scaled((128, 48))
     points = np.array([[0.1, -0.05, 1.0], [-0.2, 0.1, 1.3]])
     for calibrated in (widened, STORED):

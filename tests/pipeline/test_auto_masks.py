@@ -1,4 +1,4 @@
-"""Masks that jawusd made are known as such, and the tracker allows them more than drawn ones."""
+"""Automatic masks are recognised, and the tracker allows them larger errors than drawn ones."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_drawn_masks_are_judged_by_the_usual_numbers(tmp_path):
 
 
 def _take(frames, relative):
-    """Return tracks whose upper arch rests, and the capture's guide of jaws that rest."""
+    """Return tracks with a still upper arch, and the capture's guide with a still jaw."""
     count, still = len(frames), np.tile(np.eye(4), (len(frames), 1, 1))
     small = np.tile(np.diag([1e-6] * 3 + [1e-2] * 3), (count, 1, 1))
     found = np.isfinite(relative).all((1, 2))
@@ -60,7 +60,7 @@ def _take(frames, relative):
 
 
 def _guided(folder, frames):
-    """Return the example with masks in a folder whose guide shows jaws at rest, four times as uncertain."""
+    """Return the example with masks in a folder whose guide has still jaws, four times as uncertain."""
     covariance = np.tile(np.diag([4e-6] * 3 + [4e-2] * 3), (2, 1, 1))
     resting = RegionPose(np.tile(np.eye(4), (2, 1, 1)), np.ones(2, bool), covariance)
     save_guide(folder, "inputs", {int(f): resting for f in frames})
@@ -102,7 +102,7 @@ def test_masks_and_colours_are_weighted_by_their_covariance(tmp_path):
     moved = tracks.raw_T_upper_lower[:, 0, 3]
     assert moved[[0, 7]] == pytest.approx([0.3 * 0.8, 0.0], abs=1e-9)
     assert tracks.status[7].tolist() == [TRACKED, RECOVERED] and np.isfinite(tracks.T_upper_lower).all()
-    # The lower arch measured once more: 1 / (1 / 1 + 1 / 4) of the variance along x, and all of the colours' alone.
+    # A second measurement of the lower arch leaves 1 / (1 / 1 + 1 / 4) of the variance along x.
     assert tracks.covariance_lower[[0, 7], 3, 3] == pytest.approx([0.8e-2, 4e-2])
 
 
@@ -126,7 +126,7 @@ def test_masks_without_their_guide_are_told(tmp_path):
 
 
 def _followed(frames, mm, objective_px=900.0):
-    """Return what was followed: the jaw moved by so many mm along x on each frame."""
+    """Return followed poses, with the jaw moved by these amounts along x [mm] in each frame."""
     covariance = np.tile(np.eye(6), (2, 1, 1))
     return {
         int(frame): RegionPose(

@@ -1,4 +1,4 @@
-"""The example capture becomes a rig, and each way a capture can be wrong is one clear error that loses nothing."""
+"""A rig is built from the example capture; each defect of a capture gives one clear error and loses no data."""
 
 import json
 import os
@@ -28,7 +28,7 @@ EXAMPLE = ROOT / "examples" / "capture"
 
 
 def quiet(stage, done, total):
-    """Swallow progress."""
+    """Ignore progress."""
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_resume_redoes_only_what_depends_on_a_change(built, tmp_path, monkeypatc
 
 @pytest.fixture
 def capture(tmp_path):
-    """A copy of the example whose files may be broken; large ones are links until a test replaces them."""
+    """A copy of the example for tests that damage files; large ones are links until replaced."""
     folder = tmp_path / "capture"
     for source in EXAMPLE.rglob("*"):
         target = folder / source.relative_to(EXAMPLE)
@@ -159,7 +159,7 @@ def capture(tmp_path):
 
 
 def replace(folder, name, change):
-    """Replace a file of the copy by a changed one, never writing through a hard link."""
+    """Replace a file of the copy by a modified one without writing through a hard link."""
     data = (folder / name).read_bytes()
     (folder / name).unlink()
     (folder / name).write_bytes(change(data))
@@ -197,7 +197,7 @@ def calibration_without_rotation(folder):
 
 
 def calibration_at(width, height):
-    """Return what gives the calibration of a copy another picture size, the intrinsics scaled by hand."""
+    """Return a function that rescales the calibration of a copy to another picture size."""
 
     def change(data):
         import tomllib

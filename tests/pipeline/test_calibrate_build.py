@@ -1,4 +1,4 @@
-"""A capture with boards and no calibration: the build makes one, says so, and keeps it."""
+"""A capture with boards and no calibration: the build makes one, reports it, and reuses it."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ class Reached(Exception):
 
 
 def stop_at(stage_name, told):
-    """Return a progress function that ends the build when a stage tells of itself."""
+    """Return a progress callback that ends the build when a stage reports progress."""
 
     def progress(stage, done, total):
         told.append((stage, done, total))
@@ -40,7 +40,7 @@ def stop_at(stage_name, told):
 
 
 def track_is_reached(*arguments):
-    """Stand in for `first_pass`, which searches the teeth before it tells of itself."""
+    """Replace `first_pass`, which searches the teeth before it reports progress."""
     raise Reached
 
 
@@ -57,9 +57,9 @@ def capture(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def calibrated(capture, tmp_path_factory):
-    """The folder of a build that ended before its tracking, what it told, and the corners it found on the boards.
+    """The folder of a build that ended before tracking, its findings, and the detected corners of the boards.
 
-    The size of the squares does not change these.
+    The corners do not depend on the size of the squares.
     """
     out = tmp_path_factory.mktemp("build") / "actor"
     told, corners = [], []
@@ -173,7 +173,7 @@ def test_a_calibration_of_colmap_is_read_where_the_capture_names_it(capture, tmp
 
 
 def unpicked(capture, tmp_path, offsets=None, **boards):
-    """Return the capture without picks, its cameras aligned by given offsets, its boards described otherwise."""
+    """Return the capture without picks, with given offsets and another description of the boards."""
     opened = open_capture(capture)
     update = {
         "bootstrap": None,
@@ -204,7 +204,7 @@ def test_without_picks_and_masks_the_size_is_said_to_be_unknown(capture, calibra
     assert report["scale"]["ratio"] is None
     note = "the scale relies on [boards] square_mm alone: no picks are seen by two cameras"
     assert any(note in line for line in calibration_lines(report))
-    # Clips that cannot be aligned are no reason to fail: the boards are aligned already.
+    # Clips that cannot be aligned are no error: the boards are already aligned.
     unaligned = opened.model_copy(update={"sync": opened.sync.model_copy(update={"method": "audio"})})
     report = calibrate_boards(unaligned, out, lambda *told: None)
     assert report["scale"]["ratio"] is None and "sound" in report["scale"]["reason"]

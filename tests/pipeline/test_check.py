@@ -1,4 +1,4 @@
-"""The cheap checks find every planted fault, all at once, and say nothing of a good capture."""
+"""The quick checks find all planted faults at once, and none in a good capture."""
 
 import json
 import os
@@ -28,7 +28,7 @@ EXAMPLE = ROOT / "examples" / "capture"
 
 @pytest.fixture
 def capture(tmp_path):
-    """A copy of the example whose files may be replaced, never written through: large ones are links."""
+    """A copy of the example whose files may be replaced but not modified: large ones are links."""
     folder = tmp_path / "capture"
     for source in EXAMPLE.rglob("*"):
         target = folder / source.relative_to(EXAMPLE)
@@ -153,7 +153,7 @@ def pick_on_another_vertex(folder):
     described(folder, "vertex = 1674", "vertex = 100")
 
 
-#: Per fault: how bad it is, its kind and words of the line that names it.
+#: Per fault: severity, kind and words of its line.
 SAID = {
     frames_beyond: ("error", "frames_missing", "frames end at 3199"),
     rest_frame_outside: ("warning", "rest_frame", "motion.rest_frame is 12, frames run from 20 to 319"),
@@ -175,7 +175,7 @@ SAID = {
 }
 
 
-# Together those that do not hide one another: every check of a capture takes seconds.
+# Faults that do not hide one another share a capture, as each check takes seconds.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "plants",
@@ -232,7 +232,7 @@ def test_masks_numbered_for_another_camera_are_exchanged():
     assert swapped_cameras(right, offsets, 10, 30) == []
     wrong = {**right, "cam0": right["cam2"], "cam2": right["cam0"]}
     assert swapped_cameras(wrong, offsets, 10, 30) == [("cam0", "cam2")]
-    short = {**right, "cam1": ((12, 20), (12, 20)), "cam2": (None, None)}  # no exchange explains that
+    short = {**right, "cam1": ((12, 20), (12, 20)), "cam2": (None, None)}  # no swap explains that
     assert swapped_cameras(short, offsets, 10, 30) == []
 
 

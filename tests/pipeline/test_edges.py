@@ -1,4 +1,4 @@
-"""Numbers at the edge: takes without motion, parameters exactly on the bound, magnitudes no jaw has."""
+"""Extreme numbers: takes without motion, parameters exactly on the bound, implausible magnitudes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Deltas of the jaw joint per shape: against the bone of the skeleton, as OpenUSD evaluates it, and vertices."""
+"""Offsets of the jaw joint per shape, compared with the skeleton's joint in OpenUSD and with vertices."""
 
 import csv
 
@@ -45,7 +45,7 @@ def test_deltas_are_those_of_the_bone(tmp_path, mapping):
         np.testing.assert_allclose(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), turn, atol=1e-6)
         wxyz = [numbers[f"q{axis}"][k] for axis in "wxyz"]
         np.testing.assert_allclose(Rotation.from_quat(np.roll(wxyz, -1)).as_matrix(), turn, atol=1e-6)
-    # what a rig does with a row: turn vertices of the neutral face about the neutral joint, and move them
+    # as a rig applies a row: rotate vertices of the neutral face about the neutral joint, and translate them
     neutral = moved(rig.pose(d0)[None], mandible_vertices())[0]
     for k, T in enumerate(rig.pose(d)):
         R = Rotation.from_euler("xyz", [numbers[f"r{axis}_deg"][k] for axis in "xyz"], degrees=True).as_matrix()
@@ -55,7 +55,7 @@ def test_deltas_are_those_of_the_bone(tmp_path, mapping):
 
 
 def test_shapes_mean_what_they_mean_to_animate():
-    """Shares: open is the range, left and right its ends at the closed bite; an own mapping: its d, inside it."""
+    """Shares reach the full opening and both ends of laterotrusion; a mapping gives its d, inside the bound."""
     rig = example_rig()
     full = {row.shape: row for row in joint_deltas(rig) if row.weight == 1}
     d2_low, d2_high, _, d3_high = (float(x) for x in np.ravel(rig.ranges(0.0)))

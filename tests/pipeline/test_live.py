@@ -1,4 +1,4 @@
-"""The example's videos as cameras that run."""
+"""The example's videos played as live cameras."""
 
 import json
 import os
@@ -40,7 +40,7 @@ def rig(example_build):
 
 @pytest.fixture
 def film(tmp_path):
-    """Return a video of 24 pictures at 24 a second; picture k is k times ten bright."""
+    """Return a video of 24 pictures at 24 fps; picture k has the brightness 10 k."""
     with av.open(str(tmp_path / "film.mp4"), "w") as container:
         stream = container.add_stream("libx264", rate=24, options={"crf": "1"})
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p"
@@ -71,7 +71,7 @@ def test_files_are_played_at_their_own_rate(film):
 
 
 def test_a_file_begun_earlier_shows_its_pictures_earlier(film):
-    """Of two sources that show the same instant, the one begun half a second earlier is 12 pictures further."""
+    """At the same instant, the source that started half a second earlier is 12 pictures ahead."""
     source, begin = played(film, (64, 48), 0.5)
     source.wait(begin - 0.5, 2.0)
     assert source.times_s() and source.times_s()[-1] < begin + 0.1
@@ -91,7 +91,7 @@ def test_sources_that_cannot_be_used_are_refused(film, where, size):
 
 @pytest.fixture
 def silent():
-    """Return the address of a server that takes connections and says nothing."""
+    """Return the address of a server that accepts connections and sends nothing."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
 
@@ -105,7 +105,7 @@ def test_a_source_that_connects_and_is_silent_is_not_waited_for(silent):
 
 
 def test_a_source_that_falls_silent_is_not_waited_for(film, tmp_path):
-    """The film's first pictures come through a pipe, which then stays open."""
+    """The first pictures of a video arrive through a pipe, which then stays open."""
     pipe = tmp_path / "camera.ts"
     os.mkfifo(pipe)
     with av.open(film) as read, av.open(str(tmp_path / "film.ts"), "w") as write:
@@ -216,7 +216,7 @@ def test_lines_say_what_the_frame_holds():
 
 @pytest.fixture
 def patient_film(monkeypatch):
-    """Let films go on only when the follower waits for a picture, so that no machine is too slow for them."""
+    """Advance the videos only when the follower waits for a picture, so that slow machines drop no frames."""
     moved, wait = threading.Condition(), LiveSource.wait
     shown = [0.0]
 
@@ -258,7 +258,7 @@ def test_the_example_is_followed_at_every_frame(rig, patient_film):
 
 @pytest.mark.slow
 def test_the_command_tells_lines_and_osc(rig, tmp_path):
-    """The teeth are searched in a second of the take."""
+    """The search for the teeth has one second of the take."""
     text = (EXAMPLE / "capture.toml").read_text().replace("frames = [20, 320]", "frames = [20, 44]")
     (tmp_path / "capture.toml").write_text(re.sub(r'"(\w+/[^"]+\.\w+|calibration.toml)"', rf'"{EXAMPLE}/\1"', text))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
@@ -278,7 +278,7 @@ def test_the_command_tells_lines_and_osc(rig, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("stride", "least"), [(2, 11), (6, 7)])
 def test_teeth_are_found_again_after_frames_left_out(rig, stride, least):
-    """Up to a quarter of a second is missing time and again; poses that are said to be found are never far off."""
+    """Pictures are missing repeatedly for up to a quarter of a second; poses marked as found stay accurate."""
     capture = open_capture(EXAMPLE)
     jaw = jawusd.load(rig)
     cameras = {camera.name: camera for camera in load_cameras(capture)}

@@ -1,4 +1,4 @@
-"""Many captures on workers of their own: a killed worker, a bad capture, an interrupt, a cluster that is not there."""
+"""Builds of many captures: a killed worker, a bad capture, an interrupt, a missing cluster."""
 
 import contextlib
 import csv
@@ -38,12 +38,12 @@ INSIDE = {
 
 
 def heed_interrupts():
-    """Undo what a shell does to programs in the background, which may be how these tests run."""
+    """Restore SIGINT, which shells ignore in background programs, as these tests may be."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def started(folder, *arguments):
-    """Start the program on the list of a folder, in a process group of its own as in a terminal."""
+    """Start the program on the list of a folder, in a new process group as in a terminal."""
     command = [sys.executable, "-m", "jawusd", "build-many", str(folder / "list.txt"), "-o", str(folder / "out")]
     how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     return subprocess.Popen([*command, *arguments], **how, preexec_fn=heed_interrupts)
@@ -69,7 +69,7 @@ def recorded(folder):
 
 @pytest.fixture(scope="module")
 def shoot(tmp_path_factory):
-    """One capture listed twice and one that is not there."""
+    """One capture listed twice, and a missing one."""
     folder = tmp_path_factory.mktemp("shoot")
     write_short(folder / "take", FRAMES, without=("skull",))
     (folder / "list.txt").write_text("# a shoot\ntake, first\nnowhere\ntake, second\n")
@@ -121,13 +121,13 @@ def test_an_interrupt_leaves_no_process_and_no_half_file(shoot, tmp_path, monkey
 
 @pytest.fixture(scope="module")
 def here():
-    """A scheduler with a worker inside this process, so that tests may replace what it runs."""
+    """A scheduler with a worker inside this process, so that tests can replace its functions."""
     with LocalCluster(n_workers=1, threads_per_worker=1, **INSIDE) as found:
         yield found.scheduler_address
 
 
 def made_up_build(path, folder, options, progress):
-    """Stand in for `build`: the name of the capture says what happens."""
+    """Replace `build`: the name of the capture selects the outcome."""
     progress("track", 1, 2)
     if path.name == "bad":
         raise CaptureError("is bad.", path=path)
@@ -178,7 +178,7 @@ def test_an_interrupted_run_calls_its_builds_off(here, tmp_path, monkeypatch):
         build_many(listed(tmp_path, "good", "endless", "never"), tmp_path / "out", options, interrupt)
     rows = json.loads((tmp_path / "out" / "builds.json").read_text())["builds"]
     assert [row["status"] for row in rows] == ["built", "stopped", "stopped"]
-    # The worker is free again: another run of the same cluster goes through.
+    # The worker is free again: another run on the same cluster succeeds.
     again = build_many(listed(tmp_path, "good"), tmp_path / "again", options, lambda line: None)
     assert again[0].status == "built"
 
@@ -211,7 +211,7 @@ def test_local_workers_listen_to_this_machine_alone_and_a_deadly_capture_is_give
 
 
 def silent():
-    """Return a socket that takes connections and never answers."""
+    """Return a socket that accepts connections and never answers."""
     listener = socket.create_server(("127.0.0.1", 0))
     return listener, f"tcp://127.0.0.1:{listener.getsockname()[1]}"
 

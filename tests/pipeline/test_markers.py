@@ -1,4 +1,4 @@
-"""Poses of tables of markers: against the motion they were made from, with markers missing and misplaced."""
+"""Poses from tables of markers, compared with the true motion, with missing and misplaced markers."""
 
 import sys
 import warnings
@@ -19,7 +19,7 @@ JAW = np.array([[-69.0, -16, 100], [-20, -23, 109], [-23.5, 22, 106], [-66, 23.5
 
 
 def motions(seed, turn, shift):
-    """Return rigid motions by scipy's rotations, the first none."""
+    """Return rigid motions made with scipy's rotations; the first is the identity."""
     rng = np.random.default_rng(seed)
     T = np.tile(np.eye(4), (COUNT, 1, 1))
     T[1:, :3, :3] = Rotation.from_rotvec(rng.normal(size=(COUNT - 1, 3)) * turn).as_matrix()
@@ -135,7 +135,7 @@ NAMES = ("HL", "HR", "HF", "HB", "JL", "JR", "JF", "JB")
 
 
 def write_c3d(path, markers, unit="mm", scale=1.0, names=NAMES, hidden=np.nan):
-    """Write by ezc3d; `hidden` stands for the coordinates of markers out of sight."""
+    """Write with ezc3d; `hidden` replaces the coordinates of occluded markers."""
     file = ezc3d.c3d()
     point = file["parameters"]["POINT"]
     point["RATE"]["value"], point["UNITS"]["value"], point["LABELS"]["value"] = [120], [unit], list(names)
@@ -149,7 +149,7 @@ def write_c3d(path, markers, unit="mm", scale=1.0, names=NAMES, hidden=np.nan):
 
 
 def write_c3d_by_peer(path, markers, names=NAMES):
-    """Write by the package c3d, which keeps a residual per point: -1 is out of sight."""
+    """Write with the package c3d, which has a residual per point: -1 means occluded."""
     writer = c3d.Writer(point_rate=120.0, analog_rate=0, point_units="mm")
     for frame in markers:
         seen = np.isfinite(frame).all(axis=1)

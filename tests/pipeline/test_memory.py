@@ -1,4 +1,4 @@
-"""Freed memory goes back to the system."""
+"""Freed memory is returned to the system."""
 
 import ctypes
 import re
@@ -28,7 +28,7 @@ before = resident_mb()
 arrays.clear()
 print(before - resident_mb())
 """
-PIECES, PIECE_BYTES = 3000, 60_000  # too small to be mapped one by one
+PIECES, PIECE_BYTES = 3000, 60_000  # too small for a mapping each
 
 
 def resident_mb():

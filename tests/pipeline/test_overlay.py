@@ -27,7 +27,7 @@ CAMERAS = [
 FRAMES = np.arange(3, 9)
 OFFSETS = {"left": 0, "right": 4}  # the right camera began four frames later: it misses reference frame 3
 GREY = 100
-SHADES = 10  # the footage brightens by this per frame, so that each picture tells which one it is
+SHADES = 10  # brightness step per frame, which identifies each picture
 
 
 def scan(path, y_mm):
@@ -88,7 +88,7 @@ def pixel(camera: Camera, point) -> tuple[int, int]:
 
 
 def quiet(stage, done, total):
-    """Swallow progress."""
+    """Ignore progress."""
 
 
 def test_each_camera_gets_a_video_with_the_scans_where_they_are_seen(capture, tmp_path):
@@ -116,13 +116,13 @@ def test_each_camera_gets_a_video_with_the_scans_where_they_are_seen(capture, tm
                 assert (np.ptp(inside) > 20) == (not lost)
                 if not lost:
                     warm = inside[0] > inside[2]
-                    assert warm == (y_mm < 0)  # the upper row is orange, the lower one blue
+                    assert warm == (y_mm < 0)  # the upper arch is orange, the lower one blue
     sheet = cv2.imread(str(files[-1]))
     assert sheet.shape[1] == 2 * 480 and sheet.std() > 10
 
 
 def test_scans_are_drawn_as_the_corrected_cameras_see_them(capture, tmp_path):
-    """The take says that the left camera stands 8 mm to the side of where it was calibrated."""
+    """The tracks correct the position of the left camera by 8 mm to the side."""
     tracks, moved = some_tracks(), CAMERAS[0].T_cam_world.copy()
     moved[0, 3] += 8.0
     tracks.meta["extrinsics"] = {"T_cam_world": {"left": moved.tolist()}}
@@ -136,7 +136,7 @@ def test_scans_are_drawn_as_the_corrected_cameras_see_them(capture, tmp_path):
 
 
 def test_odd_sides_lose_a_line(capture, tmp_path):
-    """H.264 as everybody plays it needs even sides; footage in other formats may have odd ones."""
+    """Common H.264 needs even sizes; footage in other formats may have odd ones."""
     size = (SIZE[0] + 1, SIZE[1] + 1)
     with VideoWriter(capture / "left.mkv", size, 25.0, lossless=True) as out:
         for _ in range(12):
@@ -182,7 +182,7 @@ def test_the_command_guards_its_options_and_outputs(capture, tmp_path):
 
 
 def solved_tracks() -> Tracks:
-    """Return the tracks above as a solve writes them: the lower arch is out of sight in frame 5, lost in frame 8."""
+    """Return the tracks above as written by a solve: the lower arch is occluded in frame 5 and lost in frame 8."""
     tracks = some_tracks()
     count = len(FRAMES)
     tracks.T_world_lower[-1] = tracks.T_world_upper[-1]
@@ -194,7 +194,7 @@ def solved_tracks() -> Tracks:
 
 
 def colours_in(image):
-    """Return which states of a solve are drawn into a picture."""
+    """Return the solve states drawn in a picture."""
     return {
         state
         for state, colour in STATE_COLOURS.items()
@@ -220,7 +220,7 @@ def test_one_video_shows_all_cameras_side_by_side_coloured_by_state(capture, tmp
 
 
 def test_cameras_without_footage_show_their_masks(capture, tmp_path):
-    """Masks where OpenCV projects the boxes, so that the outlines must enclose them."""
+    """Masks at OpenCV's projections of the boxes, which the outlines must enclose."""
     opened = open_capture(capture)
     for camera in CAMERAS:
         for arch, y_mm in (("upper", -9.0), ("lower", 9.0)):

@@ -1,4 +1,4 @@
-"""The search for teeth in footage ends, and says what was tried."""
+"""The search for teeth in footage ends, and reports the frames tried."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ APART = Rows(np.zeros((2, 4, 4), np.uint8), 0.05)
 
 
 class _Footage:
-    """Show rows of something on every frame."""
+    """Detect arches on every frame."""
 
     def __init__(self):
         self.looked_at = []
@@ -30,7 +30,7 @@ class _Footage:
 
 @pytest.fixture
 def searched(monkeypatch):
-    """Search with a fit per frame; return the search's end and the frames tried."""
+    """Search with a given fit per frame; return the outcome and the frames tried."""
     monkeypatch.setattr("jawusd.segmentation.rows.tooth_rows", lambda picture: APART)
     monkeypatch.setattr(picture_search, "masked_cameras", lambda *given: [])
 

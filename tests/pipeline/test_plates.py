@@ -1,4 +1,4 @@
-"""Undistorted plates: a point of the world is in the plate where a pinhole camera sees it, at the frame it names."""
+"""Undistorted plates: a world point appears where a pinhole camera projects it, in the plate of the right frame."""
 
 import shutil
 import subprocess
@@ -26,7 +26,7 @@ FRAMES = np.arange(3, 9)
 
 
 def point(frame):
-    """Return where a bright ball is at a reference frame, in a corner of the picture: world [mm]."""
+    """Return the position of a bright ball at a reference frame, in a corner of the picture: world [mm]."""
     return np.array([48.0 - 2 * frame, 38.0, 4.0])
 
 
@@ -74,7 +74,7 @@ def test_plates_show_what_a_pinhole_camera_sees(capture, tmp_path):
             expected = camera.project_pinhole(point(frame)[None])[0]
             assert np.abs(ball_px(path) - expected).max() < 0.25
     bent = np.abs(CAMERAS[0].project(point(5)[None]) - CAMERAS[0].project_pinhole(point(5)[None])).max()
-    assert bent > 1  # so that the test would notice footage as it was
+    assert bent > 1  # so that the test would detect distorted footage
 
 
 def test_the_command_needs_a_built_rig(capture, tmp_path):
@@ -85,7 +85,7 @@ def test_the_command_needs_a_built_rig(capture, tmp_path):
 
 
 def test_plates_of_light_are_light(capture, tmp_path):
-    """The same ball as EXR far above white: undistorted, and as bright as it was."""
+    """The same ball as EXR, far above white, is undistorted and keeps its brightness."""
     from clip_files import write_picture
 
     from jawusd.media.pictures import read_stored

@@ -1,4 +1,4 @@
-"""The report of a finished build: written anew, with what is not at hand named, and kept by --resume."""
+"""The report of a finished build: written again, with missing parts named, and reused by --resume."""
 
 import json
 import sys
@@ -24,7 +24,7 @@ from jawusd.rig.bake import bake_rig
 
 
 def quiet(stage, done, total):
-    """Swallow progress."""
+    """Ignore progress."""
 
 
 def baked(folder, model, meshes):
@@ -34,7 +34,7 @@ def baked(folder, model, meshes):
 
 @pytest.fixture
 def built(tmp_path):
-    """Return a folder as a build leaves it; its capture is gone."""
+    """Return a folder as written by a build, whose capture is missing."""
     data = report_data(count=90)
     model = data.model
     files = baked(tmp_path, model, example_meshes())
@@ -53,7 +53,7 @@ def test_a_report_without_its_capture_says_what_it_lacks(built):
     assert path.stat().st_size == len(text.encode()) < 6e6
     assert "example: jaw rig report" in text and "the capture cannot be read" in text
     assert "report DIR --experiments" in text and "replay-data" in text
-    record = BuildState(built).valid("report", "as built")  # what --resume asks
+    record = BuildState(built).valid("report", "as built")  # as --resume tests it
     assert record is not None and list(record.outputs) == ["report.html"]
     verdict = {"grade": "good", "because": []}
     assert record.result == {"capture": "../gone", "file": "report.html", "verdict": verdict}
@@ -82,7 +82,7 @@ def test_a_placeholder_is_not_shown_as_a_mandible(built):
 
 @pytest.mark.slow
 def test_the_experiments_of_a_build_go_into_its_report(built, monkeypatch):
-    """With the paper's networks, which a build leaves out; how long they are trained is nothing to a report."""
+    """With the paper's networks, which a build omits; a report does not depend on the length of training."""
     monkeypatch.setattr("jawusd.paper.nlpca._STAGES", (60, 100))
     tracks = load_tracks(built / "tracks.npz")
     sure = {name: 1e-6 * getattr(tracks, f"covariance_{name}") for name in ("upper", "lower", "relative")}

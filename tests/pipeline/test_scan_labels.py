@@ -1,4 +1,4 @@
-"""Scans without paint: the command that labels them, file before paint before shape, and where builds keep labels."""
+"""Scans without paint: the command that labels them, the precedence of file, paint and shape, and labels in builds."""
 
 import json
 import shutil
@@ -110,7 +110,7 @@ def test_builds_keep_what_the_shape_says(painted, bare, tmp_path) -> None:
     ]
     kept = with_stored_labels(capture, folder)
     assert kept.scans.labels == folder and all_labelled(kept)
-    label_scans(bare)  # from now on the scan has labels of its own
+    label_scans(bare)  # now the scan has its own labels
     assert with_stored_labels(capture, folder) is capture and store_labels(capture, folder) == []
     assert not list(folder.iterdir())
 

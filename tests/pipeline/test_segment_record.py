@@ -1,4 +1,4 @@
-"""What is kept of a segmentation: finished frames, confidences, and the masks to be looked at."""
+"""The record of a segmentation: finished frames, confidences, and masks to inspect."""
 
 import json
 
@@ -16,7 +16,7 @@ POSES = np.stack([np.eye(4)] * 2).tolist()
 
 
 def entries(count=40):
-    """Return the records of a take with two cameras in which nothing is wrong."""
+    """Return the records of a good take with two cameras."""
     rng = np.random.default_rng(0)
     out = {}
     for frame in range(count):
@@ -75,7 +75,7 @@ def test_nothing_is_to_be_looked_at_in_an_even_take():
         ("unexpected", 0.3),
         ("residual_px", 1.6),
         ("uncovered", 0.2),
-        ("outline", [400, 560, 100]),  # most of it does not show
+        ("outline", [400, 560, 100]),  # most of it is not visible
     ],
 )
 def test_every_symptom_of_a_bad_mask_counts(symptom, value):
@@ -111,7 +111,7 @@ def test_masks_of_an_earlier_build_are_deleted_and_nothing_else(tmp_path):
     mine = folder / "cam1" / "lower" / "notes.png"
     mine.touch()
     delete_masks(folder)
-    assert all(path.exists() for path in made)  # no record: others may have drawn them
+    assert all(path.exists() for path in made)  # no record: the masks may be hand-drawn
     Journal(folder, "a", resume=False).add(7, {"poses": POSES})
     delete_masks(folder)
     assert sorted(path.name for path in folder.rglob("*")) == ["cam1", "cam2", "lower", "notes.png"]

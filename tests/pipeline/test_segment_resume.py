@@ -1,4 +1,4 @@
-"""Segmentation stopped at any moment and taken up again, against one that was never stopped."""
+"""Segmentation stopped at any moment and resumed, compared with one that was never stopped."""
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ FRAMES = 4
 
 
 class Stopped(Exception):
-    """Stands for a process that ends."""
+    """Replaces the end of a process."""
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_finished_masks_teach_and_are_written_as_they_were_drawn(take, undisturb
     drawn = {}
     for row in ("upper", "lower"):
         made = cv2.imread(str(getattr(given, row)) % own, cv2.IMREAD_GRAYSCALE)
-        drawn[row] = cv2.dilate(made, np.ones((5, 5), np.uint8))  # somebody draws wider
+        drawn[row] = cv2.dilate(made, np.ones((5, 5), np.uint8))  # an artist draws wider
         path = mask_path(tmp_path / "keys", "cam0", row, own)
         path.parent.mkdir(parents=True)
         write_mask(path, drawn[row])

@@ -1,4 +1,4 @@
-"""The first frames of the example capture as a shot of the person whose rig was built from all of it."""
+"""The first frames of the example capture as a shot, solved with the rig built from the whole capture."""
 
 import json
 import subprocess
@@ -39,7 +39,7 @@ def rig(example_build):
 
 @pytest.fixture(scope="module")
 def solved(rig, shot, tmp_path_factory):
-    """The performance of the shot, which nobody may change, and the tracks written with it."""
+    """The performance of the shot, not to be modified, and the tracks written with it."""
     path = tmp_path_factory.mktemp("solved") / "take.npz"
     return solve(rig, shot, path), path
 
@@ -98,7 +98,7 @@ def test_shots_without_masks_are_solved_from_their_videos(rig, tmp_path):
 
 @pytest.mark.slow
 def test_teeth_are_found_in_the_pictures_of_one_camera_without_picks(rig):
-    """Depth is what one camera tells least; the standard deviation has to say so."""
+    """Depth is least accurate with one camera, and must have the largest standard deviation."""
     found = solve(rig, bare(0, 24, ["cam0"], picks=False))
     errors = tip_errors_mm(jawusd.load(rig), found.frames, found.d)
     assert found.camera_names == ("cam0",) and (found.state == SolveState.SOLVED).all()
@@ -108,7 +108,7 @@ def test_teeth_are_found_in_the_pictures_of_one_camera_without_picks(rig):
 
 @pytest.mark.slow
 def test_unknown_focal_lengths_are_found_in_pictures(rig, monkeypatch):
-    """The calibration says 6 per cent too much."""
+    """The calibrated focal length is 6 % too large."""
     shot = bare(-2, 10)
     right = load_cameras(shot)
     zoomed = [replace(camera, K=camera.K * np.array([[1.06, 1.06, 1.0]]).T) for camera in right]
@@ -123,14 +123,14 @@ def test_unknown_focal_lengths_are_found_in_pictures(rig, monkeypatch):
 
 @pytest.mark.slow
 def test_a_worn_camera_has_one_head(rig):
-    """The example's head hardly moves in half a second, as before a worn camera."""
+    """The example's head hardly moves in half a second, as with a head-mounted camera."""
     found = solve(rig, bare(0, 12), fixed_head=True)
     np.testing.assert_allclose(found.T_world_upper, np.broadcast_to(found.T_world_upper[0], (12, 4, 4)), atol=1e-4)
 
 
 @pytest.mark.slow
 def test_pictures_that_do_not_show_this_person_are_refused(rig):
-    """The picked pixels of both arches are exchanged: nothing fits there."""
+    """The picked pixels of both arches are swapped, so no contour fits."""
     shot = bare(-1, 2)
     picks = shot.bootstrap
     moved = picks.model_copy(update={"frame": picks.frame + 40})
@@ -162,7 +162,7 @@ def test_one_of_several_rigs_is_solved(rig, shot, solved, tmp_path):
     assert "--prim" in run("solve", stage, shot, "-o", tmp_path / "take.usda", code=3)
     run("solve", stage, shot, "--prim", "/Shot/b", "-o", tmp_path / "take.usda")
     found, _ = solved
-    at = found.frames * 12 / open_capture(shot).fps  # the stage runs at 12 a second
+    at = found.frames * 12 / open_capture(shot).fps  # the stage has 12 time codes per second
     times, T = read_poses_of_stage(tmp_path / "take.usda", "/Shot/b")
     shown = (times >= at[0]) & (times <= at[-1])
     d = np.stack([np.interp(times[shown], at, column) for column in found.d.T], axis=1)
@@ -195,7 +195,7 @@ def test_a_shot_without_masks_and_videos_is_refused(rig, shot, tmp_path):
 
 @pytest.mark.slow
 def test_a_performance_is_drawn_and_reported(rig, shot, tmp_path):
-    """Cameras of the shot have masks alone: these are drawn over."""
+    """Cameras of the shot have only masks, which are the backdrop."""
     summary = json.loads(
         run(
             "solve", rig, shot, "-o", tmp_path / "take.npz", "--overlay", tmp_path / "take.mp4",

@@ -1,4 +1,4 @@
-"""`jawusd init`: what a folder's names and clips say, and what it cannot know."""
+"""`jawusd init`: what it finds from names and clips of a folder, and what it reports as missing."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def board_clip(path, camera):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Return a folder as people have one: natural names, nothing described."""
+    """Return a typical folder: natural names, no description."""
     cameras = studio(lens=(0.0, 0.0))
     for name, camera in zip(("left", "right"), cameras):
         clip(tmp_path / f"{name}.mp4", fps=24000 / 1001)
@@ -90,7 +90,7 @@ def test_what_is_missing_is_said(tmp_path):
     said = "\n".join(start.missing)
     for words in ("upper_teeth", "lower_teeth", "footage of at least two cameras", "a calibration of the cameras"):
         assert words in said
-    write_start(start)  # a template all the same
+    write_start(start)  # a template nevertheless
     text = (tmp_path / "capture.toml").read_text()
     assert text.count("# FILL IN:") == 3 and 'video = "front.mp4"' in text
 
@@ -181,7 +181,7 @@ def test_scans_are_told_by_name(tmp_path):
     assert str(pair_of["upper_teeth"][0]) == "maxilla.stl" and str(pair_of["lower_teeth"][0]) == "mandible.stl"
 
 
-# Files of a folder as programs and laboratories name them -> upper teeth, lower teeth, mandible, skull, not assigned.
+# File names of programs and laboratories -> upper teeth, lower teeth, mandible, skull, not assigned.
 ARCHES = {
     "one word": (["4711-upperjaw.ply", "4711-lowerjaw.ply"], "01"),
     "3Shape": (["a_UpperJawScan.stl", "a_LowerJawScan.stl"], "01"),

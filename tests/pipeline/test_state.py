@@ -52,7 +52,7 @@ def test_clear_deletes_only_what_builds_wrote(tmp_path):
     state = finished(folder)
     (folder / "mine.txt").write_text("keep")
     (tmp_path / "outside").write_text("keep")
-    # A damaged or hostile record must not reach out of the folder.
+    # A damaged or hostile record must not refer to files outside the folder.
     state.stages["track"].outputs["../outside"] = "x"
     state.clear()
     assert sorted(os.listdir(folder)) == ["mine.txt"] and (tmp_path / "outside").exists()
@@ -99,7 +99,7 @@ def test_a_file_system_without_locks_is_a_warning(tmp_path, monkeypatch, caplog,
     (tmp_path / ".jawusd-tmp-of-another").write_text("x")
     monkeypatch.setattr(fcntl, "flock", none)
     with locked(tmp_path):
-        # another build may be at work: what is unfinished may be its own
+        # another build may be running: unfinished files may belong to it
         assert (tmp_path / ".jawusd-tmp-of-another").exists()
     assert "the file system has no locks" in caplog.text and os.strerror(number) in caplog.text
 
@@ -115,7 +115,7 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path, name):
 
 
 def forged(folder, change):
-    """Change build.json and the hash that it carries."""
+    """Modify build.json, with a matching hash."""
     path = folder / BUILD_FILE
     data = json.loads(path.read_text())
     change(data["stages"])

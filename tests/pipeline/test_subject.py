@@ -1,4 +1,4 @@
-"""Whose jaw it is, from each kind of file that can say so."""
+"""The person's anatomy, from each kind of file."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ SCANS = {name: ROOT / "examples" / "capture" / "scans" / f"{name}.ply" for name 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """A folder with what a build leaves behind for the report: model and geometry."""
+    """A folder with the files of a build that the report needs: model and geometry."""
     folder = tmp_path_factory.mktemp("built")
     frames, d = example_motion()
     bake_rig(folder, example_rig(), example_meshes(), name="someone", fps=FPS, frames=frames, d=d, table_size=17)
@@ -102,7 +102,7 @@ def test_a_registration_taken_from_the_take_moves_lower_scan_and_teeth_but_no_co
 
 @pytest.mark.slow
 def test_the_rig_holds_the_lower_scan_where_the_take_shows_it(tmp_path):
-    """One model is baked as fitted without scans, the other as one that says how teeth meet."""
+    """One model is baked as fitted without scans, the other with contact of the teeth."""
     usd = pytest.importorskip("pxr.Usd")
     subject = subject_of_scans(SCANS, "someone")
     model = JawModel(example_arrays(), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool))

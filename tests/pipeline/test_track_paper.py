@@ -1,4 +1,4 @@
-"""`jawusd track --solver paper` on two rendered frames, as a user runs it."""
+"""`jawusd track --solver paper` on two rendered frames, run as a program."""
 
 import json
 import subprocess

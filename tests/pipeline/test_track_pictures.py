@@ -1,4 +1,4 @@
-"""Captures without masks are tracked from their pictures: from picks, or from where a search finds the teeth."""
+"""Captures without masks are tracked by colours, starting from picks or a search for the teeth."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Poses from elsewhere: units, direction, rest frame, and the HDF5 files of jaw-tracking-system."""
+"""Poses of other programs: units, direction, rest frame, and the HDF5 files of jaw-tracking-system."""
 
 import builtins
 
@@ -17,7 +17,7 @@ COUNT = 8
 
 @pytest.fixture
 def poses():
-    """Poses of a mandible, the first with the teeth in occlusion, and as a frame elsewhere on the mandible moves."""
+    """Poses of a mandible, the first with the teeth in occlusion, and those of another frame fixed to it."""
     twists = np.random.default_rng(0).normal(size=(COUNT, 6)) * [0.1, 0.1, 0.1, 5, 5, 5]
     T = se3_exp(twists)
     T[0] = np.eye(4)
@@ -25,7 +25,7 @@ def poses():
 
 
 def write(path, T, group=RAW_GROUP, unit="m", quaternion=True, mode="w", last=False, **extra):
-    """Write a trajectory by the layout of jaw-tracking-system 1.1, with scipy's quaternions."""
+    """Write a trajectory in the layout of jaw-tracking-system 1.1, with scipy's quaternions."""
     rotation = Rotation.from_matrix(T[:, :3, :3])
     with h5py.File(path, mode) as file:
         made = file.create_group(group)
