@@ -2,7 +2,7 @@
 
 STAGES = (
     "build", "track", "fit", "bake", "check", "calibrate", "segment", "scans", "photographs", "solve", "live", "report",
-    "library", "many", "joint_table", "camera_convert", "start_capture", "doctor", "cameras", "meshes",
+    "library", "many", "start_capture", "doctor", "cameras",
     "subject", "capture_inputs",
 )  # fmt: skip
 
