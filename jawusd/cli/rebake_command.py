@@ -101,8 +101,8 @@ def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str
         raise typer.BadParameter("RIG STAGE bakes one rig; several are baked with the shot alone.", param_hint="--prim")
     if prims or stage is not None:
         return [*prims] if prims else [None]
+    from jawusd.rig.layout import rig_prims
     from jawusd.rig.read import find_rig_prim, open_stage
-    from jawusd.rig.schema import rig_prims
 
     opened = open_stage(rig)
     return [str(prim.GetPath()) for prim in rig_prims(opened)] or [str(find_rig_prim(opened, rig).GetPath())]

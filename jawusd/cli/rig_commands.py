@@ -216,9 +216,9 @@ def _verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:
 
 def _unbaked(rig: JawRig, path: Path, prim: str | None) -> dict[str, list[str] | dict[str, float]]:
     """Return the deviation of the mandible of a stage from its d; empty if both agree."""
-    from jawusd.rig.rebake import departure
+    from jawusd.rig.rebake import deviation
 
-    away = departure(path, rig, prim) if path.suffix.lower() in USD_SUFFIXES else None
+    away = deviation(path, rig, prim) if path.suffix.lower() in USD_SUFFIXES else None
     if away is None or not away.frames:
         return {}
     message = f"the mandible deviates from d in {away.frames} of {away.of} frames and keys, by up to "
@@ -244,8 +244,8 @@ def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
     from dataclasses import asdict
 
     from jawusd.rig import Finding, find_nvidia_validator, nvidia_findings, validate_stage
+    from jawusd.rig.layout import rig_prims
     from jawusd.rig.read import open_stage
-    from jawusd.rig.schema import rig_prims
 
     findings = [Finding(one.severity, one.kind, one.path or "", one.message) for one in changed]
     findings += validate_stage(path)

@@ -98,8 +98,7 @@ def publish(
     as_json: Json = False,
 ) -> None:
     """Copy a rig under unique file names, so that actors can be packed together; or pack a shot as .usdz."""
-    from jawusd.rig.package import write_package
-    from jawusd.rig.publish import publish_rig
+    from jawusd.rig.publish import publish_rig, write_package
 
     refuse_existing(out, force)
     if not source.is_dir():

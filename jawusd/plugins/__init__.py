@@ -1,1 +1,5 @@
-"""Helpers that run inside other programs; `extension` writes them as files that need nothing of jawusd."""
+"""Code that runs inside other programs: a Blender add-on, a reader and recipes for Maya, Houdini and Unreal.
+
+`extension` writes it as files that work without jawusd. May import base, geometry, formats and evaluator; the stubs of
+the Blender add-on name what it needs of `rig`.
+"""

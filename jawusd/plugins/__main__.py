@@ -1,4 +1,4 @@
-"""Hand out what runs inside other programs.
+"""Write the files that run inside other programs.
 
 python -m jawusd.plugins jawusd_blender.zip    the Blender extension
 python -m jawusd.plugins FOLDER                reader, and recipes for Maya, Houdini and Unreal

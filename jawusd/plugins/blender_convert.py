@@ -1,9 +1,9 @@
-"""Turn a file of another format into a USD stage, inside Blender: `jawusd encode RIG take.fbx` runs this.
+"""Convert an FBX or glTF file to a USD stage inside Blender: `jawusd encode RIG take.fbx` runs this script.
 
     blender -b --factory-startup -P blender_convert.py -- take.fbx take.usdc 24
 
-or with a Python that has `bpy`. The last argument is the frames per second of files that do not say, as glTF ones; FBX
-files say. A time of 0 is frame 0.
+It also runs in a Python with `bpy`. The last argument is the frame rate of files that do not state one, such as glTF;
+FBX files do. Time 0 is frame 0.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import traceback
 
 import bpy
 
-_STILL = 1e-6  # what a curve of an object at rest varies by
-_PLACES = ("location", "rotation", "scale", "pose.bones")
+_STILL = 1e-6  # largest variation of a curve of an object at rest
+_TRANSFORM_PATHS = ("location", "rotation", "scale", "pose.bones")
 
 
 def convert(source: str, target: str, fps: float) -> None:
-    """Import a file into an empty scene and export it, over the frames of its actions."""
+    """Import a file into an empty scene and export the frame range of its actions."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.fps, scene.render.fps_base = round(fps), round(fps) / fps
     if source.lower().endswith(".fbx"):
         bpy.ops.preferences.addon_enable(module="io_scene_fbx")
         bpy.ops.import_scene.fbx(filepath=source, anim_offset=0.0)
-        _choose_takes()
+        _assign_takes()
     else:
         bpy.ops.preferences.addon_enable(module="io_scene_gltf2")
         bpy.ops.import_scene.gltf(filepath=source)
@@ -36,13 +36,13 @@ def convert(source: str, target: str, fps: float) -> None:
     bpy.ops.wm.usd_export(filepath=target, export_animation=True, export_armatures=True, export_materials=False)
 
 
-def _choose_takes() -> None:
-    """Let every object play the take of an FBX file in which it moves.
+def _assign_takes() -> None:
+    """Assign to every object the take of an FBX file in which it moves.
 
-    Blender exports every action on every object by default, the camera's on the jaw too, and reads the first one.
+    By default Blender exports every action for every object, even the camera's for the jaw, and imports the first one.
 
     Raises:
-        ValueError: A mesh moves in several takes: which one was meant cannot be told.
+        ValueError: A mesh moves in several takes, so the choice is ambiguous.
     """
     for found in bpy.data.objects:
         if not any(item.type == "MESH" for item in (found, *found.children_recursive)):
@@ -54,7 +54,7 @@ def _choose_takes() -> None:
         if moving:
             data = found.animation_data
             data.action = moving[0]
-            if hasattr(data, "action_slot"):  # Blender 4.4 and later, which do not choose one
+            if hasattr(data, "action_slot"):  # Blender 4.4 and later, which leave it unset
                 data.action_slot = data.action_suitable_slots[0]
 
 
@@ -62,7 +62,7 @@ def _moves(action: bpy.types.Action) -> bool:
     """Return whether an action moves an object or its bones."""
     layers = getattr(action, "layers", None)  # not in Blender 4.2
     bags = [bag for layer in layers for strip in layer.strips for bag in strip.channelbags] if layers else [action]
-    curves = [curve for bag in bags for curve in bag.fcurves if curve.data_path.startswith(_PLACES)]
+    curves = [curve for bag in bags for curve in bag.fcurves if curve.data_path.startswith(_TRANSFORM_PATHS)]
     values = [[point.co[1] for point in curve.keyframe_points] for curve in curves]
     return any(max(row) - min(row) > _STILL for row in values if row)
 
@@ -75,4 +75,4 @@ if __name__ == "__main__":
         traceback.print_exc()
         failed = True
     sys.stdout.flush()
-    os._exit(failed)  # the module hangs at a normal exit in some versions
+    os._exit(failed)  # bpy hangs at a normal exit in some versions

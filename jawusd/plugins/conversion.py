@@ -1,4 +1,4 @@
-"""Read FBX and glTF through Blender, in a process of its own: what comes back is a USD stage."""
+"""Convert FBX and glTF files to USD stages through Blender, in a separate process."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from jawusd.base.errors import FormatError, MissingDependencyError
 from jawusd.base.inputs import check_input
 from jawusd.formats.gltf import frame_rate
 
-#: Files that Blender reads for jawusd.
+#: Suffixes of the files that are converted by Blender.
 SUFFIXES = (".fbx", ".glb", ".gltf")
-#: Environment variable that names a Blender program, or a Python that has `bpy`.
+#: Environment variable with the path of Blender, or of a Python with `bpy`.
 SETTING = "JAWUSD_BLENDER"
 
 _SCRIPT = Path(__file__).with_name("blender_convert.py")
@@ -23,15 +23,15 @@ _TIMEOUT_S = 900
 
 
 def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps: float) -> Path:
-    """Convert a file to a USD stage in a folder; a time of 0 is frame 0.
+    """Convert a file to a USD stage in a folder; time 0 is frame 0.
 
     Args:
         path: An .fbx, .glb or .gltf file.
-        folder: Where the stage is written.
-        fps: Frames per second of files that do not say, as glTF ones of other programs.
+        folder: Folder of the stage.
+        fps: Frames per second of files that do not state it, such as glTF of other programs.
 
     Raises:
-        MissingDependencyError: There is no Blender.
+        MissingDependencyError: Blender is not installed.
         FormatError: Blender cannot read the file.
     """
     path, target = Path(path), Path(folder) / f"{Path(path).stem}.usdc"
@@ -39,19 +39,19 @@ def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps:
     if not path.is_file():
         raise FormatError("there is no such file.", path=path)
     command = [*_blender(path), "--", str(path.resolve()), str(target), repr(frame_rate(path) or fps)]
-    # plugins of this process are not meant for Blender's own OpenUSD
-    alone = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
+    # plugins of this process do not fit Blender's own OpenUSD
+    environment = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, env=alone, check=False)
-        said = done.stderr or done.stdout
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, env=environment, check=False)
+        output = done.stderr or done.stdout
     except OSError as error:
         raise MissingDependencyError(f"{command[0]} cannot be run ({error.strerror}).", hint=_hint()) from error
     except subprocess.TimeoutExpired as error:
         raise FormatError(f"Blender did not finish in {_TIMEOUT_S} s.", path=path) from error
-    if "No module named 'bpy'" in said:
+    if "No module named 'bpy'" in output:
         raise MissingDependencyError(f"{command[0]} is neither Blender nor a Python with bpy.", hint=_hint())
     if done.returncode or not target.is_file():
-        last = (said.strip().splitlines() or ["it said nothing"])[-1]
+        last = (output.strip().splitlines() or ["no output"])[-1]
         raise FormatError(f"Blender cannot read it ({last:.200}).", path=path)
     return target
 
@@ -63,7 +63,7 @@ def _blender(path: Path) -> list[str]:
         named = sys.executable
     if not named:
         raise MissingDependencyError(
-            "FBX and glTF are read through Blender, and there is none.", path=path, hint=_hint()
+            "FBX and glTF are read through Blender, which was not found.", path=path, hint=_hint()
         )
     if Path(named).stem.lower().startswith("blender"):
         return [named, "--background", "--factory-startup", "--python-exit-code", "1", "--python", str(_SCRIPT)]
@@ -71,4 +71,4 @@ def _blender(path: Path) -> list[str]:
 
 
 def _hint() -> str:
-    return f"Set {SETTING} to a Blender program (4.2 or later), or to a Python with `pip install bpy`; or export USD."
+    return f"Set {SETTING} to Blender (4.2 or later) or a Python with bpy (`pip install bpy`), or export USD instead."

@@ -1,4 +1,4 @@
-"""Write what runs inside other programs: the Blender extension as one zip, the scripts as files."""
+"""Write the files that run inside other programs: the Blender extension as a zip, the reader and recipes as scripts."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from jawusd.plugins.carrying import carried_files
+from jawusd.plugins.vendoring import vendored_files
 
 _HERE = Path(__file__).parent
 _READER = "jawusd_reader.py"
 _SCRIPTS = ("jawusd_recipes.py",)
-# one fixed time: equal sources give equal bytes
+# a fixed time, so that the zip is reproducible
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 
 def build_extension(out: Path) -> Path:
-    """Write the zip that Blender's "Install from Disk" takes (4.2 and later) and return it.
+    """Write the zip for Blender's "Install from Disk" (4.2 and later) and return its path.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The zip cannot be written.
     """
     sources = [*sorted((_HERE / "blender").glob("*.py")), _HERE / "blender" / "blender_manifest.toml"]
     contents = {source.name: source.read_bytes() for source in sources}
-    carried = carried_files(sorted((_HERE / "blender").glob("*.pyi")))
-    contents |= {name: source.encode() for name, source in sorted(carried.items())}
+    vendored = vendored_files(sorted((_HERE / "blender").glob("*.pyi")))
+    contents |= {name: source.encode() for name, source in sorted(vendored.items())}
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in contents.items():
             archive.writestr(zipfile.ZipInfo(name, _ZIP_TIME), content, zipfile.ZIP_DEFLATED)
@@ -35,10 +35,10 @@ def build_extension(out: Path) -> Path:
 
 
 def copy_scripts(folder: Path) -> list[Path]:
-    """Write the reader, and the scripts that need nothing but it, into a folder, made if missing; return the files.
+    """Write the reader and the scripts that use it to a folder, created if missing, and return their paths.
 
     Raises:
-        OSError: They cannot be written.
+        OSError: A file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     reader = folder / _READER
@@ -49,11 +49,10 @@ def copy_scripts(folder: Path) -> list[Path]:
 def packed_reader() -> str:
     """Return the source of the reader as one file that needs only the standard library.
 
-    The modules of jawusd that it imports take the place of its imports.
+    Its imports of jawusd are replaced by the modules themselves.
 
     Raises:
-        ValueError: A module does what cannot be packed: it imports in another form or from another package, or defines
-            a name that another module defines.
+        ValueError: A module cannot be packed, because of an unsupported import, or a name defined in two modules.
     """
     modules: dict[Path, ast.Module] = {}
     _collect(_HERE / _READER, modules)
@@ -73,7 +72,7 @@ def packed_reader() -> str:
 
 
 def _collect(source: Path, modules: dict[Path, ast.Module]) -> None:
-    """Parse a module and those of jawusd that it imports, each after the ones it needs."""
+    """Parse a module and the modules of jawusd that it imports, in order of dependency."""
     tree = ast.parse(source.read_text(encoding="utf-8"))
     for node in tree.body:
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("jawusd."):
@@ -84,22 +83,22 @@ def _collect(source: Path, modules: dict[Path, ast.Module]) -> None:
 
 
 def _body(source: Path, tree: ast.Module, imported: dict[str, set[str]]) -> str:
-    """Return a module without docstring and imports; those of the standard library go to `imported`."""
+    """Return a module without docstring and imports; imports of the standard library are added to `imported`."""
     lines: list[str | None] = [*source.read_text(encoding="utf-8").splitlines()]
     for node in ast.walk(tree):
         if isinstance(node, (ast.Import, ast.ImportFrom)) and node not in tree.body and "jawusd" in ast.unparse(node):
             raise ValueError(f"{source.name}, line {node.lineno}: only imports at the top of a module can be packed")
     dropped = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
     for node in dropped:
-        _note(source, node, imported)
+        _add_import(source, node, imported)
     docstring = tree.body[0] if ast.get_docstring(tree) else None
     for node in (*dropped, *([docstring] if docstring else [])):
         lines[node.lineno - 1 : node.end_lineno] = [None] * (int(node.end_lineno or node.lineno) - node.lineno + 1)
     return "\n".join(line for line in lines if line is not None).strip()
 
 
-def _note(source: Path, node: ast.Import | ast.ImportFrom, imported: dict[str, set[str]]) -> None:
-    """Add an import of the standard library to those at the top of the packed file."""
+def _add_import(source: Path, node: ast.Import | ast.ImportFrom, imported: dict[str, set[str]]) -> None:
+    """Add an import of the standard library to the header of the packed file."""
     names = {alias.name for alias in node.names}
     modules = [str(node.module)] if isinstance(node, ast.ImportFrom) else sorted(names)
     renamed = any(alias.asname or alias.name == "*" for alias in node.names)

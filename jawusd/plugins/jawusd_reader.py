@@ -1,14 +1,14 @@
 """Read and evaluate jaw rigs in any Python: one file, no dependencies, not even jawusd.
 
-`python -m jawusd.plugins FOLDER` writes that file, to be put next to your script. `model.npz` needs nothing but Python
-3.9; USD needs the `pxr` modules that Blender, Maya, Houdini and Unreal bring along.
+`python -m jawusd.plugins FOLDER` writes that file; put it next to your script. `model.npz` needs only Python 3.9. USD
+needs the `pxr` modules that Blender, Maya, Houdini and Unreal include.
 
     import jawusd_reader
     rig = jawusd_reader.load("actor/actor.usda")
     T = rig.pose(20.0, 3.0, 0.5)             # d1, d2, d3 [mm] -> T_skull_mandible, rows of a 4x4 for column vectors
     translation, wxyz = jawusd_reader.decompose(T)
     rig.margin(20.0, 3.0, 0.5)               # signed distance to the bound [mm], > 0 inside
-    rig.is_inside(20.0, 3.0, 0.5)            # True: a margin of 0 or more
+    rig.is_inside(20.0, 3.0, 0.5)            # True if the margin is 0 or more
     rig.project(20.0, 7.6, 9.2)              # the nearest (d1, d2, d3) inside the bound
     rig.ranges(20.0)                         # ((d2 min, d2 max), (d3 min, d3 max)) for sliders
 """
@@ -43,7 +43,7 @@ LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forw
 
 _NOT_NEEDED = ("codes", "polygon_", "residual_limit_mm", "tolerance_mm")
 _SEARCH_STEPS = 60
-_SLICES = 48  # openings at which a search for the nearest d starts
+_SLICES = 48  # openings at which searches for the nearest d start
 _CODES = {
     "f2": "e", "f4": "f", "f8": "d", "b1": "?", "i1": "b", "i2": "h", "i4": "i", "i8": "q",
     "u1": "B", "u2": "H", "u4": "I", "u8": "Q",
@@ -52,15 +52,15 @@ _OPERATIONS = FloatOperations()
 
 
 class ReaderError(Exception):
-    """Report a file that is no jaw rig, or one that this reader is too old for."""
+    """Report a file that is not a jaw rig, or too new for this reader."""
 
 
 def load(path: str, prim_path: str | None = None) -> Rig:
     """Load a rig.
 
     Args:
-        path: `model.npz`, or any USD file that carries the rig.
-        prim_path: Which rig, where a stage has several.
+        path: `model.npz`, or any USD file with the rig.
+        prim_path: The rig's prim, if the stage has several rigs.
 
     Raises:
         ReaderError: No rig, a newer version, or USD without `pxr`.
@@ -79,18 +79,18 @@ def load(path: str, prim_path: str | None = None) -> Rig:
         return from_prim(stage.GetPrimAtPath(prim_path))
     prims = find_rigs(stage)
     if len(prims) != 1:
-        raise ReaderError(f"{path} holds {len(prims)} jaw rigs; name the prim")
+        raise ReaderError(f"{path} has {len(prims)} jaw rigs; name the prim")
     return from_prim(prims[0])
 
 
 def find_rigs(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Return the prims of a stage that carry a rig, by their raw metadata: no plugin is needed."""
+    """Return the rig prims of a stage, found by raw metadata, so that the schema plugin is not needed."""
     applied = [(prim, prim.GetMetadata("apiSchemas")) for prim in stage.Traverse()]
     return [prim for prim, names in applied if names is not None and SCHEMA in names.GetAddedOrExplicitItems()]
 
 
 def find_blender_pxr(resource_path: Callable[[str], str]) -> None:
-    """Make Blender's own pxr importable where Blender runs as a Python module, given `bpy.utils.resource_path`."""
+    """Make Blender's own pxr importable if Blender runs as a Python module, given `bpy.utils.resource_path`."""
     version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
     for kind in ("LOCAL", "SYSTEM"):
         base = resource_path(kind)
@@ -103,14 +103,14 @@ def from_prim(prim: Usd.Prim) -> Rig:
     """Read a rig from a USD prim.
 
     Raises:
-        ReaderError: The prim carries no rig, or a newer version.
+        ReaderError: The prim is not a rig, or is of a newer version.
     """
 
     def value(name: str) -> float | Sequence[float] | str:
         attribute = prim.GetAttribute(name) if prim else None
         found = attribute.Get() if attribute else None
         if found is None:
-            raise ReaderError(f"{name} is not there: no complete jaw rig")
+            raise ReaderError(f"{name} is missing: the jaw rig is incomplete")
         return found
 
     _check_version(value("jaw:formatVersion"))
@@ -121,7 +121,7 @@ def from_prim(prim: Usd.Prim) -> Rig:
 
 
 def from_json(text: str) -> Rig:
-    """Build a rig from what `Rig.to_json` gave."""
+    """Build a rig from the text of `Rig.to_json`."""
     stored = json.loads(text)
     return Rig(stored["kind"], stored["arrays"])
 
@@ -131,7 +131,7 @@ def _flat(value: float | Sequence[float] | str) -> list[float]:
 
 
 def _attributes_of(kind: str, gliding: bool) -> dict[str, tuple[str, ...]]:
-    """Return the attributes of every array that poses and margins of a kind need; ``gliding`` ones have a table."""
+    """Return the attributes of all arrays that poses and margins need; ``gliding`` models have a glide table."""
     if kind not in MODELS:
         raise ReaderError(f"model kind {kind!r} is unknown to this reader")
     every = {**arrays_of(kind), **(GLIDE_ARRAYS if gliding else {})}
@@ -141,7 +141,7 @@ def _attributes_of(kind: str, gliding: bool) -> dict[str, tuple[str, ...]]:
 
 def _check_version(version: object) -> None:
     if int(str(version)) > FORMAT_VERSION:
-        raise ReaderError(f"format version {version}; this reader knows up to {FORMAT_VERSION}")
+        raise ReaderError(f"format version {version}; this reader supports up to {FORMAT_VERSION}")
 
 
 def _from_npz(path: str) -> Rig:
@@ -149,14 +149,14 @@ def _from_npz(path: str) -> Rig:
         with zipfile.ZipFile(path) as archive:
             raw = {name[:-4]: archive.read(name) for name in archive.namelist() if name.endswith(".npy")}
         if "meta" not in raw:
-            raise ReaderError(f"{path} has no meta: no jaw model")
+            raise ReaderError(f"{path} has no meta, so it is not a jaw model")
         (text,) = _npy("meta", raw["meta"])
         meta = json.loads(str(text))
     except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError) as error:
-        raise ReaderError(f"{path} is no jaw model, or damaged ({error})") from None
+        raise ReaderError(f"{path} is not a jaw model, or damaged ({error})") from None
     family, _, version = str(meta.get("format")).partition("/")
     if family != "jawusd-model":
-        raise ReaderError(f"{path} is of format {meta.get('format')}, expected jawusd-model")
+        raise ReaderError(f"{path} has format {meta.get('format')}, expected jawusd-model")
     _check_version(version)
     arrays = {}
     for name in _attributes_of(meta.get("kind"), "glide_d2" in raw):
@@ -170,11 +170,11 @@ def _npy(name: str, data: bytes) -> Sequence[float | str]:
     """Return the values of a .npy file, row by row (numpy/lib/format.py: versions 1 to 3, any order and byte order).
 
     Raises:
-        ReaderError: It is damaged, or holds neither numbers nor one text.
+        ReaderError: It is damaged, or contains neither numbers nor a single text.
     """
     try:
         if data[:6] != b"\x93NUMPY":
-            raise ValueError("it does not begin as a .npy file")
+            raise ValueError("it does not start like a .npy file")
         long_header = data[6] > 1
         start = 12 if long_header else 10
         (length,) = struct.unpack("<I" if long_header else "<H", data[8:start])
@@ -192,7 +192,7 @@ def _npy(name: str, data: bytes) -> Sequence[float | str]:
 
 
 def _by_rows(values: Sequence[float], shape: Sequence[int]) -> Sequence[float]:
-    """Return the values of an array in the order of rows, given in the order of columns."""
+    """Return the values of an array in row-major order, given in column-major order."""
     places, step = [0], 1
     for count in shape:
         places, step = [place + i * step for place in places for i in range(count)], step * count
@@ -204,10 +204,10 @@ class Rig:
 
     Attributes:
         kind: "anchored" or "additive".
-        arrays: The model's numbers by name, each a flat list, row by row.
+        arrays: The model's arrays by name, each a flat list, row by row.
         d_range: ((min, max), (min, max), (min, max)) of d1, d2, d3 [mm].
-        formula: The model's motion, between the two matrices.
-        matrices: T_skull_anatomical, and T_anatomical_mandible of the closed bite, rows.
+        formula: The model's motion in the anatomical frame.
+        matrices: T_skull_anatomical, and T_anatomical_mandible of the closed bite, as rows.
     """
 
     def __init__(self, kind: str, arrays: dict[str, list[float]]) -> None:
@@ -219,12 +219,12 @@ class Rig:
         self.matrices = (_rigid_inverse(A), _product(A, rows(arrays["T_rest"], 4)))
         self.formula, self._bound = MODELS[kind](arrays), BoundFormula(arrays)
         first_mm, last_mm, softness_mm, offset_mm = self._bound.numbers
-        beyond = offset_mm - softness_mm  # the rounded ends reach about so far
+        beyond = offset_mm - softness_mm  # approximate extent of the rounded ends
         self._spacing_mm = (last_mm - first_mm + 2.0 * beyond) / _SLICES
         self._openings = [first_mm - beyond + (i + 0.5) * self._spacing_mm for i in range(_SLICES)]
 
     def to_json(self) -> str:
-        """Return the rig as text, to be stored inside a scene; `from_json` reads it."""
+        """Return the rig as text, to store in a scene; `from_json` reads it."""
         return json.dumps({"kind": self.kind, "arrays": self.arrays})
 
     def pose(self, d1: float, d2: float, d3: float) -> Rows:
@@ -240,13 +240,13 @@ class Rig:
         return self._bound.margin((d1, d2, d3), self._bound.tables, _OPERATIONS)
 
     def is_inside(self, d1: float, d2: float, d3: float) -> bool:
-        """Tell whether jaw parameters [mm] lie inside the bound: a margin of 0 or more, up to rounding of 1e-6 mm."""
+        """Return whether jaw parameters [mm] are inside the bound: margin >= 0, up to rounding of 1e-6 mm."""
         return self.margin(d1, d2, d3) >= -ON_BOUND_MM
 
     def project(self, d1: float, d2: float, d3: float) -> Triple[float]:
-        """Return the nearest jaw parameters [mm] inside the bound, d itself where it is; NaN for what is not finite.
+        """Return the nearest jaw parameters [mm] inside the bound, d itself if it is inside, NaN if it is not finite.
 
-        Searched from every opening that may be nearer than the nearest point found so far.
+        The search starts at every opening that may lead to a nearer point than the nearest so far.
 
         Raises:
             ReaderError: The bound is empty.
@@ -268,13 +268,13 @@ class Rig:
                 if (distance := math.dist(found, d)) < least:
                     best, least = found, distance
         if best is None:
-            raise ReaderError("the bound of this rig leaves no valid jaw parameters")
+            raise ReaderError("the bound of this rig allows no jaw parameters")
         return best
 
     def ranges(self, d1: float, d2: float = 0.0, d3: float = 0.0) -> tuple[Pair, Pair]:
-        """Return the valid (min, max) of d2 through d3, and of d3 through d2, at d1 [mm]; (nan, nan) where none is.
+        """Return the valid (min, max) of d2 at this d3, and of d3 at this d2 [mm]; (nan, nan) if there is none.
 
-        Where the bound has closed already, some tenths of a mm before the ends of the opening, at the last one inside.
+        The bound closes some tenths of a mm before the ends of the opening; there the last valid opening is used.
         """
         d1 = self._nearest_opening(d1, d2, d3)
         along_d2 = _chord(lambda x: self.margin(d1, x, d3), *self.d_range[1])
@@ -292,7 +292,7 @@ class Rig:
 
 
 def _chord(margin: Callable[[float], float], low: float, high: float) -> Pair:
-    """Return where a concave margin crosses zero: its top by ternary search, then bisection to either side."""
+    """Return the zeros of a concave margin: its maximum by ternary search, then bisection on both sides."""
     a, b = 2.0 * low - high, 2.0 * high - low
     for _ in range(_SEARCH_STEPS):
         p, q = a + (b - a) / 3.0, b - (b - a) / 3.0
@@ -328,7 +328,7 @@ def decompose(T: Rows) -> tuple[Triple[float], tuple[float, float, float, float]
         (c - g, b + d, 1 - a + e - i, f + h),
         (d - b, c + g, f + h, 1 - a - e + i),
     )
-    # the row with the largest diagonal loses no digits
+    # the row with the largest diagonal entry is the most accurate
     q = candidates[max(range(4), key=lambda k: candidates[k][k])]
     length = math.copysign(math.sqrt(sum(v * v for v in q)), q[0] if q[0] != 0 else 1.0)
     return (x, y, z), (q[0] / length, q[1] / length, q[2] / length, q[3] / length)

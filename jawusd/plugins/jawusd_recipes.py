@@ -1,27 +1,27 @@
 """Drive a mandible with a jaw rig in Maya, Houdini or Unreal: short recipes on top of `jawusd_reader.py`.
 
-Put both files where the program's Python finds them. `model.npz` is read without `pxr`.
+Put both files on the Python path of the program. `model.npz` is read without `pxr`.
 
     import jawusd_reader, jawusd_recipes as recipes
-    rig = jawusd_reader.load("actor/model.npz")              # or actor.usda, where the program brings pxr
+    rig = jawusd_reader.load("actor/model.npz")              # or actor.usda, if the program includes pxr
 
     # Maya: import or reference actor.usda, then
     controls = recipes.maya_controls(rig)                    # a group with d1, d2, d3 [mm]; set keys on them
-    recipes.maya_bake(rig, controls, "Mandible", 1, 100)     # keys the mandible from them
+    recipes.maya_bake(rig, controls, "Mandible", 1, 100)     # keys the mandible accordingly
 
-    # Houdini: a null with d1, d2, d3, and the object that carries the mandible
+    # Houdini: a null with d1, d2, d3, and the mandible's object
     recipes.houdini_controls(rig, hou.node("/obj/jaw"))
     recipes.houdini_bake(rig, hou.node("/obj/jaw"), hou.node("/obj/mandible"), 1, 100)
 
     # Unreal: the mandible's binding in a level sequence, and keys of d1, d2, d3 by frame
     recipes.unreal_keys(rig, binding, {0: (0, 0, 0), 24: (20, 0, 0)})
 
-Every whole frame gets a key, and programs draw straight lines between them: those between sparse keys would leave the
-jaw's path by millimetres. Parameters outside the bound are moved to the nearest inside, and a warning names them;
-`measured=True` keeps them, for takes of the person. Angles go on from frame to frame without turning over.
+Every whole frame gets a key, with linear interpolation between: between sparse keys the jaw would be millimetres off
+its path. Parameters outside the bound are moved to the nearest valid ones, with a warning. `measured=True` keeps
+them, for captured takes of the person. Angles are continuous from frame to frame.
 
-The mandible's own transform is replaced by T_skull_mandible, below a parent at the skull's pose. Lengths
-are millimetres; where the parent does not scale them, give `scale`, 0.1 for centimetres.
+The mandible's own transform is replaced by T_skull_mandible, below a parent at the skull's pose. Lengths are in
+millimetres; if the parent does not scale them, set `scale`, 0.1 for centimetres.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _MAYA_ROTATE_ORDERS = ("xyz", "yzx", "zxy", "xzy", "yxz", "zyx")
 
 
 def every_frame(keys: Keys) -> dict[int, list[float]]:
-    """Return d at every whole frame from the first key to the last, on straight lines between keys, as in USD."""
+    """Return d at every whole frame from the first to the last key, linearly interpolated as in USD."""
     found = {}
     known = sorted(keys)
     for start, end in zip(known, [*known[1:], known[-1] + 1]):
@@ -55,12 +55,13 @@ def every_frame(keys: Keys) -> dict[int, list[float]]:
 
 
 def poses(rig: jawusd_reader.Rig, keys: Keys, *, measured: bool = False) -> dict[int, Rows]:
-    """Return T_skull_mandible [mm] at every key, with a warning where keys lie outside the bound.
+    """Return T_skull_mandible [mm] at every key; warn if keys are outside the bound.
 
     Args:
         rig: The rig.
-        keys: What to pose.
-        measured: Keep keys outside the bound, as measured poses may lie a little; else the nearest d inside is posed.
+        keys: d1, d2, d3 [mm] by frame.
+        measured: Keep keys outside the bound, because measured poses may be slightly outside. Otherwise they are moved
+            to the nearest valid d.
     """
     outside = {frame: -rig.margin(*d) for frame, d in keys.items() if not rig.is_inside(*d)}
     if outside:
@@ -68,7 +69,7 @@ def poses(rig: jawusd_reader.Rig, keys: Keys, *, measured: bool = False) -> dict
         d = ", ".join(f"{x:.2f}" for x in keys[worst])
         what = "kept as they are" if measured else "moved to the nearest d inside"
         warnings.warn(
-            f"{len(outside)} of {len(keys)} frames lie outside the bound and are {what}; "
+            f"{len(outside)} of {len(keys)} frames are outside the bound and {what}; "
             f"the farthest is frame {worst}, d = ({d}) mm, by {outside[worst]:.2f} mm",
             stacklevel=3,
         )
@@ -79,13 +80,13 @@ def poses(rig: jawusd_reader.Rig, keys: Keys, *, measured: bool = False) -> dict
 def nearest_turn(
     angles: Sequence[float], previous: Sequence[float] | None, middle: int = 1, full: float = 360.0
 ) -> list[float]:
-    """Return the Euler angles of the same turn that lie nearest to those of the frame before.
+    """Return the Euler angles of the same rotation that are nearest to those of the previous frame.
 
     Args:
-        angles: Three angles; ``full`` is a whole turn in their unit.
-        previous: The angles before; None at the first frame.
-        middle: Which of the three the program applies second.
-        full: A whole turn.
+        angles: Three Euler angles.
+        previous: The previous angles; None at the first frame.
+        middle: Index of the angle that the program applies second.
+        full: A full turn in the unit of the angles.
     """
     if previous is None:
         return list(angles)
@@ -104,14 +105,14 @@ def row_matrix(T: Rows, scale: float = 1.0) -> list[float]:
 def unreal_pose(T: Rows, scale: float = 0.1) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return location and quaternion (x, y, z, w) of a pose in Unreal's left-handed axes with Z up.
 
-    Its USD importer swaps y and z, a reflection S; R becomes S R S, whose axis is the swapped one turned round.
+    Its USD importer swaps y and z, a reflection S. R becomes S R S, whose rotation axis is swapped and negated.
     """
     (x, y, z), (qw, qx, qy, qz) = jawusd_reader.decompose(T)
     return (scale * x, scale * z, scale * y), (-qx, -qz, -qy, qw)
 
 
 def maya_controls(rig: jawusd_reader.Rig, name: str = "jaw_controls") -> str:
-    """Make a group with the three parameters as keyable attributes and return its name."""
+    """Create a group with the three parameters as keyable attributes and return its name."""
     from maya import cmds
 
     group = cmds.group(empty=True, name=name)
@@ -138,7 +139,7 @@ def maya_bake(
     *,
     measured: bool = False,
 ) -> None:
-    """Key the mandible at every frame from first to last by what the controls say there, see `poses`."""
+    """Key the mandible at every frame from first to last according to the controls, see `poses`."""
     from maya import cmds
 
     names = [f"{kind}{axis}" for kind in ("translate", "rotate") for axis in "XYZ"]
@@ -148,18 +149,18 @@ def maya_bake(
         frame: [cmds.getAttr(f"{controls}.{parameter}", time=frame) for parameter in jawusd_reader.PARAMETERS]
         for frame in range(first, last + 1)
     }
-    turn = None
+    previous = None
     for frame, T in poses(rig, keys, measured=measured).items():
         cmds.xform(mandible, matrix=row_matrix(T, scale), objectSpace=True)
-        turn = nearest_turn(cmds.getAttr(f"{mandible}.rotate")[0], turn, middle, full)
-        for name, value in zip(names, (*cmds.getAttr(f"{mandible}.translate")[0], *turn)):
+        previous = nearest_turn(cmds.getAttr(f"{mandible}.rotate")[0], previous, middle, full)
+        for name, value in zip(names, (*cmds.getAttr(f"{mandible}.translate")[0], *previous)):
             cmds.setKeyframe(
                 mandible, attribute=name, time=frame, value=value, inTangentType="linear", outTangentType="linear"
             )
 
 
 def houdini_controls(rig: jawusd_reader.Rig, node: hou.Node) -> None:
-    """Give a node the three parameters."""
+    """Add the three parameters to a node."""
     import hou
 
     group = node.parmTemplateGroup()
@@ -178,7 +179,7 @@ def houdini_bake(
     *,
     measured: bool = False,
 ) -> None:
-    """Key the mandible's object at every frame from first to last by what the controls say there, see `poses`."""
+    """Key the mandible's object at every frame from first to last according to the controls, see `poses`."""
     import hou
 
     orders = {
@@ -189,11 +190,11 @@ def houdini_bake(
         frame: [controls.parm(parameter).evalAtFrame(frame) for parameter in jawusd_reader.PARAMETERS]
         for frame in range(first, last + 1)
     }
-    turn = None
+    previous = None
     for frame, T in poses(rig, keys, measured=measured).items():
         parts = hou.Matrix4(row_matrix(T, scale)).explode(**orders)
-        turn = nearest_turn(parts["rotate"], turn, "xyz".index(orders["rotate_order"][1]))
-        for name, values in (("t", parts["translate"]), ("r", turn)):
+        previous = nearest_turn(parts["rotate"], previous, "xyz".index(orders["rotate_order"][1]))
+        for name, values in (("t", parts["translate"]), ("r", previous)):
             for parm, value in zip(mandible.parmTuple(name), values):
                 key = hou.Keyframe(value)
                 key.setFrame(frame)
@@ -209,19 +210,19 @@ def unreal_keys(
     *,
     measured: bool = False,
 ) -> None:
-    """Give a mandible's binding in a level sequence a transform track through keys of (d1, d2, d3) [mm] by frame.
+    """Add a transform track to a mandible's binding in a level sequence, from keys of (d1, d2, d3) [mm] by frame.
 
-    Keys at every frame from the first to the last, see `every_frame` and `poses`.
+    The track has a key at every frame from the first to the last, see `every_frame` and `poses`.
     """
     import unreal
 
     section = binding.add_track(unreal.MovieScene3DTransformTrack).add_section()
     section.set_range(min(keys), max(keys) + 1)
     channels = section.get_all_channels()  # location x y z, rotation roll pitch yaw, scale x y z
-    turn = None
+    previous = None
     for frame, T in poses(rig, every_frame(keys), measured=measured).items():
         location, quaternion = unreal_pose(T, scale)
-        turned = unreal.Quat(*quaternion).rotator()
-        turn = nearest_turn((turned.roll, turned.pitch, turned.yaw), turn)
-        for channel, value in zip(channels, (*location, *turn)):
+        rotator = unreal.Quat(*quaternion).rotator()
+        previous = nearest_turn((rotator.roll, rotator.pitch, rotator.yaw), previous)
+        for channel, value in zip(channels, (*location, *previous)):
             channel.add_key(unreal.FrameNumber(frame), value, interpolation=unreal.MovieSceneKeyInterpolation.LINEAR)

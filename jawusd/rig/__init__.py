@@ -1,7 +1,7 @@
-"""The rig as OpenUSD: authoring, reading, validation, animation, ONNX sidecar.
+"""The rig as OpenUSD: authoring, reading, animation, validation, ONNX sidecars.
 
-What its names need is loaded when they are first used. `jawusd.rig.bake` and
-`jawusd.rig.onnx_sidecar` need the package onnx (`jawusd[build]`); nothing else here does.
+May import base, geometry, formats, cameras, evaluator, meshes and media, but no other stage. Modules are loaded when
+one of their names is first used; only `bake` and the `onnx_*` modules need the package onnx (`jawusd[build]`).
 """
 
 from __future__ import annotations
@@ -10,14 +10,13 @@ import importlib
 import os
 from typing import TYPE_CHECKING
 
-from jawusd.rig.schema import register_schema, schema_is_live
+from jawusd.rig.layout import register_schema, schema_is_live
 
 if TYPE_CHECKING:
     from jawusd.base.inputs import allow_folders
     from jawusd.rig.animation import write_animation, write_splines
-    from jawusd.rig.nvidia import find_nvidia_validator, nvidia_findings
     from jawusd.rig.read import describe, load_rig
-    from jawusd.rig.validate import Finding, register_validators, validate_stage
+    from jawusd.rig.validate import Finding, find_nvidia_validator, nvidia_findings, register_validators, validate_stage
 
 __all__ = [
     "Finding",
@@ -38,18 +37,18 @@ _MODULES = {
     "Finding": "jawusd.rig.validate",
     "allow_folders": "jawusd.base.inputs",
     "describe": "jawusd.rig.read",
-    "find_nvidia_validator": "jawusd.rig.nvidia",
+    "find_nvidia_validator": "jawusd.rig.validate",
     "load_rig": "jawusd.rig.read",
-    "nvidia_findings": "jawusd.rig.nvidia",
+    "nvidia_findings": "jawusd.rig.validate",
     "register_validators": "jawusd.rig.validate",
     "validate_stage": "jawusd.rig.validate",
     "write_animation": "jawusd.rig.animation",
     "write_splines": "jawusd.rig.animation",
 }
 
-# onnxruntime would send its maker what it runs on; it reads this when it is loaded.
+# Disables the telemetry of onnxruntime, which reads the variable when it is loaded.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-# At import: OpenUSD ignores schemas registered after a process has used its first stage.
+# At import time: OpenUSD ignores schemas that are registered after the first stage was opened.
 register_schema()
 
 

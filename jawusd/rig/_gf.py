@@ -1,4 +1,4 @@
-"""The only place where numpy arrays become Gf and Vt values and back.
+"""Conversions between numpy arrays and Gf and Vt values; no other module converts them.
 
 numpy side: column vectors (`p_a = T_a_b @ p_b`), quaternions (w, x, y, z), C-contiguous. USD side: row vectors.
 """
@@ -54,7 +54,7 @@ def rotations(T: ArrayLike) -> list[Gf.Quatd]:
 
 
 def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
-    """Return the same as arrays of one single-precision quaternion each, the values of a one-joint animation."""
+    """Return rotations as `rotations` does, each a Vt.QuatfArray of length one: samples of a one-joint animation."""
     return [Vt.QuatfArray([Gf.Quatf(w, x, y, z)]) for w, x, y, z in continuous_wxyz(np.asarray(T)[:, :3, :3]).tolist()]
 
 
@@ -64,7 +64,7 @@ def row_matrix(T: ArrayLike) -> Gf.Matrix4d:
 
 
 def transform_from_ops(translation: Gf.Vec3d, rotation: Gf.Quatd) -> Array:
-    """Return the transform (4, 4) of a translate and an orient op."""
+    """Return the transform (4, 4) given by a translate op and an orient op."""
     T = np.eye(4)
     T[:3, :3] = matrix_from_wxyz([rotation.GetReal(), *rotation.GetImaginary()])
     T[:3, 3] = translation

@@ -1,7 +1,7 @@
-"""Animation layers: samples of d for tools that know the rig, a baked translation and quaternion for all others.
+"""Animation layers: samples of d for tools that know the rig, and a baked translation and quaternion for all others.
 
-Every reader interpolates d linearly between two samples; the baked ops follow that motion through the model. Matrix
-samples would shear, and products of one transform per parameter are millimetres off where two parameters combine.
+All readers interpolate d linearly between samples; the baked ops follow that motion through the model. Matrix samples
+would shear, and a product of one transform per parameter is millimetres off when parameters combine.
 """
 
 from __future__ import annotations
@@ -21,23 +21,21 @@ from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp
 from jawusd.rig import _gf
-from jawusd.rig.layers import named_after, new_layer, relative_path, stage_of, write_layer
-from jawusd.rig.layout import ACTOR, MADE_FOR, MANDIBLE, PARAMETERS
+from jawusd.rig.layers import new_layer, relative_path, rename_actor, stage_of, write_layer
+from jawusd.rig.layout import ACTOR, MANDIBLE, MODEL_HASH_KEY, PARAMETERS, rig_prims
 from jawusd.rig.read import load_rig, open_stage
-from jawusd.rig.schema import rig_prims
-from jawusd.rig.skel import offer_skeleton
+from jawusd.rig.skel import add_skeleton_variant
 from jawusd.rig.table import landmark_distance
 
-#: Between two baked samples, at the shares of the interval that follow, no landmark is farther [mm] from the model.
+#: Largest landmark distance [mm] from the model between two baked samples, at these fractions of the interval.
 BETWEEN_MM = 0.02
-_SHARES = (0.25, 0.5, 0.75)
+_FRACTIONS = (0.25, 0.5, 0.75)
 _MAX_HALVINGS = 5
-_USD_LERP_BELOW = 1e-5
-# Every whole frame is baked: an hour at 60 per second fits.
-_MOST_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
-#: Key of the lost frames in an animation layer's `customLayerData`.
+_USD_LERP_BELOW = 1e-5  # of 1 - cosine: GfSlerp interpolates linearly below
+# Limits: every whole frame is baked, and an hour at 60 frames per second must fit.
+_MAX_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
+#: Keys in an animation layer's `customLayerData`: frames without d, and frames with d inferred from their neighbours.
 LOST = "lostFrames"
-#: The same of frames that were not seen.
 CARRIED = "carriedFrames"
 
 
@@ -52,29 +50,29 @@ def write_animation(
     carried: ArrayLike = (),
     skinned: Iterable[str] = (),
 ) -> Path:
-    """Write an animation layer that sublayers an actor; a time code is a frame number.
+    """Write an animation layer that sublayers an actor; time codes are frame numbers.
 
     Args:
         out: File to write, `.usdc` or `.usda`.
         actor: The `actor.usda` it animates.
-        frames: Increasing frame numbers (F,), whole or not; keys or every frame.
-        d: Parameters (F, 3) [mm]; rows with NaN are lost frames, bridged linearly and listed in the layer's
+        frames: Increasing frame numbers (F,), integers or not; every frame, or keys only.
+        d: Parameters (F, 3) [mm]; rows with NaN are lost frames: interpolated linearly, and listed in the layer's
             `customLayerData["lostFrames"]`.
         rig: The evaluator; read from `actor` if None.
-        carried: Frames whose d was not seen but follows from those around; listed in
+        carried: Frames whose d was not measured but inferred from their neighbours; listed in
             `customLayerData["carriedFrames"]`.
-        skinned: Paths of the meshes that can also follow the `actor_skel.usdc` beside it, which has the same motion;
-            they make it a variant, see `offer_skeleton`.
+        skinned: Paths of meshes that `actor_skel.usdc` next to the layer can also move, with the same motion. They add
+            a variant, see `add_skeleton_variant`.
 
     Raises:
-        RigError: No such actor, frames that do not increase, nothing to animate, or a frame rate that is not positive.
+        RigError: The actor is missing, frames do not increase, no frame has d, or the frame rate is not positive.
         FormatError: `actor` is not a rig.
         OutputError: The file cannot be written.
-        ValueError: Shapes of frames and d that do not match.
+        ValueError: The shapes of frames and d do not match.
     """
     out, actor = Path(out), Path(actor)
     if not actor.is_file():
-        raise RigError("there is no such file, which the layer would stand on.", path=actor)
+        raise RigError("there is no such file; the layer needs it as its sublayer.", path=actor)
     rig = load_rig(actor) if rig is None else rig
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     if frames.ndim != 1 or d.shape != (len(frames), 3):
@@ -86,9 +84,9 @@ def write_animation(
         raise RigError("the frame numbers of an animation must increase.", path=out)
     if not fps > 0:
         raise RigError(f"{fps} frames per second; it must be more than 0.", path=out)
-    if frames[-1] - frames[0] > _MOST_FRAMES or np.abs(frames).max() > _FARTHEST_FRAME:
+    if frames[-1] - frames[0] > _MAX_FRAMES or np.abs(frames).max() > _FARTHEST_FRAME:
         raise RigError(
-            f"frames {frames[0]:g} to {frames[-1]:g}; an animation has at most {_MOST_FRAMES} frames within "
+            f"frames {frames[0]:g} to {frames[-1]:g}; an animation has at most {_MAX_FRAMES} frames within "
             f"+-{_FARTHEST_FRAME:g}.",
             path=out,
         )
@@ -102,23 +100,23 @@ def write_animation(
         layer.customLayerData = {**layer.customLayerData, LOST: lost}
     author_motion(layer, rig, frames[known], d[known], frames[[0, -1]])
     if paths := list(skinned):
-        offer_skeleton(layer, rig, paths)
-    return write_layer(named_after(layer, root_prim_of(actor)), out)
+        add_skeleton_variant(layer, rig, paths)
+    return write_layer(rename_actor(layer, root_prim_of(actor)), out)
 
 
 def root_prim_of(actor: Path) -> str:
-    """Return the name of the root prim of an actor's file, which carries the rig.
+    """Return the name of the root prim that is the rig in an actor's file.
 
     Raises:
-        RigError: It carries it elsewhere.
+        RigError: Not exactly one root prim is a rig.
     """
     stage = open_stage(actor)
     names = [prim.GetName() for prim in rig_prims(stage) if prim.GetPath().IsRootPrimPath()]
     if len(names) != 1:
         raise RigError(
-            "has no rig in one root prim, which the layer would stand on.",
+            "has not exactly one rig as a root prim, which the layer needs as its sublayer.",
             path=actor,
-            hint="Name the rig of a shot with --prim.",
+            hint="Choose the rig of a shot with --prim.",
         )
     return names[0]
 
@@ -126,8 +124,8 @@ def root_prim_of(actor: Path) -> str:
 def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array, Array]:
     """Return the times (n,) of the baked samples and their poses T_skull_mandible (n, 4, 4).
 
-    Every whole frame of the span (first and last time), every sample of d, and times between them until no landmark is
-    farther than 0.02 mm from the model.
+    These are every whole frame of the span, every sample of d, and as many times between them as are needed to keep all
+    landmarks within 0.02 mm of the model.
 
     Args:
         frames: Times of the samples of d, increasing, shape (F,).
@@ -136,20 +134,20 @@ def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array
     """
     whole = np.arange(np.ceil(span[0]), np.floor(span[1]) + 1)
     times = np.union1d(np.union1d(whole, span), frames)
-    poses = rig.pose(_at(times, frames, d))
+    poses = rig.pose(_interpolated(times, frames, d))
     for _ in range(_MAX_HALVINGS):
         start, step = times[:-1], np.diff(times)
         errors = []
-        for share in _SHARES:
-            exact = rig.pose(_at(start + share * step, frames, d))
-            errors.append(landmark_distance(rig, exact, _shown(poses[:-1], poses[1:], share)))
+        for share in _FRACTIONS:
+            exact = rig.pose(_interpolated(start + share * step, frames, d))
+            errors.append(landmark_distance(rig, exact, _as_shown_by_usd(poses[:-1], poses[1:], share)))
         coarse = np.max(errors, axis=0) > BETWEEN_MM
         if not coarse.any():
             break
         middles = (start + 0.5 * step)[coarse]
         where = np.flatnonzero(coarse) + 1
         times = np.insert(times, where, middles)
-        poses = np.insert(poses, where, rig.pose(_at(middles, frames, d)), axis=0)
+        poses = np.insert(poses, where, rig.pose(_interpolated(middles, frames, d)), axis=0)
     return times, poses
 
 
@@ -162,14 +160,14 @@ def author_motion(
         frames: Times of the samples of d, increasing, shape (F,).
         d: Their values [mm], shape (F, 3).
         span: First and last time to cover.
-        paths: The prims of the actor and of its mandible.
+        paths: Prim paths of the actor and of its mandible.
     """
     actor = Sdf.CreatePrimInLayer(layer, paths[0])
     for i, parameter in enumerate(PARAMETERS):
         attribute = Sdf.AttributeSpec(
             actor, parameter, Sdf.ValueTypeNames.Double, Sdf.VariabilityVarying, declaresCustom=True
         )
-        attribute.customData = {MADE_FOR: rig.model_hash}
+        attribute.customData = {MODEL_HASH_KEY: rig.model_hash}
         _set_samples(layer, attribute, frames, d[:, i].tolist())
     times, poses = bake_times(rig, frames, d, span)
     mandible = Sdf.CreatePrimInLayer(layer, paths[1])
@@ -186,16 +184,16 @@ def _set_samples(
         layer.SetTimeSample(attribute.path, time, value)
 
 
-def _at(times: Array, frames: Array, d: Array) -> Array:
+def _interpolated(times: Array, frames: Array, d: Array) -> Array:
     return np.stack([np.interp(times, frames, column) for column in d.T], axis=1)
 
 
-def _shown(T_a: Array, T_b: Array, share: float) -> Array:
-    """Return the transforms that OpenUSD shows between two samples, a share of the interval after the first.
+def _as_shown_by_usd(T_a: Array, T_b: Array, share: float) -> Array:
+    """Return the transforms that OpenUSD computes between two samples, at a fraction of the interval.
 
-    It interpolates quaternions by slerp (Shoemake 1985), but nearly equal ones (GfSlerp: cosine above 1 - 1e-5)
-    linearly and without normalising, and then takes the angle from the real part alone (GfRotation). Close to the
-    identity, where a closed jaw is, that is off by up to 0.4 mm.
+    OpenUSD interpolates quaternions by slerp (Shoemake 1985). Nearly equal ones (GfSlerp: cosine above 1 - 1e-5) are
+    interpolated linearly without normalising, and the angle is then taken from the real part alone (GfRotation). Near
+    the identity, where a closed jaw is, the error is up to 0.4 mm.
     """
     q_a, q_b = wxyz_from_matrix(T_a[:, :3, :3]), wxyz_from_matrix(T_b[:, :3, :3])
     cosine = np.einsum("ij,ij->i", q_a, q_b)
@@ -221,23 +219,22 @@ def write_splines(
     slopes: ArrayLike | None = None,
     curved: ArrayLike | None = None,
 ) -> Path:
-    """Write a layer that holds the keys of an animation as splines and sublayers that animation.
+    """Write a layer with the keys of an animation as splines; it sublayers the animation.
 
-    The splines go through the same values as the animation's samples. They stay out of every delivered layer: OpenUSD
-    before 25.05 ignores splines or cannot parse them, and other readers refuse the whole file.
+    The splines pass through the values of the animation's samples. Delivered layers contain no splines, because OpenUSD
+    before 25.05 ignores or cannot parse them, and other readers reject the whole file.
 
     Args:
         animation: The animation layer made from the same keys.
-        frames: Key frames (F,), increasing.
+        frames: Increasing key frames (F,).
         d: Keys (F, 3) [mm].
         slopes: Tangents at the keys (F, 3) [mm per frame]; zero if None.
-        curved: Which pieces between keys are cubic, with these tangents, shape (F - 1,); the others, and all if None,
-            are straight.
+        curved: Mask (F - 1,) of segments that are cubic, with these tangents; the others are linear. None: all linear.
 
     Raises:
-        RigError: The keys do not increase or are not finite.
+        RigError: The frames do not increase, or keys are not finite.
         OutputError: The file cannot be written.
-        ValueError: Shapes of frames and d that do not match.
+        ValueError: The shapes of frames and d do not match.
     """
     out = Path(out)
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
@@ -256,14 +253,14 @@ def write_splines(
     for name, values, tangent in zip(PARAMETERS, d.T, tangents.T, strict=True):
         spline = _spline(frames, values, tangent, cubic)
         actor.CreateAttribute(name, Sdf.ValueTypeNames.Double, custom=True).SetSpline(spline)
-    # A stage still open on the nameless layer would look for the animation beside it, and complain.
+    # Close the stage: on an anonymous layer it would fail to resolve the relative path below, with a warning.
     del stage, actor
     layer.subLayerPaths.append(relative_path(Path(animation), out))
     return write_layer(layer, out)
 
 
 def _spline(frames: Array, values: Array, slopes: Array, curved: Mask) -> Ts.Spline:
-    """Return a Bezier spline; handles of a third of a piece make it a cubic polynomial of time."""
+    """Return a Bezier spline. Handles of a third of a segment make it a cubic polynomial of time."""
     third = np.diff(frames) / 3.0
     before, after = np.concatenate([[0.0], third]), np.concatenate([third, [0.0]])
     cubic = np.append(curved, False)

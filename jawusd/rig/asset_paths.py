@@ -1,36 +1,43 @@
-"""What the asset paths of a layer name: files, without format arguments and places inside packages."""
+"""Files that a layer refers to, and the checksums that `actor.usda` records for the binary layers of a rig.
+
+Asset paths are reduced to files: format arguments and paths inside packages are dropped. Checksums reveal damage before
+OpenUSD parses a file.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from pxr import Ar, Sdf, UsdUtils
 
+from jawusd.base.errors import RigError
+
 
 def file_of(identifier: str) -> Path:
-    """Return the file that an asset path names: without format arguments, of a layer inside a package the package."""
+    """Return the file of an asset path, without format arguments; for a layer inside a package, the package."""
     path = Sdf.Layer.SplitIdentifier(identifier)[0]
     return Path(Ar.SplitPackageRelativePathOuter(path)[0] if Ar.IsPackageRelativePath(path) else path)
 
 
 def file_of_layer(layer: Sdf.Layer) -> Path:
-    """Return the file that a layer was read from; by a search path, it is identified by less."""
+    """Return the file that a layer was read from. Identifiers found by search path are not full paths."""
     return file_of(layer.realPath or layer.identifier)
 
 
 def is_layer(asset: str) -> bool:
-    """Return whether OpenUSD reads what an asset path names as a layer."""
+    """Return whether OpenUSD reads an asset as a layer."""
     return Sdf.FileFormat.FindByExtension(Sdf.Layer.SplitIdentifier(asset)[0]) is not None
 
 
 def target_of(layer: Sdf.Layer, asset: str) -> str | None:
-    """Return what an asset path of a layer names: what OpenUSD finds, by search paths too, else where it would lie.
+    """Return the full path of an asset of a layer: as OpenUSD resolves it, or where the missing file would be.
 
-    None for what is no path of this machine, as a drive letter or the scheme of a URL that no resolver knows. The
-    resolver context of the stage has to be bound.
+    None if it is not a path on this machine, such as one with a drive letter or the scheme of a URL that no resolver
+    knows. The resolver context of the stage must be bound.
     """
     path, arguments = Sdf.Layer.SplitIdentifier(layer.ComputeAbsolutePath(asset))
     found = str(Ar.GetResolver().Resolve(path))
@@ -43,9 +50,9 @@ def target_of(layer: Sdf.Layer, asset: str) -> str | None:
 
 
 def evaluated(layer: Sdf.Layer, variables: Mapping[str, object]) -> Sdf.Layer:
-    """Return a layer whose expressions have the values that these variables give; without variables the layer itself.
+    """Return a copy of a layer with its variable expressions evaluated; without variables the layer itself.
 
-    Where a layer is found by reference, its own variables count below those of the layers that refer to it.
+    The variables of referring layers are stronger than the layer's own.
     """
     if not variables:
         return layer
@@ -57,7 +64,7 @@ def evaluated(layer: Sdf.Layer, variables: Mapping[str, object]) -> Sdf.Layer:
 
 
 def asset_paths(layer: Sdf.Layer) -> list[str]:
-    """Return every asset path in a layer: of layers, values, clips and other metadata; expressions as paths."""
+    """Return every asset path in a layer: layers, values, clips and other metadata, with expressions evaluated."""
     found: list[str] = []
 
     def note(asset: str) -> str:
@@ -65,16 +72,16 @@ def asset_paths(layer: Sdf.Layer) -> list[str]:
         return asset
 
     edited = layer.dirty
-    silent = UsdUtils.CoalescingDiagnosticDelegate()  # a copy in memory has no folder that templates could lie in
+    silent = UsdUtils.CoalescingDiagnosticDelegate()  # an anonymous copy has no folder to search for clip templates
     UsdUtils.ModifyAssetPaths(layer, note)
     del silent
     if layer.dirty and not edited and not layer.anonymous:
-        layer.Reload(force=True)  # it had expressions, which are now replaced by what they gave
+        layer.Reload(force=True)  # restores expressions, which were replaced by their values
     return [asset for asset in dict.fromkeys(found) if asset]
 
 
 def clip_templates(layer: Sdf.Layer) -> list[str]:
-    """Return the templates of value clips in a layer, asset paths with # in place of digits."""
+    """Return the value clip templates of a layer: asset paths with # in place of digits."""
     found: list[str] = []
 
     def visit(path: Sdf.Path) -> None:
@@ -82,23 +89,60 @@ def clip_templates(layer: Sdf.Layer) -> list[str]:
         clips = spec.GetInfo("clips") if spec and spec.HasInfo("clips") else {}
         sets = [values for values in clips.values() if isinstance(values, dict)]
         found.extend(
-            _value(layer, str(values["templateAssetPath"])) for values in sets if "templateAssetPath" in values
+            _evaluated_text(layer, str(values["templateAssetPath"])) for values in sets if "templateAssetPath" in values
         )
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     return found
 
 
-def _value(layer: Sdf.Layer, text: str) -> str:
-    """Return the value of a text that may be an expression, by the layer's variables."""
+def _evaluated_text(layer: Sdf.Layer, text: str) -> str:
+    """Return a text, evaluated with the layer's variables if it is an expression."""
     if not Sdf.VariableExpression.IsExpression(text):
         return text
     return str(Sdf.VariableExpression(text).Evaluate(layer.expressionVariables).value or "")
 
 
-def of_template(template: Path) -> list[Path]:
-    """Return the files there are for the path of a template of value clips."""
+def files_of_template(template: Path) -> list[Path]:
+    """Return the existing files that match a value clip template."""
     pattern = re.compile(re.sub(r"(\\#)+", "[-0-9.]+", re.escape(template.name)))
     if not template.parent.is_dir():
         return []
     return sorted(file for file in template.parent.iterdir() if pattern.fullmatch(file.name))
+
+
+#: Key in `customLayerData` of `actor.usda`: a dictionary from names of neighbouring files to SHA-256 checksums.
+CHECKSUMS = "sha256"
+
+
+def record_checksums(layer: Sdf.Layer, folder: Path, names: Iterable[str]) -> None:
+    """Record the checksums of files in an anonymous layer that will be written to the same folder."""
+    sums = {name: _sha256(folder / name) for name in names}
+    layer.customLayerData = {**layer.customLayerData, CHECKSUMS: sums}
+
+
+def recorded_checksums(layer: Sdf.Layer) -> dict[Path, str]:
+    """Return the checksums that a layer records, by file. Old rigs record none."""
+    sums = layer.customLayerData.get(CHECKSUMS)
+    folder = file_of_layer(layer).resolve().parent
+    return {folder / name: str(value) for name, value in sums.items()} if isinstance(sums, dict) else {}
+
+
+def check_checksum(file: Path, wanted: str) -> None:
+    """Compare a file with its checksum.
+
+    Raises:
+        RigError: The checksum does not match.
+    """
+    if _sha256(file) != wanted:
+        raise RigError(
+            "is damaged, or was changed after the rig was written: its checksum differs from the one in the rig.",
+            path=file,
+            hint="Restore it from an intact copy, or build the rig again. If it was changed on purpose, remove "
+            f"{CHECKSUMS} from customLayerData in the rig's text layer.",
+        )
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()

@@ -1,4 +1,10 @@
-"""Build the two layers that carry the rig: the interface `actor.usda` and the decoder `rig.usdc`."""
+"""Build the layers that define a rig: the interface `actor.usda`, the decoder `rig.usdc` and proxies `proxy.usdc`.
+
+Proxies are meshes of few faces for crowds, chosen by the variant set `detail`. The scans are in the actor's own
+payload, so that tools without variant support show them. The variant `proxy` adds a stronger payload that replaces the
+scans. The variant `both` adds the proxies next to the scans, with purposes: viewports can draw proxies and renderers
+scans.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-from pxr import Kind, Sdf, Vt
+from pxr import Kind, Sdf, UsdGeom, Vt
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
@@ -16,29 +22,111 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import transform_points
 from jawusd.rig import _gf, layout
-from jawusd.rig.arrays import model_hash, write_arrays
-from jawusd.rig.detail import offer_detail
-from jawusd.rig.geo import extent
-from jawusd.rig.layers import apply_jaw_api, define_prim, new_layer, set_attribute, set_relationship
-from jawusd.rig.sampling import grid_points, sample_valid
-from jawusd.rig.table import DecoderTable
+from jawusd.rig.attributes import write_arrays
+from jawusd.rig.geo import MESH_PATHS, build_geometry, extent, hide_look
+from jawusd.rig.layers import apply_jaw_api, define_prim, new_layer, set_attribute, set_relationship, stage_of
+from jawusd.rig.layout import ACTOR, BOTH, DETAIL, MANDIBLE, PROXY, PROXY_FILE, PROXY_SUFFIX, SCAN
+from jawusd.rig.table import DecoderTable, grid_points, sample_valid
 
 _TYPES = Sdf.ValueTypeNames
-
+_PROXY_CLASS = ACTOR + PROXY_SUFFIX
 # The interface is text and stays short; long arrays go to the binary layer.
 _INTERFACE_ARRAYS = ("jaw:landmarks:", "jaw:thresholds:")
 _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "jaw:motion:")
 
 
+def proxy_layer(
+    proxies: Mapping[str, Mesh], meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str | None
+) -> Sdf.Layer:
+    """Build `proxy.usdc`: `geo.usdc` with proxies in place of their meshes, and a class that adds the proxies.
+
+    Args:
+        proxies: Proxies for some of the meshes, by the same names, in the same frames [mm].
+        meshes, T_rest, placeholder: As for `build_geometry`.
+
+    Raises:
+        RigError: A mesh without faces or with values that are not finite.
+    """
+    layer = build_geometry({**meshes, **proxies}, T_rest, placeholder)
+    _define_proxy_class(layer, proxies)
+    stage = stage_of(layer)
+    for name, proxy in proxies.items():
+        hide_look(UsdGeom.Mesh(stage.GetPrimAtPath(MESH_PATHS[name])), proxy, meshes[name])
+    return _with_ordered_fields(layer)
+
+
+def _with_ordered_fields(layer: Sdf.Layer) -> Sdf.Layer:
+    """Return a layer read from the text of another.
+
+    CopySpec adds fields in the order of their memory addresses, so binary layers would differ between runs.
+    """
+    ordered = Sdf.Layer.CreateAnonymous(".usda")
+    ordered.ImportFromString(layer.ExportToString())
+    return ordered
+
+
+def _define_proxy_class(layer: Sdf.Layer, proxies: Iterable[str]) -> None:
+    """Define the class with the proxies under new names. A binary layer stores equal arrays once."""
+    Sdf.CopySpec(layer, ACTOR, layer, _PROXY_CLASS)  # with the materials that its meshes are bound to
+    layer.GetPrimAtPath(_PROXY_CLASS).specifier = Sdf.SpecifierClass
+    mandible = layer.GetPrimAtPath(MANDIBLE.replace(ACTOR, _PROXY_CLASS))
+    for attribute in list(mandible.properties):
+        mandible.RemoveProperty(attribute)
+    for name, path in MESH_PATHS.items():
+        mesh = layer.GetPrimAtPath(path.replace(ACTOR, _PROXY_CLASS))
+        if mesh is not None and name not in proxies:
+            del mesh.nameParent.nameChildren[mesh.name]
+        elif mesh is not None:
+            _rename(mesh, Sdf.Path(_proxy_path(name)).name)
+            _set_purpose(mesh, UsdGeom.Tokens.proxy)
+
+
+def _rename(mesh: Sdf.PrimSpec, name: str) -> None:
+    for subset in list(mesh.nameChildren):
+        subset.name = subset.name.replace(mesh.name, name)
+    mesh.name = name
+
+
+def add_detail_variants(actor: Sdf.PrimSpec, proxies: Iterable[str]) -> None:
+    """Add the variants `scan` (selected, empty), `proxy` and `both` to an actor.
+
+    Args:
+        proxies: Names of the meshes that have a proxy.
+    """
+    variants = Sdf.VariantSetSpec(actor, DETAIL)
+    Sdf.VariantSpec(variants, SCAN)
+    file = f"./{PROXY_FILE}"
+    for name, payload in ((PROXY, Sdf.Payload(file)), (BOTH, Sdf.Payload(file, _PROXY_CLASS))):
+        Sdf.VariantSpec(variants, name).primSpec.payloadList.prependedItems = [payload]
+    actor.variantSetNameList.prependedItems = [DETAIL]
+    actor.variantSelections[DETAIL] = SCAN
+    both = actor.path.AppendVariantSelection(DETAIL, BOTH)
+    for name in proxies:
+        scan = Sdf.CreatePrimInLayer(actor.layer, Sdf.Path(MESH_PATHS[name]).ReplacePrefix(actor.path, both))
+        _set_purpose(scan, UsdGeom.Tokens.render)
+        relationship = Sdf.RelationshipSpec(scan, "proxyPrim", custom=False)
+        relationship.targetPathList.explicitItems = [Sdf.Path(_proxy_path(name))]
+
+
+def _proxy_path(name: str) -> str:
+    """Return the path of a mesh's proxy, next to the mesh."""
+    return f"{MESH_PATHS[name].removesuffix('Mesh')}Proxy"
+
+
+def _set_purpose(prim: Sdf.PrimSpec, purpose: str) -> None:
+    attribute = Sdf.AttributeSpec(prim, "purpose", Sdf.ValueTypeNames.Token, Sdf.VariabilityUniform)
+    attribute.default = purpose
+
+
 def interface_layer(
     rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: float, proxies: Iterable[str] = ()
 ) -> Sdf.Layer:
-    """Build `actor.usda`, the prim that users and tools see.
+    """Build `actor.usda`, the interface for users and tools.
 
     Args:
         meshes: As for `build_geometry`.
         fps: Time codes per second.
-        proxies: Names of the meshes that have one in `proxy.usdc`, which makes variants.
+        proxies: Names of the meshes that have a proxy in `proxy.usdc`; they add variants.
     """
     layer = new_layer(fps)
     layer.subLayerPaths.append(f"./{layout.RIG_FILE}")
@@ -52,9 +140,9 @@ def interface_layer(
     apply_jaw_api(actor, "GeomModelAPI")
     actor.payloadList.prependedItems = [Sdf.Payload(f"./{layout.GEO_FILE}")]
     if names := list(proxies):
-        offer_detail(actor, names)
+        add_detail_variants(actor, names)
     hint = Sdf.AttributeSpec(actor, "extentsHint", _TYPES.Float3Array, Sdf.VariabilityVarying)
-    hint.default = _gf.vec3f_array(reach(rig, meshes))
+    hint.default = _gf.vec3f_array(motion_extent(rig, meshes))
 
     for parameter, limits in zip(layout.PARAMETERS, rig.d_range, strict=True):
         set_attribute(actor, parameter, _TYPES.Double, 0.0, animated=True)
@@ -64,7 +152,7 @@ def interface_layer(
     set_attribute(actor, "jaw:lengthUnit", _TYPES.Token, "mm")
     set_attribute(actor, "jaw:angleUnit", _TYPES.Token, "rad")
     set_attribute(actor, "jaw:twistOrder", _TYPES.TokenArray, Vt.TokenArray(["omega", "v"]))
-    set_attribute(actor, "jaw:modelHash", _TYPES.String, model_hash(rig))
+    set_attribute(actor, "jaw:modelHash", _TYPES.String, rig.model_hash)
     for attribute, file in zip(layout.ONNX_ATTRIBUTES, (layout.ONNX_FILE, layout.ENCODE_FILE), strict=True):
         set_attribute(actor, attribute, _TYPES.Asset, Sdf.AssetPath(f"./{file}"))
     set_attribute(actor, "jaw:landmarks:names", _TYPES.TokenArray, Vt.TokenArray(list(LANDMARKS)))
@@ -75,16 +163,16 @@ def interface_layer(
 
 
 def record_sidecars(layer: Sdf.Layer, folder: Path) -> None:
-    """Record in `actor.usda` the SHA-256 of its ONNX files, as custom data."""
+    """Record the SHA-256 checksums of the ONNX files in `actor.usda`, as custom data."""
     for attribute, file in zip(layout.ONNX_ATTRIBUTES, (layout.ONNX_FILE, layout.ENCODE_FILE), strict=True):
         found = hashlib.sha256((folder / file).read_bytes()).hexdigest()
-        layer.GetAttributeAtPath(f"{layout.ACTOR}.{attribute}").customData = {layout.SIDECAR_HASH: found}
+        layer.GetAttributeAtPath(f"{layout.ACTOR}.{attribute}").customData = {layout.SIDECAR_HASH_KEY: found}
 
 
 def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
     """Build `rig.usdc`: the exact model, the bounds, and the sampled table with its error.
 
-    It does not apply JawRigAPI: only the interface that sublayers it is a rig.
+    JawRigAPI is not applied here: only the interface that sublayers it is a rig.
     """
     layer = new_layer()
     actor = define_prim(layer, layout.ACTOR, "Xform")
@@ -101,8 +189,8 @@ def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
     return layer
 
 
-def reach(rig: JawRig, meshes: Mapping[str, Mesh]) -> Array:
-    """Return the box (2, 3) [mm] that holds all meshes at rest and, at 500 valid parameters, the mandible's own box."""
+def motion_extent(rig: JawRig, meshes: Mapping[str, Mesh]) -> Array:
+    """Return a box (2, 3) [mm] around all meshes at rest and the mandible's bounding box at 500 valid parameters."""
     fixed = [extent(meshes[name].vertices) for name in ("skull", "upper_teeth") if name in meshes]
     moving = [meshes[name].vertices for name in ("mandible", "lower_teeth") if name in meshes]
     low, high = extent(np.concatenate(moving))

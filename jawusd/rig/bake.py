@@ -1,4 +1,4 @@
-"""Write a whole rig folder from a model and the actor's meshes."""
+"""Write the complete folder of a rig from a model and the actor's meshes."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.rig.animation import write_animation
-from jawusd.rig.author import decoder_layer, interface_layer, record_sidecars
-from jawusd.rig.checksums import record_checksums
-from jawusd.rig.detail import proxy_layer
+from jawusd.rig.asset_paths import record_checksums
+from jawusd.rig.author import decoder_layer, interface_layer, proxy_layer, record_sidecars
 from jawusd.rig.geo import MESH_PATHS, build_geometry, check_meshes
-from jawusd.rig.layers import named_after, write_layer
+from jawusd.rig.layers import rename_actor, write_layer
 from jawusd.rig.layout import (
     ACTOR,
     ACTOR_FILE,
+    CAPTURED_FILE,
     ENCODE_FILE,
     GEO_FILE,
     ONNX_FILE,
@@ -31,14 +31,11 @@ from jawusd.rig.layout import (
     SKEL_FILE,
     check_prim_name,
 )
-from jawusd.rig.onnx_check import check_written
-from jawusd.rig.onnx_sidecar import decode_model, encode_model, write_onnx
-from jawusd.rig.package import write_package
+from jawusd.rig.onnx_sidecar import check_written, decode_model, encode_model, write_onnx
 from jawusd.rig.placeholder import grow_placeholder
+from jawusd.rig.publish import write_package
 from jawusd.rig.skel import write_skel
 from jawusd.rig.table import DEFAULT_SIZE, build_table
-
-CAPTURED_MOTION = "anim_capture.usdc"
 
 
 def bake_rig(
@@ -56,26 +53,26 @@ def bake_rig(
 ) -> list[Path]:
     """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
-    Without a mandible mesh a placeholder is grown from the lower scan, and marked as such. Every file is written
-    atomically, `actor.usda` after all it refers to.
+    A missing mandible mesh is replaced by a placeholder grown from the lower scan, and marked as such. Every file is
+    written atomically, `actor.usda` after the files it refers to.
 
     Args:
-        folder: Where the files go; made if missing.
+        folder: Output folder; created if missing.
         meshes: `upper_teeth` and optionally `skull` in the skull frame, `lower_teeth` and optionally `mandible` in the
             mandible frame [mm].
         fps: Frames per second of the captured motion.
-        frames: Captured frame numbers (F,), increasing.
+        frames: Increasing numbers of the captured frames (F,).
         d: Parameters of the captured frames (F, 3) [mm], NaN where lost.
         table_size: Values per axis of the sampled decoder, 17, 33 or 65.
-        proxies: Stand-ins of few faces for some of the meshes, by the same names; they make a variant.
-        prim_name: Of the actor's prim; joints have it in front.
+        proxies: Proxies of few faces for some of the meshes, by the same names; they add variants.
+        prim_name: Name of the actor's prim, and prefix of the joint names.
 
     Returns:
         The files, in the order written.
 
     Raises:
-        RigError: Meshes, bounds or frames that make no rig.
-        OutputError: The folder cannot be written.
+        RigError: Invalid meshes, bounds, frames, frame rate or prim name.
+        OutputError: A file cannot be written.
         ValueError: Frames without d, or d without frames.
     """
     folder = Path(folder)
@@ -92,12 +89,12 @@ def bake_rig(
     geometry = build_geometry(meshes, rig.T_rest, placeholder)
     moving = np.concatenate([meshes[key].vertices for key in ("mandible", "lower_teeth")])
     table = build_table(rig, moving, table_size)
-    written = [write_layer(named_after(geometry, prim_name), folder / GEO_FILE)]
+    written = [write_layer(rename_actor(geometry, prim_name), folder / GEO_FILE)]
     if proxies:
         thinned = proxy_layer(proxies, meshes, rig.T_rest, placeholder)
-        written.append(write_layer(named_after(thinned, prim_name), folder / PROXY_FILE))
+        written.append(write_layer(rename_actor(thinned, prim_name), folder / PROXY_FILE))
     written += [
-        write_layer(named_after(decoder_layer(rig, table), prim_name), folder / RIG_FILE),
+        write_layer(rename_actor(decoder_layer(rig, table), prim_name), folder / RIG_FILE),
         write_onnx(folder / ONNX_FILE, decode_model(rig)),
         write_onnx(folder / ENCODE_FILE, encode_model(rig)),
     ]
@@ -106,12 +103,12 @@ def bake_rig(
     interface = interface_layer(rig, name, meshes, fps, proxies or ())
     record_sidecars(interface, folder)
     record_checksums(interface, folder, [path.name for path in written if path.suffix == ".usdc"])
-    written.append(write_layer(named_after(interface, prim_name), folder / ACTOR_FILE))
+    written.append(write_layer(rename_actor(interface, prim_name), folder / ACTOR_FILE))
     written.append(write_skel(folder / SKEL_FILE, rig, list(meshes), fps, frames, d, prim_name))
     shown = folder / ACTOR_FILE
     if frames is not None and d is not None:
         skinned = [MESH_PATHS[key] for key in meshes]
-        shown = write_animation(folder / CAPTURED_MOTION, folder / ACTOR_FILE, frames, d, fps, rig=rig, skinned=skinned)
+        shown = write_animation(folder / CAPTURED_FILE, folder / ACTOR_FILE, frames, d, fps, rig=rig, skinned=skinned)
         written.append(shown)
     written.append(write_package(folder / PACKAGE_FILE, shown))
     return written

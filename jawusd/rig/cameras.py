@@ -1,4 +1,7 @@
-"""The take as a scene, to be composited over the footage: the calibrated cameras and the actor carried by the head."""
+"""A take as a scene for compositing over the footage: calibrated cameras, and the actor moved by the head.
+
+Cameras are also written and read alone, to exchange calibrations with other programs.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +26,17 @@ from jawusd.rig.untrusted import raises_format_error
 
 TAKE, TAKE_CAMERAS = "/Take", "/Take/Cameras"
 
-# Undistorted images of a camera, relative to the take, numbered by time code.
+# Undistorted images of a camera, relative to the take, numbered by time code; the second for footage in linear light.
 PLATE = "plates/{name}/{name}.%06d.jpg"
-LIGHT_PLATE = "plates/{name}/{name}.%06d.exr"  # of a camera whose footage is light in fractions
+LIGHT_PLATE = "plates/{name}/{name}.%06d.exr"
 
-# A sensor of 36 mm, in tenths of a scene unit as UsdGeomCamera measures apertures and focal lengths.
+# A sensor of 36 mm. UsdGeomCamera measures apertures and focal lengths in tenths of a scene unit.
 _SENSOR_WIDTH = 360.0
 _CLIPPING_MM = (1.0, 10_000.0)
 _LARGEST_SKEW = 1e-6
-# By these Omniverse says which lens a camera has, before and since it has schemas for it.
+# Attributes for the lens model in Omniverse: before its lens schemas, and with them.
 _LENS_MODELS = ("cameraProjectionType", "omni:lensdistortion:model")
-# Camera and world axes of OpenCV are x right, y down, z forward; those of USD x right, y up, z backward.
+# Camera and world axes are x right, y down, z forward in OpenCV, and x right, y up, z backward in USD.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -46,16 +49,16 @@ def write_cameras(
     fps: float,
     light: Container[str] = (),
 ) -> list[Path]:
-    """Write the take: one `UsdGeom.Camera` per camera, and the actor carried by the tracked head.
+    """Write the take: one `UsdGeom.Camera` per camera, and the actor moved by the tracked head.
 
-    The cameras are pinholes: they match footage without lens distortion. `jaw:plate` of a camera is a printf pattern,
-    by time code and relative to the take, of such undistorted images; `jaw:distortion` holds the OpenCV coefficients of
-    the footage itself, `jaw:imageSize` its size. The head's motion goes to a binary layer that the take sublayers.
+    The cameras are pinholes, which match undistorted images. `jaw:plate` is the printf pattern of such images, by time
+    code and relative to the take. `jaw:distortion` holds the OpenCV coefficients of the footage itself, `jaw:imageSize`
+    its size. The head's motion is written to a binary layer that the take sublayers.
 
     Args:
         out: File to write, `.usda`; the motion goes to `<name>_motion.usdc` beside it.
         actor: The layer to show, `anim_capture.usdc` or `actor.usda`.
-        frames: Frame numbers (F,), increasing.
+        frames: Increasing frame numbers (F,).
         T_world_skull: Poses of the skull (F, 4, 4) [mm], NaN where lost.
         fps: Frames per second.
         light: Names of cameras whose plates are EXR.
@@ -64,7 +67,7 @@ def write_cameras(
         The motion's file and the take's, in the order written.
 
     Raises:
-        RigError: No cameras, two of one name, a camera with skewed pixels, or no frame with a pose.
+        RigError: No cameras, cameras of equal names, skewed pixels, or no frame with a pose.
         OutputError: The file cannot be written.
         ValueError: Poses of another shape.
     """
@@ -74,7 +77,7 @@ def write_cameras(
         raise ValueError(f"T_world_skull must have shape {(len(frames), 4, 4)}, got {T_world_skull.shape}")
     names = [Sdf.Path(TAKE_CAMERAS).AppendChild(_prim_name(camera.name)) for camera in cameras]
     if not names or len(set(names)) < len(names):
-        raise RigError("a take needs cameras, each with a name of its own.", path=out)
+        raise RigError("a take needs cameras with unique names.", path=out)
     known = np.isfinite(T_world_skull).all(axis=(1, 2))
     if not known.any():
         raise RigError("the skull has no pose in any frame.", path=out)
@@ -83,18 +86,18 @@ def write_cameras(
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
     define_prim(layer, TAKE, "Xform").kind = Kind.Tokens.assembly
     define_prim(layer, TAKE_CAMERAS, "Scope")
-    place = f"{TAKE}/{root_prim_of(Path(actor))}"
-    shown = define_prim(layer, place, "Xform")
+    actor_path = f"{TAKE}/{root_prim_of(Path(actor))}"
+    shown = define_prim(layer, actor_path, "Xform")
     stage = stage_of(layer)
     add_pose(stage.GetPrimAtPath(TAKE), _FLIP)
     for name, camera in zip(names, cameras, strict=True):
         plate = LIGHT_PLATE if camera.name in light else PLATE
         _define_camera(stage, name, camera, plate.format(name=camera.name))
-    # A stage still open on the nameless layer would look for the files beside it, and complain.
+    # Close the stage: on an anonymous layer it would fail to resolve the relative paths below, with a warning.
     del stage
     layer.subLayerPaths.append(relative_path(motion, out))
     shown.referenceList.prependedItems = [Sdf.Reference(relative_path(Path(actor), out))]
-    moving = _motion_layer(place, frames[known], T_world_skull[known], fps)
+    moving = _motion_layer(actor_path, frames[known], T_world_skull[known], fps)
     return [write_layer(moving, motion), write_layer(layer, out)]
 
 
@@ -103,14 +106,14 @@ def _prim_name(name: str) -> str:
     return cleaned if cleaned[:1].isalpha() else f"cam_{cleaned}"
 
 
-def _motion_layer(place: str, frames: Array, T_world_skull: Array, fps: float) -> Sdf.Layer:
+def _motion_layer(actor_path: str, frames: Array, T_world_skull: Array, fps: float) -> Sdf.Layer:
     """Return the layer that moves the actor with the head."""
     layer = new_layer(fps, TAKE)
-    for path in (TAKE, place):
+    for path in (TAKE, actor_path):
         define_prim(layer, path, "Xform")
     stage = stage_of(layer)
-    add_pose(stage.GetPrimAtPath(place), T_world_skull[0])
-    translate, orient = UsdGeom.Xformable(stage.GetPrimAtPath(place)).GetOrderedXformOps()
+    add_pose(stage.GetPrimAtPath(actor_path), T_world_skull[0])
+    translate, orient = UsdGeom.Xformable(stage.GetPrimAtPath(actor_path)).GetOrderedXformOps()
     samples = zip(frames.tolist(), _gf.translations(T_world_skull), _gf.rotations(T_world_skull), strict=True)
     for frame, translation, rotation in samples:
         translate.Set(translation, frame)
@@ -119,16 +122,16 @@ def _motion_layer(place: str, frames: Array, T_world_skull: Array, fps: float) -
 
 
 def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -> Path:
-    """Write calibrated cameras alone as a stage in mm, in their own world; for attributes see `write_cameras`.
+    """Write calibrated cameras alone as a stage in mm, in the calibration's world; attributes as in `write_cameras`.
 
     Raises:
-        RigError: Two cameras of one name, or one with skewed pixels.
+        RigError: No cameras, cameras of equal names, or skewed pixels.
         OutputError: The file cannot be written.
     """
     out = Path(out)
     names = [Sdf.Path(TAKE_CAMERAS).AppendChild(_prim_name(camera.name)) for camera in cameras]
     if not names or len(set(names)) < len(names):
-        raise RigError("a stage of cameras needs some, each with a name of its own.", path=out)
+        raise RigError("a camera stage needs cameras with unique names.", path=out)
     layer = new_layer(24.0, TAKE)
     define_prim(layer, TAKE, "Xform").kind = Kind.Tokens.assembly
     define_prim(layer, TAKE_CAMERAS, "Scope")
@@ -141,25 +144,25 @@ def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -
 
 @raises_format_error(0)
 def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, tuple[int, int]]]) -> list[Camera]:
-    """Read the perspective cameras of a stage, by the names of their prims; lengths in mm, OpenCV axes and pixels.
+    """Read the perspective cameras of a stage, named after their prims, in mm, with OpenCV axes and pixels.
 
-    Prims of one name are called after their paths. The picture spans the aperture, shifted by its offsets;
-    `jaw:imageSize` says its size [px], else the footage, and `jaw:distortion` OpenCV's coefficients. Cameras that move
-    are read at their first time.
+    Prims of equal names are named after their paths. The image spans the aperture, shifted by its offsets. Its size
+    [px] is `jaw:imageSize` or that of the footage; `jaw:distortion` holds OpenCV's coefficients. Moving cameras are
+    read at their first time.
 
     Args:
-        path: A stage, or Alembic (in cm) where OpenUSD has the plugin for it, as its wheels have not.
+        path: A stage, or Alembic (in cm) if OpenUSD has the plugin for it, which its wheels lack.
         sizes: Returns (width, height) [px] by camera, for cameras without `jaw:imageSize`.
 
     Raises:
-        RigError: The stage cannot be opened, names files outside its folder, or holds no perspective camera.
-        CalibrationError: A size is not known, or a lens is a fisheye or another that OpenCV's coefficients do not
-            describe.
+        RigError: The stage cannot be opened, refers to files outside its folder, or has no perspective camera.
+        CalibrationError: An image size is unknown, or a lens such as a fisheye is not described by OpenCV's
+            coefficients.
         FormatError: A value has an unexpected type.
     """
     if Path(path).suffix.lower() == ".abc" and Sdf.FileFormat.FindByExtension("abc") is None:
         raise RigError(
-            "is Alembic, which OpenUSD reads with its plugin usdAbc only; it is not installed.",
+            "is Alembic, which needs OpenUSD's plugin usdAbc; it is not installed.",
             path=path,
             hint="Export the cameras as USD from the program that wrote them (Blender, Houdini and Maya read Alembic "
             "and write USD), or use a build of OpenUSD with Alembic.",
@@ -167,7 +170,7 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     stage = open_stage(path)
     mm = UsdGeom.GetStageMetersPerUnit(stage) * 1000.0
     cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
-    # the others are the views of a program from above and from the sides
+    # orthographic cameras are the top and side views of a program
     prims = [prim for prim in cameras if UsdGeom.Camera(prim).GetProjectionAttr().Get() != "orthographic"]
     names = names_of_labels(Path(path), [str(prim.GetPath())[1:] for prim in prims])
     known: Mapping[str, tuple[int, int]] | None = None
@@ -181,22 +184,22 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
                 raise CalibrationError(
                     f"camera {name} has no jaw:imageSize, and there is no footage of that name.",
                     path=path,
-                    hint="Name each [[camera]] as the camera's prim, or give --size.",
+                    hint="Name each [[camera]] like the camera's prim, or give --size.",
                 )
             size = known[name]
         out.append(_read_camera(name, prim, (int(size[0]), int(size[1])), mm))
     if not out:
-        raise RigError("holds no camera with perspective.", path=path)
+        raise RigError("has no perspective camera.", path=path)
     return out
 
 
 def _check_lens(path: str | os.PathLike[str], prim: Usd.Prim) -> None:
-    """Raise if a camera has a fisheye or another lens that only Omniverse knows."""
+    """Raise CalibrationError if a camera has a fisheye or another lens model of Omniverse."""
     for name in _LENS_MODELS:
-        said = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
-        if said and str(said) != "pinhole":
+        model = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
+        if model and str(model) != "pinhole":
             raise CalibrationError(
-                f"has {name} = {said}; read are pinholes, with OpenCV's coefficients in jaw:distortion.",
+                f"has {name} = {model}; only pinholes with OpenCV's coefficients in jaw:distortion can be read.",
                 path=path,
                 camera=prim.GetName(),
                 hint="Undistort the footage first, or export the camera as a pinhole.",
@@ -213,14 +216,14 @@ def _read_camera(name: str, prim: Usd.Prim, size: tuple[int, int], mm: float) ->
     cy = size[1] * (0.5 + optics.verticalApertureOffset / high) - 0.5
     K = np.array([[focal / wide * size[0], 0.0, cx], [0.0, focal / high * size[1], cy], [0.0, 0.0, 1.0]])
     placed = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time), np.float64).T
-    u, _, vt = np.linalg.svd(placed[:3, :3])  # scales of parents move cameras and change no picture
+    u, _, vt = np.linalg.svd(placed[:3, :3])  # drop scales of parents, which move cameras but do not change the image
     T_world_cam = make_transform(u @ vt @ _FLIP[:3, :3], mm * placed[:3, 3])
     lens = prim.GetAttribute("jaw:distortion").Get() if prim.HasAttribute("jaw:distortion") else None
     return Camera(name, size, K, np.zeros(0) if lens is None else np.array(lens), se3_inverse(T_world_cam))
 
 
 def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, plate: str) -> None:
-    """Define one camera: the image spans pixel edges, half a pixel outside the first and last centres."""
+    """Define a camera. The image spans pixel edges, half a pixel beyond the first and last pixel centres."""
     (fx, skew, cx), (_, fy, cy) = camera.K[:2]
     width, height = camera.size_px
     if abs(skew) > _LARGEST_SKEW * fx:

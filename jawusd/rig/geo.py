@@ -1,4 +1,4 @@
-"""The geometry payload: skull, teeth and mandible with normals and materials, written and read."""
+"""The geometry payload: skull, teeth and mandible with normals, materials, colours and texture coordinates."""
 
 from __future__ import annotations
 
@@ -8,21 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import RigError
-from jawusd.formats.mesh import Mesh, crown_face_mask, without_loose
+from jawusd.formats.mesh import Mesh, crown_face_mask, natural_colors, without_loose
 from jawusd.rig import _gf
-from jawusd.rig.arrays import value_of
+from jawusd.rig.attributes import value_of
 from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of
-from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
+from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL, rig_prims
 from jawusd.rig.read import find_rig_prim, open_stage
-from jawusd.rig.scan_look import read_look, write_look
-from jawusd.rig.schema import rig_prims
 from jawusd.rig.untrusted import raises_format_error
 
-# Every mesh name is unique: Blender merges an Xform with an only child and keeps the child's name.
+# Mesh names are unique, because Blender merges an Xform with its only child and keeps the child's name.
 MESH_PATHS = {
     "skull": f"{SKULL}/SkullMesh",
     "upper_teeth": f"{SKULL}/UpperTeethMesh",
@@ -38,6 +37,63 @@ MATERIAL_LOOKS = {
     "Bone": ((0.75, 0.68, 0.54), 0.70),
     "Placeholder": ((0.35, 0.45, 0.60), 0.90),
 }
+_UV = "st"  # the conventional name of the primvar
+
+
+def write_look(prim: UsdGeom.Mesh, mesh: Mesh, plain: tuple[float, float, float]) -> None:
+    """Write a scan's natural colours per vertex as displayColor, and its texture coordinates.
+
+    Args:
+        plain: displayColor of scans without natural colours, linear red, green, blue.
+    """
+    colors = natural_colors(mesh)
+    if colors is None:
+        prim.CreateDisplayColorAttr([plain])
+    else:
+        shown = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+        shown.Set(_gf.vec3f_array(linear_from_srgb(colors)))
+    if mesh.uv is not None:
+        kind = Sdf.ValueTypeNames.TexCoord2fArray
+        places = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(_UV, kind, UsdGeom.Tokens.faceVarying)
+        places.Set(_gf.vec2f_array(mesh.uv.reshape(-1, 2)))
+
+
+def hide_look(prim: UsdGeom.Mesh, mesh: Mesh, below: Mesh) -> None:
+    """Override the primvars of a mesh in a weaker layer, which has other points, if this mesh does not set them."""
+    if natural_colors(mesh) is None and natural_colors(below) is not None:
+        prim.GetDisplayColorPrimvar().SetInterpolation(UsdGeom.Tokens.constant)
+    if mesh.uv is None and below.uv is not None:
+        UsdGeom.PrimvarsAPI(prim).CreatePrimvar(_UV, Sdf.ValueTypeNames.TexCoord2fArray).GetAttr().Block()
+
+
+def read_look(prim: UsdGeom.Mesh, vertices: int, faces: int) -> tuple[NDArray[np.uint8] | None, Array | None]:
+    """Return vertex colours (V, 3) and texture coordinates of face corners (F, 3, 2); None if missing."""
+    shown = prim.GetDisplayColorPrimvar()
+    colors = _values(shown, (vertices, 3)) if shown.GetInterpolation() == UsdGeom.Tokens.vertex else None
+    places = _values(UsdGeom.PrimvarsAPI(prim).GetPrimvar(_UV), (3 * faces, 2))
+    return (
+        None if colors is None else srgb_from_linear(colors),
+        None if places is None else places.reshape(faces, 3, 2),
+    )
+
+
+def _values(primvar: UsdGeom.Primvar, shape: tuple[int, int]) -> Array | None:
+    """Return the values of a primvar; None if they have another shape or are not finite."""
+    found = np.array((primvar.ComputeFlattened() if primvar else None) or (), dtype=np.float64)
+    return found if found.shape == shape and np.isfinite(found).all() else None
+
+
+def linear_from_srgb(colors: NDArray[np.uint8]) -> Array:
+    """Convert 8-bit sRGB colours to linear values 0 .. 1, as USD stores them (IEC 61966-2-1)."""
+    coded = colors / 255.0
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(values: Array) -> NDArray[np.uint8]:
+    """Convert linear colours to 8-bit sRGB (IEC 61966-2-1), clipped to 0 .. 1."""
+    linear = np.clip(np.asarray(values, dtype=np.float64), 0.0, 1.0)
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.round(255 * coded).astype(np.uint8)
 
 
 def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str | None = None) -> Sdf.Layer:
@@ -47,7 +103,7 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str |
         meshes: `upper_teeth` and `skull` in the skull frame, `lower_teeth` and `mandible` in the mandible frame [mm];
             `skull` and `mandible` may be missing.
         T_rest: T_skull_mandible of the closed bite, shape (4, 4), the mandible's default pose.
-        placeholder: If given, the mandible's mesh is marked as a placeholder; says where its condyles come from.
+        placeholder: Source of the condyles if the mandible's mesh is a placeholder, which is then marked as one.
 
     Raises:
         RigError: An unknown or missing mesh, or a mesh without faces or with values that are not finite.
@@ -79,7 +135,7 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str |
 
 
 def _mark_placeholder(mesh: Sdf.PrimSpec, condyles: str) -> None:
-    """Mark a mesh as a placeholder in every way that readers show."""
+    """Mark a mesh as a placeholder in all fields that programs display."""
     text = f"Not anatomy: a placeholder grown from the lower scan, there was no mandible mesh. Condyles: {condyles}."
     mesh.SetInfo("displayName", "Mandible (placeholder)")
     mesh.SetInfo("documentation", text)
@@ -89,12 +145,12 @@ def _mark_placeholder(mesh: Sdf.PrimSpec, condyles: str) -> None:
 
 
 def extent(vertices: Array) -> Array:
-    """Return the smallest and largest corner, shape (2, 3), of points (n, 3)."""
+    """Return the lower and upper corner, shape (2, 3), of the bounding box of points (n, 3)."""
     return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
 
 
 def check_meshes(meshes: Mapping[str, Mesh]) -> None:
-    """Check the meshes of a rig; raise RigError as `build_geometry` does."""
+    """Check the meshes of a rig; raises RigError as `build_geometry` does."""
     unknown = sorted(set(meshes) - set(MESH_PATHS))
     if unknown:
         raise RigError(f"there is no mesh called {unknown[0]!r}; allowed are {', '.join(MESH_PATHS)}.")
@@ -149,7 +205,7 @@ def corner_normals(mesh: Mesh) -> Array:
 
 
 def vertex_normals(mesh: Mesh) -> Array:
-    """Return smooth unit normals, shape (V, 3): faces weighted by their area."""
+    """Return smooth unit normals, shape (V, 3): face normals weighted by area."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.cross(b - a, c - a)
     normals = np.empty_like(mesh.vertices)
@@ -157,7 +213,7 @@ def vertex_normals(mesh: Mesh) -> Array:
     for axis in range(3):
         normals[:, axis] = np.bincount(corners, np.repeat(area[:, axis], 3), minlength=len(mesh.vertices))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    # corners of degenerate faces only: any unit vector is as good as another
+    # vertices of degenerate faces only: any unit vector will do
     return np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
 
 
@@ -165,20 +221,20 @@ def vertex_normals(mesh: Mesh) -> Array:
 def read_geometry(
     path: str | os.PathLike[str], prim_path: str | None = None, *, placeholders: bool = False
 ) -> dict[str, Mesh]:
-    """Read the meshes of a rig, as in `geo.usdc`: those of anatomy, or the placeholders.
+    """Read the meshes of a rig, as in `geo.usdc`: either scanned anatomy or placeholders.
 
     Args:
         path: A layer or package with the meshes, or a stage that references them.
-        prim_path: The prim that carries the rig; None: the only one, or the default prim of a layer without rigs.
-        placeholders: Which of both.
+        prim_path: The rig's prim; None: the only rig, or the default prim of a layer without rigs.
+        placeholders: Whether to read placeholders.
 
     Returns:
-        Meshes by the names of `MESH_PATHS`, skull ones in the skull frame, mandible ones in the mandible frame
-        [mm], with the layer's single precision, and colours and texture coordinates of scans that had them. Meshes
-        the rig lacks are missing.
+        Meshes by the names of `MESH_PATHS`, omitting those the rig lacks. Skull and upper teeth are in the skull frame,
+        mandible and lower teeth in the mandible frame [mm], in single precision as stored. Colours and texture
+        coordinates are included if the scan had them.
 
     Raises:
-        RigError: Not a USD file, or a mesh that is not made of triangles.
+        RigError: Not a USD file, or a mesh with faces other than triangles.
     """
     stage = open_stage(path)
     found = {}
@@ -188,7 +244,7 @@ def read_geometry(
             continue
         counts = np.array(value_of(mesh.GetFaceVertexCountsAttr(), path) or [])
         if not counts.size or (counts != 3).any():
-            raise RigError(f"{place} must be made of triangles.", path=Path(path))
+            raise RigError(f"{place} has faces that are not triangles.", path=Path(path))
         points, corners = (value_of(a, path) for a in (mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr()))
         vertices = np.array(points, dtype=np.float64)
         faces = np.array(corners, dtype=np.int32).reshape(-1, 3)
@@ -201,9 +257,9 @@ def read_geometry(
 
 @raises_format_error(0)
 def read_gum(path: str | os.PathLike[str], prim_path: str | None = None) -> dict[str, Mask]:
-    """Return which faces (F,) of the teeth meshes are gum, by the names of `MESH_PATHS`.
+    """Return masks of the gum faces (F,) of the teeth meshes, by the names of `MESH_PATHS`.
 
-    Meshes without such a subset are missing.
+    Meshes without a gum subset are omitted.
 
     Raises:
         RigError: Not a USD file.

@@ -1,4 +1,4 @@
-"""A motion of a rig as binary glTF: skull, mandible and teeth, the mandible's node animated."""
+"""Export a motion of a rig as binary glTF: skull, mandible and teeth, with an animated mandible node."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.gltf import Material, Node, Surface, save_glb
 from jawusd.formats.mesh import Mesh, natural_colors
 from jawusd.rig.animation import bake_times
-from jawusd.rig.geo import MATERIAL_LOOKS, MESH_PATHS, read_geometry, read_gum, vertex_normals
+from jawusd.rig.geo import MATERIAL_LOOKS, MESH_PATHS, linear_from_srgb, read_geometry, read_gum, vertex_normals
 from jawusd.rig.layout import MANDIBLE, SKULL
-from jawusd.rig.scan_look import linear_from_srgb
 
-_HIGHEST_FRAME = 100_000.0  # up to here, single precision is within a hundredth of a frame
-_SCAN = "Scan"  # white: the colours of the vertices multiply it
+_HIGHEST_FRAME = 100_000.0  # up to here, single precision resolves a hundredth of a frame
+_SCAN = "Scan"  # white, because it is multiplied by the vertex colours
 
 
 def write_glb(
@@ -31,15 +30,15 @@ def write_glb(
     d: ArrayLike,
     fps: float,
 ) -> Path:
-    """Write the meshes of an actor and its motion, in the frame of the skull; frame 0 is at 0 s, see `frame_at_zero`.
+    """Write the meshes of an actor and its motion in the skull frame; frame 0 is at 0 s, see `frame_at_zero`.
 
-    The mandible has a key at every whole frame, and more where straight lines between them would leave the model. The
-    animation's `extras` name frame rate, first and last frame, and the frame at 0 s.
+    The mandible has a key at every whole frame, and more where interpolation would deviate from the model. The
+    animation's `extras` state the frame rate, first and last frame, and the frame at 0 s.
 
     Args:
         actor: `actor.usda`, or another stage of one actor.
         frames: Increasing frame numbers (F,).
-        d: Parameters (F, 3) [mm]; rows with NaN are bridged linearly.
+        d: Parameters (F, 3) [mm]; rows with NaN are interpolated linearly.
 
     Raises:
         RigError: There are no meshes, or no frame has parameters.
@@ -47,7 +46,7 @@ def write_glb(
     """
     out = Path(out)
     meshes = read_geometry(actor, placeholders=True)
-    grown = set(meshes)
+    placeholders = set(meshes)
     meshes |= read_geometry(actor)
     gums = read_gum(actor)
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
@@ -60,7 +59,7 @@ def write_glb(
     parts: dict[str, list[Surface]] = {SKULL: [], MANDIBLE: []}
     for name, mesh in meshes.items():
         folder, title = MESH_PATHS[name].rsplit("/", 1)
-        base = "Placeholder" if name in grown else "Enamel" if name.endswith("teeth") else "Bone"
+        base = "Placeholder" if name in placeholders else "Enamel" if name.endswith("teeth") else "Bone"
         parts[folder].append(_surface(title, mesh, base, gums.get(name)))
     zero = frame_at_zero(frames)
     clock = {"fps": fps, "frames": frames[[0, -1]].tolist(), "frame_at_zero": zero}
@@ -77,9 +76,10 @@ def write_glb(
 
 
 def frame_at_zero(frames: Array) -> float:
-    """Return the frame of a take, frames (F,), that a .glb has at 0 s: frame 0, so that other programs see its numbers.
+    """Return the frame of a take, frames (F,), at 0 s of a .glb: frame 0, so that frame numbers are kept.
 
-    The first frame where that cannot be: glTF has no times before 0, and its single precision would blur high frames.
+    It is the first frame if that is negative, because glTF has no times before 0, or if frame numbers are too high for
+    its single precision.
     """
     return 0.0 if frames[0] >= 0 and frames[-1] <= _HIGHEST_FRAME else float(frames[0])
 
@@ -99,10 +99,10 @@ def _surface(title: str, mesh: Mesh, base: str, gum: Mask | None) -> Surface:
 
 
 def _split(faces: NDArray[np.int32], uv: Array) -> tuple[NDArray[np.int32], NDArray[np.int64], Array]:
-    """Give a point on a seam a vertex for each of its places in the picture.
+    """Split vertices on texture seams, so that each has one texture coordinate.
 
     Returns:
-        Faces (F, 3); of every new vertex the old one (n,), and its place (n, 2).
+        Faces (F, 3), and for every new vertex the index of the old one (n,) and the texture coordinate (n, 2).
     """
     corners = np.column_stack([faces.reshape(-1), uv.reshape(-1, 2)])
     rows, index = np.unique(corners, axis=0, return_inverse=True)

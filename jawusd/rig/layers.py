@@ -1,4 +1,4 @@
-"""Build USD layers in memory and put them on disk in one step."""
+"""Build USD layers in memory and write them atomically."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ from jawusd.base.inputs import check_path
 from jawusd.base.version import __version__
 from jawusd.formats.atomic import atomic_path
 from jawusd.rig import _gf
-from jawusd.rig.layout import ACTOR, BESIDE
-from jawusd.rig.schema import SCHEMA_NAME
+from jawusd.rig.layout import ACTOR, PROXY_SUFFIX, SCHEMA_NAME
 
 T = TypeVar("T")
 
-# What OpenUSD 26.11 says of every spline that it writes.
-_OF_SPLINES = "inner looping is deprecated"
+# Warning of OpenUSD 26.11 for every spline it writes.
+_SPLINE_WARNING = "inner looping is deprecated"
 
 
 def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
-    """Return a layer in memory with the units of every jawusd file: Y up, mm.
+    """Return an anonymous layer with the units of all jawusd files: Y up, millimetres.
 
     Args:
-        fps: Time codes per second; None leaves the layer without time.
+        fps: Time codes per second; None leaves them unset.
         default_prim: Path of the default prim.
     """
     layer = Sdf.Layer.CreateAnonymous(".usda")
@@ -45,21 +44,22 @@ def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
     return layer
 
 
-def named_after(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name, files: str = ".*") -> Sdf.Layer:
-    """Give the actor's prims and joints in a layer in memory another name, with all paths that lead to them.
+def rename_actor(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name, files: str = ".*") -> Sdf.Layer:
+    """Rename the actor's prims and joints in an anonymous layer, and all paths to them.
 
     Args:
         layer: Changed in place, and returned.
-        before: The name that the actor's prim has in the layer; its joints may have none in front yet.
-        files: Pattern of the asset paths whose prims are renamed as well.
+        name: The new name.
+        before: The current name of the actor's prim. Joint names need not start with it yet.
+        files: Pattern of asset paths: references and payloads to matching files are renamed as well.
     """
-    renamed_prims = {Sdf.Path(f"/{before}{end}"): Sdf.Path(f"/{name}{end}") for end in ("", BESIDE)}
+    renamed_prims = {Sdf.Path(f"/{before}{end}"): Sdf.Path(f"/{name}{end}") for end in ("", PROXY_SUFFIX)}
 
     def renamed(path: Sdf.Path) -> Sdf.Path:
         first = path.GetPrefixes()[0] if path.GetPrefixes() else path
         return path.ReplacePrefix(first, renamed_prims.get(first, first))
 
-    def moved(arc: Sdf.Reference | Sdf.Payload) -> Sdf.Reference | Sdf.Payload:
+    def renamed_arc(arc: Sdf.Reference | Sdf.Payload) -> Sdf.Reference | Sdf.Payload:
         if not re.fullmatch(files, arc.assetPath):
             return arc
         more = (arc.customData,) if isinstance(arc, Sdf.Reference) else ()
@@ -74,8 +74,8 @@ def named_after(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name,
             if spec.name == "joints" and spec.default is not None:
                 spec.default = Vt.TokenArray([_joint(joint, name, before) for joint in spec.default])
         elif isinstance(spec, Sdf.PrimSpec) and not path.IsAbsoluteRootPath():
-            _replace(spec.referenceList, moved)
-            _replace(spec.payloadList, moved)
+            _replace(spec.referenceList, renamed_arc)
+            _replace(spec.payloadList, renamed_arc)
             _replace(spec.inheritPathList, renamed)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
@@ -87,7 +87,7 @@ def named_after(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name,
 
 
 def _replace(items: object, change: Callable[[T], T]) -> None:
-    """Change the items of a list operation of OpenUSD where they are."""
+    """Change the items of an OpenUSD list op in place."""
     for group in ("explicitItems", "prependedItems", "appendedItems", "addedItems", "deletedItems"):
         old = list(getattr(items, group))
         new = [change(item) for item in old]
@@ -96,24 +96,24 @@ def _replace(items: object, change: Callable[[T], T]) -> None:
 
 
 def _joint(joint: str, name: str, before: str) -> str:
-    """Return the path of a joint with the actor's name in front of each of its parts."""
+    """Return the path of a joint with the actor's name prefixed to each of its parts."""
     return "/".join(f"{name}_{part.removeprefix(f'{before}_')}" for part in joint.split("/"))
 
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
-    """Return a stage on a layer in memory, for schema classes that need one.
+    """Return a stage on an anonymous layer, for schema classes that need one.
 
     Raises:
         RigError: OpenUSD cannot open it.
     """
     stage = Usd.Stage.Open(layer, load=Usd.Stage.LoadNone)
     if stage is None:
-        raise RigError("OpenUSD could not open a layer in memory.")
+        raise RigError("OpenUSD could not open an anonymous layer.")
     return stage
 
 
 def define_prim(layer: Sdf.Layer, path: str, type_name: str) -> Sdf.PrimSpec:
-    """Define a prim of a type in a layer and return its spec; an existing spec becomes that definition."""
+    """Define a prim of a type in a layer and return its spec; an existing spec is redefined."""
     spec = Sdf.CreatePrimInLayer(layer, path)
     spec.specifier = Sdf.SpecifierDef
     spec.typeName = type_name
@@ -121,7 +121,7 @@ def define_prim(layer: Sdf.Layer, path: str, type_name: str) -> Sdf.PrimSpec:
 
 
 def apply_jaw_api(spec: Sdf.PrimSpec, *others: str) -> None:
-    """Apply JawRigAPI, and other schemas, to a prim spec. Needs no plugin: the name is plain metadata."""
+    """Apply JawRigAPI and other schemas to a prim spec, as plain metadata: the schema plugin is not needed."""
     schemas = Sdf.TokenListOp()
     schemas.prependedItems = [SCHEMA_NAME, *others]
     spec.SetInfo("apiSchemas", schemas)
@@ -132,7 +132,7 @@ def set_attribute(
 ) -> None:
     """Write an attribute with its default value, uniform unless animated.
 
-    `custom` is set on all: Blender imports no other attributes.
+    All are `custom`: Blender imports no other attributes.
     """
     variability = Sdf.VariabilityVarying if animated else Sdf.VariabilityUniform
     attribute = Sdf.AttributeSpec(spec, name, type_name, variability, declaresCustom=True)
@@ -146,9 +146,9 @@ def set_relationship(spec: Sdf.PrimSpec, name: str, targets: Iterable[str]) -> N
 
 
 def add_pose(prim: Usd.Prim, T: Array) -> None:
-    """Give a prim translate and orient ops whose default value is a pose (4, 4).
+    """Add translate and orient ops to a prim, with a pose (4, 4) as default value.
 
-    Never a matrix op: USD interpolates matrix samples entry by entry, which shears between frames.
+    A matrix op would shear between frames: USD interpolates matrix samples entry by entry.
     """
     xform = UsdGeom.Xformable(prim)
     xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.translations(T[None])[0])
@@ -156,14 +156,14 @@ def add_pose(prim: Usd.Prim, T: Array) -> None:
 
 
 def relative_path(target: Path, layer: Path) -> str:
-    """Return the path of a file as a layer should name it: relative to the layer's folder, starting with a dot."""
+    """Return the asset path of a file in a layer: relative to the layer's folder, starting with a dot."""
     relative = Path(os.path.relpath(target.resolve(), layer.resolve().parent)).as_posix()
     return relative if relative.startswith(".") else f"./{relative}"
 
 
 @contextlib.contextmanager
 def without_warning(words: str) -> Iterator[None]:
-    """Keep OpenUSD's warnings with these words from stderr; others are printed afterwards."""
+    """Suppress OpenUSD's warnings that contain these words; other warnings are issued afterwards."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
@@ -175,22 +175,22 @@ def without_warning(words: str) -> Iterator[None]:
 
 
 def write_layer(layer: Sdf.Layer, path: Path) -> Path:
-    """Write a layer to a file atomically; a copy of that file already open in this process is reloaded.
+    """Write a layer to a file atomically and reload the file's layer if this process has it open.
 
     Raises:
-        OutputError: The file cannot be written, or OpenUSD could not follow its path.
+        OutputError: The file cannot be written, or OpenUSD does not support its path.
     """
     path = Path(path)
     check_path(path, OutputError)
     with atomic_path(path) as temporary:
         try:
-            with without_warning(_OF_SPLINES):
+            with without_warning(_SPLINE_WARNING):
                 written = layer.Export(str(temporary))
-        except Tf.ErrorException:  # names a line of OpenUSD, not a reason
+        except Tf.ErrorException:  # its text names a source line of OpenUSD, not the reason
             written = False
         if not written:
-            raise OutputError("could not be written; is the disk full? What was there before is untouched.", path=path)
-    # OpenUSD keeps layers by name; without this a stage opened later in this process would show the old content.
+            raise OutputError("could not be written; is the disk full? Any previous file is unchanged.", path=path)
+    # OpenUSD caches layers by name: without a reload, stages opened later would show the old content.
     in_use = Sdf.Layer.Find(str(path.resolve())) or Sdf.Layer.Find(str(path))
     if in_use is not None:
         in_use.Reload(force=True)

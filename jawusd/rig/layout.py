@@ -1,62 +1,69 @@
-"""Prim paths and file names of a rig; `jawusd.evaluator.schema` has the attributes of the model arrays.
+"""Names of a rig in USD: prim paths, files, attributes and the codeless schema JawRigAPI.
 
-Layers are built with the paths below, and renamed after the actor as they are written, see `layers.named_after`.
+Layers are built with the prim paths below and renamed after the actor when they are written (`layers.rename_actor`).
+`jawusd.evaluator.schema` names the attributes of the model arrays.
+
+The schema provides documentation, slider limits and type checks. Rigs are read and written without it: attributes are
+found by name, and the applied schema in the raw `apiSchemas` metadata.
 """
 
 from __future__ import annotations
 
 import re
 import unicodedata
+import warnings
 from pathlib import Path
 
-from pxr import Sdf
+from pxr import Plug, Sdf, Usd, UsdGeom
 
 from jawusd.base.errors import RigError
+from jawusd.base.plugin_path import schema_folder
 
 FORMAT_VERSION = 2
+SCHEMA_NAME = "JawRigAPI"
 
 ACTOR, GEO, MATERIALS = "/Actor", "/Actor/geo", "/Actor/mtl"
-BESIDE = "WithProxies"  # ends the name of the class with the proxies beside the scans
+PROXY_SUFFIX = "WithProxies"  # of the class prim that adds the proxies next to the scans
 SKULL, MANDIBLE = "/Actor/geo/Skull", "/Actor/geo/Mandible"
 
 ACTOR_FILE, RIG_FILE, GEO_FILE = "actor.usda", "rig.usdc", "geo.usdc"
 ONNX_FILE, ENCODE_FILE = "actor.onnx", "actor_encode.onnx"
 SKEL_FILE, PACKAGE_FILE = "actor_skel.usdc", "actor.usdz"
-PROXY_FILE = "proxy.usdc"
+PROXY_FILE, CAPTURED_FILE = "proxy.usdc", "anim_capture.usdc"
 
-DETAIL, SCAN, PROXY, BOTH = "detail", "scan", "proxy", "both"  # a variant set and its variants
-MOTION, TRANSFORMS, SKELETON = "motion", "transforms", "skeleton"  # the one of the captured motion
+DETAIL, SCAN, PROXY, BOTH = "detail", "scan", "proxy", "both"  # variant set for the level of detail, and its variants
+MOTION, TRANSFORMS, SKELETON = "motion", "transforms", "skeleton"  # variant set for captured motion, and its variants
 
 PARAMETERS = ("jaw:d1", "jaw:d2", "jaw:d3")
 ONNX_ATTRIBUTES = ("jaw:onnx", "jaw:onnx:encode")
-MADE_FOR = "modelHash"  # key of the custom data of sampled parameters: the model that they are meant for
-SIDECAR_HASH = "sha256"  # key of the custom data of these attributes
+MODEL_HASH_KEY = "modelHash"  # custom data of animated parameters: hash of the model they were made with
+SIDECAR_HASH_KEY = "sha256"  # custom data of the ONNX attributes: checksum of the file
 
 
 def prim_name_of(actor: str) -> str:
-    """Return the name of an actor's prim: letters, digits and "_" of the actor's name, from a letter on."""
+    """Return a valid prim name made from an actor's name: ASCII letters, digits and "_", starting with a letter."""
     plain = unicodedata.normalize("NFKD", actor).encode("ascii", "ignore").decode()
     found = re.sub(r"\W+", "_", plain).strip("_")
     return found if found[:1].isalpha() else "_".join(filter(None, ("Actor", found)))
 
 
 def check_prim_name(name: str) -> str:
-    """Return the name that an actor's prim shall have.
+    """Return a name for an actor's prim after checking that it is valid.
 
     Raises:
-        RigError: It is no identifier that all versions of OpenUSD read.
+        RigError: The name is not an identifier in all versions of OpenUSD.
     """
     if not (name.isascii() and Sdf.Path.IsValidIdentifier(name)):
-        hint = "Letters, digits and _ do, from a letter on, as hero_2. Give another one with --prim-name."
-        raise RigError(f'"{name}" cannot be the name of a prim.', hint=hint)
+        hint = "Use letters, digits and _, starting with a letter, as in hero_2. Set the name with --prim-name."
+        raise RigError(f'"{name}" is not a valid prim name.', hint=hint)
     return name
 
 
 def actor_in_folder(path: Path) -> Path:
-    """Return the actor of a rig's folder, as built or as published under another name; other paths as they are.
+    """Return the actor file of a rig folder, as built or published under another name. Other paths are returned as is.
 
     Raises:
-        RigError: a folder without one.
+        RigError: The folder has no actor file.
     """
     if not path.is_dir():
         return path
@@ -65,8 +72,47 @@ def actor_in_folder(path: Path) -> Path:
     if not actor.exists() and len(published) == 1:
         return published[0]
     if not actor.exists():
-        hint = "Name the folder of a build (jawusd build ... -o FOLDER), or a file of it."
+        hint = "Give the folder of a build (jawusd build ... -o FOLDER), or a file in it."
         if (path / "capture.toml").exists():
-            hint = f"It is a capture; build a rig from it with: jawusd build {path} -o out"
+            hint = f"This is a capture. Build a rig from it: jawusd build {path} -o out"
         raise RigError(f"is a folder without {ACTOR_FILE}.", path=path, hint=hint)
     return actor
+
+
+def register_schema() -> bool:
+    """Register the schema with OpenUSD and return whether this process knows it; may be called repeatedly.
+
+    OpenUSD builds its schema registry when a process first opens a stage. Plugins registered later are ignored (OpenUSD
+    issue 3596); a warning says so.
+    """
+    folder = schema_folder()
+    if folder is not None:
+        Plug.Registry().RegisterPlugins(str(folder))
+    live = schema_is_live()
+    if folder is not None and not live:
+        message = f"OpenUSD does not know {SCHEMA_NAME}: a stage was opened before it was registered. "
+        message += f"Import jawusd first, or set PXR_PLUGINPATH_NAME={folder}. Rigs can be read and written without it."
+        warnings.warn(message, stacklevel=2)
+    return live
+
+
+def schema_is_live() -> bool:
+    """Return whether this process knows JawRigAPI. The call freezes the process's schema registry."""
+    return Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(SCHEMA_NAME) is not None
+
+
+def has_jaw_api(prim: Usd.Prim) -> bool:
+    """Return whether JawRigAPI is applied to a prim, even if this process does not know the schema."""
+    applied = prim.GetMetadata("apiSchemas")
+    return applied is not None and SCHEMA_NAME in applied.GetAddedOrExplicitItems()
+
+
+def rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
+    """Return the active prims of a stage with JawRigAPI, including unloaded ones and those inside instances."""
+    found = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsDefined & ~Usd.PrimIsAbstract)
+    return [prim for prim in stage.Traverse(found) if has_jaw_api(prim)]
+
+
+def meshes_below(prim: Usd.Prim) -> list[Usd.Prim]:
+    """Return the active meshes at and below a prim, including those inside instances."""
+    return [mesh for mesh in Usd.PrimRange(prim, Usd.TraverseInstanceProxies()) if mesh.IsA(UsdGeom.Mesh)]

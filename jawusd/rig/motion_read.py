@@ -1,4 +1,7 @@
-"""Read how the mandible moves in a stage, from its transforms or bones or from samples of d."""
+"""Read how the mandible moves in a stage, from transforms, bones or samples of d.
+
+Also: at which times and how closely a baked mandible must match its d, and whether the skull is moved.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +14,19 @@ from pxr import Usd, UsdGeom
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError
+from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import rigidity_defect
-from jawusd.rig.animation import LOST
-from jawusd.rig.bones import bones_of, place_in
-from jawusd.rig.keys import MOST_FRAMES, key_times, time_codes, values_at
-from jawusd.rig.layout import PARAMETERS
+from jawusd.rig.animation import BETWEEN_MM, LOST
+from jawusd.rig.attributes import MAX_FRAMES, key_and_frame_times, key_times, time_codes, values_at
+from jawusd.rig.layout import PARAMETERS, meshes_below
 from jawusd.rig.read import find_rig_prim, open_stage
+from jawusd.rig.skel import SAME_MOTION, bones_of, transform_in_actor
+from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
-_RIGID = 1e-5  # single-precision quaternions, as DCCs write them, stay below
-_APART = 1e-4  # far more than the transforms of two meshes that move together differ by
+#: Largest distance [mm] of a baked pose from that of d.
+BAKED_MM = 0.01
+_RIGID = 1e-5  # largest rigidity defect; single-precision quaternions, as DCCs write them, stay below
 
 
 @raises_format_error(0)
@@ -29,14 +35,14 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
 
     Args:
         path: An animation layer of a rig, or a shot that references one.
-        prim_path: Which rig, where the stage has several.
+        prim_path: The rig's prim, if the stage has several rigs.
 
     Returns:
         Frame numbers (F,) and T_skull_mandible (F, 4, 4) [mm], relative to the actor.
 
     Raises:
         RigError: Not a stage.
-        FormatError: No rig or several, no mandible, no motion, or one that is not rigid.
+        FormatError: No rig or several rigs, no mandible, no time range, or a motion that is not rigid.
     """
     stage = open_stage(path)
     actor = find_rig_prim(stage, path, prim_path)
@@ -45,13 +51,13 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
 
 
 def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object) -> Array:
-    """Return where a mandible is in the world, relative to the skull, by transforms or by bones.
+    """Return the poses of a mandible relative to the skull, given by transforms or bones.
 
     Args:
-        times: shape (F,); without any, the default time is read.
+        times: Shape (F,); the default time is read if it is empty.
 
     Returns:
-        T_skull_mandible [mm], shape (F, 4, 4), in the actor's units; without a skull relative to the actor.
+        T_skull_mandible [mm], shape (F, 4, 4), in the actor's units; relative to the actor if there is no skull.
 
     Raises:
         FormatError: The motion is not rigid.
@@ -64,31 +70,31 @@ def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object
     if not defect.max() <= _RIGID:
         worst = int(np.argmax(np.where(np.isfinite(defect), defect, np.inf)))
         raise FormatError(
-            f"the mandible is not rigid at frame {codes[worst]} (off by {defect[worst]:.2g}, allowed {_RIGID:g}).",
+            f"the mandible is not rigid at frame {codes[worst]} (defect {defect[worst]:.2g}, allowed {_RIGID:g}).",
             path=str(path),
-            hint="Samples of matrices shear in between: key translate and orient.",
+            hint="Matrix samples shear when interpolated: key translate and orient instead.",
         )
     return poses
 
 
 def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode], path: object) -> Array:
-    """Return what carries the points of the meshes below a prim to the actor's frame, shape (F, 4, 4).
+    """Return the transforms (F, 4, 4) from the frame of the meshes below a prim to the actor's frame.
 
     Raises:
-        FormatError: Bones bend the meshes, or they move in different ways.
+        FormatError: Bones deform the meshes, or the meshes move differently.
     """
     bones = bones_of(prim)
     if bones is not None:
         return bones.poses(actor, times, path)
-    movers = _movers(prim)
+    movers = _moving_prims(prim)
     moved = np.empty((len(movers), len(times), 4, 4))
     for k, time in enumerate(times):
         cache = UsdGeom.XformCache(time)
         for i, mover in enumerate(movers):
-            moved[i, k] = np.array(place_in(actor, mover, cache)).T  # USD multiplies rows from the left
-    if not np.abs(moved - moved[:1]).max() <= _APART:
+            moved[i, k] = np.array(transform_in_actor(actor, mover, cache)).T  # USD multiplies rows from the left
+    if not np.abs(moved - moved[:1]).max() <= SAME_MOTION:
         raise FormatError(
-            f"the meshes below {prim.GetPath()} move in different ways.",
+            f"the meshes below {prim.GetPath()} move differently.",
             path=str(path),
             hint="Move the prim above them instead.",
         )
@@ -97,49 +103,44 @@ def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode
 
 
 def moving_attributes(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Attribute]:
-    """Return the attributes that move a prim in its actor: of joints, or the ops of prims from meshes to actor."""
+    """Return the attributes that move a prim in its actor: those of joints, or the ops of prims up to the actor."""
     bones = bones_of(prim)
     if bones is not None:
-        return bones.keyed()
-    chain = dict.fromkeys(above for mover in _movers(prim) for above in prims_between(mover, actor))
+        return bones.animated_attributes()
+    chain = dict.fromkeys(above for mover in _moving_prims(prim) for above in prims_between(mover, actor))
     return [op.GetAttr() for above in chain for op in UsdGeom.Xformable(above).GetOrderedXformOps()]
 
 
 def prims_between(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Prim]:
-    """Return a prim and those above it that transforms move, up to its actor and without it."""
+    """Return the transformable prims from a prim up to, but without, its actor."""
     found = []
     while prim and prim != actor and not prim.IsPseudoRoot():
         found.append(prim)
         prim = prim.GetParent()
-    return [one for one in found if one.IsA(UsdGeom.Xformable)]
+    return [each for each in found if each.IsA(UsdGeom.Xformable)]
 
 
-def meshes_below(prim: Usd.Prim) -> list[Usd.Prim]:
-    """Return the active meshes below a prim, of an instance too."""
-    return [mesh for mesh in Usd.PrimRange(prim, Usd.TraverseInstanceProxies()) if mesh.IsA(UsdGeom.Mesh)]
-
-
-def _movers(prim: Usd.Prim) -> list[Usd.Prim]:
-    """Return the meshes below a prim where one of them has transforms of its own, else the prim."""
+def _moving_prims(prim: Usd.Prim) -> list[Usd.Prim]:
+    """Return the meshes below a prim if any prim between has transforms, otherwise the prim."""
     meshes = meshes_below(prim)
     below = [above for mesh in meshes for above in prims_between(mesh, prim)]
-    own = any(UsdGeom.Xformable(one).GetXformOpOrderAttr().HasAuthoredValue() for one in below)
-    return meshes if own else [prim]
+    is_transformed = any(UsdGeom.Xformable(each).GetXformOpOrderAttr().HasAuthoredValue() for each in below)
+    return meshes if is_transformed else [prim]
 
 
 @raises_format_error(0)
 def read_parameters_of_stage(
     path: str | os.PathLike[str], prim_path: str | None = None
 ) -> tuple[Array, Array, float] | None:
-    """Read the samples of d that an animation layer holds.
+    """Read the samples of d in an animation layer.
 
     Returns:
-        Times (F,), d (F, 3) [mm] with NaN in the frames the layer lists as lost, and frames per second; None when the
-        motion is given by transforms alone.
+        Times (F,), d (F, 3) [mm] with NaN in the frames that the layer lists as lost, and frames per second; None if
+        the motion is given by transforms only.
 
     Raises:
         RigError: Not a stage.
-        FormatError: No rig or several, or parameters that are not finite.
+        FormatError: No rig or several rigs, or parameters that are not finite.
     """
     stage = open_stage(path)
     return parameters_of(find_rig_prim(stage, path, prim_path), path)
@@ -157,11 +158,11 @@ def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] |
     times = np.unique(np.concatenate([np.zeros(0), *sampled]))
     if len(sampled) < len(PARAMETERS) or not len(times):
         return None
-    if len(times) > MOST_FRAMES:
-        raise FormatError(f"has {len(times)} samples of d, at most {MOST_FRAMES} are read.", path=str(path))
+    if len(times) > MAX_FRAMES:
+        raise FormatError(f"has {len(times)} samples of d, more than the limit of {MAX_FRAMES}.", path=str(path))
     d = np.array([values_at(attribute, times.tolist()) for attribute in attributes], dtype=np.float64).T
     if not np.isfinite(d).all():
-        raise FormatError("its samples of d hold values that are not finite.", path=str(path))
+        raise FormatError("its samples of d have values that are not finite.", path=str(path))
     listed = stage.GetRootLayer().customLayerData.get(LOST, [])
     lost = np.setdiff1d(np.array(list(listed), dtype=np.float64), times)
     order = np.argsort(np.concatenate([times, lost]))
@@ -170,62 +171,99 @@ def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] |
 
 
 def mandible_of(actor: Usd.Prim, path: object) -> Usd.Prim:
-    """Return the prim that a rig moves.
+    """Return the mandible prim of a rig.
 
     Raises:
-        FormatError: jaw:mandible names none or several, or one that is not there or cannot move.
+        FormatError: jaw:mandible has not exactly one target, or its target is missing or cannot be moved.
     """
-    return _named_by(actor, "jaw:mandible", path)
+    return _relationship_target(actor, "jaw:mandible", path)
 
 
 def skull_of(actor: Usd.Prim, path: object) -> Usd.Prim | None:
-    """Return the prim of a rig's skull; None where it names none or is inactive: the skull's frame is the actor's.
+    """Return the skull prim of a rig; None if it is not set or inactive: the skull frame is then the actor's frame.
 
     Raises:
-        FormatError: jaw:skull names several, or one that is not there.
+        FormatError: jaw:skull has several targets, or its target is missing.
     """
-    named = actor.GetRelationship("jaw:skull")
-    found = [actor.GetStage().GetPrimAtPath(target) for target in named.GetTargets()] if named else []
-    return None if all(prim and not prim.IsActive() for prim in found) else _named_by(actor, "jaw:skull", path)
+    relationship = actor.GetRelationship("jaw:skull")
+    targets = relationship.GetTargets() if relationship else []
+    found = [actor.GetStage().GetPrimAtPath(target) for target in targets]
+    if all(prim and not prim.IsActive() for prim in found):
+        return None
+    return _relationship_target(actor, "jaw:skull", path)
 
 
-def _named_by(actor: Usd.Prim, name: str, path: object) -> Usd.Prim:
+def _relationship_target(actor: Usd.Prim, name: str, path: object) -> Usd.Prim:
     relationship, stage = actor.GetRelationship(name), actor.GetStage()
     targets = relationship.GetTargets() if relationship else []
     if len(targets) != 1:
-        raise FormatError(f"{name} of {actor.GetPath()} names {len(targets)} prims, expected 1.", path=str(path))
-    there = [prim for prim in map(stage.GetPrimAtPath, targets[0].GetPrefixes()) if prim]
+        raise FormatError(f"{name} of {actor.GetPath()} has {len(targets)} targets, expected 1.", path=str(path))
+    existing = [prim for prim in map(stage.GetPrimAtPath, targets[0].GetPrefixes()) if prim]
     prim = stage.GetPrimAtPath(targets[0])
-    if there and not there[-1].IsActive():
-        found = f"{there[-1].GetPath()} is inactive."
+    if existing and not existing[-1].IsActive():
+        found = f"{existing[-1].GetPath()} is inactive."
     elif not prim or not prim.IsDefined():
         found = "there is no such prim. Is the geometry (payload) missing, or not loaded?"
     elif not prim.IsA(UsdGeom.Xformable):
-        found = f"it is of type {prim.GetTypeName() or 'none'}, which nothing moves."
+        found = f"it is of type {prim.GetTypeName() or 'none'}, which cannot be transformed."
     elif not targets[0].HasPrefix(actor.GetPath()):
-        found = "it does not lie in the actor."
+        found = "it is not below the actor."
     else:
         return prim
-    raise FormatError(f"{name} names {targets[0]}: {found}", path=str(path))
+    raise FormatError(f"{name} targets {targets[0]}: {found}", path=str(path))
 
 
 def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
     """Return the whole frames between start and end of a stage.
 
     Raises:
-        FormatError: The stage has no start and end, or too many frames between them.
+        FormatError: The stage has no time range, or one with too many frames.
     """
     if not stage.HasAuthoredTimeCodeRange():
         raise FormatError(
-            "has no start and end time code: nothing says which frames to read.",
+            "has no start and end time code, so the frames to read are unknown.",
             path=str(path),
-            hint="Name an animation layer, or set both in the shot.",
+            hint="Give an animation layer, or set both in the shot.",
         )
     first, last = int(np.ceil(stage.GetStartTimeCode())), int(np.floor(stage.GetEndTimeCode()))
-    if not 0 < last - first + 1 <= MOST_FRAMES:
+    if not 0 < last - first + 1 <= MAX_FRAMES:
         raise FormatError(
             f"its time codes run from {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}: no whole frame, or "
-            f"more than {MOST_FRAMES}.",
+            f"more than {MAX_FRAMES}.",
             path=str(path),
         )
     return np.arange(first, last + 1)
+
+
+def comparison_times(actor: Usd.Prim, moving: list[Usd.Attribute], by_bones: bool) -> tuple[Array, Array]:
+    """Return the times at which a mandible is compared with d, and the allowed distances.
+
+    The times are the keys of both, because a jaw whose d alone is keyed does not move, and the whole frames between
+    them, because d and the mandible are interpolated differently. For bones, keys are enough: they have one at every
+    key of d.
+
+    Args:
+        moving: The attributes that move the mandible.
+        by_bones: Whether they belong to joints.
+
+    Returns:
+        Increasing times, shape (n,), n = 0 if nothing has keys; landmark distances [mm], shape (max(n, 1),).
+    """
+    times, keyed = key_and_frame_times([*moving, *(actor.GetAttribute(name) for name in PARAMETERS)])
+    if by_bones:
+        times, keyed = times[keyed], keyed[keyed]
+    return times, np.where(keyed, BAKED_MM, BAKED_MM + BETWEEN_MM) if len(times) else np.array([BAKED_MM])
+
+
+def skull_displacement_mm(actor: Usd.Prim, rig: JawRig, path: object) -> float:
+    """Return the largest displacement [mm] of the skull in its actor by transforms or bones.
+
+    Raises:
+        FormatError: Bones deform the skull, or it is missing.
+    """
+    skull = skull_of(actor, path)
+    if skull is None:
+        return 0.0
+    times = time_codes(key_and_frame_times(moving_attributes(skull, actor))[0])
+    poses = poses_in_actor(skull, actor, times, path)
+    return float(landmark_distance(rig, poses, np.broadcast_to(np.eye(4), poses.shape)).max())

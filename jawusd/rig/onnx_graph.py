@@ -1,4 +1,4 @@
-"""Write formulas as ONNX graphs: values with operators, each of which adds a node to their graph."""
+"""Write formulas as ONNX graphs: each operation on a `Value` adds a node to its `Graph`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from jawusd.evaluator.formula import long_angle_series
 from jawusd.evaluator.operations import Symbol, triple
 from jawusd.geometry.rodrigues import Triple, angle_quotients
 
-# |B_2k|, k = 1..8, of the series of the inverse left Jacobian
+# |B_2k|, k = 1..8: Bernoulli numbers in the series of the inverse left Jacobian
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510)
 _INVERSE_SERIES = [number / factorial(2 * k) for k, number in enumerate(_BERNOULLI, start=1)]
-# Below this squared angle the closed forms lose digits in float32 to cancellation, above it the series would.
+# Below this squared angle the closed forms lose digits to cancellation in float32; above it the series is inaccurate.
 _SERIES_BELOW_RAD2 = 0.25
 
 _ARITHMETIC = {"Add": "Add", "Subtract": "Sub", "Multiply": "Mul", "Divide": "Div"}
@@ -29,7 +29,7 @@ FloatType = type[np.float32] | type[np.float64]
 
 @dataclass(frozen=True)
 class Value(Symbol):
-    """A value of a graph: a column (n, 1), or a wide number (n, m), see `jawusd.evaluator.operations`."""
+    """A value in a graph: a column (n, 1), or a wide number (n, m), see `jawusd.evaluator.operations`."""
 
     graph: Graph = field(repr=False)
     name: str
@@ -45,13 +45,13 @@ class Value(Symbol):
 
 @dataclass(eq=False)
 class Graph:
-    """Collect the nodes of a graph of one floating-point type; also `Operations` on its values.
+    """A graph of one floating-point type under construction; also `Operations` on its values.
 
     Attributes:
         dtype: float32 or float64.
-        prefix: Start of every name; graphs inside one another must not share names.
-        nodes: Operators so far.
-        initializers: Constants so far.
+        prefix: Prefix of all names; nested graphs must not share names.
+        nodes: Operators added so far.
+        initializers: Constants added so far.
     """
 
     dtype: FloatType
@@ -68,7 +68,7 @@ class Graph:
         return TensorProto.DOUBLE if self.dtype is np.float64 else TensorProto.FLOAT
 
     def constant(self, value: ArrayLike, dtype: type[np.int64] | type[np.bool_] | None = None) -> Value:
-        """Add a constant, of the graph's type if no other is given, once per value."""
+        """Add a constant, by default of the graph's type. Equal constants are added once."""
         array = np.array(value, dtype=dtype or self.dtype)
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
@@ -79,7 +79,7 @@ class Graph:
     def op(
         self, kind: str, *inputs: Value | float, name: str | None = None, **attributes: int | Sequence[int]
     ) -> Value:
-        """Add an operator, unless the same one is there already, and return its one output."""
+        """Add an operator and return its output; an equal operator is reused."""
         names = [(x if isinstance(x, Value) else self.constant(x)).name for x in inputs]
         key = (kind, *names, str(sorted(attributes.items())))
         if name is None and key in self._found:
@@ -133,16 +133,16 @@ class Graph:
         return self.op("Where", small, series[3], (1.0 - a / (2.0 * b)) / far)
 
     def _near_and_far(self, squared: Value) -> tuple[Value, Value, list[Value]]:
-        """Return where a squared angle is small, itself for the closed forms, and the series, which must not overflow.
+        """Return where a squared angle is small, the angle limited for the closed forms, and the series.
 
-        What overflows is no longer left out where it is multiplied with 0.
+        Both branches are evaluated everywhere and must not overflow, because infinity times 0 is NaN.
         """
         near = self.op("Min", squared, _SERIES_BELOW_RAD2)
         series = self.polynomials([*long_angle_series(), _INVERSE_SERIES], near)
         return self.op("Less", squared, _SERIES_BELOW_RAD2), self.op("Max", squared, _SERIES_BELOW_RAD2), series
 
     def polynomials(self, coefficients: Sequence[Sequence[float]], x: Value) -> list[Value]:
-        """Return several polynomials of x: its powers times one matrix, a third of the operators of Horner's scheme."""
+        """Return polynomials of x as its powers times one matrix: a third of the operators of Horner's scheme."""
         degree = max(map(len, coefficients)) - 1
         powers = [x]
         while len(powers) < degree:
@@ -157,7 +157,7 @@ class Graph:
         return self._polynomials[key]
 
     def log_sum_exp(self, terms: Sequence[Value]) -> Value:
-        """Return the logarithm of the sum of exponentials, free of overflow."""
+        """Return the logarithm of the sum of exponentials without overflow."""
         joined = self.concat(terms)
         peak = self.op("ReduceMax", joined, axes=[1], keepdims=1)
         return peak + self.op("Log", self.sum_columns(self.exp(joined - peak)))
@@ -171,9 +171,9 @@ class Graph:
         return triple(self.parts(factors[0] @ weights, 3))
 
     def lookup(self, x: Value, knots: Array, tables: Sequence[Array]) -> list[tuple[Value]]:
-        """Return, of each table, the rows (n, k) whose index is the number of knots (m, 1) at or below x.
+        """Return the row (n, k) of each table whose index is the number of knots (m, 1) at or below x.
 
-        The first row and, for each knot passed, what the next one has more: affine, where looking up is not.
+        Computed as the first row plus the difference of the next row for each knot passed, which is a matrix product.
         """
         passed = self.op("Cast", self.op("GreaterOrEqual", x, self.constant(knots.T)), to=self.elem_type)
         return [(passed @ np.diff(table, axis=0) + self.constant(table[:1]),) for table in tables]

@@ -1,4 +1,4 @@
-"""A rig whose poses, twists, margins and encoding onnxruntime computes from its ONNX sidecars, in single precision."""
+"""A rig whose poses, twists, margins and encoding onnxruntime computes from its sidecars, in single precision."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ from jawusd.base.errors import FormatError, MissingDependencyError
 try:
     import onnxruntime  # noqa: F401
 except ModuleNotFoundError as error:
-    raise MissingDependencyError("ONNX files run in onnxruntime.", hint="pip install 'jawusd[build]'") from error
+    raise MissingDependencyError("running ONNX files needs onnxruntime.", hint="pip install 'jawusd[build]'") from error
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.batching import usable_rows
 from jawusd.evaluator.kernels import NumpyKernels, RigParts
 from jawusd.evaluator.rig import load
-from jawusd.rig.onnx_check import Run, load_sidecar, runner
+from jawusd.rig.onnx_sidecar import Run, load_sidecar, runner
 from jawusd.rig.read import load_rig
 
-# Single precision cannot tell the two sides of the bound apart: this near to it, the exact margin decides.
+# Within this distance of the bound, margins are recomputed exactly: single precision cannot decide the side.
 _NEAR_MM = 1e-3
 
 
 def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
-    """Load the rig that an ONNX file lies beside, to be computed by that file.
+    """Load the rig in the folder of an ONNX file, to be evaluated by that file.
 
-    The file `X.onnx` decodes, `X_encode.onnx`, where it is there, encodes. The rig, `X.usda` or `model.npz` in the same
-    folder, gives what graphs do not hold: limits, landmarks, searches inside the bound.
+    `X.onnx` decodes; `X_encode.onnx`, if it exists, encodes. The rig, `X.usda` or `model.npz` in the same folder,
+    supplies what the graphs lack: limits, landmarks and searches inside the bound.
 
     Raises:
-        FormatError: No rig beside it, not a decoding graph of jawusd, or made from another model.
+        FormatError: No rig in the folder, not a decoder of jawusd, or made from another model.
     """
     path = Path(path)
     actor, model = path.with_suffix(".usda"), path.with_name("model.npz")
     if not actor.is_file() and not model.is_file():
         raise FormatError(
-            f"lies beside neither {actor.name} nor {model.name}, which hold the limits of the rig.",
+            f"has neither {actor.name} nor {model.name} next to it, which define the limits of the rig.",
             path=path,
-            hint="Load it in the folder of its rig; a runtime of its own needs the .onnx alone.",
+            hint="Load it from the folder of its rig. To run only the .onnx, use onnxruntime directly.",
         )
     rig = load_rig(actor, prim) if actor.is_file() else load(model)
     decode = load_sidecar(path, rig)
     if [entry.name for entry in decode.graph.input] != ["d"]:
-        raise FormatError('encodes poses; name the file that decodes, of the input "d".', path=path)
-    beside = path.with_name(f"{path.stem}_encode.onnx")
-    encode = load_sidecar(beside, rig).SerializeToString() if beside.is_file() else None
+        raise FormatError('is an encoder; give the decoder, whose input is "d".', path=path)
+    encoder = path.with_name(f"{path.stem}_encode.onnx")
+    encode = load_sidecar(encoder, rig).SerializeToString() if encoder.is_file() else None
     found = JawRig(rig.arrays, rig.meta, kernels=partial(OnnxKernels, decode.SerializeToString(), encode))
     try:
         found.pose(np.zeros(3))

@@ -1,32 +1,47 @@
-"""The ONNX sidecars: the exact model, not a fit of it, as graphs d -> pose, twist, margin and pose -> d, residual.
+"""The ONNX sidecars of a rig: graphs of the exact model, d -> pose, twist, margin and pose -> d, residual.
 
-The batch size is dynamic. Two files, because decoding needs only arithmetic, which every runtime has, and encoding
-needs a loop.
+Decoding and encoding are separate files, because decoding needs only arithmetic, which every runtime supports, and
+encoding needs a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is installed, otherwise by the
+reference evaluator of the package onnx, which is slower.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import onnx
+from numpy.typing import NDArray
 from onnx import helper
+from onnx.external_data_helper import convert_model_from_external_data
+from onnx.reference import ReferenceEvaluator
 
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError, JawusdError, RigError
+from jawusd.base.inputs import check_input
 from jawusd.base.version import __version__
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.rig.arrays import model_hash
-from jawusd.rig.onnx_encode import add_encoder
-from jawusd.rig.onnx_graph import FloatType, Graph, Value
-from jawusd.rig.onnx_model import add_margin, add_twist, decode_motion, images
+from jawusd.rig.onnx_graph import FloatType, Graph, Value, float_type
+from jawusd.rig.onnx_model import add_encoder, add_margin, add_twist, decode_motion, images
+from jawusd.rig.table import landmark_distance, sample_valid
 
 FORMAT = "jawusd-onnx/1"
 OPSET = 17
-_IR_VERSION = 8  # the one that came with opset 17: older runtimes refuse a newer number
+_IR_VERSION = 8  # released with opset 17; older runtimes reject newer versions
+
+#: Largest landmark distance from the model [mm].
+ALLOWED_MM = 0.01
+PROBES = 100  # random valid d at which graphs are compared with the model
 
 Shapes = dict[str, list[str | int]]
+Floats = NDArray[np.float32] | NDArray[np.float64]
+# (names of outputs, inputs by name) -> outputs
+Run = Callable[[Sequence[str], Mapping[str, Floats]], list[Array]]
 
 
 def write_onnx(path: str | os.PathLike[str], model: onnx.ModelProto) -> Path:
@@ -54,7 +69,7 @@ def decode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
     d = Value(g, "d")
     motion = decode_motion(g, rig, d)
     add_twist(g, rig, motion, "twist")
-    columns = images(g, rig, motion, np.eye(4))  # of the pose, one after another, without its bottom row
+    columns = images(g, rig, motion, np.eye(4))  # columns of the pose without its bottom row, concatenated
     flat = columns @ np.eye(16).reshape(4, 4, 16)[:3].swapaxes(0, 1).reshape(12, 16) + g.constant([np.eye(16)[15]])
     g.op("Reshape", flat, g.constant([-1, 4, 4], np.int64), name="pose")
     g.op("Squeeze", add_margin(g, rig, d), g.constant([1], np.int64), name="margin")
@@ -80,7 +95,7 @@ def encode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
 
 
 def _model(g: Graph, rig: JawRig, name: str, doc: str | None, inputs: Shapes, outputs: Shapes) -> onnx.ModelProto:
-    """Close a graph and label it."""
+    """Make a checked model with metadata from a graph."""
 
     def declared(shapes: Shapes) -> list[onnx.ValueInfoProto]:
         return [helper.make_tensor_value_info(key, g.elem_type, shape) for key, shape in shapes.items()]
@@ -106,6 +121,106 @@ def _metadata(rig: JawRig) -> dict[str, str]:
         "twist_order": "omega v",
         "kind": rig.kind,
         "actor": rig.actor,
-        "rig_hash": model_hash(rig),
+        "rig_hash": rig.model_hash,
         "d_range_mm": json.dumps(rig.d_range.tolist()),
     }
+
+
+def runner(graph: bytes) -> Run:
+    """Return a function that runs a serialised graph, as from `load_sidecar`, on one thread, with any float inputs."""
+    model = onnx.load_from_string(graph)
+    dtype = float_type(model)
+    try:
+        import onnxruntime
+    except ImportError:
+        run = ReferenceEvaluator(model).run
+    else:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        options.log_severity_level = 4  # failures are raised as exceptions as well
+        # optimising takes longer than it saves over thousands of poses
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        run = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"]).run
+
+    def run_cast(outputs: Sequence[str], inputs: Mapping[str, Floats]) -> list[Array]:
+        found = run(list(outputs), {name: value.astype(dtype) for name, value in inputs.items()})
+        return [np.asarray(value, dtype=np.float64) for value in found]
+
+    return run_cast
+
+
+def check_written(path: str | os.PathLike[str], rig: JawRig) -> None:
+    """Check that a written sidecar gives the results of its model.
+
+    Raises:
+        RigError: It is too far from the model.
+    """
+    error_mm = onnx_error_mm(path, rig, sample_valid(rig, PROBES))
+    if not error_mm <= ALLOWED_MM:
+        raise RigError(f"is {error_mm:.3f} mm from the model, allowed {ALLOWED_MM} mm.", path=path)
+
+
+def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded: str | None = None) -> float:
+    """Return the largest landmark distance [mm] between a graph and the model over parameters d (n, 3).
+
+    A decoder is compared by its poses. An encoder is given the model's poses of d, which are compared with the model's
+    poses of the parameters it finds.
+
+    Args:
+        d: Parameters (n, 3) [mm].
+        recorded: SHA-256 of the file as recorded in the rig; other files are rejected without parsing. None disables
+            the check: rigs baked before 0.1.0 record no checksum.
+
+    Raises:
+        FormatError: Not the recorded file, not an ONNX file of jawusd, or made from another model.
+    """
+    model = load_sidecar(path, rig, recorded)
+    try:
+        return _error_mm(model, rig, d)
+    except JawusdError:
+        raise
+    except Exception as error:  # damaged graphs raise errors of any type, depending on the operator
+        raise FormatError(f"cannot be run ({type(error).__name__}).", path=path) from error
+
+
+def _error_mm(model: onnx.ModelProto, rig: JawRig, d: Array) -> float:
+    dtype = float_type(model)
+    run = runner(model.SerializeToString())
+    if model.graph.input[0].name == "d":
+        d = d.astype(dtype)
+        exact = rig.pose(d.astype(np.float64))
+        (found,) = run(["pose"], {"d": d})
+    else:
+        exact = rig.pose(d).astype(dtype).astype(np.float64)
+        (encoded,) = run(["d"], {"pose": exact})
+        found = rig.pose(encoded)
+    return float(landmark_distance(rig, found, exact).max())
+
+
+def load_sidecar(path: str | os.PathLike[str], rig: JawRig, recorded: str | None = None) -> onnx.ModelProto:
+    """Read a graph that was made from the model of a rig.
+
+    Raises:
+        FormatError: As for `onnx_error_mm`.
+    """
+    check_input(path)
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+    if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
+        raise FormatError("is not the file baked with the rig (SHA-256 differs); bake the rig again.", path=path)
+    try:
+        model = onnx.load_from_string(content)
+        onnx.checker.check_model(model)
+        convert_model_from_external_data(model)  # raises if weights are in other files, which runtimes would read
+    except Exception as error:  # the protobuf and onnx exceptions share no base
+        raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error
+    if model.functions or model.graph.sparse_initializer:  # not covered by the check for other files
+        raise FormatError("has functions or sparse weights, which graphs written by jawusd do not have.", path=path)
+    properties = {entry.key: entry.value for entry in model.metadata_props}
+    if properties.get("format") != FORMAT:
+        raise FormatError(f"has the format {properties.get('format')!r}, expected {FORMAT!r}.", path=path)
+    if properties.get("rig_hash") != rig.model_hash:
+        raise FormatError("was made from another model (rig_hash differs); bake the rig again.", path=path)
+    return model

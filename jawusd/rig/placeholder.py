@@ -1,9 +1,9 @@
 """A placeholder for a missing mandible mesh: a tube swept below the lower scan and up to the condyles.
 
-It shows roughly where bone may be; it is not anatomy, and marked as such. The condyles come from the landmarks, or,
-where those are only mean adult positions, from the motion: in opening and protrusion alike the condyle slides along one
-path, the eminence, so that its trajectories are thinner than those of the points around it (the kinematic condylar
-centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
+It shows roughly where bone may be. It is not anatomy, and is marked as such. The condyles are taken from the landmarks,
+or from the motion if the landmarks are only mean adult positions. In opening and in protrusion the condyle slides along
+the same path, the eminence, so its trajectories form a thinner band than those of points around it (the kinematic
+condylar centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 _CONDYLES = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
 _INCISOR = LANDMARKS.index("incisor")
 
-# Search range and step for the thinnest trajectories, up and forward from the mean adult position [mm].
+# Search range and step for the point of the thinnest trajectories, up and forward from the mean adult position [mm].
 _REACH_MM = 18.0
 _STEP_MM = 1.5
 _PATH_DEGREE = 3
-# The motion is used only if the condyles travel this far and their paths are clearly thinner than at the mean position.
+# The motion is used only if the condyles travel this far, and if their paths are thinner by this factor than those at
+# the mean position.
 _LEAST_TRAVEL_MM = 5.0
 _CLEARLY_THINNER = 0.85
 _FEWEST_POSES = 30
 
-# The body below the arch, by direction from the middle of its open end; 0 is the front [rad].
+# Stations of the body below the arch: directions from the middle of its open end, 0 is the front [rad].
 _STATIONS = np.radians([75.0, 50.0, 25.0, 0.0, -25.0, -50.0, -75.0])
 _STATION_WIDTH = np.radians(9.0)
 _FEWEST_VERTICES = 10
-# Half thickness and half height of the cross-sections, and their depth, of a mean adult mandible [mm].
+# Half thickness and half height of cross-sections, and depth of the body below the scan, of a mean adult mandible [mm].
 _BODY_MM = (5.5, 13.0)
 _BODY_BELOW_SCAN_MM = 9.0
 _HEAD_MM, _NECK_MM, _RAMUS_MM, _ANGLE_MM = (9.0, 4.5), (5.0, 4.0), (4.5, 14.0), (5.0, 13.0)
@@ -50,7 +51,7 @@ class Placeholder:
     Attributes:
         mesh: Closed surface, mandible frame [mm].
         condyles: Centres left and right, mandible frame [mm], shape (2, 3).
-        source: Where the condyles come from.
+        source: Source of the condyles.
     """
 
     mesh: Mesh
@@ -68,9 +69,9 @@ def grow_placeholder(rig: JawRig, lower_teeth: Mesh) -> Placeholder:
 
 
 def find_condyles(rig: JawRig) -> tuple[Array, str]:
-    """Return the condyle centres left and right, mandible frame [mm], shape (2, 3), and where they come from.
+    """Return the centres of left and right condyle, mandible frame [mm], shape (2, 3), and their source.
 
-    The motion gives height and depth of a condyle; its distance from the midline is that of the landmark.
+    The motion determines height and depth of a condyle; its distance from the midline is that of the landmark.
     """
     landmarks = rig.landmarks[_CONDYLES]
     inferred = [text for text in rig.inferred if text.startswith("condyle")]
@@ -88,7 +89,7 @@ def find_condyles(rig: JawRig) -> tuple[Array, str]:
 
 
 def _thinnest(poses: Array, mean: Array) -> Array | None:
-    """Return the point near a mean position whose sagittal trajectory is thinnest; None if the motion is too poor."""
+    """Return the point near a mean position with the thinnest sagittal trajectory; None if the motion is too small."""
     offsets = np.arange(-_REACH_MM, _REACH_MM + 0.5 * _STEP_MM, _STEP_MM)
     grid = np.stack(np.meshgrid([0.0], offsets, offsets, indexing="ij"), axis=-1)[0] + mean
     thickness = np.array([[_thickness(poses, point) for point in row] for row in grid])
@@ -99,7 +100,7 @@ def _thinnest(poses: Array, mean: Array) -> Array | None:
 
 
 def _thickness(poses: Array, point: Array) -> float:
-    """Return the RMS distance [mm] of a point's sagittal trajectory from a smooth path through it."""
+    """Return the RMS distance [mm] of a point's sagittal trajectory from a smooth path."""
     y, z = transform_point(poses, point)[:, 1:].T
     travel = np.ptp(z)
     if travel < _LEAST_TRAVEL_MM:
@@ -111,7 +112,7 @@ def _thickness(poses: Array, point: Array) -> float:
 
 
 def _control_sections(scan: Array, condyles: Array) -> tuple[Array, Array, Array]:
-    """Return centres and both half axes of the control sections from the left condyle to the right one, each (n, 3)."""
+    """Return centres and half axes of the control sections from the left to the right condyle, each (n, 3)."""
     body, thin, tall = _body(scan)
     left, right = (np.array(_ramus(condyle, body[end])) for condyle, end in ((condyles[0], 0), (condyles[1], -1)))
     sections = np.concatenate([left, np.stack([body, thin, tall], axis=1), right[::-1]])
@@ -119,7 +120,7 @@ def _control_sections(scan: Array, condyles: Array) -> tuple[Array, Array, Array
 
 
 def _ramus(condyle: Array, rear: Array) -> list[tuple[Array, Array, Array]]:
-    """Return centre and half axes of head, neck, ramus and angle; the thin axis points outward on either side."""
+    """Return centre and half axes of head, neck, ramus and angle. The thin axis points outward on both sides."""
     side = np.sign(condyle[0])
     angle = np.array([0.9 * condyle[0], rear[1] - 4.0, condyle[2] + 10.0])
     neck = condyle + [0.0, -11.0, 2.0]
@@ -140,9 +141,9 @@ def _body(scan: Array) -> tuple[Array, Array, Array]:
         if len(near) >= _FEWEST_VERTICES:
             known.append(station)
             found.append([*near[:, [0, 2]].mean(axis=0), np.percentile(near[:, 1], 5)])
-    if len(known) < 2:  # a scan of a few teeth: a body of its own size around them
+    if len(known) < 2:  # a scan of a few teeth: use a body of default size around them
         known, found = [0.0], [[*scan[:, [0, 2]].mean(axis=0), scan[:, 1].min()]]
-    # stations run from left to right, np.interp needs rising ones
+    # stations run from left to right; np.interp needs increasing values
     x, z, low = (np.interp(_STATIONS, known[::-1], column) for column in np.array(found)[::-1].T)
     centres = np.stack([x, low - _BODY_BELOW_SCAN_MM, z], axis=1)
     outward = np.stack([np.sin(_STATIONS), np.zeros(len(_STATIONS)), np.cos(_STATIONS)], axis=1)
@@ -153,7 +154,7 @@ def _swept(centres: Array, thin: Array, tall: Array) -> tuple[Array, NDArray[np.
     """Return vertices and faces of elliptic sections swept along a smooth path, closed by rounded ends."""
     at = np.linspace(0, len(centres) - 1, _SECTIONS * (len(centres) - 1) + 1)
     centres, thin, tall = (_smooth(rows, at) for rows in (centres, thin, tall))
-    # Domes: sections on beyond both ends, shrinking as a circle does.
+    # Rounded caps: further sections beyond both ends, shrinking like a circle.
     turn = np.linspace(0, np.pi / 2, 7)[1:-1]
     for end, inner in ((0, 1), (-1, -2)):
         ahead = centres[end] - centres[inner]
@@ -169,7 +170,7 @@ def _swept(centres: Array, thin: Array, tall: Array) -> tuple[Array, NDArray[np.
 
 
 def _smooth(rows: Array, at: Array) -> Array:
-    """Return a Catmull-Rom curve through rows (n, 3), at places 0 .. n - 1."""
+    """Return a Catmull-Rom curve through rows (n, 3) at parameters 0 .. n - 1."""
     slopes = np.gradient(rows, axis=0)
     i = np.minimum(at.astype(int), len(rows) - 2)
     t = (at - i)[:, None]
@@ -188,6 +189,6 @@ def _tube_faces(rings: int) -> NDArray[np.int32]:
 
 
 def _outward(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the faces turned so that their normals point out of the volume."""
+    """Return the faces, flipped if their normals point into the volume."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return faces if np.einsum("ij,ij->", a, np.cross(b, c)) > 0 else faces[:, ::-1].copy()

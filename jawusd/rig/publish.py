@@ -1,4 +1,8 @@
-"""Copy a rig under names of its own: tools that gather files from several actors into one folder mix up equal names."""
+"""Packages for viewers (`.usdz`), and copies of a rig with unique file names.
+
+A package is an actor or a whole shot, flattened into one layer. Unique names are needed by tools that gather files of
+several actors in one folder and confuse files of equal names.
+"""
 
 from __future__ import annotations
 
@@ -7,49 +11,134 @@ import re
 import shutil
 from pathlib import Path
 
-from pxr import Sdf, UsdUtils
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdUtils
 
 from jawusd.base.errors import RigError
 from jawusd.base.inputs import check_input, is_allowed
-from jawusd.formats.atomic import atomic_path
-from jawusd.rig.checksums import record_checksums
-from jawusd.rig.layers import named_after, write_layer
+from jawusd.formats.atomic import atomic_path, scratch_folder
+from jawusd.rig.asset_paths import CHECKSUMS, record_checksums
+from jawusd.rig.layers import rename_actor, write_layer
 from jawusd.rig.layout import (
     ACTOR_FILE,
+    CAPTURED_FILE,
     ENCODE_FILE,
     GEO_FILE,
+    ONNX_ATTRIBUTES,
     ONNX_FILE,
     PACKAGE_FILE,
     PROXY_FILE,
     RIG_FILE,
     check_prim_name,
+    has_jaw_api,
     prim_name_of,
 )
-from jawusd.rig.package import write_package
 from jawusd.rig.read import describe, open_stage
 
+# Archives store file times; a fixed time makes packages reproducible. It is the first that a zip can store in any zone.
+_ZIP_EPOCH = 315_619_200
+_OP = "xformOp:"
 _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 _LAYERS, _COPIED = (".usda", ".usdc", ".usd"), (".onnx",)
-_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # written before what refers to them
-_CAPTURED = "anim_capture.usdc"
+_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # each before those that refer to it
+_NAMES_INSIDE = "actor.usdc", "shot.usdc"
+# Binary layers compress vectors of small integers, which three.js (r187) reads as NaN. This offset avoids integers.
+_OFFSET = 1e-9
+
+
+def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -> Path:
+    """Flatten `actor.usda`, an animation layer on it, or a shot with several actors into a `.usdz`.
+
+    The layer inside is binary: a third of the size of text, and faster to open. The ONNX files are left out, because
+    packages may only contain USD, images and sound.
+
+    Raises:
+        RigError: The source cannot be opened or packed, or has no rig.
+        OutputError: The package cannot be written.
+    """
+    out = Path(out)
+    layer = _flattened(open_stage(source), source)
+    with scratch_folder(out) as scratch:
+        rigs = [path for path in _rigs_in(layer) if not path.IsRootPrimPath()]
+        flat = scratch / _NAMES_INSIDE[bool(rigs)]
+        if not layer.Export(str(flat)):
+            raise RigError("OpenUSD could not flatten it.", path=source)
+        os.utime(flat, (_ZIP_EPOCH, _ZIP_EPOCH))
+        with atomic_path(out) as temporary:
+            if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(flat)), str(temporary)):
+                raise RigError("OpenUSD could not pack it.", path=out)
+    return out
+
+
+def _flattened(stage: Usd.Stage, source: str | os.PathLike[str]) -> Sdf.Layer:
+    layer = stage.Flatten(addSourceFileComment=False)
+    rigs = _rigs_in(layer)
+    if not rigs:
+        raise RigError("has no jaw rig.", path=source)
+    layer.customLayerData = {key: value for key, value in layer.customLayerData.items() if key != CHECKSUMS}
+    for path in rigs:
+        actor = layer.GetPrimAtPath(path)
+        for prop in actor.properties:
+            # flattening drops `custom` if the schema is known, and Blender imports only custom attributes
+            if prop.name.startswith("jaw:"):
+                prop.custom = True
+        for attribute in ONNX_ATTRIBUTES:
+            if attribute in actor.properties:
+                actor.RemoveProperty(actor.properties[attribute])
+        # the identifier is an asset path, and would be packed
+        actor.assetInfo = {key: value for key, value in dict(actor.assetInfo).items() if key != "identifier"}
+    _avoid_integers(layer)
+    return layer
+
+
+def _rigs_in(layer: Sdf.Layer) -> list[Sdf.Path]:
+    """Return the rig prims of a flattened layer, in which prototypes have other paths than in the stage."""
+    flat = Usd.Stage.Open(layer)
+    return [prim.GetPath() for prim in flat.TraverseAll() if has_jaw_api(prim)]
+
+
+def _avoid_integers(layer: Sdf.Layer) -> None:
+    """Offset integer-valued transforms by a millionth of a micrometre, or the least possible in single precision."""
+    found: list[Sdf.Path] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if _OP in path.name else None)
+    for path in found:
+        attribute = layer.GetAttributeAtPath(path)
+        if attribute is None:
+            continue
+        if attribute.default is not None:
+            attribute.default = _offset(attribute.default)
+        for time in layer.ListTimeSamplesForPath(path):
+            layer.SetTimeSample(path, time, _offset(layer.QueryTimeSample(path, time)))
+
+
+def _offset(value: object) -> object:
+    """Return a vector of integers with a small offset, and other values unchanged."""
+    if not isinstance(value, Gf.Vec3d | Gf.Vec3f) or any(x != round(x) for x in value):
+        return value
+    first = value[0] + _OFFSET
+    if isinstance(value, Gf.Vec3f):  # the next single-precision number
+        first = float(np.nextafter(np.float32(value[0]), np.float32(np.inf))) if value[0] else _OFFSET
+    return type(value)(first, value[1], value[2])
 
 
 def publish_rig(
     folder: str | os.PathLike[str], out: str | os.PathLike[str], prefix: str | None = None, prim_name: str | None = None
 ) -> list[Path]:
-    """Copy the layers and graphs of a rig's folder to another one, with a prefix to every name, and pack it anew.
+    """Copy the layers and ONNX graphs of a rig to another folder under prefixed names, and write a new package.
 
-    `actor.usda` becomes `hero.usda`, `rig.usdc` `hero_rig.usdc`; what the layers name is renamed in them.
+    `actor.usda` becomes `hero.usda`, `rig.usdc` becomes `hero_rig.usdc`. References in the layers are updated.
 
     Args:
-        prefix: Starts every name; None: the actor's name, as far as it makes file names.
-        prim_name: Of the actor's prim, and in front of joints; None: after the actor.
+        folder: The rig's folder.
+        out: The folder to write.
+        prefix: Prefix of all file names; None: the actor's name, with characters that file names cannot have replaced.
+        prim_name: Name of the actor's prim and prefix of its joints; None: derived from the actor's name.
 
     Returns:
         The files, in the order written.
 
     Raises:
-        RigError: No rig, a prefix that makes no file names, or a folder that would be written over.
+        RigError: No rig, an invalid prefix, or the output is the rig's own folder.
         OutputError: A file cannot be written.
     """
     folder, out = Path(folder), Path(out)
@@ -59,47 +148,47 @@ def publish_rig(
         prefix = re.sub(r"[^A-Za-z0-9_-]", "_", described["actor"])
     if not _PREFIX.fullmatch(prefix):
         raise RigError(
-            f'"{prefix}" starts no file names; letters, digits, "_" and "-" do, from a letter on.',
+            f'"{prefix}" is not a valid prefix: use letters, digits, "_" and "-", starting with a letter.',
             path=actor,
-            hint="Give another one with --prefix.",
+            hint="Set another one with --prefix.",
         )
     if out.resolve() == folder.resolve():
-        raise RigError("is the rig's own folder; publish to another one.", path=out)
+        raise RigError("is the rig's own folder; publish to another folder.", path=out)
     found = [path.name for path in sorted(folder.iterdir()) if path.suffix in (*_LAYERS, *_COPIED)]
     ordered = [*(name for name in _FIRST if name in found), *(name for name in found if name not in _FIRST)]
-    names = {name: _named(prefix, name) for name in ordered}
+    names = {name: _prefixed(prefix, name) for name in ordered}
     for name in names:
         _check_own(folder / name)
     out.mkdir(parents=True, exist_ok=True)
     prims = Sdf.Path(described["prim"]).name, check_prim_name(prim_name or prim_name_of(described["actor"]))
     written = [_copy(folder / name, out / new, names, prims) for name, new in names.items()]
-    shown = names.get(_CAPTURED, names[ACTOR_FILE])
-    return [*written, write_package(out / _named(prefix, PACKAGE_FILE), out / shown)]
+    shown = names.get(CAPTURED_FILE, names[ACTOR_FILE])
+    return [*written, write_package(out / _prefixed(prefix, PACKAGE_FILE), out / shown)]
 
 
 def _check_own(path: Path) -> None:
-    """Check that a file that is copied is one, and that no link brings it from elsewhere.
+    """Check that a file to be copied is a regular file, and not a link to another folder.
 
     Raises:
-        RigError: It is not.
+        RigError: It is not a regular file, or links to another folder.
     """
     check_input(path, RigError)
     if not is_allowed(path) and not path.resolve().is_relative_to(path.parent.resolve()):
-        raise RigError("links to a file outside its own folder.", path=path, hint="Put a copy in its place.")
+        raise RigError("links to a file outside its own folder.", path=path, hint="Replace the link by a copy.")
 
 
-def _named(prefix: str, name: str) -> str:
-    """Return a name with the prefix, which takes the place of "actor"."""
+def _prefixed(prefix: str, name: str) -> str:
+    """Return a file name with the prefix, which replaces a leading "actor"."""
     return prefix + (name.removeprefix("actor") if name.startswith("actor") else f"_{name}")
 
 
 def _copy(source: Path, target: Path, names: dict[str, str], prims: tuple[str, str]) -> Path:
-    """Copy a file with the names of files and of the actor's prim, before and after, changed in it."""
+    """Copy a file and rename the files and the actor's prim (before, after) that it refers to."""
     if source.suffix in _COPIED:
         with atomic_path(target) as temporary:
             shutil.copyfile(source, temporary)
         return target
-    open_stage(source)  # refuses what reaches out of its folder
+    open_stage(source)  # rejects references to files outside its folder
     layer = Sdf.Layer.OpenAsAnonymous(str(source))
 
     def renamed(asset: str) -> str:
@@ -107,7 +196,7 @@ def _copy(source: Path, target: Path, names: dict[str, str], prims: tuple[str, s
         return f"./{names[parts[0]]}" if len(parts) == 1 and parts[0] in names else asset
 
     UsdUtils.ModifyAssetPaths(layer, renamed)
-    named_after(layer, prims[1], prims[0], "|".join(["", *(rf"\./{re.escape(new)}" for new in names.values())]))
+    rename_actor(layer, prims[1], prims[0], "|".join(["", *(rf"\./{re.escape(new)}" for new in names.values())]))
     if source.name == ACTOR_FILE:
         record_checksums(
             layer, target.parent, [names[name] for name in (GEO_FILE, PROXY_FILE, RIG_FILE) if name in names]

@@ -16,13 +16,10 @@ from jawusd.base.errors import EvaluatorError, FormatError, RigError, UnitsError
 from jawusd.base.guard import out_of_memory
 from jawusd.base.inputs import check_path
 from jawusd.evaluator import JawRig
-from jawusd.rig.arrays import read_arrays, read_value, value_of
-from jawusd.rig.keys import key_times
-from jawusd.rig.layout import MADE_FOR, ONNX_ATTRIBUTES, PARAMETERS
-from jawusd.rig.schema import has_jaw_api, rig_prims
+from jawusd.rig.attributes import key_times, read_arrays, read_value, upgrade_rig, value_of, was_upgraded
+from jawusd.rig.layout import MODEL_HASH_KEY, ONNX_ATTRIBUTES, PARAMETERS, has_jaw_api, meshes_below, rig_prims
 from jawusd.rig.table import DecoderTable
 from jawusd.rig.untrusted import open_checked, raises_format_error
-from jawusd.rig.versions import upgrade_rig, was_upgraded
 
 PathArg = str | os.PathLike[str]
 
@@ -32,13 +29,13 @@ def load_rig(path: PathArg, prim_path: str | None = None) -> JawRig:
 
     Args:
         path: `actor.usda`, an animation layer, a package, or any stage that references an actor.
-        prim_path: Which rig, where a stage has several.
+        prim_path: The rig's prim, if the stage has several rigs.
 
     Raises:
         FormatError: No rig, several rigs, missing or malformed values.
         VersionError: Written by a newer version.
         UnitsError: Other units or twist order.
-        RigError: The stage cannot be opened, or names files outside its folder.
+        RigError: The stage cannot be opened, or refers to files outside its folder.
     """
     stage = open_stage(path)
     return rig_of(find_rig_prim(stage, path, prim_path), path)
@@ -48,14 +45,14 @@ def open_stage(path: PathArg) -> Usd.Stage:
     """Open a stage.
 
     Raises:
-        RigError: There is no such file, it is not USD, or names files that `check_reach` forbids.
-        ResourceError: It needs more memory than there is.
+        RigError: The file does not exist, is not USD, or refers to files that `check_file_access` rejects.
+        ResourceError: There is not enough memory.
     """
     path = Path(path)
     if not path.is_file():
         raise RigError("there is no such file.", path=path)
     if path.suffix == ".npz":
-        raise RigError("is an npz file, a USD file is needed.", path=path, hint="Name the rig's actor.usda.")
+        raise RigError("is an npz file; a USD file is needed.", path=path, hint="Give the rig's actor.usda.")
     check_path(path, RigError)
     try:
         return open_checked(path)
@@ -64,22 +61,22 @@ def open_stage(path: PathArg) -> Usd.Stage:
 
 
 def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None) -> Usd.Prim:
-    """Return the prim that carries the rig.
+    """Return the prim of a rig.
 
     Raises:
-        FormatError: There is none, there are several, or the named prim is none.
+        FormatError: There is no rig, there are several, or the given prim is not a rig.
     """
     if prim_path is not None:
         prim = stage.GetPrimAtPath(prim_path) if Sdf.Path.IsValidPathString(prim_path) else None
         if not prim or not has_jaw_api(prim):
-            raise FormatError(f"{prim_path} carries no jaw rig.", path=str(where))
+            raise FormatError(f"{prim_path} is not a jaw rig.", path=str(where))
         return prim
     prims = rig_prims(stage)
     if not prims:
-        raise FormatError("holds no jaw rig (no prim with JawRigAPI).", path=str(where))
+        raise FormatError("has no jaw rig (no prim with JawRigAPI).", path=str(where))
     if len(prims) > 1:
         names = ", ".join(str(prim.GetPath()) for prim in prims)
-        raise FormatError(f"holds several jaw rigs: {names}.", path=str(where), hint="Name the prim with --prim.")
+        raise FormatError(f"has several jaw rigs: {names}.", path=str(where), hint="Choose one with --prim.")
     return prims[0]
 
 
@@ -88,8 +85,8 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
     """Build the evaluator from a rig prim.
 
     Raises:
-        FormatError: A header that is not JSON or names another kind of model, or a package whose rig has not its own
-            model; else as `load_rig`.
+        FormatError: The metadata are not JSON or state another model kind, a package mixes files of several actors, or
+            as for `load_rig`.
     """
     upgrade_rig(prim, where)
     check_units(prim, where)
@@ -107,39 +104,39 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
         rig = JawRig(arrays, meta)
     except EvaluatorError as error:
         raise FormatError(error.message, path=str(where)) from error
-    # thresholds of a folder may have been edited; nobody edits packages, but packagers mix up equal names in them
+    # In a folder, thresholds may have been edited. In a package, a mismatch means that files of equal names were mixed.
     packed = prim.GetStage().GetRootLayer().identifier.endswith(".usdz")
-    if packed and not set(named_models(prim)) <= {None, rig.model_hash}:
+    if packed and not set(recorded_hashes(prim)) <= {None, rig.model_hash}:
         raise FormatError(
-            f"{prim.GetPath()} has not its own model (jaw:modelHash): files of several actors were mixed in packing.",
+            f"{prim.GetPath()} does not match its model (jaw:modelHash): packing mixed files of several actors.",
             path=str(where),
-            hint="Pack shots with `jawusd publish SHOT -o shot.usdz`, or publish the actors under names of their own.",
+            hint="Pack shots with `jawusd publish SHOT -o shot.usdz`, or publish the actors under other names first.",
         )
     return rig
 
 
-def named_models(prim: Usd.Prim) -> tuple[object, object]:
-    """Return the hashes of the models that a rig prim names: its own, and the one its motion is for; None for none.
+def recorded_hashes(prim: Usd.Prim) -> tuple[object, object]:
+    """Return the recorded hashes of a rig's model and of the model its motion was made with; None if not recorded.
 
-    None, too, for a rig of an older format, whose upgraded arrays have another hash.
+    Both are None for a rig of an older format version, because upgraded arrays have another hash.
     """
     if was_upgraded(prim):
         return None, None
     own = prim.GetAttribute("jaw:modelHash").Get() if prim.HasAttribute("jaw:modelHash") else None
     keyed = prim.HasAttribute(PARAMETERS[0])
-    return own, prim.GetAttribute(PARAMETERS[0]).GetCustomDataByKey(MADE_FOR) if keyed else None
+    return own, prim.GetAttribute(PARAMETERS[0]).GetCustomDataByKey(MODEL_HASH_KEY) if keyed else None
 
 
 def check_units(prim: Usd.Prim, where: object) -> None:
     """Check units and twist order.
 
     Raises:
-        UnitsError: They are not mm, rad and (omega, v).
+        UnitsError: They differ from mm, rad and (omega, v).
     """
     for name, wanted in (("jaw:lengthUnit", "mm"), ("jaw:angleUnit", "rad"), ("jaw:twistOrder", ["omega", "v"])):
         found = np.array(read_value(prim, name, where)).tolist()
         if found != wanted:
-            raise UnitsError(f"{name} is {found}, allowed is {wanted}.", path=str(where))
+            raise UnitsError(f"{name} is {found}, expected {wanted}.", path=str(where))
 
 
 @raises_format_error(1)
@@ -147,7 +144,7 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     """Read the sampled decoder of a rig prim.
 
     Raises:
-        FormatError: Values are missing, or do not match one another.
+        FormatError: Values are missing or inconsistent.
         VersionError: Written by a newer version.
     """
     upgrade_rig(prim, where)
@@ -160,9 +157,9 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     twists = _numbers(prim, "jaw:decoder:twists", where).astype(np.float32)
     shape = (*counts, 6) if stored_as == "grid" else (sum(counts), 6)
     if twists.size != math.prod(shape):
-        raise FormatError(f"jaw:decoder:twists holds {twists.size} numbers, expected {shape}.", path=str(where))
+        raise FormatError(f"jaw:decoder:twists has {twists.size} numbers, expected {shape}.", path=str(where))
     if not np.isfinite(twists).all() or not all(np.isfinite(axis).all() for axis in axes):
-        raise FormatError("jaw:decoder holds values that are not finite.", path=str(where))
+        raise FormatError("jaw:decoder has values that are not finite.", path=str(where))
     error_mm, samples = (_numbers(prim, f"jaw:decoder:{name}", where) for name in ("maxError", "errorSamples"))
     return DecoderTable(stored_as, axes, twists.reshape(shape), float(error_mm), int(samples))
 
@@ -172,7 +169,7 @@ def _numbers(prim: Usd.Prim, name: str, where: object) -> Array:
 
 
 class TableDescription(TypedDict):
-    """The sampled decoder of a rig, see `DecoderTable`."""
+    """Sampled decoder of a rig, see `DecoderTable`."""
 
     format: str
     shape: list[int]
@@ -180,7 +177,7 @@ class TableDescription(TypedDict):
 
 
 class Description(TypedDict):
-    """What a rig file holds, as plain JSON values."""
+    """Contents of a rig file, as plain JSON values."""
 
     file: str
     prim: str
@@ -207,7 +204,7 @@ class Description(TypedDict):
 
 @raises_format_error(0)
 def describe(path: PathArg, prim_path: str | None = None) -> Description:
-    """Return what a rig file holds, for `jawusd info`; arguments and errors as for `load_rig`."""
+    """Return the contents of a rig file, for `jawusd info`; arguments and errors as for `load_rig`."""
     stage = open_stage(path)
     prim = find_rig_prim(stage, path, prim_path)
     rig = rig_of(prim, path)
@@ -240,7 +237,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "fps": stage.GetTimeCodesPerSecond(),
         "animation": animation,
         "meshes": _meshes(prim, path),
-        "placeholders": [p.GetName() for p in _below(prim) if p.GetAttribute("jaw:placeholder").Get()],
+        "placeholders": [p.GetName() for p in meshes_below(prim) if p.GetAttribute("jaw:placeholder").Get()],
         "contact": rig.meta.get("contact"),
         "joints": rig.meta.get("joints"),
         "speeds": _speeds(rig),
@@ -257,10 +254,5 @@ def _speeds(rig: JawRig) -> dict[str, list[float]] | None:
 
 def _meshes(prim: Usd.Prim, where: object) -> dict[str, int]:
     """Return the number of points of every mesh below a prim, by name."""
-    meshes = [UsdGeom.Mesh(p) for p in _below(prim) if p.IsA(UsdGeom.Mesh)]
+    meshes = [UsdGeom.Mesh(p) for p in meshes_below(prim)]
     return {mesh.GetPrim().GetName(): len(np.array(value_of(mesh.GetPointsAttr(), where) or [])) for mesh in meshes}
-
-
-def _below(prim: Usd.Prim) -> Usd.PrimRange:
-    """Return a prim and all below it, of an instance too."""
-    return Usd.PrimRange(prim, Usd.TraverseInstanceProxies())

@@ -1,4 +1,4 @@
-"""Bring d and the mandible of a stage together again, where only one of them was keyed or moved."""
+"""Make d and the mandible of a stage consistent again after only one of them was edited."""
 
 from __future__ import annotations
 
@@ -17,38 +17,39 @@ from jawusd.base.errors import FormatError, RigError
 from jawusd.evaluator import JawRig
 from jawusd.rig import _gf
 from jawusd.rig.animation import CARRIED, author_motion
-from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm
-from jawusd.rig.bones import bones_of
-from jawusd.rig.keys import key_times
+from jawusd.rig.attributes import key_times
 from jawusd.rig.layers import new_layer, relative_path, write_layer
-from jawusd.rig.layout import MOTION, PARAMETERS, SKELETON, TRANSFORMS
+from jawusd.rig.layout import MOTION, PARAMETERS, SKELETON, TRANSFORMS, rig_prims
 from jawusd.rig.motion_read import (
+    BAKED_MM,
+    comparison_times,
     frames_of_stage,
     mandible_of,
     moving_attributes,
     parameters_of,
     poses_at,
+    skull_displacement_mm,
 )
 from jawusd.rig.read import find_rig_prim, open_stage, rig_of
-from jawusd.rig.schema import rig_prims
+from jawusd.rig.skel import bones_of
 from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
 Origin = Literal["d", "mandible"]
-_SAME_MM = 1e-6
+_SAME_MM = 1e-6  # keys of d that differ by less are equal
 
 
 class StageMotion(NamedTuple):
     """A motion of a rig in a stage.
 
     Attributes:
-        frames: Times, increasing, shape (F,).
+        frames: Increasing times, shape (F,).
         d: Jaw parameters [mm], shape (F, 3), NaN in lost frames.
         fps: Frames per second.
-        origin: What it was read from, the keys of d or the mandible's transforms.
+        origin: Source of the motion: the keys of d or the mandible's transforms.
         residual_mm: Distance of the mandible's poses from the model, shape (F,); zero for d.
-        fitted: Whether the rig's meshes were fitted to a stage that does not carry the rig.
-        prim: The rig's prim in the stage; empty if fitted.
+        fitted: Whether the rig's meshes were fitted to a stage without the rig.
+        prim: Path of the rig's prim in the stage; empty if fitted.
     """
 
     frames: Array
@@ -60,8 +61,14 @@ class StageMotion(NamedTuple):
     prim: str = ""
 
 
-class Departure(NamedTuple):
-    """How far a mandible is from where d puts it: in how many of the frames looked at, and the largest distance."""
+class Deviation(NamedTuple):
+    """Deviation of a mandible from the pose given by d.
+
+    Attributes:
+        frames: Number of frames that deviate.
+        of: Number of frames compared.
+        largest_mm: Largest landmark distance.
+    """
 
     frames: int
     of: int
@@ -69,52 +76,52 @@ class Departure(NamedTuple):
 
 
 @raises_format_error(0)
-def departure(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None = None) -> Departure | None:
-    """Return how far the mandible of a stage departs from its d; None where d has no keys.
+def deviation(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None = None) -> Deviation | None:
+    """Return the deviation of the mandible of a stage from its d; None if d has no keys.
 
     Raises:
         RigError: Not a stage.
-        FormatError: No rig or several, no mandible, or parameters that are not finite.
+        FormatError: No rig or several rigs, no mandible, or parameters that are not finite.
     """
     stage = open_stage(path)
-    return _departure(_actor(stage, path, rig, prim_path), rig, path)
+    return _deviation(_actor(stage, path, rig, prim_path), rig, path)
 
 
-def _departure(actor: Usd.Prim, rig: JawRig, path: object) -> Departure | None:
+def _deviation(actor: Usd.Prim, rig: JawRig, path: object) -> Deviation | None:
     stage, mandible = actor.GetStage(), mandible_of(actor, path)
     moving, parameters = moving_attributes(mandible, actor), [actor.GetAttribute(name) for name in PARAMETERS]
     sampled = parameters_of(actor, path)
     if not all(parameters) or (sampled is None and _rank(stage, parameters) >= _rank(stage, moving)):
         return None
-    times, allowed_mm = looked_at(actor, moving, bones_of(mandible) is not None)
+    times, allowed_mm = comparison_times(actor, moving, bones_of(mandible) is not None)
     times = times if len(times) else np.zeros(1)
     d = np.array([[attribute.Get(time) for attribute in parameters] for time in times.tolist()], dtype=np.float64)
     away = landmark_distance(rig, poses_at(mandible, actor, times, path), rig.pose(d))
-    return Departure(int((~(away <= allowed_mm)).sum()), len(away), float(away.max()))
+    return Deviation(int((~(away <= allowed_mm)).sum()), len(away), float(away.max()))
 
 
 @raises_format_error(0)
 def motion_of_stage(
     path: str | os.PathLike[str], rig: JawRig, prim_path: str | None = None, origin: Origin | None = None
 ) -> StageMotion:
-    """Read the motion of a rig in a stage, from what was edited: keys of d, or transforms of the mandible.
+    """Read the motion of a rig in a stage from whichever was edited: keys of d or transforms of the mandible.
 
     Args:
-        prim_path: Which rig, where the stage has several.
-        origin: Which of both; None: the one that moves, or where both do and disagree, the one in the stronger layer.
+        prim_path: The rig's prim, if the stage has several rigs.
+        origin: Source to read; None: the one that is animated. If both are and disagree, the one in the stronger layer.
 
     Raises:
-        RigError: Not a stage, or d and mandible disagree and nothing says which one counts.
-        FormatError: No rig or several, no mandible, or a motion that is not rigid or not finite.
+        RigError: Not a stage, or d and mandible disagree and are in the same layer.
+        FormatError: No rig or several rigs, no mandible, or a motion that is not rigid or not finite.
     """
     stage = open_stage(path)
     actor = _actor(stage, path, rig, prim_path)
     mandible = mandible_of(actor, path)
     if origin is None:
-        origin = _origin(stage, actor, mandible, _departure(actor, rig, path), path)
+        origin = _origin(stage, actor, mandible, _deviation(actor, rig, path), path)
     sampled = parameters_of(actor, path)
     if origin == "d":
-        sampled = _held(stage, actor, path) if sampled is None else sampled
+        sampled = _constant_motion(stage, actor, path) if sampled is None else sampled
         return StageMotion(*sampled, origin, np.zeros(len(sampled[0])), prim=str(actor.GetPath()))
     frames = frames_of_stage(stage, path)
     d, residual_mm = rig.encode(poses_at(mandible, actor, frames, path))
@@ -122,10 +129,10 @@ def motion_of_stage(
     return StageMotion(frames.astype(np.float64), d, fps, origin, residual_mm, prim=str(actor.GetPath()))
 
 
-def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, away: Departure | None, path: object) -> Origin:
-    if away is None:
+def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, deviating: Deviation | None, path: object) -> Origin:
+    if deviating is None:
         return "mandible"
-    if not away.frames:
+    if not deviating.frames:
         return "d"
     moving = moving_attributes(mandible, actor)
     if not any(key_times(attribute) for attribute in moving):
@@ -133,29 +140,29 @@ def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, away: Departu
     ranks = [_rank(stage, attributes) for attributes in ([actor.GetAttribute(name) for name in PARAMETERS], moving)]
     if ranks[0] == ranks[1]:
         raise RigError(
-            f"d and the mandible disagree by up to {away.largest_mm:.2f} mm, and both have keys in one layer.",
+            f"d and the mandible disagree by up to {deviating.largest_mm:.2f} mm, and both have keys in one layer.",
             path=str(path),
-            hint="Say which one counts: --from d or --from mandible.",
+            hint="Choose the one to use: --from d or --from mandible.",
         )
     return "d" if ranks[0] < ranks[1] else "mandible"
 
 
 def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -> Usd.Prim:
-    """Return the prim that carries a rig, of several the only one made from the same model; refuse another person's."""
+    """Return a rig's prim in a stage: of several, the only one with the same model. Reject rigs of other people."""
     alike = [p for p in rig_prims(stage) if p.GetAttribute("jaw:modelHash").Get() == rig.model_hash]
     found = alike[0] if prim_path is None and len(alike) == 1 else find_rig_prim(stage, path, prim_path)
     own, other = (str(meta.get("actor") or "") for meta in (rig.meta, rig_of(found, path).meta))
     if own and other and own != other:
         raise FormatError(
-            f'{found.GetPath()} is the rig of "{other}", the rig given is of "{own}": another person\'s d and bound.',
+            f'{found.GetPath()} is the rig of "{other}", but the given rig is of "{own}"; their d and bounds differ.',
             path=str(path),
-            hint="Name the rig of that person, or carry the motion over with `jawusd retarget`.",
+            hint="Give the rig of that person, or transfer the motion with `jawusd retarget`.",
         )
     return found
 
 
-def _held(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array, float]:
-    """Return a d without keys as a motion that stays there: first and last frame, d twice [mm], frames per second."""
+def _constant_motion(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array, float]:
+    """Return a d without keys as a constant motion: first and last frame, d at both [mm], frames per second."""
     frames = frames_of_stage(stage, path)[[0, -1]]
     d = np.array([actor.GetAttribute(name).Get() for name in PARAMETERS], dtype=np.float64)
     if not np.isfinite(d).all():
@@ -165,7 +172,7 @@ def _held(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array
 
 
 def _rank(stage: Usd.Stage, attributes: list[Usd.Attribute]) -> float:
-    """Return how many layers of a stage are stronger than the strongest opinion of several attributes."""
+    """Return the number of layers that are stronger than the strongest opinion about any of several attributes."""
     layers = stage.GetLayerStack(includeSessionLayers=False)
     strongest = [stack[0].layer for stack in (attribute.GetPropertyStack() for attribute in attributes) if stack]
     return min((float(layers.index(layer)) for layer in strongest if layer in layers), default=np.inf)
@@ -181,15 +188,15 @@ def write_over(
     prim_path: str,
     carried: ArrayLike = (),
 ) -> Path:
-    """Write a motion as a layer over a stage, for one of its rigs; its frames pass at their own rate.
+    """Write a motion for one rig of a stage as a layer over the stage, keeping the frame rate of the motion.
 
     Args:
         out: File to write; it sublayers the stage.
-        frames: Frame numbers, increasing, shape (F,).
-        d: Jaw parameters [mm], shape (F, 3); rows with NaN are bridged.
+        frames: Increasing frame numbers, shape (F,).
+        d: Jaw parameters [mm], shape (F, 3); rows with NaN are interpolated.
         fps: Frames per second.
-        prim_path: Which rig of the stage.
-        carried: Frames whose d was not seen.
+        prim_path: The rig's prim.
+        carried: Frames whose d was inferred; see `write_animation`.
 
     Raises:
         JawusdError: As `write_rebaked`.
@@ -201,7 +208,7 @@ def write_over(
 
 
 class Rebaked(NamedTuple):
-    """What a rig of a stage is given: times (F,) and d [mm] (F, 3); its prim, where the stage has several."""
+    """Motion for a rig of a stage: times (F,), d (F, 3) [mm], and the rig's prim if the stage has several."""
 
     rig: JawRig
     times: Array
@@ -217,27 +224,28 @@ def write_rebaked(
     *,
     root: bool = False,
 ) -> list[str]:
-    """Write a layer for a stage that gives its rigs d and the mandible's ops that belong to it.
+    """Write a layer for a stage with d of its rigs and the matching ops of their mandibles.
 
-    An instance is made editable: its mandible could not be moved otherwise. A rig that follows its skeleton follows its
-    transforms from then on.
+    Instances are made editable, because their mandibles cannot be moved otherwise. Rigs with a selected skeleton are
+    switched to transforms.
 
     Args:
         out: File to write.
-        carried: Times whose d was not seen; see `write_animation`.
-        root: Whether it sublayers the stage; else it is to be sublayered by the stage, or above it.
+        motions: The motions, one for each rig to animate.
+        carried: Times whose d was inferred; see `write_animation`.
+        root: Whether the layer sublayers the stage. Otherwise it is meant to become a sublayer of the stage.
 
     Returns:
-        The paths of what the stage's own root layer has opinions on: these are stronger than those of its sublayers.
+        Paths on which the stage's root layer has its own opinions, which are stronger than those of a sublayer.
 
     Raises:
-        RigError: Not a stage, the output is the stage itself, or the mandible would not go where d puts it.
-        FormatError: No rig or several, or no mandible.
+        RigError: Not a stage, the output is the stage itself, or a mandible would not move to the pose of its d.
+        FormatError: No rig or several rigs, or no mandible.
         OutputError: The file cannot be written.
     """
     out = Path(out)
     if out.resolve() == Path(shot).resolve():
-        raise RigError("the layer written goes over the stage and cannot replace it.", path=out)
+        raise RigError("the output is a layer over the stage and cannot replace it.", path=out)
     stage = open_stage(shot)
     layer = _layer_over(stage, np.concatenate([motion.times for motion in motions]))
     if len(np.atleast_1d(carried)):
@@ -249,11 +257,11 @@ def write_rebaked(
     if root:
         layer.subLayerPaths.append(relative_path(Path(shot), out))
     write_layer(layer, out)
-    return [] if root else _stronger_in_root(stage, layer)
+    return [] if root else _overridden_by_root(stage, layer)
 
 
 def _layer_over(stage: Usd.Stage, times: Array) -> Sdf.Layer:
-    """Return a layer in memory with units, rate and span of a stage; without one, with that of times."""
+    """Return an anonymous layer with the units, rate and time range of a stage, or of the times if it has no range."""
     layer = new_layer(float(stage.GetTimeCodesPerSecond()))
     layer.pseudoRoot.SetInfo(UsdGeom.Tokens.metersPerUnit, UsdGeom.GetStageMetersPerUnit(stage))
     layer.pseudoRoot.SetInfo(UsdGeom.Tokens.upAxis, UsdGeom.GetStageUpAxis(stage))
@@ -266,23 +274,23 @@ def _layer_over(stage: Usd.Stage, times: Array) -> Sdf.Layer:
 
 def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) -> None:
     mandible = mandible_of(actor, shot)
-    if not (away_mm := skull_moved_mm(actor, motion.rig, shot)) <= BAKED_MM:
+    if not (away_mm := skull_displacement_mm(actor, motion.rig, shot)) <= BAKED_MM:
         raise RigError(
-            f"{actor.GetPath()} has its skull moved by {away_mm:.2f} mm: a mandible baked in it would be off as much.",
+            f"the skull of {actor.GetPath()} is moved by {away_mm:.2f} mm: a baked mandible would be off by as much.",
             path=str(shot),
-            hint="Move the actor instead of its skull, or give it the motion: jawusd encode, then jawusd animate.",
+            hint="Move the actor instead of its skull, or animate it: jawusd encode, then jawusd animate.",
         )
     paths = str(actor.GetPath()), str(mandible.GetPath())
     author_motion(layer, motion.rig, motion.times, motion.d, motion.times[[0, -1]], paths)
     moved = layer.GetPrimAtPath(mandible.GetPath())
     order = Sdf.AttributeSpec(moved, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
-    order.default = Vt.TokenArray(["xformOp:translate", "xformOp:orient"])  # whatever it was moved by
+    order.default = Vt.TokenArray(["xformOp:translate", "xformOp:orient"])  # replaces any other ops
     if bones_of(mandible) is not None:
         if actor.GetVariantSet(MOTION).GetVariantSelection() != SKELETON:
             raise RigError(
-                f"bones move {mandible.GetPath()}, and would over what is written.",
+                f"bones move {mandible.GetPath()} and would override the baked motion.",
                 path=str(shot),
-                hint="Give the motion to the actor itself: jawusd encode, then jawusd animate.",
+                hint="Animate the actor itself: jawusd encode, then jawusd animate.",
             )
         layer.GetPrimAtPath(actor.GetPath()).variantSelections[MOTION] = TRANSFORMS
     for prefix in mandible.GetPath().GetPrefixes():
@@ -291,27 +299,27 @@ def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) ->
 
 
 def _check_moves(layer: Sdf.Layer, prims: list[str], motions: Sequence[Rebaked], shot: str | os.PathLike[str]) -> None:
-    """Compose a layer over its stage, and check that its mandibles are where d puts them in the world.
+    """Compose a layer over its stage and check that its mandibles have the poses of d in the world.
 
     Raises:
-        RigError: One is not.
+        RigError: A mandible has another pose.
     """
     root = Sdf.Layer.CreateAnonymous(".usda")
     root.timeCodesPerSecond = layer.timeCodesPerSecond
     root.subLayerPaths = [layer.identifier, str(Path(shot).resolve())]
     composed = Usd.Stage.Open(root)
     for prim, motion in zip(prims, motions, strict=True):
-        away = _departure(composed.GetPrimAtPath(prim), motion.rig, shot)
+        away = _deviation(composed.GetPrimAtPath(prim), motion.rig, shot)
         if away is not None and away.frames:
             raise RigError(
-                f"the mandible of {prim} would still be {away.largest_mm:.2f} mm from where d puts it.",
+                f"the mandible of {prim} would still be {away.largest_mm:.2f} mm from its pose by d.",
                 path=str(shot),
-                hint="Prims above or below the mandible move it, too: `jawusd validate` names them.",
+                hint="Prims above or below the mandible move it as well: `jawusd validate` lists them.",
             )
 
 
-def _stronger_in_root(stage: Usd.Stage, layer: Sdf.Layer) -> list[str]:
-    """Return the paths of a layer's attributes and prims that the root layer of a stage says something else of."""
+def _overridden_by_root(stage: Usd.Stage, layer: Sdf.Layer) -> list[str]:
+    """Return the paths of a layer's attributes and prims on which the root layer of a stage has other opinions."""
     found: list[str] = []
     root = stage.GetRootLayer()
 
@@ -319,7 +327,7 @@ def _stronger_in_root(stage: Usd.Stage, layer: Sdf.Layer) -> list[str]:
         if path.IsPrimPropertyPath() and root.GetAttributeAtPath(path):
             times, attribute = layer.ListTimeSamplesForPath(path), stage.GetAttributeAtPath(path)
             same = not times and root.GetAttributeAtPath(path).default == layer.GetAttributeAtPath(path).default
-            if path.name in PARAMETERS:  # keys of d that stay as they are
+            if path.name in PARAMETERS:  # unchanged keys of d do not count
                 now, then = (
                     [value(time) for time in times] for value in (attribute.Get, partial(layer.QueryTimeSample, path))
                 )

@@ -1,4 +1,4 @@
-"""The rules for rigs: plain functions of a rig prim, independent of UsdValidation and of the schema plugin."""
+"""Validation rules for rigs: functions of a rig prim, independent of UsdValidation and of the schema plugin."""
 
 from __future__ import annotations
 
@@ -14,30 +14,35 @@ from jawusd.base.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import OUTSIDE, place
 from jawusd.rig.assembly import faults_of_assembly
-from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm
-from jawusd.rig.bones import bones_of
-from jawusd.rig.keys import time_codes, times_between
-from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
-from jawusd.rig.motion_read import mandible_of, moving_attributes, poses_at
-from jawusd.rig.read import named_models, read_table, rig_of
-from jawusd.rig.sampling import sample_valid
-from jawusd.rig.table import landmark_distance
-from jawusd.rig.untrusted import FAULTS, fault_message
+from jawusd.rig.attributes import key_and_frame_times, time_codes
+from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH_KEY
+from jawusd.rig.motion_read import (
+    BAKED_MM,
+    comparison_times,
+    mandible_of,
+    moving_attributes,
+    poses_at,
+    skull_displacement_mm,
+)
+from jawusd.rig.read import read_table, recorded_hashes, rig_of
+from jawusd.rig.skel import bones_of
+from jawusd.rig.table import landmark_distance, sample_valid
+from jawusd.rig.untrusted import VALUE_ERRORS, value_error_message
 
-_TABLE_SLACK_MM = 0.01  # the table states its error over more parameters than are tried here
+_TABLE_SLACK_MM = 0.01  # above the stated error of the table, which was measured at other parameters
 _OPS = [("xformOp:translate", "double3"), ("xformOp:orient", "quatd")]
-_PROBES = 500
+_PROBES = 500  # random valid d at which the table is compared with the model
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A violation of a rule, or a note.
+    """A violation of a rule, or information.
 
     Attributes:
         severity: "error", "warning" or "info".
         rule: Name of the rule.
         path: Prim or attribute concerned.
-        message: What was found and what is allowed.
+        message: The value found and the values allowed.
     """
 
     severity: str
@@ -50,26 +55,26 @@ Rule = Callable[[Usd.Prim], Iterator[Finding]]
 
 
 def check_model(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that version, units and model arrays can be read, and are those of the motion on top of them."""
+    """Check that version, units and model arrays can be read, and that the motion was made with this model."""
     try:
         rig = rig_of(prim, _where(prim))
     except JawusdError as error:
         yield _finding("error", "Model", prim, error.message)
         return
-    own, made_for = named_models(prim)
+    own, made_for = recorded_hashes(prim)
     if own not in (None, rig.model_hash):
         message = "the model is not the one it was baked from (jaw:modelHash): files of several actors were mixed, "
-        message += "or values of it, as ranges, were changed by hand. `jawusd publish` gives actors names of their own."
+        message += "or model values such as ranges were edited. `jawusd publish` gives each actor unique file names."
         yield _finding("error", "Model", prim, message)
     if made_for not in (None, rig.model_hash):
         message = f"the model is not the one that its motion was made with ({PARAMETERS[0]} names another). "
-        message += "Either files of several actors were mixed: `jawusd publish` them first. "
-        message += "Or the rig was built anew since: `jawusd rebake` the motion."
+        message += "Either files of several actors were mixed: run `jawusd publish` on them first. "
+        message += "Or the rig was rebuilt since: run `jawusd rebake` on the motion."
         yield _finding("error", "Model", prim, message)
 
 
 def check_table(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that the sampled table is complete, and within its stated error of the exact model."""
+    """Check that the sampled table is complete and within its stated error of the exact model."""
     try:
         table = read_table(prim, _where(prim))
     except JawusdError as error:
@@ -87,21 +92,21 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that the ONNX files named by the rig were made from this model and give its results."""
+    """Check that the ONNX files of the rig were made from this model and give its results."""
     rig = _rig(prim)
     attributes = [prim.GetAttribute(name) for name in ONNX_ATTRIBUTES]
-    assets = {a.Get(): a.GetCustomDataByKey(SIDECAR_HASH) for a in attributes if isinstance(a.Get(), Sdf.AssetPath)}
+    assets = {a.Get(): a.GetCustomDataByKey(SIDECAR_HASH_KEY) for a in attributes if isinstance(a.Get(), Sdf.AssetPath)}
     if rig is None or not assets:
         return
     try:
-        from jawusd.rig.onnx_check import ALLOWED_MM, PROBES, onnx_error_mm
+        from jawusd.rig.onnx_sidecar import ALLOWED_MM, PROBES, onnx_error_mm
     except ImportError:
         yield _finding("info", "Onnx", prim, "not checked: the package onnx is not installed (jawusd[build]).")
         return
     d = sample_valid(rig, PROBES)
     for asset, recorded in assets.items():
         if not asset.resolvedPath:
-            yield _finding("error", "Onnx", prim, f"{asset.path} is not there.")
+            yield _finding("error", "Onnx", prim, f"{asset.path} does not exist.")
             continue
         try:
             error_mm = onnx_error_mm(asset.resolvedPath, rig, d, recorded)
@@ -114,27 +119,27 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that every value of d1, d2, d3, at every time, lies inside the bound; within the tolerance is a note."""
+    """Check that d1, d2, d3 are inside the bound at every time; within the tolerance it is information only."""
     rig = _rig(prim)
     if rig is None:
         return
-    times = time_codes(times_between(prim.GetAttribute(name) for name in PARAMETERS)[0])
+    times = time_codes(key_and_frame_times(prim.GetAttribute(name) for name in PARAMETERS)[0])
     d = _parameters(prim, times)
     margin = rig.margin(d)
     worst = int(np.argmin(np.where(np.isfinite(margin), margin, -np.inf)))
     outside = ~rig.is_inside(d)
     if outside.any():
         values = ", ".join(f"{x:.2f}" for x in d[worst])
-        said = place(float(margin[worst]), rig.tolerance_mm)
+        verdict = place(float(margin[worst]), rig.tolerance_mm)
         message = f"{outside.sum()} of {len(d)} samples are outside; worst at {times[worst]}: d = ({values}) mm, "
-        message += f"margin {margin[worst]:.2f} mm, {said}."
-        yield _finding("warning" if said == OUTSIDE else "info", "Bounds", prim, message)
+        message += f"margin {margin[worst]:.2f} mm, {verdict}."
+        yield _finding("warning" if verdict == OUTSIDE else "info", "Bounds", prim, message)
 
 
 def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that the mandible moves as the model does: by translate (double3) and orient (quatd) alone, or by bones."""
+    """Check that the mandible moves like the model: by translate (double3) and orient (quatd) only, or by bones."""
     if not prim.IsLoaded():
-        yield _finding("error", "Mandible", prim, "the geometry (payload) is not loaded: nothing can be checked.")
+        yield _finding("error", "Mandible", prim, "the geometry (payload) is not loaded and cannot be checked.")
         return
     try:
         mandible = mandible_of(prim, _where(prim))
@@ -146,18 +151,18 @@ def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
     if bones is None and (names != _OPS or body.GetResetXformStack()):
         message = f"the ops are {names}, expected translate (double3) and orient (quatd)."
         if body.GetResetXformStack():
-            message = "!resetXformStack! takes it out of the actor: it stays behind where the actor is moved."
+            message = "!resetXformStack! detaches it from the actor: it does not move with the actor."
         yield _finding("error", "Mandible", mandible, message)
         return
     rig = _rig(prim)
     if rig is None:
         return
     moving = moving_attributes(mandible, prim)
-    at, allowed_mm = looked_at(prim, moving, bones is not None)
+    at, allowed_mm = comparison_times(prim, moving, bones is not None)
     times = time_codes(at)
     try:
         baked = poses_at(mandible, prim, at, _where(prim))
-        away_mm = skull_moved_mm(prim, rig, _where(prim))
+        away_mm = skull_displacement_mm(prim, rig, _where(prim))
     except FormatError as error:
         yield _finding("error", "Mandible", mandible, error.message)
         return
@@ -165,12 +170,12 @@ def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
         message = f"the skull is moved in the actor by {away_mm:.3f} mm ({BAKED_MM} allowed): move the actor instead."
         yield _finding("error", "Mandible", prim, message)
         return
-    still = not any(attribute.GetNumTimeSamples() for attribute in moving)
-    yield from _check_baked(rig, mandible, times, baked, _parameters(prim, times), allowed_mm, still)
+    unkeyed = not any(attribute.GetNumTimeSamples() for attribute in moving)
+    yield from _check_baked(rig, mandible, times, baked, _parameters(prim, times), allowed_mm, unkeyed)
 
 
 def check_assembly(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that what a shot does to an actor leaves its jaw whole, shown, in its place and of its size."""
+    """Check that a shot does not hide, deform, detach or rescale the jaw of an actor."""
     for severity, at, message in faults_of_assembly(prim):
         yield _finding(severity, "Assembly", at, message)
 
@@ -182,7 +187,7 @@ def _check_baked(
     baked: Array,
     d: Array,
     allowed_mm: Array,
-    still: bool,
+    unkeyed: bool,
 ) -> Iterator[Finding]:
     error_mm = landmark_distance(rig, baked, rig.pose(d))
     over_mm = error_mm - allowed_mm
@@ -190,26 +195,26 @@ def _check_baked(
     if not over_mm[worst] <= 0:
         message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from that of d "
         message += f"({allowed_mm[worst]:.2f} allowed)."
-        message += " Only d is keyed, the mandible is not:" if still else " Bring both together:"
-        message += " bake it with `jawusd rebake`." if still else " `jawusd rebake`."
+        message += " Only d is keyed, the mandible is not: bake it with" if unkeyed else " To make them agree, run"
+        message += " `jawusd rebake`."
         yield _finding("error", "Mandible", mandible, message)
 
 
-def _with_any_values(name: str, rule: Rule) -> Rule:
-    """Return a rule that finds values of unexpected types, which any layer may hold, to be an error."""
+def _reporting_malformed_values(name: str, rule: Rule) -> Rule:
+    """Return a rule that reports values of unexpected types as an error."""
 
     @functools.wraps(rule)
     def checked(prim: Usd.Prim) -> Iterator[Finding]:
         try:
             yield from rule(prim)
-        except FAULTS as error:
-            yield _finding("error", name, prim, fault_message(error))
+        except VALUE_ERRORS as error:
+            yield _finding("error", name, prim, value_error_message(error))
 
     return checked
 
 
 RULES: dict[str, Rule] = {
-    name: _with_any_values(name, rule)
+    name: _reporting_malformed_values(name, rule)
     for name, rule in {
         "Model": check_model,
         "Table": check_table,
@@ -230,7 +235,7 @@ def _finding(severity: str, rule: str, prim: Usd.Prim, message: str) -> Finding:
 
 
 def _rig(prim: Usd.Prim) -> JawRig | None:
-    """Return the evaluator, or None where `check_model` finds an error."""
+    """Return the evaluator; None if `check_model` finds an error."""
     try:
         return rig_of(prim, _where(prim))
     except JawusdError:

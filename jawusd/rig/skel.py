@@ -1,4 +1,7 @@
-"""The UsdSkel variant of an actor: the jaw as a bone with keys, for tools that edit skeletons but not rigs."""
+"""The UsdSkel variant of an actor: the jaw as an animated joint, for tools that edit skeletons but not rigs.
+
+Written for every actor, and read from stages in which bones move the meshes (`motion = "skeleton"`).
+"""
 
 from __future__ import annotations
 
@@ -8,22 +11,38 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pxr import Kind, Sdf, Usd, UsdSkel, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
 from jawusd.rig import _gf
 from jawusd.rig.geo import MESH_PATHS
-from jawusd.rig.layers import define_prim, named_after, new_layer, stage_of, write_layer
-from jawusd.rig.layout import ACTOR, GEO, GEO_FILE, MANDIBLE, MOTION, SKEL_FILE, SKELETON, SKULL, TRANSFORMS
+from jawusd.rig.layers import define_prim, new_layer, rename_actor, stage_of, write_layer
+from jawusd.rig.layout import (
+    ACTOR,
+    GEO,
+    GEO_FILE,
+    MANDIBLE,
+    MOTION,
+    SKEL_FILE,
+    SKELETON,
+    SKULL,
+    TRANSFORMS,
+    meshes_below,
+)
 
 _TYPES = Sdf.ValueTypeNames
 
 JOINTS = ("skull", "skull/jaw")
 SKEL, KEYS = f"{ACTOR}/Skel", f"{ACTOR}/Skel/Motion"
 _SKEL_IN_GEO = f"{GEO}/Skel"
+# Largest difference between matrix entries of meshes that move together [mm or 1]. Single precision, 100 mm from the
+# origin, stays far below.
+SAME_MOTION = 1e-4
+_BIND_RIGIDLY = "Bind every mesh of the mandible to one joint, or name meshes to be fitted with --mandible and --skull."
 
 
 def write_skel(
@@ -35,17 +54,17 @@ def write_skel(
     d: ArrayLike | None = None,
     prim_name: str = Sdf.Path(ACTOR).name,
 ) -> Path:
-    """Write the skeleton beside `geo.usdc`, whose meshes it binds rigidly to two joints.
+    """Write the skeleton layer next to `geo.usdc`, whose meshes it binds rigidly to two joints.
 
-    The joint `skull/jaw` sits midway between the condyles and carries one key per frame; it has no d1, d2, d3 and
-    no bounds.
+    The joint `skull/jaw` is midway between the condyles and has one key per frame. The layer has neither d1, d2, d3 nor
+    bounds.
 
     Args:
         out: File to write, in the folder of `geo.usdc`.
         mesh_names: The meshes in `geo.usdc`, names as in `MESH_PATHS`.
-        frames: Frame numbers (F,), increasing; without them the jaw stays in the closed bite.
+        frames: Increasing frame numbers (F,); None leaves the jaw in the closed bite.
         d: Parameters (F, 3) [mm]; rows with NaN get no key.
-        prim_name: Of the actor's prim; joints have it in front.
+        prim_name: Name of the actor's prim, and prefix of the joint names.
 
     Raises:
         OutputError: The file cannot be written.
@@ -61,14 +80,14 @@ def write_skel(
     _bind(layer, rig, [Sdf.Path(MESH_PATHS[name]) for name in mesh_names], Sdf.Path(SKEL), Sdf.Path(MANDIBLE))
     root.payloadList.prependedItems = [Sdf.Payload(f"./{GEO_FILE}")]
     del stage
-    return write_layer(named_after(layer, prim_name), Path(out))
+    return write_layer(rename_actor(layer, prim_name), Path(out))
 
 
-def offer_skeleton(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -> None:
-    """Give the actor of an animation layer the variants `transforms`, which is selected and empty, and `skeleton`.
+def add_skeleton_variant(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -> None:
+    """Add the variants `transforms` (selected, empty) and `skeleton` to the actor of an animation layer.
 
-    The bones and their keys are those of `actor_skel.usdc` beside the layer, by reference. The prim above the meshes
-    becomes the SkelRoot: a variant cannot change the type that `actor.usda` itself gives to the actor.
+    Joints and keys are referenced from `actor_skel.usdc` next to the layer. The prim above the meshes becomes the
+    SkelRoot, because a variant cannot change the type that `actor.usda` gives the actor itself.
 
     Args:
         meshes: Paths of the meshes that follow the bones.
@@ -81,29 +100,29 @@ def offer_skeleton(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -> None
     actor.variantSelections[MOTION] = TRANSFORMS
     inside = Sdf.Path(ACTOR).AppendVariantSelection(MOTION, SKELETON)
 
-    def place(path: str) -> Sdf.Path:
+    def in_variant(path: str) -> Sdf.Path:
         return Sdf.Path(path).ReplacePrefix(Sdf.Path(ACTOR), inside)
 
-    # overs all: without the payload there is nothing to move
-    Sdf.CreatePrimInLayer(layer, place(GEO)).typeName = "SkelRoot"
-    skeleton = Sdf.CreatePrimInLayer(layer, place(_SKEL_IN_GEO))
+    # all are overs: the meshes come from the payload
+    Sdf.CreatePrimInLayer(layer, in_variant(GEO)).typeName = "SkelRoot"
+    skeleton = Sdf.CreatePrimInLayer(layer, in_variant(_SKEL_IN_GEO))
     skeleton.referenceList.prependedItems = [Sdf.Reference(f"./{SKEL_FILE}", SKEL)]
-    # what lies beside the meshes inherits the binding of the prims above, as proxies do in the variant with both
-    paths = [place(path) for path in (SKULL, MANDIBLE, *meshes)]
-    _bind(layer, rig, paths, Sdf.Path(_SKEL_IN_GEO), place(MANDIBLE))
+    # the prims above the meshes are bound too, so that proxies next to the meshes inherit the binding
+    paths = [in_variant(path) for path in (SKULL, MANDIBLE, *meshes)]
+    _bind(layer, rig, paths, Sdf.Path(_SKEL_IN_GEO), in_variant(MANDIBLE))
 
 
 def joint_poses(rig: JawRig, d: Array) -> Array:
     """Return the joint `skull/jaw` in skull coordinates, shape (n, 4, 4), for parameters (n, 3) [mm].
 
-    It moves as D hinge, D = pose rest^-1: a vertex bound at rest is carried to D rest p = pose p.
+    The joint moves by D = pose rest^-1, because a vertex bound at rest then moves to D rest p = pose p.
     """
     moved = rig.pose(d) @ se3_inverse(rig.T_rest)
     return make_transform(moved[:, :3, :3], (moved @ _hinge(rig))[:, :3, 3])
 
 
 def _hinge(rig: JawRig) -> Array:
-    """Return the joint in the closed bite, midway between the condyles, in the skull's axes, shape (4, 4) [mm]."""
+    """Return the joint in the closed bite: midway between the condyles, with the skull's axes, shape (4, 4) [mm]."""
     condyles = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
     return make_transform(np.eye(3), transform_points(rig.T_rest, rig.landmarks[condyles]).mean(axis=0))
 
@@ -138,15 +157,16 @@ def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: A
 
 
 def _bind(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[Sdf.Path], skeleton: Sdf.Path, mandible: Sdf.Path) -> None:
-    """Bind meshes of the payload, which is not loaded here, rigidly to the joints: those of the mandible to the jaw."""
-    # The bind transforms place the meshes; Blender would apply the ops of the payload on top.
+    """Bind meshes of the payload, which is not loaded, rigidly to the joints: those of the mandible to the jaw."""
+    # The bind transforms place the meshes. Blender would apply the ops of the payload as well.
     order = Sdf.AttributeSpec(
         Sdf.CreatePrimInLayer(layer, mandible), "xformOpOrder", _TYPES.TokenArray, Sdf.VariabilityUniform
     )
     order.default = Vt.TokenArray()
     for path in meshes:
-        moves = path.HasPrefix(mandible)
-        _bind_mesh(Sdf.CreatePrimInLayer(layer, path), skeleton, rig.T_rest if moves else np.eye(4), int(moves))
+        is_moving = path.HasPrefix(mandible)
+        bind = rig.T_rest if is_moving else np.eye(4)
+        _bind_mesh(Sdf.CreatePrimInLayer(layer, path), skeleton, bind, int(is_moving))
 
 
 def _bind_mesh(mesh: Sdf.PrimSpec, skeleton: Sdf.Path, bind: Array, joint: int) -> None:
@@ -163,3 +183,90 @@ def _bind_mesh(mesh: Sdf.PrimSpec, skeleton: Sdf.Path, bind: Array, joint: int) 
         primvar.default = value
         primvar.SetInfo("interpolation", "constant")
         primvar.SetInfo("elementSize", 1)
+
+
+class Bones:
+    """Skeletons that move the meshes below a prim."""
+
+    def __init__(self, prim: Usd.Prim, bound: list[tuple[UsdSkel.SkinningQuery, UsdSkel.SkeletonQuery]]) -> None:
+        self._prim, self._bound = prim, bound
+
+    def animated_attributes(self) -> list[Usd.Attribute]:
+        """Return the attributes that animate the joints."""
+        animations = [UsdSkel.Animation(skeleton.GetAnimQuery().GetPrim()) for _, skeleton in self._bound]
+        return [
+            attribute
+            for animation in animations
+            if animation
+            for attribute in (animation.GetTranslationsAttr(), animation.GetRotationsAttr(), animation.GetScalesAttr())
+        ]
+
+    def poses(self, actor: Usd.Prim, times: Iterable[Usd.TimeCode], path: object) -> Array:
+        """Return the transforms (n, 4, 4) [mm] from the meshes' own frame to the actor's frame at n times.
+
+        Raises:
+            FormatError: A mesh is deformed, not bound, or moves differently from the others.
+        """
+        for mesh in meshes_below(self._prim):
+            if mesh.GetPath() not in {skinning.GetPrim().GetPath() for skinning, _ in self._bound}:
+                raise FormatError(
+                    f"bones move other meshes of {self._prim.GetPath()}, but not {mesh.GetPath()}.",
+                    path=str(path),
+                    hint=_BIND_RIGIDLY,
+                )
+        for skinning, _ in self._bound:
+            if not skinning.IsRigidlyDeformed() or skinning.HasBlendShapes():
+                raise FormatError(
+                    f"bones or blend shapes deform {skinning.GetPrim().GetPath()}: only rigid motion can be read.",
+                    path=str(path),
+                    hint=_BIND_RIGIDLY,
+                )
+        moved = np.array([[self._pose(*pair, actor, time) for time in times] for pair in self._bound])
+        difference = np.abs(moved - moved[:1]).max(axis=(1, 2, 3))
+        if not difference.max() <= SAME_MOTION:
+            paths = [str(self._bound[i][0].GetPrim().GetPath()) for i in (0, int(np.argmax(difference)))]
+            raise FormatError(f"bones move {paths[0]} and {paths[1]} differently.", path=str(path), hint=_BIND_RIGIDLY)
+        first: Array = moved[0]
+        return first
+
+    @staticmethod
+    def _pose(
+        skinning: UsdSkel.SkinningQuery, skeleton: UsdSkel.SkeletonQuery, actor: Usd.Prim, time: Usd.TimeCode
+    ) -> Array:
+        moved = skinning.ComputeSkinnedTransform(skeleton.ComputeSkinningTransforms(time), time)
+        placed = transform_in_actor(actor, skeleton.GetPrim(), UsdGeom.XformCache(time))
+        return np.array(moved * placed).T  # USD multiplies rows from the left
+
+    def foreign_joints(self) -> list[str]:
+        """Return the animated joints that no skeleton has."""
+        found = []
+        for _, skeleton in self._bound:
+            animation = skeleton.GetAnimQuery()
+            moved = animation.GetJointOrder() if animation else []
+            found += [str(joint) for joint in moved if joint not in skeleton.GetJointOrder()]
+        return list(dict.fromkeys(found))
+
+
+def transform_in_actor(actor: Usd.Prim, prim: Usd.Prim, cache: UsdGeom.XformCache) -> Gf.Matrix4d:
+    """Return the transform of a prim in the frame of its actor, also if it resets the transform stack."""
+    placed, resets = cache.ComputeRelativeTransform(prim, actor)
+    if resets:
+        placed = cache.GetLocalToWorldTransform(prim) * cache.GetLocalToWorldTransform(actor).GetInverse()
+    return placed
+
+
+def bones_of(prim: Usd.Prim) -> Bones | None:
+    """Return the skeletons that move the meshes below a prim; None if there are none."""
+    root = UsdSkel.Root.Find(prim)
+    if not root:
+        return None
+    instances = Usd.TraverseInstanceProxies()
+    cache = UsdSkel.Cache()
+    cache.Populate(root, instances)
+    bound = [
+        (skinning, cache.GetSkelQuery(binding.GetSkeleton()))
+        for binding in cache.ComputeSkelBindings(root, instances)
+        for skinning in binding.GetSkinningTargets()
+        if skinning.GetPrim().GetPath().HasPrefix(prim.GetPath())
+    ]
+    return Bones(prim, bound) if bound else None

@@ -1,8 +1,8 @@
-"""Read how the jaw moves in a stage that carries no rig: from Xforms, bones or point caches of the actor's meshes.
+"""Read the motion of the jaw from a stage without a rig: from Xforms, bones or point caches of the actor's meshes.
 
-What programs export keeps vertices and little else: names, units, axes and hierarchy change, and formats such as glTF
-split vertices and order them anew. So the meshes of the rig are found by their number of vertices, or of different
-ones, and fitted, frame by frame, to where the stage puts them.
+Exporters change names, units, axes and hierarchy, and formats such as glTF split and reorder vertices. Meshes of
+the rig are therefore identified by their number of vertices, or of distinct positions, and fitted to the stage in every
+frame.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry.points import match_points
 from jawusd.geometry.rigid import rigid_fit
 from jawusd.geometry.se3 import se3_inverse, transform_points
-from jawusd.rig.arrays import value_of
+from jawusd.rig.attributes import value_of
 from jawusd.rig.geo import read_geometry
+from jawusd.rig.layout import meshes_below, rig_prims
 from jawusd.rig.motion_read import frames_of_stage
 from jawusd.rig.read import find_rig_prim, open_stage
-from jawusd.rig.schema import rig_prims
 from jawusd.rig.untrusted import raises_format_error
 
-_POINTS = 2000  # of a mesh, evenly spread over its vertices, are fitted
-# Exports in single precision, also in metres, stay far below; a mesh of as many vertices that is another one does not.
-_MOST_MISFIT_MM = 0.5
-_SAME_POINT_MM = 0.02  # far above single precision, below the distance of a scan's vertices
+_POINTS = 2000  # vertices of a mesh that are fitted, evenly spaced by index
+# Largest RMS distance of a fitted mesh. Exports in single precision, even in metres, stay far below; other meshes with
+# the same number of vertices do not.
+_MAX_MISFIT_MM = 0.5
+_SAME_POINT_MM = 0.02  # far above single precision, below the spacing of a scan's vertices
 _SKULL, _MANDIBLE = ("upper_teeth", "skull"), ("lower_teeth", "mandible")
 
 
@@ -38,11 +39,11 @@ class StagePoses(NamedTuple):
     """Poses fitted to a stage.
 
     Attributes:
-        frames: Whole frames, shape (F,).
+        frames: Frame numbers, shape (F,).
         T: T_skull_mandible [mm], shape (F, 4, 4).
         fps: Frames per second.
-        misfit_mm: Largest root mean squared distance of a mesh from its place in the rig, over the frames.
-        meshes: Paths of the prims fitted, of skull and mandible.
+        misfit_mm: RMS distance of the fitted meshes from the stage, the largest of all frames.
+        meshes: Paths of the fitted prims of skull and mandible.
     """
 
     frames: NDArray[np.int64]
@@ -53,21 +54,21 @@ class StagePoses(NamedTuple):
 
 
 def carries_rig(path: str | os.PathLike[str], prim_path: str | None = None) -> bool:
-    """Tell whether a stage holds a rig whose mandible moves by transforms or its bones: nothing has to be fitted.
+    """Return whether a stage has a rig whose mandible is moved by transforms or bones, so that no fit is needed.
 
     Args:
         path: Any stage.
-        prim_path: Which rig, where it has several.
+        prim_path: The rig's prim, if the stage has several rigs.
 
     Raises:
         RigError: Not a stage.
-        FormatError: The named prim carries no rig, though others do.
+        FormatError: The prim is not a rig, although others are.
     """
     stage = open_stage(path)
     rigs = rig_prims(stage)
     if rigs and prim_path is not None:
         rigs = [find_rig_prim(stage, path, prim_path)]
-    meshes = [UsdGeom.Mesh(prim) for rig in rigs for prim in _meshes(rig)]
+    meshes = [UsdGeom.Mesh(prim) for rig in rigs for prim in meshes_below(rig)]
     return bool(rigs) and not any(mesh.GetPointsAttr().ValueMightBeTimeVarying() for mesh in meshes)
 
 
@@ -82,15 +83,15 @@ def fit_poses_of_stage(
     """Fit the meshes of an actor to a stage at every whole frame.
 
     Args:
-        path: Any stage that holds copies of the actor's meshes, moved by transforms, bones or time-sampled points.
-        actor: The rig's own file, which gives the meshes in their frames.
-        mandible: Prim to look below for the lower teeth or the mandible; None: everywhere.
+        path: Any stage with copies of the actor's meshes, moved by transforms, bones or time-sampled points.
+        actor: The rig's own file, which defines the meshes in their frames.
+        mandible: Prim below which the lower teeth or the mandible are searched; None: everywhere.
         skull: The same for the upper teeth or the skull.
-        rig_prim: Which rig of the file, where it has several.
+        rig_prim: The rig's prim, if the file has several rigs.
 
     Raises:
         RigError: Not a stage.
-        FormatError: No mesh with as many vertices, one that is another mesh, or no start and end.
+        FormatError: No mesh with matching vertices, a mesh that does not fit, or no time range.
     """
     stage = open_stage(path)
     rest = read_geometry(actor, rig_prim, placeholders=True) | read_geometry(actor, rig_prim)
@@ -99,32 +100,33 @@ def fit_poses_of_stage(
     fitted, misfit_mm = np.empty((2, len(frames), 4, 4)), 0.0
     for k, frame in enumerate(frames.tolist()):
         seen = [place.points(Usd.TimeCode(frame)) for place in places]
-        # one size for both: a stage in cm, or an actor scaled to it
-        size = _spread(seen[0]) / _spread(places[0].source)
+        # one scale for both: the stage may be in cm, or the actor scaled
+        scale = _spread(seen[0]) / _spread(places[0].source)
         for i, (place, points) in enumerate(zip(places, seen, strict=True)):
-            fitted[i, k] = rigid_fit(place.source, points / size)
-            off = transform_points(fitted[i, k], place.source) - points / size
-            misfit_mm = max(misfit_mm, float(np.sqrt((off**2).sum(axis=1).mean())))
-    if not misfit_mm <= _MOST_MISFIT_MM:
+            fitted[i, k] = rigid_fit(place.source, points / scale)
+            residual = transform_points(fitted[i, k], place.source) - points / scale
+            misfit_mm = max(misfit_mm, float(np.sqrt((residual**2).sum(axis=1).mean())))
+    if not misfit_mm <= _MAX_MISFIT_MM:
         raise FormatError(
             f"its meshes {places[0].path} and {places[1].path} are up to {misfit_mm:.2f} mm from those of the rig, "
-            f"allowed are {_MOST_MISFIT_MM} mm: other meshes, or bent ones.",
+            f"allowed are {_MAX_MISFIT_MM} mm: they are other meshes, or deformed.",
             path=str(path),
-            hint="Name the prims of skull and mandible with --skull and --mandible.",
+            hint="Choose the prims of skull and mandible with --skull and --mandible.",
         )
     T = se3_inverse(fitted[0]) @ fitted[1]
     return StagePoses(frames, T, float(stage.GetTimeCodesPerSecond()), misfit_mm, (places[0].path, places[1].path))
 
 
 def _spread(points: Array) -> float:
+    """Return a measure of the size of a point set: its root summed squared distance from the centroid."""
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum()))
 
 
-class _Place:
-    """A mesh of the rig as a stage holds it."""
+class _StageMesh:
+    """A mesh of the rig in a stage."""
 
-    def __init__(self, prim: Usd.Prim, source: Array, own: NDArray[np.int64], there: NDArray[np.int64]) -> None:
-        self.path, self.source, self._chosen = str(prim.GetPath()), source[own], there
+    def __init__(self, prim: Usd.Prim, source: Array, in_rig: NDArray[np.int64], in_stage: NDArray[np.int64]) -> None:
+        self.path, self.source, self._chosen = str(prim.GetPath()), source[in_rig], in_stage
         self._mesh, self._skinning = UsdGeom.Mesh(prim), None
         root = UsdSkel.Root.Find(prim)
         if not root:
@@ -136,7 +138,7 @@ class _Place:
             self._skinning, self._skeleton = skinning, self._cache.GetSkelQuery(skeleton)
 
     def points(self, time: Usd.TimeCode) -> Array:
-        """Return the chosen vertices in the world of the stage, shape (n, 3)."""
+        """Return the chosen vertices in the stage's world space, shape (n, 3)."""
         points, moved_by = self._mesh.GetPointsAttr().Get(time), self._mesh.GetPrim()
         if self._skinning is not None:
             points = Vt.Vec3fArray(points)
@@ -147,47 +149,45 @@ class _Place:
         return np.array(points, dtype=np.float64)[self._chosen] @ M[:3, :3] + M[3, :3]
 
 
-def _find(stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below: str | None, path: object) -> _Place:
-    """Return the mesh of the stage that has the vertices of one of those named; teeth before bone."""
+def _find(
+    stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below: str | None, path: object
+) -> _StageMesh:
+    """Return the mesh of the stage that matches one of the named meshes of the rig; teeth before bone."""
     if below is not None and not (Sdf.Path.IsValidPathString(below) and stage.GetPrimAtPath(below)):
         raise FormatError(f"has no prim {below}.", path=str(path))
-    meshes = _meshes(stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot())
+    meshes = meshes_below(stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot())
     found = {str(prim.GetPath()): _used_points(prim, path) for prim in meshes}
     wanted = {name: rest[name] for name in names if name in rest}
-    doubtful: list[str] = []
+    ambiguous: list[str] = []
     for name, mesh in wanted.items():
         alike = [prim for prim in meshes if len(found[str(prim.GetPath())].all) == len(mesh.vertices)]
-        alike = alike or [prim for prim in meshes if found[str(prim.GetPath())].different == _different(mesh)]
-        # both rows may have as many vertices: then the name has to tell
+        alike = alike or [prim for prim in meshes if found[str(prim.GetPath())].distinct == _distinct(mesh)]
+        # upper and lower teeth may have equally many vertices: then names decide
         named = [prim for prim in alike if _plain(name) in _plain(str(prim.GetPath()))] or alike
         if len(named) == 1:
-            return _Place(named[0], mesh.vertices, *_correspondence(mesh, found[str(named[0].GetPath())]))
-        doubtful = doubtful or [str(prim.GetPath()) for prim in named]
-    if doubtful:
+            return _StageMesh(named[0], mesh.vertices, *_correspondence(mesh, found[str(named[0].GetPath())]))
+        ambiguous = ambiguous or [str(prim.GetPath()) for prim in named]
+    if ambiguous:
         raise FormatError(
-            f"has several meshes with the vertices of the rig's {next(iter(wanted))}: {', '.join(doubtful)}.",
+            f"has several meshes with the vertices of the rig's {next(iter(wanted))}: {', '.join(ambiguous)}.",
             path=str(path),
-            hint="Say whose jaw is meant: name prims of one actor with --skull and --mandible.",
+            hint="Choose the prims of one actor with --skull and --mandible.",
         )
     sizes = " or ".join(f"{len(mesh.vertices)} ({name})" for name, mesh in wanted.items())
     where = f" below {below}" if below is not None else ""
     raise FormatError(
-        f"has no mesh{where} with {sizes} vertices, as the rig's.",
+        f"has no mesh{where} with {sizes} vertices, like the rig.",
         path=str(path),
-        hint="Name the prims of skull and mandible with --skull and --mandible; vertices must not be merged or moved.",
+        hint="Choose the prims of skull and mandible with --skull and --mandible. Export without merging vertices.",
     )
 
 
 class _Points(NamedTuple):
-    """Points of a mesh (n, 3), which of them faces use, and how many places these have."""
+    """Points of a mesh (n, 3), indices of those used by faces, and the number of distinct positions of these."""
 
     all: Array
     used: NDArray[np.int64]
-    different: int
-
-
-def _meshes(below: Usd.Prim) -> list[Usd.Prim]:
-    return [prim for prim in Usd.PrimRange(below, Usd.TraverseInstanceProxies()) if prim.IsA(UsdGeom.Mesh)]
+    distinct: int
 
 
 def _used_points(prim: Usd.Prim, where: object) -> _Points:
@@ -198,30 +198,30 @@ def _used_points(prim: Usd.Prim, where: object) -> _Points:
     return _Points(points, used, len(np.unique(points[used], axis=0)))
 
 
-def _different(mesh: Mesh) -> int:
+def _distinct(mesh: Mesh) -> int:
     return len(np.unique(mesh.vertices[np.unique(mesh.faces)], axis=0))
 
 
 def _correspondence(mesh: Mesh, found: _Points) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return indices of vertices of a rig's mesh, and those of the same ones in a stage: by shape, else by order."""
+    """Return indices of corresponding vertices in a rig's mesh and in the stage: by shape, otherwise by order."""
     used = np.unique(mesh.faces).astype(np.int64)
     spread = np.unique(np.linspace(0, len(used) - 1, _POINTS).astype(int))
     same = len(mesh.vertices) == len(found.all)
     if not same or not _in_order(mesh.vertices, found.all):
-        there = match_points(mesh.vertices[used], found.all[found.used], spread, _SAME_POINT_MM)
-        if there is not None:
-            return used[spread], found.used[there]
+        matched = match_points(mesh.vertices[used], found.all[found.used], spread, _SAME_POINT_MM)
+        if matched is not None:
+            return used[spread], found.used[matched]
     chosen = np.unique(np.linspace(0, min(len(mesh.vertices), len(found.all)) - 1, _POINTS).astype(int))
     return chosen, chosen
 
 
 def _in_order(source: Array, points: Array) -> bool:
-    """Tell whether points are those of a mesh in its order, moved and scaled."""
+    """Return whether points are the vertices of a mesh in the same order, up to motion and scale."""
     chosen = np.unique(np.linspace(0, len(source) - 1, _POINTS).astype(int))
     a, b = source[chosen], points[chosen]
     b = b * (_spread(a) / _spread(b))
-    off = transform_points(rigid_fit(a, b), a) - b
-    return bool(np.sqrt((off**2).sum(axis=1).mean()) <= _MOST_MISFIT_MM)
+    residual = transform_points(rigid_fit(a, b), a) - b
+    return bool(np.sqrt((residual**2).sum(axis=1).mean()) <= _MAX_MISFIT_MM)
 
 
 def _plain(name: str) -> str:

@@ -1,7 +1,12 @@
-"""The sampled decoder: a table of twists for readers that do not know the exact model, and its error."""
+"""The sampled decoder: a table of twists for readers without the exact model, its error, and samples of d.
+
+The error of linear interpolation over a step h is h^2 / 8 times the second derivative. A grid whose density is the
+square root of the curvature therefore spreads the error evenly (de Boor, A Practical Guide to Splines, chapter XII).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +18,104 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.schema import ADDITIVE
 from jawusd.evaluator.table import SampledTable
 from jawusd.geometry.se3 import se3_exp, transform_points
-from jawusd.rig.sampling import grid_axes, grid_points, sample_valid, valid_box
 
-DEFAULT_SIZE = 33
+DEFAULT_SIZE = 33  # values per axis
 SIZES = (17, 33, 65)
-_VALID_SAMPLES = 10_000
-_FULL_CHECKS = 200
+_VALID_SAMPLES = 10_000  # random valid d at which the error is measured
+_FULL_CHECKS = 200  # worst d that are checked at every vertex
+
+_PROBES_PER_AXIS = 41  # of the grid that finds the box of valid d
+_FINE = 161  # values per axis at which the curvature is measured
+_COARSE = 13  # values along the two other axes
+_NEAR_BOUND_MM = -0.5  # smallest margin that is considered: cells extend beyond the bound
+_SMOOTHING = 9  # window over the curvature, in fine steps
+_FLOOR = 0.05  # lower limit of the curvature, as a fraction of its maximum
+_POINTS = 40  # mandible points at which the curvature is measured
+
+
+def valid_box(rig: JawRig) -> Array:
+    """Return the box (3, 2) [mm] of d that the table spans: `d_range`, widened to contain all valid d.
+
+    Raises:
+        RigError: The bounds allow no parameters.
+    """
+    box = np.array(rig.d_range, dtype=np.float64)
+    reach = 1.0 + rig.bound.offset_mm + rig.bound.softness_mm
+    wide = box + np.array([-reach, reach])
+    axes = [np.linspace(low, high, _PROBES_PER_AXIS) for low, high in wide]
+    probes = grid_points(axes)
+    valid = probes[rig.margin(probes) >= 0]
+    if not len(valid):
+        raise RigError("the bounds of the model allow no parameters.")
+    step = np.array([axis[1] - axis[0] for axis in axes])
+    low, high = valid.min(axis=0) - step, valid.max(axis=0) + step
+    return np.stack([np.minimum(box[:, 0], low), np.maximum(box[:, 1], high)], axis=1).clip(wide[:, :1], wide[:, 1:])
+
+
+def grid_points(axes: Sequence[Array] | Array) -> Array:
+    """Return the points (n1 n2 n3, 3) of a grid with these axis values."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def sample_valid(rig: JawRig, count: int, seed: int = 0) -> Array:
+    """Return `count` random valid d, shape (count, 3) [mm], uniform over the volume inside the bound."""
+    rng = np.random.default_rng(seed)
+    box = valid_box(rig)
+    found: list[Array] = []
+    missing = count
+    while missing > 0:
+        d = rng.uniform(box[:, 0], box[:, 1], (4 * count, 3))
+        d = d[rig.margin(d) >= 0][:missing]
+        found.append(d)
+        missing -= len(d)
+    return np.concatenate(found)
+
+
+def grid_axes(rig: JawRig, box: Array, points: Array, size: int) -> tuple[Array, Array, Array]:
+    """Return axis values of d1, d2 and d3 that minimise the error of linear interpolation.
+
+    Args:
+        box: Range of each parameter [mm], shape (3, 2).
+        points: Mandible points whose motion is considered, mandible frame [mm], shape (V, 3).
+        size: Number of values per axis.
+
+    Returns:
+        Three increasing arrays (size,) [mm] that span the box. They contain 0, so that the closed bite is exact.
+    """
+    points = points[:: max(1, len(points) // _POINTS)]
+    return _axis(rig, box, points, 0, size), _axis(rig, box, points, 1, size), _axis(rig, box, points, 2, size)
+
+
+def _axis(rig: JawRig, box: Array, points: Array, axis: int, size: int) -> Array:
+    fine = np.linspace(box[axis, 0], box[axis, 1], _FINE)
+    bend = np.convolve(
+        np.pad(_curvature(rig, box, points, axis), _SMOOTHING // 2, mode="edge"),
+        np.hanning(_SMOOTHING) / np.hanning(_SMOOTHING).sum(),
+        mode="valid",
+    )
+    density = np.sqrt(bend + _FLOOR * bend.max() + np.finfo(float).tiny)
+    share = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+    rest = np.interp(0.0, fine, share)
+    below = int(np.clip(round((size - 1) * rest / share[-1]), 1, size - 2))
+    even = np.concatenate([np.linspace(0.0, rest, below + 1), np.linspace(rest, share[-1], size - below)[1:]])
+    values = np.interp(even, share, fine)
+    values[below] = 0.0
+    return values
+
+
+def _curvature(rig: JawRig, box: Array, points: Array, axis: int) -> Array:
+    """Return the largest second difference of any point along one axis of d, shape (_FINE,) [1/mm]."""
+    axes = [np.linspace(low, high, _FINE if i == axis else _COARSE) for i, (low, high) in enumerate(box)]
+    d = np.moveaxis(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), axis, 0)
+    near = rig.margin(d) >= _NEAR_BOUND_MM
+    bend = np.zeros(_FINE)
+    step = axes[axis][1] - axes[axis][0]
+    for j in range(d.shape[1]):
+        moved = transform_points(rig.pose(d[:, j]), points)
+        second = np.linalg.norm(moved[2:] - 2 * moved[1:-1] + moved[:-2], axis=-1).max(-1) / step**2
+        bend[1:-1] = np.maximum(bend[1:-1], np.where(near[1:-1, j], second, 0.0).max(-1))
+    bend[[0, -1]] = bend[[1, -2]]
+    return bend
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +123,7 @@ class DecoderTable:
     """Twists sampled over d.
 
     Attributes:
-        format: "grid" (twists over the three axes) or "curves" (three curves, to be added).
+        format: "grid" (twists over the three axes) or "curves" (three curves that are summed).
         axes: Values of d1, d2, d3 [mm], each array increasing.
         twists: Twists (omega [rad], v [mm]) in the skull frame, float32: (n1, n2, n3, 6), or (n1 + n2 + n3, 6).
         max_error_mm: Largest distance to the exact model found at any vertex.
@@ -71,16 +168,16 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
         A grid, or three curves for an additive model, whose sum is exact between the axes.
 
     Raises:
-        RigError: The size is not offered, or the bounds leave nothing valid.
+        RigError: An unsupported size, or bounds that allow no parameters.
     """
     if size not in SIZES:
-        raise RigError(f"a table of {size} knots per axis is not offered; allowed are {', '.join(map(str, SIZES))}.")
+        raise RigError(f"a table of {size} knots per axis is not supported; allowed are {', '.join(map(str, SIZES))}.")
     axes = grid_axes(rig, valid_box(rig), vertices[extreme_vertices(vertices)], size)
     if rig.kind == ADDITIVE:
         twists = np.concatenate([rig.twist(np.outer(axis, np.eye(3)[i])) for i, axis in enumerate(axes)])
         table = DecoderTable("curves", axes, twists.astype(np.float32))
     else:
-        twists = _between(rig, axes)
+        twists = _balanced_twists(rig, axes)
         table = DecoderTable("grid", axes, twists.astype(np.float32))
     # the error of linear interpolation peaks in the middle of the cells
     middles = grid_points([0.5 * (axis[1:] + axis[:-1]) for axis in axes])
@@ -89,11 +186,11 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
     return DecoderTable(table.format, table.axes, table.twists, error, len(samples))
 
 
-def _between(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
-    """Return twists at the knots, shape (n1, n2, n3, 6), from which linear interpolation errs to both sides alike.
+def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
+    """Return twists at the knots, shape (n1, n2, n3, 6), shifted to balance the interpolation error.
 
-    Interpolated exact values err to one side, most in the middle of the cells; half of what they err there, as the mean
-    of both cells along each axis, is taken off at the knots. The closed bite stays exact.
+    Interpolating exact values gives errors of one sign, largest in the middle of the cells. Half of that error,
+    averaged over the two cells along each axis, is subtracted at the knots. The closed bite stays exact.
     """
     exact = rig.twist(grid_points(axes)).reshape(*map(len, axes), 6)
     out = exact.copy()
@@ -113,8 +210,8 @@ def _between(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
 def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> float:
     """Return the largest distance [mm] between table and model at any vertex (V, 3), over parameters d (n, 3).
 
-    The distance is a convex function of the vertex, so vertices that are extreme in some direction find the worst
-    parameters; those are then checked at every vertex.
+    The distance is a convex function of the vertex, so vertices that are extreme in some direction suffice to find the
+    worst parameters, which are then checked at every vertex.
     """
     exact = rig.pose(d)
     read = table.pose(d, rig.T_rest)
@@ -124,14 +221,14 @@ def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> 
 
 
 def landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
-    """Return the largest distance [mm] of a landmark between two sets of poses (n, 4, 4), shape (n,)."""
+    """Return the largest landmark distance [mm], shape (n,), between two sets of poses (n, 4, 4)."""
     return np.linalg.norm(transform_points(T_a - T_b, rig.landmarks), axis=-1).max(axis=-1)
 
 
 def largest_distance(T_a: Array, T_b: Array, points: Array) -> Array:
-    """Return the largest distance [mm], shape (n,), of points (V, 3) under two sets of poses (n, 4, 4).
+    """Return the largest distance [mm], shape (n,), between points (V, 3) under two sets of poses (n, 4, 4).
 
-    |(T_a - T_b) p|^2 is a quadratic form in (p, 1): ten numbers per pose and per point, one matrix product.
+    |(T_a - T_b) p|^2 is a quadratic form in (p, 1): ten numbers per pose and per point, so one matrix product.
     """
     D = (T_a - T_b)[:, :3, :]
     Q = np.swapaxes(D, 1, 2) @ D
@@ -145,7 +242,7 @@ def largest_distance(T_a: Array, T_b: Array, points: Array) -> Array:
 
 
 def extreme_vertices(vertices: Array) -> NDArray[np.int64]:
-    """Return the indices of vertices (V, 3) that lie farthest in one of about 400 directions."""
+    """Return the indices of vertices (V, 3) that are extreme in one of 400 directions."""
     i = np.arange(400) + 0.5
     height, turn = 1 - 2 * i / len(i), np.pi * (1 + 5**0.5) * i  # Fibonacci sphere
     radius = np.sqrt(1 - height**2)

@@ -1,4 +1,4 @@
-"""Read USD from untrusted sources: files outside a rig's folder stay closed, faults of a file become FormatErrors."""
+"""Open USD from untrusted sources: only permitted files are read, and malformed values raise FormatError."""
 
 from __future__ import annotations
 
@@ -14,47 +14,56 @@ from jawusd.base.guard import most_cpu, note_input, out_of_memory
 from jawusd.base.inputs import is_allowed
 from jawusd.rig.asset_paths import (
     asset_paths,
+    check_checksum,
     clip_templates,
     evaluated,
     file_of,
     file_of_layer,
+    files_of_template,
     is_layer,
-    of_template,
+    recorded_checksums,
     target_of,
 )
-from jawusd.rig.checksums import check_checksum, recorded_checksums
-from jawusd.rig.schema import SCHEMA_NAME
+from jawusd.rig.layout import SCHEMA_NAME
 
 
-class _Named(NamedTuple):
-    """A layer that is named by another: where, in which rig's folder, from outside of whose folder, and variables."""
+class _LayerRef(NamedTuple):
+    """A layer that another layer refers to.
+
+    Attributes:
+        target: Full path of the layer.
+        rig_folder: Folder of the rig it is part of; None if it is not part of one.
+        user: The layer that refers to it from another folder, if any.
+        variables: Expression variables of the layers that refer to it.
+        is_sublayer: Whether it is a sublayer, whose own variables are ignored.
+    """
 
     target: str
-    home: Path | None
+    rig_folder: Path | None
     user: str | None
-    variables: Mapping[str, object]  # of the layers that refer to it
-    is_sublayer: bool = False  # its own variables do not count then
+    variables: Mapping[str, object]
+    is_sublayer: bool = False
 
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: A value in USD has whatever type its file declares; code that expects another type raises one of these.
-FAULTS = (
+#: Raised by code that meets a value of an unexpected type: values in USD have any type that their file declares.
+VALUE_ERRORS = (
     ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError, Tf.ErrorException,
 )  # fmt: skip
-#: Processor time [s] for opening a stage in a guarded process. Rigs take 0.02 s, stages of a million prims some five.
-MOST_CPU_S = 20
-_ALLOW = "If you trust it, allow its folder with --allow or the setting JAWUSD_ALLOW."
+#: Processor time [s] for opening a stage in a guarded process. Rigs take 0.02 s, a million prims about 5 s.
+MAX_CPU_S = 20
+_ALLOW = "If you trust it, allow its folder with --allow or the environment variable JAWUSD_ALLOW."
 _UNREADABLE = "is not a USD file that OpenUSD can read"
-#: Prims and properties in a layer, and samples of an attribute, that are read.
-MOST_SPECS, MOST_SAMPLES = 2_000_000, 1_000_000
-_MOST_READINGS = 20_000  # of layers, one for each set of variables
-_OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
+#: Limits: prims and properties in a layer, samples of an attribute.
+MAX_SPECS, MAX_SAMPLES = 2_000_000, 1_000_000
+_MAX_LAYER_READS = 20_000  # a layer is read once for each set of variables
+_RIG_ATTRIBUTES = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
 
 def raises_format_error(argument: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator that makes a reader raise FormatError where values of a file have unexpected types.
+    """Return a decorator that turns errors from values of unexpected types into FormatError.
 
     Args:
         argument: Index of the reader's positional argument that names the file.
@@ -67,30 +76,30 @@ def raises_format_error(argument: int) -> Callable[[Callable[P, R]], Callable[P,
                 return function(*args, **named)
             except MemoryError as error:
                 raise out_of_memory(str(args[argument])) from error
-            except FAULTS as error:
-                raise FormatError(fault_message(error), path=str(args[argument])) from error
+            except VALUE_ERRORS as error:
+                raise FormatError(value_error_message(error), path=str(args[argument])) from error
 
         return wrapped
 
     return decorate
 
 
-def fault_message(error: BaseException) -> str:
-    """Return what a fault of a file's values is called."""
+def value_error_message(error: BaseException) -> str:
+    """Return the message for an error caused by a malformed value."""
     found = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-    return f"holds values that cannot be ({found:.200})."
+    return f"has malformed values ({found:.200})."
 
 
 def open_checked(path: Path) -> Usd.Stage:
-    """Open a stage that names no files but those it may.
+    """Open a stage after checking the files it refers to.
 
     Raises:
-        RigError: It is not USD, or names files that `check_reach` forbids.
+        RigError: It is not USD, or refers to files that `check_file_access` rejects.
     """
     note_input(path)
     try:
-        with most_cpu(MOST_CPU_S):
-            layers = check_reach(path)
+        with most_cpu(MAX_CPU_S):
+            layers = check_file_access(path)
             stage = Usd.Stage.Open(str(path))
     except (Tf.ErrorException, RuntimeError, ValueError, OSError) as error:
         raise RigError(_unreadable(path, error), path=path) from error
@@ -101,124 +110,127 @@ def open_checked(path: Path) -> Usd.Stage:
 
 
 def _unreadable(file: Path, error: BaseException | None = None) -> str:
-    """Return what is wrong with a file, with what OpenUSD says of it, such as the line of a syntax error."""
-    said = error.args if isinstance(error, Tf.ErrorException) else ()
-    words = next((str(one.commentary).strip() for one in said if getattr(one, "commentary", "")), "")
-    words = words.replace(f"{file.absolute()}:", "line ", 1)
-    return f"{_UNREADABLE}: {words:.300}" if words else f"{_UNREADABLE}."
+    """Return the message for an unreadable file, with OpenUSD's reason, such as the line of a syntax error."""
+    details = error.args if isinstance(error, Tf.ErrorException) else ()
+    reason = next((str(each.commentary).strip() for each in details if getattr(each, "commentary", "")), "")
+    reason = reason.replace(f"{file.absolute()}:", "line ", 1)
+    return f"{_UNREADABLE}: {reason:.300}" if reason else f"{_UNREADABLE}."
 
 
-def check_reach(path: Path) -> list[Sdf.Layer]:
-    """Check, before a layer or package is composed, that a rig's layers name only files in their own folder or below.
+def check_file_access(path: Path) -> list[Sdf.Layer]:
+    """Check, before a layer or package is composed, which files its layers refer to.
 
-    Paths count as OpenUSD finds them: absolute ones, by search paths, and by expressions with variables.
-    Layers that only use a rig (animation, shots) may name it outside their folder, and nothing else, in values neither:
-    what values name is read (ONNX) and packed (pictures). Files that a rig's layers name must lie in the rig's folder,
-    with links resolved. Any may lie in folders that were allowed, see `base.inputs`.
+    Layers of a rig may refer only to files in the rig's folder or below, with links resolved. Layers that use a rig
+    (animation, shots) may refer to rigs outside their folder, but to no other files there. Asset paths in values count
+    too, because their files are read (ONNX) and packed (images). Files in allowed folders are always accepted, see
+    `base.inputs`. Paths are resolved as OpenUSD does, including search paths and variable expressions.
 
     Returns:
         The layers, which stay loaded as long as they are referenced.
 
     Raises:
-        RigError: A path that is not allowed, or a layer that is damaged.
+        RigError: A path is not allowed, or a layer is damaged.
     """
     resolver = Ar.GetResolver()
     with Ar.ResolverContextBinder(resolver.CreateDefaultContextForAsset(str(path))):
-        return _reached(path)
+        return _checked_layers(path)
 
 
-def _reached(path: Path) -> list[Sdf.Layer]:
+def _checked_layers(path: Path) -> list[Sdf.Layer]:
     layers: list[Sdf.Layer] = []
     seen: set[tuple[str, Path | None, bool, str]] = set()
     sums: dict[Path, str] = {}
-    waiting = [_Named(str(path), None, None, {})]
+    waiting = [_LayerRef(str(path), None, None, {})]
     while waiting:
-        one = waiting.pop()
-        name, home = one.target, one.home
-        key = (name, home, one.is_sublayer, str(sorted(one.variables.items())))
+        ref = waiting.pop()
+        name, rig_folder = ref.target, ref.rig_folder
+        key = (name, rig_folder, ref.is_sublayer, str(sorted(ref.variables.items())))
         if key in seen:
             continue
-        if len(seen) == _MOST_READINGS:
-            raise RigError(f"names layers in more than {_MOST_READINGS} ways, by variables.", path=path)
+        if len(seen) == _MAX_LAYER_READS:
+            raise RigError(f"uses variables to refer to layers in more than {_MAX_LAYER_READS} ways.", path=path)
         seen.add(key)
         layer = _layer(name, sums)
         if layer is None:
             continue
         layers.append(layer)
         sums |= recorded_checksums(layer)
-        if home is None and _carries_rig(layer):
-            home = file_of(name).resolve().parent
-        if home is None and one.user is not None:
+        if rig_folder is None and _is_rig_layer(layer):
+            rig_folder = file_of(name).resolve().parent
+        if rig_folder is None and ref.user is not None:
             raise RigError(
-                f"names the file {name:.200}, outside its own folder and no rig.", path=one.user, hint=_ALLOW
+                f"refers to the file {name:.200}, which is outside its own folder and not a rig.",
+                path=ref.user,
+                hint=_ALLOW,
             )
-        own = {} if one.is_sublayer else layer.expressionVariables
-        waiting += _layers_named(layer, home, {**own, **one.variables})
+        own = {} if ref.is_sublayer else layer.expressionVariables
+        waiting += _referenced_layers(layer, rig_folder, {**own, **ref.variables})
     return layers
 
 
 def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
-    """Check that a stage holds no layers but those of `check_reach`.
+    """Check that a stage has no layers besides those that `check_file_access` returned.
 
     Raises:
-        RigError: It holds another.
+        RigError: It has others.
     """
     known = {file_of_layer(layer).resolve() for layer in checked}
     for layer in stage.GetUsedLayers():
         if not layer.anonymous and file_of_layer(layer).resolve() not in known:
             raise RigError(
-                f"is composed of {layer.identifier:.200}, which it does not name.", path=checked[0].identifier
+                f"is composed of {layer.identifier:.200}, to which it does not refer.", path=checked[0].identifier
             )
 
 
-def _layers_named(layer: Sdf.Layer, home: Path | None, variables: Mapping[str, object]) -> list[_Named]:
-    """Return the layers that a layer names, after checking all files that it names.
+def _referenced_layers(layer: Sdf.Layer, rig_folder: Path | None, variables: Mapping[str, object]) -> list[_LayerRef]:
+    """Check all files that a layer refers to, and return the layers among them.
 
     Args:
-        home: Folder of the rig that the layer is part of; None where it only uses rigs.
-        variables: Those that expressions have in the layer.
+        rig_folder: Folder of the rig that the layer is part of; None if it only uses rigs.
+        variables: Expression variables of the layer.
     """
-    folder = home or file_of_layer(layer).resolve().parent
+    folder = rig_folder or file_of_layer(layer).resolve().parent
     read = evaluated(layer, variables)
-    named: list[_Named] = []
-    for template in clip_templates(read):  # first: OpenUSD lists their folders when it is asked for asset paths
-        pattern = _inside(layer, template, folder)
-        for file in of_template(pattern):
-            _inside(layer, str(file), folder)
-            named.append(_Named(str(file), None if is_allowed(file) else home, None, variables))
+    found: list[_LayerRef] = []
+    for template in clip_templates(read):  # first: OpenUSD lists their folders when asset paths are collected
+        pattern = _checked_file(layer, template, folder)
+        for file in files_of_template(pattern):
+            _checked_file(layer, str(file), folder)
+            found.append(_LayerRef(str(file), None if is_allowed(file) else rig_folder, None, variables))
     assets = asset_paths(read)
     composed, sublayers = read.GetCompositionAssetDependencies(), set(read.subLayerPaths)
     for asset in assets:
         is_part = asset in composed or is_layer(asset)
-        if home is not None or not is_part:
-            _inside(layer, asset, folder)
+        if rig_folder is not None or not is_part:
+            _checked_file(layer, asset, folder)
         target = target_of(layer, asset) if is_part else None
         if target is None:
             continue
         allowed = is_allowed(file_of(target))
         user = None if allowed or file_of(target).resolve().is_relative_to(folder) else layer.identifier
-        one = _Named(target, None if allowed else home, user, variables)
-        named += [one, one._replace(is_sublayer=True)] if asset in sublayers else [one]
-    return named
+        ref = _LayerRef(target, None if allowed else rig_folder, user, variables)
+        found += [ref, ref._replace(is_sublayer=True)] if asset in sublayers else [ref]
+    return found
 
 
-def _inside(layer: Sdf.Layer, asset: str, folder: Path) -> Path:
-    """Return the file that a layer names.
+def _checked_file(layer: Sdf.Layer, asset: str, folder: Path) -> Path:
+    """Return the file of an asset path after checking it.
 
     Raises:
-        RigError: It lies outside a folder, links resolved, and was not allowed.
+        RigError: The file, with links resolved, is outside the folder and not allowed.
     """
     target = target_of(layer, asset)
     if target is None or not (is_allowed(file_of(target)) or file_of(target).resolve().is_relative_to(folder)):
-        raise RigError(f"names the file {asset:.200}, outside its own folder.", path=layer.identifier, hint=_ALLOW)
+        found = f"refers to the file {asset:.200}, which is outside its own folder."
+        raise RigError(found, path=layer.identifier, hint=_ALLOW)
     return file_of(target)
 
 
 def _layer(name: str, sums: Mapping[Path, str]) -> Sdf.Layer | None:
-    """Open a layer, after comparing its file with the checksum that a rig has for it; None if there is no such file.
+    """Open a layer after comparing its file with the checksum that the rig records; None if the file is missing.
 
     Raises:
-        RigError: It is damaged, or no layer.
+        RigError: The file is damaged, or not a layer.
     """
     file = file_of(name)
     if not file.exists():
@@ -231,16 +243,16 @@ def _layer(name: str, sums: Mapping[Path, str]) -> Sdf.Layer | None:
         layer = Sdf.Layer.FindOrOpen(name)
     except Tf.ErrorException as error:
         raise RigError(_unreadable(file, error), path=file) from error
-    if layer is not None and not _is_whole(layer):
-        raise RigError("is damaged: it names prims or properties that it does not hold.", path=file)
+    if layer is not None and not _is_intact(layer):
+        raise RigError("is damaged: it lists prims or properties that it does not contain.", path=file)
     return layer
 
 
-def _is_whole(layer: Sdf.Layer) -> bool:
-    """Return whether a layer holds all prims and properties it names; OpenUSD ends the process where it does not.
+def _is_intact(layer: Sdf.Layer) -> bool:
+    """Return whether a layer contains all prims and properties it lists; OpenUSD aborts the process if not.
 
     Raises:
-        RigError: It holds more than is read.
+        RigError: It exceeds the limits.
     """
     missing, count = [], 0
 
@@ -252,20 +264,20 @@ def _is_whole(layer: Sdf.Layer) -> bool:
         nonlocal count
         count += 1
         samples = layer.GetNumTimeSamplesForPath(path) if path.IsPropertyPath() else 0
-        if count > MOST_SPECS or samples > MOST_SAMPLES:
-            found = f"{MOST_SPECS} prims and properties" if count > MOST_SPECS else f"{MOST_SAMPLES} samples of {path}"
-            raise RigError(f"holds more than {found:.200}, the most that is read.", path=layer.identifier)
+        if count > MAX_SPECS or samples > MAX_SAMPLES:
+            found = f"{MAX_SPECS} prims and properties" if count > MAX_SPECS else f"{MAX_SAMPLES} samples of {path}"
+            raise RigError(f"has more than {found:.200}, the limit.", path=layer.identifier)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     return not missing
 
 
-def _carries_rig(layer: Sdf.Layer) -> bool:
+def _is_rig_layer(layer: Sdf.Layer) -> bool:
     found = []
 
     def visit(path: Sdf.Path) -> None:
         if path.IsPropertyPath():
-            found.append(path.name.startswith(_OF_A_RIG))
+            found.append(path.name.startswith(_RIG_ATTRIBUTES))
         elif path.IsPrimPath() or path.IsPrimVariantSelectionPath():
             spec = layer.GetPrimAtPath(path)
             schemas = spec.GetInfo("apiSchemas") if spec else None

@@ -1,33 +1,47 @@
-"""Validation: jawusd's rules as UsdValidation validators, and every finding about a file in one list."""
+"""Validation of USD files: jawusd's rules as UsdValidation validators, and the findings of all validators.
+
+The findings of NVIDIA's validator (usd-validation-nvidia) are available if it is installed.
+"""
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 
 from pxr import Sdf, Usd
 
+from jawusd.base.errors import RigError
+from jawusd.rig.layout import rig_prims
 from jawusd.rig.read import open_stage
 from jawusd.rig.rules import RULES, Finding, Rule
-from jawusd.rig.schema import rig_prims
 
 try:
     from pxr import UsdValidation
 except ImportError:  # OpenUSD before 25.02 has no such module
     UsdValidation = None
 
+PROGRAM = "nvidia_usd_validate"
+_TIMEOUT_S = 600
+_NVIDIA_SEVERITIES = {"INFO": "info", "WARNING": "warning"}
+
 KEYWORD = "JawUsd"
 _PREFIX = "jawusd:"
 
-# UsdValidation takes validators written in Python from OpenUSD 26.05 on.
+# UsdValidation accepts validators written in Python since OpenUSD 26.05.
 _PLUGGABLE = UsdValidation is not None and hasattr(UsdValidation.ValidationRegistry, "RegisterStageValidator")
 _NO_STOCK = "OpenUSD's own validators were not run: usd-core is older than 26.5."
 
 
 def register_validators() -> bool:
-    """Register the rules with UsdValidation, once per process, so that any tool that validates applies them.
+    """Register the rules with UsdValidation, so that all validation in this process applies them.
 
-    Returns False if this OpenUSD takes no validators written in Python.
+    Returns False if this version of OpenUSD does not accept validators written in Python.
     """
     if not _PLUGGABLE:
         return False
@@ -40,9 +54,9 @@ def register_validators() -> bool:
 
 
 def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
-    """Return the findings of UsdValidation and of jawusd's own rules about any USD file.
+    """Return the findings of UsdValidation and jawusd's own rules about a USD file.
 
-    A file without a rig is checked by the stock validators alone.
+    A file without a rig is checked by OpenUSD's own validators only.
 
     Raises:
         RigError: The file cannot be opened.
@@ -57,7 +71,7 @@ def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
 
 
 def _rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Return the prims that carry a rig; of instances that share one, the first."""
+    """Return the rig prims of a stage, one for each prototype that instances share."""
     first: dict[Sdf.Path, Usd.Prim] = {}
     for prim in rig_prims(stage):
         first.setdefault(prim.GetPrimInPrototype().GetPath() if prim.IsInstanceProxy() else prim.GetPath(), prim)
@@ -96,3 +110,41 @@ def _finding(error: UsdValidation.ValidationError) -> Finding:
     return Finding(
         severities.get(error.GetType(), "error"), error.GetName(), sites[0] if sites else "/", error.GetMessage()
     )
+
+
+def find_nvidia_validator() -> Path | None:
+    """Return NVIDIA's validator next to this Python interpreter or on PATH; None if there is none."""
+    found = shutil.which(PROGRAM, path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
+    return Path(found) if found else None
+
+
+def nvidia_findings(path: str | os.PathLike[str], program: Path) -> list[Finding]:
+    """Return the findings of NVIDIA's validator with its default rules.
+
+    Args:
+        path: The file to validate.
+        program: The validator, from `find_nvidia_validator`.
+
+    Raises:
+        RigError: The program wrote no report.
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        report = Path(scratch) / "report.json"
+        command = [str(program), "--json-output", str(report), str(path)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+        except subprocess.TimeoutExpired as error:
+            raise RigError(f"{PROGRAM} did not finish in {_TIMEOUT_S} s.", path=path) from error
+        if not report.is_file():
+            raise RigError(f"{PROGRAM} wrote no report: {done.stderr.strip()[-300:]}", path=path)
+        rules = json.loads(report.read_text(encoding="utf-8")).get("rules", [])
+    return [
+        Finding(
+            _NVIDIA_SEVERITIES.get(issue["severity"], "error"),
+            issue["rule"]["name"],
+            str(issue["at"] or "/"),
+            issue["message"],
+        )
+        for rule in rules
+        for issue in rule["issues"]
+    ]

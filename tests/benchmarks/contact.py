@@ -43,8 +43,7 @@ from jawusd.pipeline.contact import condyle_solids, tooth_solids, with_condyle_c
 from jawusd.pipeline.fit import fit_subject
 from jawusd.pipeline.subject import Subject, _measured, load_meshes, subject_of_capture
 from jawusd.rig.author import decoder_layer
-from jawusd.rig.sampling import sample_valid
-from jawusd.rig.table import DecoderTable
+from jawusd.rig.table import DecoderTable, sample_valid
 from jawusd.synthetic.anatomy import build_anatomy, opened_bite
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person

@@ -26,7 +26,7 @@ from jawusd.geometry import se3_exp  # noqa: E402
 from jawusd.plugins import jawusd_reader  # noqa: E402
 from jawusd.rig import load_rig  # noqa: E402
 from jawusd.rig.onnx_sidecar import decode_model  # noqa: E402
-from jawusd.rig.sampling import sample_valid  # noqa: E402
+from jawusd.rig.table import sample_valid  # noqa: E402
 
 MESHES = {"geo.usdc", "proxy.usdc", "actor.usdz"}  # files that hold meshes
 RIG = {"actor.usda", "rig.usdc", "actor.onnx", "actor_encode.onnx", "actor_skel.usdc", "anim_capture.usdc"}

@@ -322,7 +322,7 @@ def test_cameras_of_any_stage(tmp_path):
     with pytest.raises(CalibrationError, match=r"has no jaw:imageSize"):
         read_cameras(tmp_path / "shot.usda", dict)
     Usd.Stage.CreateNew(str(tmp_path / "none.usda")).Save()
-    with pytest.raises(RigError, match="holds no camera"):
+    with pytest.raises(RigError, match="has no perspective camera"):
         read_cameras(tmp_path / "none.usda", dict)
 
 

@@ -50,7 +50,7 @@ MISTAKES = [
     (
         "a folder in place of a rig",
         ["pose", "empty", "--d", "1,2,3"],
-        ["without actor.usda", "Name the folder of a build"],
+        ["without actor.usda", "Give the folder of a build"],
     ),
     ("a rig that is not there", ["info", "out/actor.usda"], ["out/actor.usda"]),
     ("a video in place of a rig", ["info", "left.mp4"], ["left.mp4"]),

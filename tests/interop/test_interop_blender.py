@@ -15,8 +15,8 @@ from example_rig import (
 from foreign import run_in
 
 from jawusd.rig.bake import bake_rig
+from jawusd.rig.geo import linear_from_srgb
 from jawusd.rig.glb import write_glb
-from jawusd.rig.scan_look import linear_from_srgb
 from jawusd.rig.stage_poses import fit_poses_of_stage
 
 MESHES = {"MandibleMesh": "mandible", "LowerTeethMesh": "lower_teeth", "SkullMesh": "skull"}

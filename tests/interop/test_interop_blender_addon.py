@@ -20,7 +20,7 @@ from jawusd.plugins.extension import build_extension
 from jawusd.rig.animation import write_animation
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_parameters_of_stage
-from jawusd.rig.sampling import sample_valid
+from jawusd.rig.table import sample_valid
 
 BLENDERS = ["blender45", "blender50"]
 EXACT_MM = 1e-4

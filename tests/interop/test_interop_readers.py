@@ -25,7 +25,7 @@ from jawusd.plugins.extension import copy_scripts
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.cameras import write_cameras
 from jawusd.rig.glb import write_glb
-from jawusd.rig.nvidia import nvidia_findings
+from jawusd.rig.validate import nvidia_findings
 
 SHOWN = (0, 9, 17, 30, 39)
 

@@ -7,7 +7,7 @@ from foreign import SCRIPTS, environment, run, run_in
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.package import write_package
+from jawusd.rig.publish import write_package
 
 KINDS, OFFSET, COUNT = {"hero": "anchored", "villain": "additive"}, 10, 12
 

@@ -9,8 +9,8 @@ from pathlib import PurePosixPath
 
 import pytest
 
-from jawusd.plugins.carrying import carried_files
 from jawusd.plugins.extension import build_extension
+from jawusd.plugins.vendoring import vendored_files
 
 
 def test_zip_holds_manifest_modules_and_reader(tmp_path):
@@ -19,7 +19,7 @@ def test_zip_holds_manifest_modules_and_reader(tmp_path):
     with zipfile.ZipFile(first) as archive:
         names = set(archive.namelist())
         own = {f"{name}.py" for name in ("__init__", "bake", "handle", "jaw", "operators", "panel", "scene")}
-        own |= {"blender_manifest.toml", "carried.py", "carried_usd.py"}
+        own |= {"blender_manifest.toml", "vendored.py", "vendored_usd.py"}
         assert {name for name in names if "/" not in name} == own
         assert {"jawusd/evaluator/rig.py", "jawusd/rig/animation.py", "jawusd/plugins/jawusd_reader.py"} <= names
         manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
@@ -40,7 +40,7 @@ def test_zip_holds_manifest_modules_and_reader(tmp_path):
                     assert found <= {*sys.stdlib_module_names, "numpy", "pxr", "bpy", "bpy_extras"}, name
 
 
-def test_carried_modules_work_where_no_jawusd_is(tmp_path):
+def test_vendored_modules_work_where_no_jawusd_is(tmp_path):
     """Below another package, in an interpreter that cannot import jawusd."""
     build_extension(tmp_path / "a.zip")
     with zipfile.ZipFile(tmp_path / "a.zip") as archive:
@@ -50,7 +50,7 @@ def test_carried_modules_work_where_no_jawusd_is(tmp_path):
 import sys
 sys.modules["jawusd"] = None
 from inside.jawusd.evaluator import JawRig
-from inside.carried_usd import rig_of, write_animation
+from inside.vendored_usd import rig_of, write_animation
 assert not [name for name in sys.modules if name.startswith("jawusd.")]
 print(JawRig.__module__, write_animation.__module__)
 """
@@ -58,10 +58,10 @@ print(JawRig.__module__, write_animation.__module__)
     assert done.stdout == "inside.jawusd.evaluator.rig inside.jawusd.rig.animation\n", done.stderr
 
 
-def test_what_cannot_be_carried_is_refused(tmp_path):
+def test_modules_that_cannot_be_vendored_are_rejected(tmp_path):
     (tmp_path / "stub.pyi").write_text("import jawusd.evaluator\n")
-    with pytest.raises(ValueError, match="cannot be carried"):
-        carried_files([tmp_path / "stub.pyi"])
+    with pytest.raises(ValueError, match="cannot be vendored"):
+        vendored_files([tmp_path / "stub.pyi"])
 
 
 def test_one_command_writes_it(tmp_path):

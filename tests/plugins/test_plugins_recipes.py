@@ -19,7 +19,7 @@ import jawusd.plugins
 from jawusd.evaluator import JawRig, load
 from jawusd.geometry import make_transform
 from jawusd.plugins.extension import copy_scripts
-from jawusd.rig.sampling import sample_valid
+from jawusd.rig.table import sample_valid
 
 FRAMES = range(1, 25)
 POINTS = np.array([[0.0, 0, 0], [10, 20, -30], [-50, 3, 8]])
@@ -261,7 +261,7 @@ def test_parameters_outside_the_bound_are_named_and_moved_inside(recipes, model)
     d1, d2, d3 = OUTSIDE
     keys = {0: (0.0, 0.0, 0.0), 7: (d1, min(d2, rig.d_range[1, 1]), min(d3, rig.d_range[2, 1]))}
     assert rig.margin(keys[7]) < -1.0
-    with pytest.warns(UserWarning, match=r"1 of 2 frames lie outside the bound and are moved .* 7, d = \(20.00, "):
+    with pytest.warns(UserWarning, match=r"1 of 2 frames are outside the bound and moved .* 7, d = \(20.00, "):
         moved = recipes.poses(reader, keys)
     np.testing.assert_allclose(moved[7], rig.pose(rig.project(keys[7])), atol=1e-4)
     with pytest.warns(UserWarning, match="kept as they are"):

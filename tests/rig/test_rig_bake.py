@@ -21,8 +21,7 @@ from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import so3_left_jacobian
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.geo import corner_normals
-from jawusd.rig.sampling import grid_axes, grid_points, sample_valid, valid_box
-from jawusd.rig.table import SIZES, build_table, table_error
+from jawusd.rig.table import SIZES, build_table, grid_axes, grid_points, sample_valid, table_error, valid_box
 
 GRAPHS = {"actor.onnx", "actor_encode.onnx"}
 FILES = {"actor.usda", "rig.usdc", "geo.usdc", "anim_capture.usdc", "actor_skel.usdc", "actor.usdz"} | GRAPHS

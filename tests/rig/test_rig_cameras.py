@@ -101,7 +101,7 @@ def test_lost_frames_get_no_sample(anchored_folder):
     ("chosen", "head", "message"),
     [
         ([], head_motion(2), "needs cameras"),
-        ([*cameras(), cameras()[0]], head_motion(2), "name of its own"),
+        ([*cameras(), cameras()[0]], head_motion(2), "unique names"),
         (cameras(skew=2.0), head_motion(2), "skewed"),
         (cameras(), np.full((2, 4, 4), np.nan), "no pose"),
     ],

@@ -10,7 +10,7 @@ from pxr import Sdf
 
 from jawusd.base.errors import RigError
 from jawusd.rig import describe, load_rig, validate_stage, write_animation
-from jawusd.rig.checksums import CHECKSUMS
+from jawusd.rig.asset_paths import CHECKSUMS
 from jawusd.rig.publish import publish_rig
 
 

@@ -9,8 +9,7 @@ from pxr import Usd, UsdGeom
 
 from jawusd.base.errors import RigError
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.geo import read_geometry, read_gum
-from jawusd.rig.scan_look import linear_from_srgb, srgb_from_linear
+from jawusd.rig.geo import linear_from_srgb, read_geometry, read_gum, srgb_from_linear
 
 
 def bake(folder, meshes):

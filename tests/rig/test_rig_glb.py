@@ -14,10 +14,9 @@ from jawusd.formats.mesh import crown_face_mask
 from jawusd.geometry import make_transform
 from jawusd.rig.animation import write_animation
 from jawusd.rig.author import decoder_layer, interface_layer
-from jawusd.rig.geo import build_geometry
+from jawusd.rig.geo import build_geometry, linear_from_srgb
 from jawusd.rig.glb import write_glb
 from jawusd.rig.layers import write_layer
-from jawusd.rig.scan_look import linear_from_srgb
 from jawusd.rig.table import build_table
 
 KINDS = {5123: "<u2", 5126: "<f4", 5125: "<u4"}

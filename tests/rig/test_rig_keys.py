@@ -3,7 +3,7 @@
 import pytest
 from pxr import Sdf, Ts, Usd
 
-from jawusd.rig.keys import key_times, times_between, values_at
+from jawusd.rig.attributes import key_and_frame_times, key_times, values_at
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def test_splines_have_their_knots_and_the_whole_frames_between(stage):
     attribute = stage[0].GetAttributeAtPath("/A.x")
     assert key_times(attribute) == [1, 2, 3, 4, 4.5, 5]
     assert values_at(attribute, [2, 4.5]) == [2, 7]
-    times, keyed = times_between([attribute])
+    times, keyed = key_and_frame_times([attribute])
     assert times.tolist() == [1, 2, 3, 4, 4.5, 5] and keyed.all()
 
 

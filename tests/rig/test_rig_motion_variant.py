@@ -12,9 +12,8 @@ from jawusd.rig import load_rig, validate_stage, write_animation
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.geo import MESH_PATHS
 from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
-from jawusd.rig.package import write_package
-from jawusd.rig.publish import publish_rig
-from jawusd.rig.rebake import Rebaked, departure, motion_of_stage, write_rebaked
+from jawusd.rig.publish import publish_rig, write_package
+from jawusd.rig.rebake import Rebaked, deviation, motion_of_stage, write_rebaked
 
 FRAMES, D = example_motion()
 OTHER = {30: (4.0, 0.0, 0.0), 69: (4.0, 1.0, 0.5)}
@@ -102,7 +101,7 @@ def test_jawusd_reads_the_skeleton(anchored_folder, tmp_path, path):
     frames, T = read_poses_of_stage(file, path)
     np.testing.assert_array_equal(frames, FRAMES)
     np.testing.assert_allclose(T, rig.pose(D), atol=2e-5)
-    away = departure(file, rig)
+    away = deviation(file, rig)
     assert away.frames == 0 and away.of == len(D) and away.largest_mm < 1e-4
     assert "40 poses: 40 inside" in run("validate", anchored_folder / "actor.usda", file, "--prim", path)
     said = run("encode", anchored_folder / "actor.usda", file, "--prim", path, "-o", tmp_path / "d.csv")
@@ -186,9 +185,9 @@ def bent(actor):
     ("change", "words", "read"),
     [
         (other_key, "the baked pose at 50 is", True),
-        (binding("skull", "jointIndices", Vt.IntArray([1])), "different ways", True),
-        (binding("upper_teeth", "geomBindTransform", Gf.Matrix4d().SetTranslate((0, 1, 0))), "different ways", True),
-        (binding("lower_teeth", "jointIndices", Vt.IntArray([0])), "different ways", False),
+        (binding("skull", "jointIndices", Vt.IntArray([1])), "differently", True),
+        (binding("upper_teeth", "geomBindTransform", Gf.Matrix4d().SetTranslate((0, 1, 0))), "differently", True),
+        (binding("lower_teeth", "jointIndices", Vt.IntArray([0])), "differently", False),
         (unbound, "but not /Actor/geo/Mandible/LowerTeethMesh", False),
         (bent, "bend /Actor/geo/Mandible/MandibleMesh", False),
     ],

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from jawusd.base.errors import RigError
-from jawusd.rig.nvidia import PROGRAM, find_nvidia_validator, nvidia_findings
 from jawusd.rig.rules import Finding
+from jawusd.rig.validate import PROGRAM, find_nvidia_validator, nvidia_findings
 
 
 def program(folder, body):
@@ -42,7 +42,7 @@ def test_a_clean_report_is_no_finding(tmp_path):
 
 
 def test_no_report_is_an_error(tmp_path):
-    with pytest.raises(RigError, match="gave no report: broken"):
+    with pytest.raises(RigError, match="wrote no report: broken"):
         nvidia_findings("x", program(tmp_path, "sys.exit('broken')"))
 
 

@@ -18,12 +18,10 @@ import jawusd
 from jawusd.base.errors import FormatError, RigError
 from jawusd.evaluator import JawRig
 from jawusd.geometry import se3_exp
-from jawusd.rig import onnx_check
-from jawusd.rig.arrays import model_hash
+from jawusd.rig import onnx_sidecar
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.onnx_check import check_written, onnx_error_mm
-from jawusd.rig.onnx_sidecar import OPSET, decode_model, encode_model, write_onnx
-from jawusd.rig.sampling import sample_valid
+from jawusd.rig.onnx_sidecar import OPSET, check_written, decode_model, encode_model, onnx_error_mm, write_onnx
+from jawusd.rig.table import sample_valid
 
 
 def run(rig, d, dtype, outputs=("pose", "twist", "margin")):
@@ -143,7 +141,7 @@ def test_file_says_what_it_is(kind, tmp_path):
     path = write_onnx(tmp_path / "actor.onnx", decode_model(rig))
     model = onnx.load(path)
     properties = {entry.key: entry.value for entry in model.metadata_props}
-    assert properties["rig_hash"] == model_hash(rig)
+    assert properties["rig_hash"] == rig.model_hash
     assert (properties["length_unit"], properties["angle_unit"]) == ("mm", "rad")
     assert (properties["twist_order"], properties["kind"]) == ("omega v", kind)
     assert model.opset_import[0].version == OPSET
@@ -172,7 +170,7 @@ def test_check_measures_the_distance_and_refuses_other_files(kind, tmp_path):
 @pytest.mark.parametrize("installed", [True, False])
 def test_what_was_written_is_checked_by_either_runtime(kind, tmp_path, monkeypatch, installed):
     rig, used = example_rig(kind), []
-    monkeypatch.setattr(onnx_check, "ReferenceEvaluator", lambda model: used.append(1) or ReferenceEvaluator(model))
+    monkeypatch.setattr(onnx_sidecar, "ReferenceEvaluator", lambda model: used.append(1) or ReferenceEvaluator(model))
     if not installed:
         monkeypatch.setitem(sys.modules, "onnxruntime", None)
     path = write_onnx(tmp_path / "actor.onnx", decode_model(rig))
@@ -242,7 +240,7 @@ def test_a_rig_of_its_onnx_file_poses_and_judges(folder):
 
 def test_a_model_beside_the_onnx_file_will_do_and_encoding_falls_back(folder, tmp_path):
     shutil.copy(folder / "actor.onnx", tmp_path / "actor.onnx")
-    with pytest.raises(FormatError, match=r"beside neither actor.usda nor model.npz"):
+    with pytest.raises(FormatError, match=r"has neither actor.usda nor model.npz"):
         jawusd.load(tmp_path / "actor.onnx")
     save(example_rig(), tmp_path / "model.npz")
     rig = jawusd.load(tmp_path / "actor.onnx")
@@ -254,7 +252,7 @@ def test_onnx_files_that_cannot_pose_are_refused(folder, tmp_path):
     (copied := tmp_path / "actor").mkdir()
     save(example_rig(), copied / "model.npz")
     for name, make, message in (
-        ("encode.onnx", lambda: (folder / "actor_encode.onnx").read_bytes(), "encodes poses"),
+        ("encode.onnx", lambda: (folder / "actor_encode.onnx").read_bytes(), "is an encoder"),
         ("other.onnx", lambda: decode_model(example_rig("additive")).SerializeToString(), "another model"),
         ("cut.onnx", lambda: (folder / "actor.onnx").read_bytes()[:5000], "not a valid ONNX file"),
     ):

@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdGeom
 from jawusd.base.errors import RigError
 from jawusd.rig import load_rig
 from jawusd.rig.motion_read import read_poses_of_stage
-from jawusd.rig.package import write_package
+from jawusd.rig.publish import write_package
 
 
 def test_package_holds_one_binary_layer(folder):

@@ -65,7 +65,7 @@ def test_actors_packed_together_keep_their_data(published, tmp_path):
 
 
 def test_what_cannot_be_published(published, anchored_folder, tmp_path):
-    with pytest.raises(RigError, match="starts no file names"):
+    with pytest.raises(RigError, match="is not a valid prefix"):
         publish_rig(anchored_folder, tmp_path / "out", "../hero")
     with pytest.raises(RigError, match="own folder"):
         publish_rig(anchored_folder, anchored_folder, "hero")
@@ -103,7 +103,7 @@ def test_actors_mixed_up_by_a_packager_are_refused(tmp_path, file):
         try:
             assert load_rig(package, f"/Shot/{name}").kind == kind
         except FormatError as error:
-            refused += "mixed in packing" in str(error)
+            refused += "packing mixed files" in str(error)
     assert refused == 1
     found = [finding.message for finding in validate_stage(package) if finding.rule == "Model"]
     assert any("mixed" in message for message in found)

@@ -15,7 +15,7 @@ from jawusd.evaluator import JawRig
 from jawusd.rig import write_animation
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
-from jawusd.rig.rebake import departure, motion_of_stage
+from jawusd.rig.rebake import deviation, motion_of_stage
 
 KEYS = {1: (0.0, 0.0, 0.0), 13: (15.0, 2.0, 1.0), 25: (4.0, -2.0, 0.5)}
 
@@ -126,8 +126,8 @@ def test_what_was_edited_last_counts(folder, kind):
             attribute.Set(value + (0.5 if expected == "d" else Gf.Vec3d(0, -0.5, 0)), frame)
         layer.Save()
         assert motion_of_stage(layer.realPath, rig).origin == expected
-    assert departure(animation, rig).frames == 0 and motion_of_stage(animation, rig).origin == "d"
-    with pytest.raises(RigError, match="goes over the stage"):
+    assert deviation(animation, rig).frames == 0 and motion_of_stage(animation, rig).origin == "d"
+    with pytest.raises(RigError, match="is a layer over the stage"):
         run_rebake_onto_itself(folder, animation)
     layer = Sdf.Layer.FindOrOpen(str(animation))
     for frame in frames.tolist():
@@ -145,7 +145,7 @@ def run_rebake_onto_itself(folder, path):
 
 def test_one_of_several_rigs_is_named(folder, kind):
     path = shot(folder, key_d, actors=("Anna", "Ben"))
-    with pytest.raises(FormatError, match="Name the prim"):
+    with pytest.raises(FormatError, match="Choose one with --prim"):
         motion_of_stage(path, example_rig(kind))
     run("rebake", folder / "actor.usda", path, "-o", folder / "baked.usdc", "--root", "--prim", "/Shot/Ben")
     for name, moves in (("Anna", False), ("Ben", True)):
@@ -198,7 +198,7 @@ def test_a_mandible_that_departs_from_d_between_keys_is_found(anchored_folder):
 
     path = shot(folder, key_both)
     assert "(0.03 allowed)" in run("validate", path, code=1)
-    assert departure(path, rig).largest_mm > 0.3
+    assert deviation(path, rig).largest_mm > 0.3
     run("validate", folder / "actor.usda", path, code=1)
 
 
@@ -233,7 +233,7 @@ def test_a_moved_skull_is_found_and_taken_out_of_poses(anchored_folder):
     expected[:, 1, 3] += 2
     np.testing.assert_allclose(T, expected, atol=1e-6)
     done = CliRunner().invoke(app, ["rebake", str(folder / "actor.usda"), str(path), "--from", "d"])
-    assert "skull moved by 2.00 mm" in str(done.exception)
+    assert "is moved by 2.00 mm" in str(done.exception)
 
 
 def test_the_rig_of_another_person_is_refused(anchored_folder):
@@ -241,10 +241,10 @@ def test_the_rig_of_another_person_is_refused(anchored_folder):
     rig = example_rig()
     path = shot(folder, key_d)
     other = JawRig(rig.arrays, {**rig.meta, "actor": "Ben"})
-    with pytest.raises(FormatError, match='is the rig of "example", the rig given is of "Ben"'):
+    with pytest.raises(FormatError, match='is the rig of "example", but the given rig is of "Ben"'):
         motion_of_stage(path, other)
-    with pytest.raises(FormatError, match="another person's d"):
-        departure(path, other)
+    with pytest.raises(FormatError, match="their d and bounds differ"):
+        deviation(path, other)
     bake_rig(folder / "ben", other, example_meshes(), name="Ben", fps=24, table_size=17)
     for command in (["validate"], ["encode"], ["animate"], ["rebake"]):
         done = CliRunner().invoke(app, [*command, str(folder / "ben" / "actor.usda"), str(path)])
@@ -423,4 +423,4 @@ def test_a_mandible_whose_meshes_were_moved_apart_is_not_baked(anchored_folder):
 
     path = department_shot(anchored_folder, move, ("Anna",))
     done = CliRunner().invoke(app, ["rebake", str(path), "-o", str(anchored_folder / "out.usdc")])
-    assert "move in different ways" in str(done.exception) and not (anchored_folder / "out.usdc").exists()
+    assert "move differently" in str(done.exception) and not (anchored_folder / "out.usdc").exists()

@@ -9,7 +9,7 @@ from pathlib import Path
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from jawusd.rig import schema_is_live
-from jawusd.rig.schema import SCHEMA_NAME, has_jaw_api
+from jawusd.rig.layout import SCHEMA_NAME, has_jaw_api
 
 SCHEMAS = Path(__file__).parents[2] / "schemas"
 FILES = ("schema.usda", "generatedSchema.usda", "plugInfo.json")

@@ -11,7 +11,7 @@ from jawusd.base.errors import RigError
 from jawusd.base.inputs import SETTING
 from jawusd.rig import describe, untrusted
 from jawusd.rig.asset_paths import file_of
-from jawusd.rig.package import write_package
+from jawusd.rig.publish import write_package
 from jawusd.rig.read import open_stage
 
 OUTSIDE = '#usda 1.0\nover "Actor" {\n    string jaw:actor = "evil"\n    double jaw:d1 = 7\n}\n'
@@ -245,7 +245,7 @@ def test_a_search_path_leads_to_rigs_alone(anchored_folder, tmp_path):
         command = [sys.executable, "-c", code, f"{name}.usda"]
         said[name] = subprocess.check_output(command, cwd=tmp_path / "shots", env=environment, text=True)
     assert said["rig"] == "anchored\n"
-    assert "evil.usda, outside its own folder and no rig" in said["other"]
+    assert "evil.usda, which is outside its own folder and not a rig" in said["other"]
 
 
 def test_a_path_that_is_found_beside_the_shot_is_read(anchored_folder):
@@ -290,13 +290,13 @@ def test_expressions_are_read_by_the_variables_they_have(where, anchored_folder)
 
 
 def test_layers_named_in_endlessly_many_ways_are_refused(anchored_folder, monkeypatch):
-    monkeypatch.setattr(untrusted, "_MOST_READINGS", 50)
+    monkeypatch.setattr(untrusted, "_MAX_LAYER_READS", 50)
     for i in range(12):
         arcs = "".join(f'def "{c}" ( references = @./{c}{i + 1}.usda@</A> ) {{}}\n' for c in "ab")
         for c in "ab":
             (anchored_folder / f"{c}{i}.usda").write_text(with_variables({f"X{i}": c}, "") + arcs)
     with pytest.raises(RigError, match="more than 50 ways"):
-        untrusted.check_reach(anchored_folder / "a0.usda")
+        untrusted.check_file_access(anchored_folder / "a0.usda")
 
 
 @pytest.mark.parametrize("name", ["shot.usda", "below.usda"])

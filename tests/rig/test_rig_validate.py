@@ -140,7 +140,7 @@ BROKEN = [
     (break_table_shape, "actor.usda", "Table", "error", "jaw:decoder:shape"),
     (break_table_finiteness, "actor.usda", "Table", "error", "not finite"),
     (break_table_agreement, "actor.usda", "Table", "error", "mm from the model"),
-    (break_onnx_presence, "actor.usda", "Onnx", "error", "not there"),
+    (break_onnx_presence, "actor.usda", "Onnx", "error", "does not exist"),
     (break_onnx_hash, "actor.usda", "Onnx", "error", "SHA-256 differs"),
     (break_onnx_identity, "actor.usda", "Onnx", "error", "another model"),
     (break_onnx_agreement, "actor.usda", "Onnx", "error", "mm from the model"),

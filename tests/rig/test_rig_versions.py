@@ -6,9 +6,9 @@ from example_rig import example_rig, forget_checksums
 from pxr import Sdf, Usd
 
 from jawusd.base.errors import VersionError
-from jawusd.rig import describe, load_rig, validate_stage, versions
+from jawusd.rig import attributes, describe, load_rig, validate_stage
 
-NEXT = versions.FORMAT_VERSION + 1
+NEXT = attributes.FORMAT_VERSION + 1
 OLD_NAME, NEW_NAME = "jaw:decoder:error", "jaw:decoder:maxError"
 
 
@@ -16,7 +16,7 @@ OLD_NAME, NEW_NAME = "jaw:decoder:error", "jaw:decoder:maxError"
 def older(anchored_folder, monkeypatch):
     """Return a rig as a version before the present one would have been: another name, inches in the incisal point.
 
-    What is present becomes the next version, and STEPS gets the step to it.
+    What is present becomes the next version, and UPGRADES gets the step to it.
     """
     for file, change in (("rig.usdc", _rename), ("rig.usdc", _to_inches)):
         layer = Sdf.Layer.OpenAsAnonymous(str(anchored_folder / file))
@@ -30,8 +30,8 @@ def older(anchored_folder, monkeypatch):
         incisor = prim.GetAttribute("jaw:model:incisor")
         incisor.Set(np.array(incisor.Get()) * 25.4)
 
-    monkeypatch.setattr(versions, "FORMAT_VERSION", NEXT)
-    monkeypatch.setitem(versions.STEPS, NEXT - 1, step)
+    monkeypatch.setattr(attributes, "FORMAT_VERSION", NEXT)
+    monkeypatch.setitem(attributes.UPGRADES, NEXT - 1, step)
     return anchored_folder
 
 
@@ -63,7 +63,7 @@ def test_reading_twice_on_one_stage_upgrades_once(older):
     stage = Usd.Stage.Open(str(older / "actor.usda"))
     prim = stage.GetPrimAtPath("/Actor")
     for _ in range(2):
-        versions.upgrade_rig(prim, older)
+        attributes.upgrade_rig(prim, older)
         assert prim.GetAttribute("jaw:formatVersion").Get() == NEXT
     np.testing.assert_allclose(prim.GetAttribute("jaw:model:incisor").Get(), example_rig().arrays["incisor"])
 
@@ -77,4 +77,4 @@ def test_a_version_after_the_present_one_is_refused(older):
 
 
 def test_every_older_version_has_a_step():
-    assert sorted(versions.STEPS) == list(range(1, versions.FORMAT_VERSION))
+    assert sorted(attributes.UPGRADES) == list(range(1, attributes.FORMAT_VERSION))

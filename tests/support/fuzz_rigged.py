@@ -62,7 +62,7 @@ def _check_inside(place):
 
 def onnx_reader(rig):
     def read(place, path):
-        from jawusd.rig.onnx_check import onnx_error_mm
+        from jawusd.rig.onnx_sidecar import onnx_error_mm
 
         onnx_error_mm(path, rig, np.array([[5.0, 0.2, 0.1]]))
 

@@ -1,6 +1,6 @@
-"""Blender add-on: a jaw rig imported from USD gets sliders, keys, a handle, its cameras, and a way back to USD.
+"""Blender add-on for jaw rigs imported from USD: sliders, keys, handles, cameras, and export back to USD.
 
-The extension is built by `python -m jawusd.plugins FILE.zip`, which puts what it uses of jawusd beside these modules.
+`python -m jawusd.plugins FILE.zip` builds the extension and adds the modules of jawusd that it needs.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import bpy
 
-from . import bake, carried, handle, jaw, operators, panel, scene
+from . import bake, handle, jaw, operators, panel, scene, vendored
 
 
 class JawUsdHook(bpy.types.USDHook):
@@ -23,16 +23,16 @@ class JawUsdHook(bpy.types.USDHook):
     def on_import(context: bpy.types.Context) -> bool:
         """Link every rig and camera of the stage; Blender calls this at the end of an import."""
         stage, prim_map = context.get_stage(), context.get_prim_map()
-        alone = not jaw.actors()
+        is_first = not jaw.actors()
         linked = jaw.link_rigs(stage, prim_map)
-        if linked and alone:
-            scene.take_rate(stage)
+        if linked and is_first:
+            scene.apply_stage_settings(stage)
         scene.add_plates(stage, prim_map)
         return linked
 
 
 def glTF2_pre_export_callback(export_settings: Mapping[str, logging.Logger]) -> None:
-    """Warn of a jaw that a glTF file would hold without its motion; Blender's exporter calls it by this name."""
+    """Warn if a glTF file would lack the motion of a jaw; Blender's exporter calls this by name."""
     warning = bake.warning(bpy.context.scene)
     if warning:
         export_settings["log"].warning(warning)
@@ -40,8 +40,8 @@ def glTF2_pre_export_callback(export_settings: Mapping[str, logging.Logger]) -> 
 
 def register() -> None:
     """Register the hook, the panel and the handlers that restore rigs in reopened files."""
-    carried.find_blender_pxr(bpy.utils.resource_path)
-    # Blender aborts when a hook is registered and pxr cannot be imported: fail before
+    vendored.find_blender_pxr(bpy.utils.resource_path)
+    # Blender aborts if a hook is registered and pxr cannot be imported: fail earlier
     import pxr.Usd  # noqa: F401
 
     bpy.utils.register_class(JawUsdHook)
@@ -52,7 +52,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Remove them."""
+    """Unregister them."""
     handle.unregister()
     jaw.unregister()
     panel.unregister()

@@ -1,13 +1,13 @@
-"""Keys instead of drivers: what FBX, glTF, game engines, and Blender without the add-on need."""
+"""Bake drivers to keys: FBX, glTF, game engines, and Blender without the add-on need keys."""
 
 from __future__ import annotations
 
 import bpy
 import numpy as np
 
-from . import carried, jaw
+from . import jaw, vendored
 
-#: Export operators that write keys alone, not what drivers show; their settings, and what to do with them.
+#: Export operators that write keys but not drivers; their relevant settings, with advice.
 SETTINGS = {
     "EXPORT_SCENE_OT_fbx": {
         "bake_anim_simplify_factor": "0: keep every frame; 1 costs up to 0.05 mm in slow motion",
@@ -18,19 +18,19 @@ SETTINGS = {
     "WM_OT_collada_export": {},
 }
 _CHANNELS = ("location", "rotation_quaternion")
-# FBX plays every action on every object that has what the action moves: one curve is of what no other object has.
+# FBX export applies an action to every object that has all its channels. A property unique to the mandible prevents it.
 _OWN = "jawusd_own"
 _LINEAR = 1  # the interpolation of a key, as Blender stores it
 
 
 def warning(scene: bpy.types.Scene) -> str | None:
-    """Return what the exporters of `SETTINGS` would lose of a scene; None where nothing."""
+    """Return a warning if the exporters of `SETTINGS` would lose motion of a scene, otherwise None."""
     names = [found.name for found in scene.objects if jaw.is_driven(found)]
     return f"{', '.join(names)} will not move: its motion is on the sliders. Bake it to keys first." if names else None
 
 
-def parameters_over(actor: bpy.types.Object, scene: bpy.types.Scene, frames: range) -> carried.Array:
-    """Return what an actor shows in each frame: d (F, 3) [mm]; the scene stays at its frame."""
+def parameters_over(actor: bpy.types.Object, scene: bpy.types.Scene, frames: range) -> vendored.Array:
+    """Return the displayed d of an actor in each frame, shape (F, 3) [mm]; the scene's frame is restored."""
     present, subframe, d = scene.frame_current, scene.frame_subframe, []
     for frame in frames:
         scene.frame_set(frame)
@@ -40,35 +40,35 @@ def parameters_over(actor: bpy.types.Object, scene: bpy.types.Scene, frames: ran
 
 
 def frames_of(actor: bpy.types.Object, scene: bpy.types.Scene, span: str) -> range:
-    """Return the frames of the scene, or of an actor's take: from the first to the last key of its sliders.
+    """Return the frame range of the scene, or of an actor's take: from the first to the last key of its sliders.
 
     Raises:
-        carried.JawusdError: The take has no keys.
+        vendored.JawusdError: The take has no keys.
     """
     if span == "SCENE":
         return range(scene.frame_start, scene.frame_end + 1)
     times = [point.co[0] for curve in jaw.curves(actor) for point in curve.keyframe_points]
     if not times:
-        raise carried.JawusdError(f"the sliders of {actor.name} have no keys.", hint="Bake the frames of the scene.")
+        raise vendored.JawusdError(f"the sliders of {actor.name} have no keys.", hint="Bake the frames of the scene.")
     return range(int(np.floor(min(times))), int(np.ceil(max(times))) + 1)
 
 
 def bake(actor: bpy.types.Object, scene: bpy.types.Scene, frames: range) -> None:
-    """Key the mandible of an actor at every frame, where its sliders put it, and remove the drivers.
+    """Key the mandible of an actor at every frame according to its sliders, and remove the drivers.
 
     Raises:
-        carried.JawusdError: The mandible belongs to another file, or was deleted.
+        vendored.JawusdError: The mandible belongs to another file, or was deleted.
     """
     mandible = jaw.mandible_of(actor)
     if not mandible.is_editable or mandible.override_library is not None:
-        raise carried.JawusdError(
+        raise vendored.JawusdError(
             f"{mandible.name} belongs to another file, whose drivers cannot be removed here.",
-            hint="Bake it there, or make actor and mandible local.",
+            hint="Bake it in that file, or make actor and mandible local.",
         )
     T = jaw.rig_of(actor).pose(parameters_over(actor, scene, frames))
-    values = np.concatenate([T[:, :3, 3], carried.continuous_wxyz(T[:, :3, :3])], axis=1)
-    jaw.release(mandible)
-    forget(mandible)
+    values = np.concatenate([T[:, :3, 3], vendored.continuous_wxyz(T[:, :3, :3])], axis=1)
+    jaw.remove_drivers(mandible)
+    remove_baked_keys(mandible)
     mandible[_OWN] = f"{mandible.name} keys"[:60]
     mandible[mandible[_OWN]] = True
     for path in (*_CHANNELS, _own_path(mandible)):
@@ -83,11 +83,11 @@ def bake(actor: bpy.types.Object, scene: bpy.types.Scene, frames: range) -> None
     scene.frame_set(scene.frame_current, subframe=scene.frame_subframe)
 
 
-def forget(mandible: bpy.types.Object) -> None:
-    """Remove the keys that `bake` gave to a mandible."""
-    for held in jaw.curve_lists(mandible):
-        for curve in [curve for curve in held if curve.data_path in (*_CHANNELS, _own_path(mandible))]:
-            held.remove(curve)
+def remove_baked_keys(mandible: bpy.types.Object) -> None:
+    """Remove the keys that `bake` added to a mandible."""
+    for collection in jaw.curve_lists(mandible):
+        for curve in [curve for curve in collection if curve.data_path in (*_CHANNELS, _own_path(mandible))]:
+            collection.remove(curve)
     data = mandible.animation_data
     if data is not None and data.action is not None and not jaw.curves(mandible):
         action, data.action = data.action, None

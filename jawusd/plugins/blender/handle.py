@@ -1,25 +1,25 @@
-"""A handle at the chin or an incisor: drag it, and inverse kinematics moves the sliders, inside the bound."""
+"""Handles at chin or incisor: dragging one moves the sliders by inverse kinematics, inside the bound."""
 
 from __future__ import annotations
 
 import bpy
 import numpy as np
 
-from . import carried, jaw
+from . import jaw, vendored
 
 _POINT, _ACTOR = "jawusd_point", "jawusd_handle_of"
-_MOVED_MM = 1e-3  # of a handle: more than single precision rounds
+_MOVED_MM = 1e-3  # smallest drag of a handle; above single-precision rounding
 
 
 def add(actor: bpy.types.Object, point: tuple[float, float, float], name: str) -> bpy.types.Object:
-    """Add a handle for a point of the mandible [mm], mandible frame; return it."""
+    """Add and return a handle for a point of the mandible [mm], mandible frame."""
     handle = bpy.data.objects.new(name, None)
     handle.empty_display_type, handle.empty_display_size = "SPHERE", 3.0
     for collection in actor.users_collection:
         collection.objects.link(handle)
     handle.parent = actor
     handle[_POINT], handle[_ACTOR] = point, actor
-    _put(handle)
+    _snap(handle)
     return handle
 
 
@@ -28,46 +28,46 @@ def handles() -> list[bpy.types.Object]:
     return [found for found in bpy.data.objects if _POINT in found and found.get(_ACTOR) is not None]
 
 
-def _place(handle: bpy.types.Object) -> carried.Array:
-    """Return where the point of a handle is now [mm], skull frame."""
+def _position(handle: bpy.types.Object) -> vendored.Array:
+    """Return the current position of a handle's point [mm], skull frame."""
     actor = handle[_ACTOR]
     T = jaw.rig_of(actor).pose(jaw.shown(actor, jaw.parameters(actor)))
-    return carried.transform_point(T, np.array(handle[_POINT]))
+    return vendored.transform_point(T, np.array(handle[_POINT]))
 
 
-def _put(handle: bpy.types.Object) -> None:
-    handle.location = _place(handle)
+def _snap(handle: bpy.types.Object) -> None:
+    handle.location = _position(handle)
 
 
 def follow(handle: bpy.types.Object) -> bool:
-    """Move the sliders so that a dragged handle's point comes nearest to it; return whether it was dragged."""
+    """Move the sliders so that a handle's point follows the handle; return whether the handle was dragged."""
     target = np.array(handle.location, dtype=np.float64)
-    if np.linalg.norm(target - _place(handle)) <= _MOVED_MM:
+    if np.linalg.norm(target - _position(handle)) <= _MOVED_MM:
         return False
     actor = handle[_ACTOR]
     d = jaw.rig_of(actor).ik(np.array(handle[_POINT]), target, start=jaw.parameters(actor)).d
-    for name, value in zip(carried.PARAMETERS, d.tolist()):
+    for name, value in zip(vendored.PARAMETERS, d.tolist()):
         actor[name] = value
-    _put(handle)
+    _snap(handle)
     actor.update_tag()
     return True
 
 
 @bpy.app.handlers.persistent
 def _dragged(_: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Follow a handle that was moved; one whose jaw was moved goes along."""
+    """Follow dragged handles, and move the handles of jaws that were moved."""
     moved = {update.id.original for update in depsgraph.updates if isinstance(update.id, bpy.types.Object)}
     for handle in handles():
         if handle in moved and not jaw.curves(handle):
             follow(handle)
-        elif handle[_ACTOR] in moved and np.linalg.norm(_place(handle) - np.array(handle.location)) > _MOVED_MM:
-            _put(handle)
+        elif handle[_ACTOR] in moved and np.linalg.norm(_position(handle) - np.array(handle.location)) > _MOVED_MM:
+            _snap(handle)
 
 
 @bpy.app.handlers.persistent
 def _played(*_: object) -> None:
     for handle in handles():
-        _put(handle)
+        _snap(handle)
 
 
 _HANDLERS = (("depsgraph_update_post", _dragged), ("frame_change_post", _played))

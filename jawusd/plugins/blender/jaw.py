@@ -13,49 +13,49 @@ from typing import TYPE_CHECKING
 import bpy
 import numpy as np
 
-from . import carried
+from . import vendored
 
 if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
-PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # prim path to the objects and data made from it
+PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # from prim paths to the objects and data created from them
 
 SOURCE, KEEP, FPS = "jawusd_source", "keep_valid", "jawusd_fps"
 _STORE, _ACTOR, _FIXED = "jawusd_rig", "jawusd_actor", "jawusd_fixed"
 _FUNCTION, _OLD_FUNCTION = "jawusd_offset", "jawusd_channel"
-# A driver that fails, as all do where the add-on is missing or scripts are off, gives 0. So the mandible's own
-# transform is its rest pose, and what is driven are offsets from it that are 0 there: the translation, and x, y, z of a
-# quaternion whose w stays as it is.
+# Failing drivers, as without the add-on or with scripts disabled, evaluate to 0. The mandible's own transform is
+# therefore its rest pose, and the drivers set offsets from it that are 0 at rest: the delta location, and x, y, z of
+# the delta rotation, whose w is constant.
 _CHANNELS = (*(("delta_location", i) for i in range(3)), *(("delta_rotation_quaternion", i) for i in (1, 2, 3)))
-# Quaternions are normalised before use. Blender 5.0 sets driven values within 1e-4 of 0 or 1 to it, in a unit
-# quaternion up to 0.02 mm at the chin.
+# Large, because Blender 5.0 snaps driven values within 1e-4 of 0 or 1, which for a unit quaternion is up to 0.02 mm at
+# the chin. Quaternions are normalised before use.
 _QUATERNION_W = 1024.0
 
-_rigs: dict[str, carried.JawRig] = {}  # by the text stored in the actor
+_rigs: dict[str, vendored.JawRig] = {}  # by the text that is stored in the actor
 _poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
 
 
 def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
-    """Add sliders, drivers and keys to the rigs of an imported stage; return whether there is one.
+    """Add sliders, drivers and keys to the rigs of an imported stage; return whether it has rigs.
 
-    Rigs that cannot have sliders stay as imported; the panel says why.
+    Rigs that cannot have sliders are left as imported, and the panel shows the reason.
     """
-    from . import carried_usd
+    from . import vendored_usd
 
-    prims = carried_usd.rig_prims(stage)
+    prims = vendored_usd.rig_prims(stage)
     for prim in prims:
         actor, mandible = (_object_of(prim_map, path) for path in (prim.GetPath(), _mandible_path(prim)))
         if actor is None or mandible is None:
-            _leave(prim, _nearest_object(prim_map, prim.GetPath()))
+            _note_missing_sliders(prim, _nearest_object(prim_map, prim.GetPath()))
             continue
         if any(modifier.type == "ARMATURE" for mesh in meshes_of(mandible) for modifier in mesh.modifiers):
             actor[_FIXED] = f"{prim.GetPath()}: bones move it. For sliders import it with motion = transforms."
             continue
         actor[SOURCE] = _source_of(prim)
         actor[FPS] = stage.GetTimeCodesPerSecond()
-        rig = carried_usd.rig_of(prim, actor[SOURCE])
+        rig = vendored_usd.rig_of(prim, actor[SOURCE])
         actor[_STORE] = _text_of(rig)
-        values = [prim.GetAttribute(f"jaw:{name}").Get() or 0.0 for name in carried.PARAMETERS]
+        values = [prim.GetAttribute(f"jaw:{name}").Get() or 0.0 for name in vendored.PARAMETERS]
         _add_sliders(actor, rig, values)
         drive(mandible, actor)
         _key(actor, prim)
@@ -66,92 +66,93 @@ def _mandible_path(prim: Usd.Prim) -> Sdf.Path:
     return prim.GetRelationship("jaw:mandible").GetTargets()[0]
 
 
-def _leave(prim: Usd.Prim, nearest: bpy.types.Object | None) -> None:
-    """Note at an object why a rig below it has no sliders."""
+def _note_missing_sliders(prim: Usd.Prim, nearest: bpy.types.Object | None) -> None:
+    """Store in an object why a rig below it has no sliders."""
     if prim.IsInstance() or prim.IsInstanceProxy():
         why = 'it is instanced. For sliders import it with "Scene Instancing" off.'
     else:
-        why = "its mandible was not imported. For sliders import all of it."
+        why = "its mandible was not imported. For sliders import the whole rig."
     print(f"jawusd: {prim.GetPath()}: {why}")
     if nearest is not None:
         nearest[_FIXED] = "\n".join(filter(None, (nearest.get(_FIXED), f"{prim.GetPath()}: {why}")))
 
 
-def fixed() -> list[str]:
-    """Return a line for each rig in the file that has no sliders: its prim, why, and what to do."""
+def without_sliders() -> list[str]:
+    """Return a line for each rig in the file without sliders: its prim, the reason, and the remedy."""
     return [line for found in bpy.data.objects for line in str(found.get(_FIXED, "")).splitlines()]
 
 
 def actors() -> list[bpy.types.Object]:
-    """Return the objects that carry a rig."""
+    """Return the objects with a rig."""
     return [found for found in bpy.data.objects if _STORE in found]
 
 
 def mandible_of(actor: bpy.types.Object) -> bpy.types.Object:
-    """Return the object that an actor moves.
+    """Return the mandible of an actor.
 
-    Library overrides of reopened files point to the actor in the library: look below the actor first.
+    Children of the actor are searched first, because library overrides in reopened files refer to the actor in the
+    library.
 
     Raises:
-        carried.JawusdError: It was deleted.
+        vendored.JawusdError: The mandible was deleted.
     """
     below = [found for found in actor.children_recursive if _ACTOR in found]
     below += [found for found in bpy.data.objects if found.get(_ACTOR) == actor]
     if not below:
-        raise carried.JawusdError(f"{actor.name} has no mandible any more.", hint="Import the rig again.")
+        raise vendored.JawusdError(f"the mandible of {actor.name} was deleted.", hint="Import the rig again.")
     return below[0]
 
 
 def meshes_of(mandible: bpy.types.Object) -> list[bpy.types.Object]:
-    """Return the meshes that a mandible carries, its own among them."""
+    """Return the meshes at and below a mandible."""
     return [found for found in (mandible, *mandible.children_recursive) if found.type == "MESH"]
 
 
-def rig_of(actor: bpy.types.Object) -> carried.JawRig:
-    """Return the evaluator of an actor, built once per stored text.
+def rig_of(actor: bpy.types.Object) -> vendored.JawRig:
+    """Return the evaluator of an actor, cached by the stored text.
 
     Raises:
-        carried.JawusdError: An older version of the add-on stored it.
+        vendored.JawusdError: It was stored by an older version of the add-on.
     """
     text = actor[_STORE]
     if text not in _rigs:
         if text.startswith("{"):
-            raise carried.JawusdError("was imported by an older version of the add-on.", hint="Import the rig again.")
+            raise vendored.JawusdError("was imported by an older version of the add-on.", hint="Import the rig again.")
         with np.load(io.BytesIO(zlib.decompress(base64.b64decode(text))), allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
-        _rigs[text] = carried.JawRig(arrays, json.loads(str(arrays.pop("meta"))))
+        _rigs[text] = vendored.JawRig(arrays, json.loads(str(arrays.pop("meta"))))
     return _rigs[text]
 
 
 def parameters(actor: bpy.types.Object) -> tuple[float, float, float]:
-    """Return d1, d2, d3 [mm] as the sliders show them."""
-    d1, d2, d3 = (float(actor[name]) for name in carried.PARAMETERS)
+    """Return d1, d2, d3 [mm] of the sliders."""
+    d1, d2, d3 = (float(actor[name]) for name in vendored.PARAMETERS)
     return d1, d2, d3
 
 
 def shown(actor: bpy.types.Object, d: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the parameters [mm] that the mandible takes: d, brought inside the bound where the actor keeps valid."""
+    """Return the displayed parameters [mm]: d, moved inside the bound if the actor has "Keep valid" on."""
     return _kept(rig_of(actor), d) if actor.get(KEEP) else d
 
 
-def _kept(rig: carried.JawRig, d: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return parameters [mm] brought inside the bound."""
+def _kept(rig: vendored.JawRig, d: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return parameters [mm] moved inside the bound."""
     if rig.is_inside(d):
         return d
     d1, d2, d3 = rig.keep_inside([0.0], [d]).d[0].tolist()
     return d1, d2, d3
 
 
-def _text_of(rig: carried.JawRig) -> str:
+def _text_of(rig: vendored.JawRig) -> str:
     """Return a rig as text that a scene can store."""
     packed = io.BytesIO()
-    # Blender's numpy has no argument `allow_pickle`, which the types expect
+    # Blender's numpy lacks the argument `allow_pickle`, which the type stubs require
     np.savez(packed, **{**rig.arrays, "meta": np.array(json.dumps(rig.meta))})  # type: ignore[arg-type]  # flags are named
     return base64.b64encode(zlib.compress(packed.getvalue())).decode()
 
 
 def _source_of(prim: Usd.Prim) -> str:
-    """Return the file that defines a rig, `actor.usda` as a rule, also where a stage references it."""
+    """Return the file that defines a rig, usually `actor.usda`, even if a stage references it."""
     for spec in prim.GetPrimStack():
         if spec.HasInfo("apiSchemas") and spec.layer.realPath:
             return str(spec.layer.realPath).split("[")[0]
@@ -159,13 +160,13 @@ def _source_of(prim: Usd.Prim) -> str:
 
 
 def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
-    """Return the object made from a prim; of a prim merged with its only child, the child's."""
+    """Return the object created from a prim, or from its only child if the two were merged."""
     below = [other for other in prim_map if str(other).startswith(f"{path}/")]
     return next((found for other in (path, *below) for found in _objects(prim_map, other)), None)
 
 
 def _nearest_object(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
-    """Return the object made from a prim, or from the nearest one above it."""
+    """Return the object created from a prim or its nearest ancestor."""
     return next((found for other in reversed(path.GetPrefixes()) for found in _objects(prim_map, other)), None)
 
 
@@ -173,40 +174,42 @@ def _objects(prim_map: PrimMap, path: Sdf.Path) -> list[bpy.types.Object]:
     return [found for found in prim_map.get(path, []) if isinstance(found, bpy.types.Object)]
 
 
-def _add_sliders(actor: bpy.types.Object, rig: carried.JawRig, values: list[float]) -> None:
-    for name, value in zip(carried.PARAMETERS, values):
+def _add_sliders(actor: bpy.types.Object, rig: vendored.JawRig, values: list[float]) -> None:
+    for name, value in zip(vendored.PARAMETERS, values):
         actor[name] = float(value)
     actor[KEEP] = False
-    actor.id_properties_ui(KEEP).update(description="Show the nearest valid jaw where the sliders leave the bound")
+    actor.id_properties_ui(KEEP).update(
+        description="Show the nearest valid pose when the sliders are outside the bound"
+    )
     _set_limits(actor, rig)
-    for name in (*carried.PARAMETERS, KEEP):
+    for name in (*vendored.PARAMETERS, KEEP):
         actor.property_overridable_library_set(f'["{name}"]', True)
 
 
-def _set_limits(actor: bpy.types.Object, rig: carried.JawRig) -> None:
-    """Let sliders end at the whole range; Blender clamps keyed values to the hard limits, so these lie far beyond."""
-    for name, label, (low, high) in zip(carried.PARAMETERS, carried.LABELS, rig.d_range.tolist()):
+def _set_limits(actor: bpy.types.Object, rig: vendored.JawRig) -> None:
+    """Set the slider range. Blender clamps keyed values to the hard limits, which are therefore far beyond it."""
+    for name, label, (low, high) in zip(vendored.PARAMETERS, vendored.LABELS, rig.d_range.tolist()):
         slack = high - low
         ui = actor.id_properties_ui(name)
         ui.update(min=low - slack, max=high + slack, soft_min=low, soft_max=high, description=label, precision=2)
 
 
 def drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
-    """Let d1, d2, d3 of the actor drive the mandible, instead of the cached motion of the file or keys."""
+    """Drive the mandible by d1, d2, d3 of the actor, instead of the cached motion of the file or keys."""
     for constraint in list(mandible.constraints):
         if constraint.type == "TRANSFORM_CACHE":
             mandible.constraints.remove(constraint)
-    release(mandible)
+    remove_drivers(mandible)
     mandible[_ACTOR] = actor
     mandible.rotation_mode = "QUATERNION"
     rest = rig_of(actor).pose((0.0, 0.0, 0.0))
-    mandible.location, mandible.rotation_quaternion = rest[:3, 3], carried.wxyz_from_matrix(rest[:3, :3])
+    mandible.location, mandible.rotation_quaternion = rest[:3, 3], vendored.wxyz_from_matrix(rest[:3, :3])
     mandible.delta_rotation_quaternion = (_QUATERNION_W, 0.0, 0.0, 0.0)
     for channel, (path, index) in enumerate(_CHANNELS):
         driver = mandible.driver_add(path, index).driver
         driver.type = "SCRIPTED"
         driver.use_self = True
-        for name in (*carried.PARAMETERS, KEEP):
+        for name in (*vendored.PARAMETERS, KEEP):
             variable = driver.variables.new()
             variable.name = name
             variable.targets[0].id = actor
@@ -214,15 +217,15 @@ def drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
         driver.expression = f"{_FUNCTION}(self, d1, d2, d3, {KEEP}, {channel})"
 
 
-def release(mandible: bpy.types.Object) -> None:
-    """Remove the drivers of a mandible, and its offset from its own transform."""
+def remove_drivers(mandible: bpy.types.Object) -> None:
+    """Remove the drivers of a mandible, and reset its delta transform."""
     for curve in _drivers(mandible, (_FUNCTION, _OLD_FUNCTION)):
         mandible.driver_remove(curve.data_path, curve.array_index)
     mandible.delta_location, mandible.delta_rotation_quaternion = [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
 
 
 def is_driven(mandible: bpy.types.Object) -> bool:
-    """Return whether the sliders move a mandible, rather than keys of its own."""
+    """Return whether the sliders drive a mandible, rather than its own keys."""
     return bool(_drivers(mandible, (_FUNCTION,)))
 
 
@@ -233,13 +236,13 @@ def _drivers(mandible: bpy.types.Object, functions: tuple[str, ...]) -> list[bpy
 
 
 def _key(actor: bpy.types.Object, prim: Usd.Prim) -> None:
-    """Give the sliders the samples and splines of the file as linearly interpolated keys."""
-    from . import carried_usd
+    """Key the sliders with the samples and splines of the file, linearly interpolated."""
+    from . import vendored_usd
 
-    for name in carried.PARAMETERS:
+    for name in vendored.PARAMETERS:
         attribute = prim.GetAttribute(f"jaw:{name}")
-        times = carried_usd.key_times(attribute)
-        for time, value in zip(times, carried_usd.values_at(attribute, times)):
+        times = vendored_usd.key_times(attribute)
+        for time, value in zip(times, vendored_usd.values_at(attribute, times)):
             if value is not None:
                 actor[name] = value
                 actor.keyframe_insert(f'["{name}"]', frame=time)
@@ -250,11 +253,11 @@ def _key(actor: bpy.types.Object, prim: Usd.Prim) -> None:
 
 def curves(found: bpy.types.Object) -> list[bpy.types.FCurve]:
     """Return the curves of an object's action."""
-    return [curve for held in curve_lists(found) for curve in held]
+    return [curve for collection in curve_lists(found) for curve in collection]
 
 
 def curve_lists(found: bpy.types.Object) -> list[bpy.types.bpy_prop_collection[bpy.types.FCurve]]:
-    """Return what holds the curves of an object: its slot in the action (Blender 4.4 and later), or the action."""
+    """Return the curve collections of an object: of its action slot (Blender 4.4 and later), or of its action."""
     data = found.animation_data
     if data is None or data.action is None:
         return []
@@ -265,41 +268,41 @@ def curve_lists(found: bpy.types.Object) -> list[bpy.types.bpy_prop_collection[b
 
 
 def _offset(mandible: bpy.types.Object, d1: float, d2: float, d3: float, keep: float, channel: int) -> float:
-    """Return one channel of the mandible's offset from its rest pose (mm, the actor is scaled): the driver function."""
+    """Return a channel of the mandible's offset from its rest pose [mm]: the driver function. The actor is scaled."""
     actor = mandible[_ACTOR]
     key = (actor[_STORE], d1, d2, d3, bool(keep))
     if key not in _poses:
-        _poses.clear()  # the six channels of one pose follow one another
+        _poses.clear()  # the six channels of a pose are evaluated in sequence
         rig = rig_of(actor)
         T, rest = rig.pose(_kept(rig, (d1, d2, d3)) if keep else (d1, d2, d3)), rig.pose((0.0, 0.0, 0.0))
-        w, *turn = carried.wxyz_from_matrix(T[:3, :3] @ rest[:3, :3].T).tolist()
+        w, *turn = vendored.wxyz_from_matrix(T[:3, :3] @ rest[:3, :3].T).tolist()
         _poses[key] = (*(T[:3, 3] - rest[:3, 3]).tolist(), *(_QUATERNION_W / w * x for x in turn))
     return _poses[key][channel]
 
 
 @bpy.app.handlers.persistent
 def _install(*_: object) -> None:
-    """Register the driver function, which Blender drops with every file it opens."""
+    """Register the driver function, which Blender discards whenever it opens a file."""
     bpy.app.driver_namespace[_FUNCTION] = _offset
     _poses.clear()
     for mandible in (found for found in bpy.data.objects if _ACTOR in found):
         if _drivers(mandible, (_OLD_FUNCTION,)):
-            with contextlib.suppress(carried.JawusdError):  # the panel says that it cannot be read
+            with contextlib.suppress(vendored.JawusdError):  # the panel shows the error
                 drive(mandible, mandible[_ACTOR])
-        # Blender marks a driver whose function was missing as broken and does not try again
+        # Blender marks drivers with a missing function as broken; setting the expression makes it retry
         for curve in _drivers(mandible, (_FUNCTION,)):
             curve.driver.expression = str(curve.driver.expression)
 
 
 def register() -> None:
-    """Install the driver function, also in files to be opened and in the one that is open."""
+    """Install the driver function in the current file and in files opened later."""
     bpy.app.driver_namespace[_FUNCTION] = _offset
     bpy.app.handlers.load_post.append(_install)
-    bpy.app.timers.register(_install, first_interval=0.0)  # add-ons see no objects while they are enabled
+    bpy.app.timers.register(_install, first_interval=0.0)  # add-ons cannot access objects while they are being enabled
 
 
 def unregister() -> None:
-    """Remove it."""
+    """Remove the driver function."""
     if bpy.app.timers.is_registered(_install):
         bpy.app.timers.unregister(_install)
     bpy.app.handlers.load_post.remove(_install)

@@ -1,4 +1,4 @@
-"""The buttons of the panel: key, handle, export, bake."""
+"""Operators of the panel: key, handle, export, bake."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 from bpy_extras.io_utils import ExportHelper
 
-from . import bake, carried, handle, jaw
+from . import bake, handle, jaw, vendored
 
 _CHIN_HALF_WIDTH_MM = 10.0
 
@@ -16,7 +16,7 @@ def _actor(operator: bpy.types.Operator) -> bpy.types.Object:
 
 
 class JAWUSD_OT_key(bpy.types.Operator):
-    """The operator behind the key button."""
+    """Operator of the key button."""
 
     bl_idname = "jawusd.key"
     bl_label = "Key Jaw"
@@ -27,17 +27,17 @@ class JAWUSD_OT_key(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Insert the keys."""
-        for name in carried.PARAMETERS:
+        for name in vendored.PARAMETERS:
             _actor(self).keyframe_insert(f'["{name}"]')
         return {"FINISHED"}
 
 
 class JAWUSD_OT_handle(bpy.types.Operator):
-    """The operator behind the handle buttons."""
+    """Operator of the handle buttons."""
 
     bl_idname = "jawusd.handle"
     bl_label = "Add Jaw Handle"
-    bl_description = "Add an empty to drag the jaw by; the sliders follow, inside the bound"
+    bl_description = "Add an empty to drag the jaw with; the sliders follow, inside the bound"
     bl_options = {"REGISTER", "UNDO"}
 
     __annotations__ = {
@@ -57,7 +57,7 @@ class JAWUSD_OT_handle(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _chin(actor: bpy.types.Object, rig: carried.JawRig) -> carried.Array:
+def _chin(actor: bpy.types.Object, rig: vendored.JawRig) -> vendored.Array:
     """Return the lowest vertex of the mandible below the incisal point [mm], mandible frame."""
     meshes = jaw.meshes_of(jaw.mandible_of(actor))
     points = np.concatenate([np.array([v.co for v in mesh.data.vertices], dtype=np.float64) for mesh in meshes])
@@ -66,18 +66,18 @@ def _chin(actor: bpy.types.Object, rig: carried.JawRig) -> carried.Array:
 
 
 class JAWUSD_OT_export(bpy.types.Operator, ExportHelper):
-    """The operator behind the export button."""
+    """Operator of the export button."""
 
     bl_idname = "jawusd.export"
     bl_label = "Export Jaw Animation"
-    bl_description = "Write d and the baked mandible of every frame to a USD layer over the rig, kept inside the bound"
+    bl_description = "Write d and the baked mandible of every frame to a USD layer over the rig, inside the bound"
     filename_ext = ".usdc"
 
     __annotations__ = {"actor": bpy.props.StringProperty()}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Write the layer."""
-        from . import carried_usd
+        from . import vendored_usd
 
         actor, scene = _actor(self), context.scene
         frames = range(scene.frame_start, scene.frame_end + 1)
@@ -85,27 +85,27 @@ class JAWUSD_OT_export(bpy.types.Operator, ExportHelper):
         rig, rate = jaw.rig_of(actor), scene.render.fps / scene.render.fps_base
         try:
             inside = rig.keep_inside(np.array(frames, dtype=np.float64), d)
-            carried_usd.write_animation(self.filepath, actor[jaw.SOURCE], inside.times, inside.d, rate, rig=rig)
-        except carried.JawusdError as error:
+            vendored_usd.write_animation(self.filepath, actor[jaw.SOURCE], inside.times, inside.d, rate, rig=rig)
+        except vendored.JawusdError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         moved = float(np.linalg.norm(inside.d[inside.given] - d, axis=1).max())
-        self.report({"INFO"}, f"{len(frames)} frames, moved by {moved:.2f} mm at most to stay inside the bound")
+        self.report({"INFO"}, f"{len(frames)} frames, moved by up to {moved:.2f} mm to stay inside the bound")
         return {"FINISHED"}
 
 
 class JAW_OT_bake_to_keys(bpy.types.Operator):
-    """The operator behind the bake button: `bpy.ops.jaw.bake_to_keys()` from scripts."""
+    """Operator of the bake button, and for scripts: `bpy.ops.jaw.bake_to_keys()`."""
 
     bl_idname = "jaw.bake_to_keys"
     bl_label = "Bake to Keys"
     bl_description = (
-        "Key the mandible at every frame and take it from the sliders: for FBX, glTF, game engines and render farms"
+        "Key the mandible at every frame and detach it from the sliders: for FBX, glTF, game engines and render farms"
     )
     bl_options = {"REGISTER", "UNDO"}
 
     __annotations__ = {
-        "actor": bpy.props.StringProperty(description="Whose jaw; all in the file where it is empty"),
+        "actor": bpy.props.StringProperty(description="The actor; all actors in the file if empty"),
         "frames": bpy.props.EnumProperty(
             items=[
                 ("SCENE", "Scene", "From the start to the end of the scene"),
@@ -118,26 +118,26 @@ class JAW_OT_bake_to_keys(bpy.types.Operator):
         """Bake."""
         chosen, scene = [found for found in jaw.actors() if self.actor in ("", found.name)], context.scene
         if not chosen:
-            self.report({"ERROR"}, f"There is no such jaw rig ({self.actor or 'any'}). Import one from USD.")
+            self.report({"ERROR"}, f"There is no jaw rig {self.actor or 'in the file'}. Import one from USD.")
             return {"CANCELLED"}
         try:
             spans = [bake.frames_of(actor, scene, self.frames) for actor in chosen]
             for actor, frames in zip(chosen, spans):
                 bake.bake(actor, scene, frames)
-        except carried.JawusdError as error:
+        except vendored.JawusdError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         names = ", ".join(f"{actor.name}: frames {span[0]} .. {span[-1]}" for actor, span in zip(chosen, spans))
-        self.report({"INFO"}, f"{names}. The sliders move the jaw again after {JAW_OT_use_sliders.bl_label}")
+        self.report({"INFO"}, f"{names}. {JAW_OT_use_sliders.bl_label} reconnects the sliders")
         return {"FINISHED"}
 
 
 class JAW_OT_use_sliders(bpy.types.Operator):
-    """The operator behind the button that takes a bake back."""
+    """Operator of the button that undoes a bake."""
 
     bl_idname = "jaw.use_sliders"
     bl_label = "Use Sliders"
-    bl_description = "Remove the keys that were baked; the sliders move the jaw again"
+    bl_description = "Remove the baked keys, so that the sliders move the jaw again"
     bl_options = {"REGISTER", "UNDO"}
 
     __annotations__ = {"actor": bpy.props.StringProperty()}
@@ -145,7 +145,7 @@ class JAW_OT_use_sliders(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Drive the mandible again."""
         mandible = jaw.mandible_of(_actor(self))
-        bake.forget(mandible)
+        bake.remove_baked_keys(mandible)
         jaw.drive(mandible, _actor(self))
         return {"FINISHED"}
 

@@ -1,10 +1,10 @@
-"""The panels: sliders of the rigs in the scene, whether their pose is valid, and what an export would lose."""
+"""Panels: sliders of the rigs in the scene, validity of their poses, and a warning about what an export would lose."""
 
 from __future__ import annotations
 
 import bpy
 
-from . import bake, carried, jaw, operators
+from . import bake, jaw, operators, vendored
 
 
 class JAWUSD_PT_sliders(bpy.types.Panel):
@@ -17,8 +17,8 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Show the panel when the file has a rig."""
-        return bool(jaw.actors() or jaw.fixed())
+        """Show the panel if the file has a rig."""
+        return bool(jaw.actors() or jaw.without_sliders())
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw sliders, bound and buttons of every rig."""
@@ -27,10 +27,10 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
             box.label(text=actor.name)
             try:
                 rig, driven = jaw.rig_of(actor), jaw.is_driven(jaw.mandible_of(actor))
-            except carried.JawusdError as error:
+            except vendored.JawusdError as error:
                 box.label(text=str(error), icon="ERROR")
                 continue
-            for name, label in zip(carried.PARAMETERS, carried.LABELS):
+            for name, label in zip(vendored.PARAMETERS, vendored.LABELS):
                 box.prop(actor, f'["{name}"]', text=label)
             for text, icon in _readout(rig, jaw.parameters(actor)):
                 box.label(text=text, icon=icon)
@@ -53,12 +53,12 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
             else:
                 row.operator(operators.JAW_OT_use_sliders.bl_idname).actor = actor.name
                 box.label(text="Baked to keys: the sliders do not move the jaw", icon="INFO")
-        for text in jaw.fixed():
+        for text in jaw.without_sliders():
             self.layout.label(text=text, icon="LOCKED")
 
 
 class JAW_PT_export(bpy.types.Panel):
-    """What an export loses, beside its settings in the file browser."""
+    """Warning about what an export loses, next to its settings in the file browser."""
 
     bl_label = "Jaw"
     bl_space_type = "FILE_BROWSER"
@@ -66,12 +66,12 @@ class JAW_PT_export(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Show the panel where a format is exported that holds no drivers, of a file with a rig."""
+        """Show the panel if a file with a rig is exported to a format without drivers."""
         exporter = context.space_data.active_operator
         return exporter is not None and exporter.bl_idname in bake.SETTINGS and bool(jaw.actors())
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the warning, the bake, and the settings of the exporter that matter."""
+        """Draw the warning, the bake button, and the relevant settings of the exporter."""
         warning, exporter = bake.warning(context.scene), context.space_data.active_operator
         if warning:
             self.layout.label(text=warning, icon="ERROR")
@@ -81,8 +81,8 @@ class JAW_PT_export(bpy.types.Panel):
             self.layout.prop(exporter, name)
 
 
-def _readout(rig: carried.JawRig, d: tuple[float, float, float]) -> list[tuple[str, str]]:
-    """Return the lines, each with its icon, that say how parameters d [mm] lie to the bound."""
+def _readout(rig: vendored.JawRig, d: tuple[float, float, float]) -> list[tuple[str, str]]:
+    """Return lines with icons that show how far parameters d [mm] are inside or outside the bound."""
     inside, distance = bool(rig.is_inside(d)), abs(float(rig.margin(d)))
     word = "inside" if inside else "OUTSIDE"
     lines = [(f"{word} the bound by {distance:.1f} mm", "INFO" if inside else "ERROR")]

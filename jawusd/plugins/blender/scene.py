@@ -1,4 +1,4 @@
-"""What a take brings besides its rig: rate, frames and units of the scene, cameras with the footage behind them."""
+"""Settings of a take in the scene: rate, frame range and units, and cameras with their footage."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
 
-def take_rate(stage: Usd.Stage) -> None:
-    """Set rate, frames and unit of the scene to those of a stage."""
+def apply_stage_settings(stage: Usd.Stage) -> None:
+    """Set rate, frame range and unit of the scene to those of a stage."""
     scene, rate = bpy.context.scene, stage.GetTimeCodesPerSecond()
     scene.render.fps = max(1, round(rate))
     scene.render.fps_base = scene.render.fps / rate
@@ -24,7 +24,7 @@ def take_rate(stage: Usd.Stage) -> None:
 
 
 def add_plates(stage: Usd.Stage, prim_map: Mapping[Sdf.Path, list[bpy.types.ID]]) -> None:
-    """Put the undistorted footage of a take behind its cameras, where `jawusd plates` has written it."""
+    """Show the undistorted footage of a take behind its cameras, if `jawusd plates` has written it."""
     scene, first = bpy.context.scene, None
     for path, made in prim_map.items():
         prim = stage.GetPrimAtPath(path)
@@ -49,7 +49,7 @@ def _show(camera: bpy.types.Camera, pattern: str, last: int) -> None:
     image.source = "SEQUENCE"
     background = camera.background_images.new()
     background.image, background.alpha, background.display_depth = image, 1.0, "BACK"
-    # the number in a plate's name is its time code, which is the frame of the scene
+    # the number in a plate's name is its time code, which is the scene's frame
     user = background.image_user
     user.frame_start, user.frame_offset, user.frame_duration = 1, 0, max(last, 1)
     camera.show_background_images = True

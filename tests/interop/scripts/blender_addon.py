@@ -135,7 +135,7 @@ def from_older_version(package, folder, take, d):
     bpy.ops.wm.usd_import(filepath=take)
     mandible, actor = bpy.data.objects["Mandible"], bpy.data.objects["Actor"]
     actor.animation_data_clear()
-    package.jaw.release(mandible)
+    package.jaw.remove_drivers(mandible)
     mandible.delta_location = [-256.0] * 3
     for channel, (path, index) in enumerate(
         [("location", i) for i in range(3)] + [("rotation_quaternion", i) for i in range(4)]

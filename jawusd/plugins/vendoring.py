@@ -1,4 +1,4 @@
-"""Carry modules of jawusd inside another package, where none is installed: with all they import."""
+"""Copy modules of jawusd, and all modules they import, into a package that must work without jawusd installed."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ _OURS = re.compile(r"^(\s*)from jawusd((?:\.\w+)*) import", re.MULTILINE)
 _VERSION = re.compile(r"^__version__ = .*$", re.MULTILINE)
 
 
-def carried_files(stubs: Iterable[Path]) -> dict[str, str]:
-    """Return the files to be put into a package, by their path in it.
+def vendored_files(stubs: Iterable[Path]) -> dict[str, str]:
+    """Return the files to add to a package, by their path in it.
 
     Args:
-        stubs: `.pyi` files that import the names wanted, each in the form `from jawusd.x import y as y`.
+        stubs: `.pyi` files that import the required names, each in the form `from jawusd.x import y as y`.
 
     Returns:
-        The modules that the stubs describe, and below `jawusd/` what they import.
+        A module for each stub, and below `jawusd/` the modules that they import.
 
     Raises:
-        ValueError: A module imports jawusd in another form than `from jawusd.x import y`.
+        ValueError: A module imports jawusd in a form other than `from jawusd.x import y`.
     """
     sources: dict[str, str] = {}
     version = _VERSION.search((_ROOT / "base" / "version.py").read_text(encoding="utf-8"))
@@ -39,7 +39,7 @@ def carried_files(stubs: Iterable[Path]) -> dict[str, str]:
 
 
 def _collect(tree: ast.Module, sources: dict[str, str]) -> None:
-    """Add the modules of jawusd that a module imports, and those they import."""
+    """Add the modules of jawusd that a module imports, recursively."""
     for module in _imported(tree):
         if module == "jawusd" or module in sources:
             continue
@@ -51,17 +51,18 @@ def _imported(tree: ast.Module) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             if any(alias.name.split(".")[0] == "jawusd" for alias in node.names):
-                raise ValueError(f"line {node.lineno}: {ast.unparse(node)!r} cannot be carried")
+                raise ValueError(f"line {node.lineno}: {ast.unparse(node)!r} cannot be vendored")
         elif isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "jawusd":
             for alias in node.names:
-                below = f"{node.module}.{alias.name}"
-                yield below if _file(below).is_file() and _file(below).stem != "__init__" else str(node.module)
+                submodule = f"{node.module}.{alias.name}"
+                is_module = _file(submodule).is_file() and _file(submodule).stem != "__init__"
+                yield submodule if is_module else str(node.module)
 
 
 def _relative(module: str, source: str) -> str:
-    """Return the source of a module with its imports of jawusd relative to where it is carried."""
-    inside = module.split(".")[1:]
-    dots = "." * (len(inside) + (_file(module).name == "__init__.py"))
+    """Return the source of a module with relative imports in place of those of jawusd."""
+    parts = module.split(".")[1:]
+    dots = "." * (len(parts) + (_file(module).name == "__init__.py"))
     return _OURS.sub(lambda found: f"{found[1]}from {dots}{found[2][1:]} import", source)
 
 

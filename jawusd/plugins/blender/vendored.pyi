@@ -1,5 +1,5 @@
-# What the extension uses of jawusd. `jawusd.plugins.carrying` puts these modules, and all they import, into the zip,
-# and makes a module of this stub that takes the names from there.
+# The names of jawusd that the extension uses. `jawusd.plugins.vendoring` turns this stub into a module of the zip, and
+# adds the modules that it imports.
 
 from jawusd.base.arrays import Array as Array
 from jawusd.base.errors import JawusdError as JawusdError

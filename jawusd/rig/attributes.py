@@ -1,0 +1,208 @@
+"""Attributes of a rig prim: model arrays, key times, and upgrades of older format versions.
+
+To add a format version:
+
+1. Raise `layout.FORMAT_VERSION`.
+2. Add the upgrade from the previous version to `UPGRADES`. It derives the new attributes from the old ones.
+3. Let `tests/golden/make_golden_rig.py` write golden rigs of the new version next to the old ones, which tests upgrade.
+4. Do the same in `plugins/jawusd_reader.py`.
+
+Upgrades happen in memory; files are never rewritten. `jawusd bake` on the model writes a rig of the current version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pxr import Sdf, Usd
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FormatError, VersionError
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, OPTIONAL, ArraySpec, arrays_of
+from jawusd.rig import _gf
+from jawusd.rig.layers import set_attribute
+from jawusd.rig.layout import FORMAT_VERSION
+
+if TYPE_CHECKING:
+    from pxr import Ts  # not in OpenUSD 24.11
+
+
+_TYPES = Sdf.ValueTypeNames
+
+#: Largest array that is read, in numbers or points: the corners of the largest mesh that is accepted.
+MAX_VALUES = 30_000_000
+
+
+def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> None:
+    """Write the model arrays whose attribute names start with one of the prefixes."""
+    optional = {name: spec for group in OPTIONAL.values() for name, spec in group.items() if name in rig.arrays}
+    for name, spec in {**arrays_of(rig.kind), **optional}.items():
+        if spec.attribute is None or not spec.attribute.startswith(prefixes):
+            continue
+        value = rig.arrays[name]
+        if spec.integer:
+            set_attribute(prim, spec.attribute, _TYPES.IntArray, _gf.int_array(value))
+        elif spec.shape:
+            set_attribute(prim, spec.attribute, _TYPES.DoubleArray, _gf.double_array(value))
+        else:
+            set_attribute(prim, spec.attribute, _TYPES.Double, float(value))
+
+
+def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, Array]:
+    """Return all model arrays of a rig prim by name.
+
+    Raises:
+        FormatError: An attribute is missing, is not an array of numbers, or has the wrong length.
+    """
+    arrays: dict[str, Array] = {}
+    lengths: dict[str, int] = {}
+    for name, spec in {**arrays_of(kind), **_optional_arrays(prim)}.items():
+        if spec.attribute is None:
+            ranges = [read_value(prim, attribute, where) for attribute in D_RANGE_ATTRIBUTES]
+            arrays[name] = np.array(ranges, dtype=np.float64)
+            continue
+        value = np.array(read_value(prim, spec.attribute, where))
+        if value.dtype.kind not in "fiu" or value.ndim > 1:
+            raise FormatError(f"{spec.attribute} is not a flat array of numbers.", path=str(where))
+        shape = [lengths.get(n, -1) if isinstance(n, str) else n for n in spec.shape]
+        try:
+            arrays[name] = value.astype(np.float64).reshape(shape)
+        except ValueError as error:
+            expected = "(" + ", ".join(str(n) for n in spec.shape) + ")"
+            message = f"{spec.attribute} has {value.size} numbers, expected shape {expected}."
+            raise FormatError(message, path=str(where)) from error
+        lengths.update((n, found) for n, found in zip(spec.shape, arrays[name].shape) if isinstance(n, str))
+    return arrays
+
+
+def _optional_arrays(prim: Usd.Prim) -> dict[str, ArraySpec]:
+    """Return the optional arrays that a rig prim has."""
+    found: dict[str, ArraySpec] = {}
+    for first, group in OPTIONAL.items():
+        if prim.GetAttribute(group[first].attribute or "").HasAuthoredValue():
+            found |= group
+    return found
+
+
+def read_value(prim: Usd.Prim, name: str, where: object) -> object:
+    """Return the default value of an attribute.
+
+    Raises:
+        FormatError: The attribute has no value, or too many numbers.
+    """
+    attribute = prim.GetAttribute(name)
+    value = value_of(attribute, where) if attribute else None
+    if value is None:
+        raise FormatError(f"{prim.GetPath()} has no value for {name}; the jaw rig is incomplete.", path=str(where))
+    return value
+
+
+def value_of(attribute: Usd.Attribute, where: object, time: Usd.TimeCode | None = None) -> object:
+    """Return the value of an attribute at a time, or its default value; None if there is none.
+
+    Raises:
+        FormatError: It is an array of more than `MAX_VALUES`.
+    """
+    value = attribute.Get(Usd.TimeCode.Default() if time is None else time)
+    if hasattr(value, "__len__") and len(value) > MAX_VALUES:
+        found = f"{attribute.GetPath()} has {len(value)} values, more than the limit of {MAX_VALUES}."
+        raise FormatError(found, path=str(where))
+    return value
+
+
+MAX_FRAMES = 220_000  # the limit for writing, too: an hour at 60 frames per second
+
+
+def key_times(attribute: Usd.Attribute) -> list[float]:
+    """Return the times of an attribute's samples. For a spline: its knots and the whole frames between them."""
+    spline = _spline_of(attribute)
+    if spline is None:
+        return list(attribute.GetTimeSamples())
+    knots = np.array(sorted(spline.GetKnots()))
+    first, last = np.ceil(knots.min(initial=np.inf)), np.floor(knots.max(initial=-np.inf))
+    if not last - first < MAX_FRAMES:
+        return knots.tolist()
+    return np.union1d(knots, np.arange(first, last + 1)).tolist()
+
+
+def values_at(attribute: Usd.Attribute, times: Iterable[float]) -> list[float | None]:
+    """Return the values of an attribute at times. Evaluates splines itself: OpenUSD 25.02 only reads them."""
+    spline = _spline_of(attribute)
+    return [attribute.Get(time) if spline is None else spline.Eval(time) for time in times]
+
+
+def _spline_of(attribute: Usd.Attribute) -> Ts.Spline | None:
+    """Return the spline of an attribute; None if it has none, or if samples or a default value are stronger."""
+    if not hasattr(attribute, "HasSpline") or not attribute.HasSpline():  # OpenUSD 24.11 has no splines
+        return None
+    for spec in attribute.GetPropertyStack():
+        strongest = next((name for name in ("timeSamples", "spline", "default") if spec.HasInfo(name)), None)
+        if strongest:
+            return attribute.GetSpline() if strongest == "spline" else None
+    return None
+
+
+def key_and_frame_times(attributes: Iterable[Usd.Attribute]) -> tuple[Array, Mask]:
+    """Return the times at which any of several attributes has samples, and the whole frames between them.
+
+    Returns:
+        Increasing times, shape (n,), and a mask of those that have samples, shape (n,).
+    """
+    keys = np.unique(np.concatenate([np.zeros(0), *(key_times(attribute) for attribute in attributes)]))
+    first, last = np.ceil(keys.min(initial=np.inf)), np.floor(keys.max(initial=-np.inf))
+    times = np.union1d(keys, np.arange(first, last + 1)) if 0 <= last - first < MAX_FRAMES else keys
+    return times, np.isin(times, keys)
+
+
+def time_codes(times: Array) -> list[Usd.TimeCode]:
+    """Return times as time codes; the default time code if there are none."""
+    return [Usd.TimeCode(time) for time in times.tolist()] or [Usd.TimeCode.Default()]
+
+
+def _upgrade_1_to_2(prim: Usd.Prim) -> None:
+    """Derive the tolerance of measured poses from the smallest valid margin, which version 1 stored instead.
+
+    The other additions of version 2 are optional: the glide surface table and the clearances of the teeth.
+    """
+    limit = read_value(prim, "jaw:thresholds:margin", prim.GetStage().GetRootLayer().identifier)
+    if not isinstance(limit, float):
+        raise FormatError(f"jaw:thresholds:margin is {limit!r}, expected a number.", path=str(prim.GetPath()))
+    tolerance = prim.CreateAttribute("jaw:thresholds:tolerance", Sdf.ValueTypeNames.Double)
+    tolerance.Set(-limit)
+
+
+UPGRADES: dict[int, Callable[[Usd.Prim], None]] = {1: _upgrade_1_to_2}
+
+
+def upgrade_rig(prim: Usd.Prim, where: object) -> None:
+    """Check the format version of a rig prim and upgrade it if it is older.
+
+    The new attributes are authored in the session layer of the stage, which is in memory and stronger than the files.
+
+    Raises:
+        FormatError: The version is not a positive integer.
+        VersionError: The version is newer than this jawusd supports.
+    """
+    version = read_value(prim, "jaw:formatVersion", where)
+    if not isinstance(version, int) or version < 1:
+        raise FormatError(f"jaw:formatVersion is {version!r}, expected a positive integer.", path=str(where))
+    if version > FORMAT_VERSION:
+        raise VersionError(
+            f"the rig has format version {version}, this jawusd reads up to {FORMAT_VERSION}.",
+            path=str(where),
+            hint="Update jawusd.",
+        )
+    stage = prim.GetStage()
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        for step in range(version, FORMAT_VERSION):
+            UPGRADES[step](prim)
+            prim.GetAttribute("jaw:formatVersion").Set(step + 1)
+
+
+def was_upgraded(prim: Usd.Prim) -> bool:
+    """Return whether `upgrade_rig` changed a rig prim, so that the hashes in its files no longer match its values."""
+    path = prim.GetPath().AppendProperty("jaw:formatVersion")
+    return prim.GetStage().GetSessionLayer().GetAttributeAtPath(path) is not None
