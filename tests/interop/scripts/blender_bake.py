@@ -129,7 +129,8 @@ def main(archive, folder, take, splines, instances, shown):
     result["instanced"] = []
     for instancing in (True, False):
         opened(instances, support_scene_instancing=instancing)
-        result["instanced"].append([sorted(actor.name for actor in package.jaw.actors()), sorted(package.jaw.without_sliders())])
+        names = sorted(actor.name for actor in package.jaw.actors())
+        result["instanced"].append([names, sorted(package.jaw.without_sliders())])
     result["panel"] = package.panel.JAWUSD_PT_sliders.poll(bpy.context)
     print("RESULT " + json.dumps(result))
 
