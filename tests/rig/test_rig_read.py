@@ -193,7 +193,7 @@ def test_what_uses_a_rig_may_reach_out_for_it_only(anchored_folder):
     shot.subLayerPaths.append("../other.usda")
     shot.Save()
     del other, shot
-    with pytest.raises(RigError, match="other.usda, which is outside its own folder and not a rig"):
+    with pytest.raises(RigError, match="other.usda, outside its own folder and not a rig"):
         load_rig(away / "shot.usda")
 
 

@@ -52,7 +52,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Unregister them."""
+    """Unregister everything that `register` registered."""
     handle.unregister()
     jaw.unregister()
     panel.unregister()

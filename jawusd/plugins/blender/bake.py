@@ -11,8 +11,8 @@ from . import jaw, vendored
 SETTINGS = {
     "EXPORT_SCENE_OT_fbx": {
         "bake_anim_simplify_factor": "0: keep every frame; 1 costs up to 0.05 mm in slow motion",
-        "bake_anim_use_all_actions": "Off where other objects move too,",
-        "bake_anim_use_nla_strips": "and this too",
+        "bake_anim_use_all_actions": "Turn off if other objects are animated,",
+        "bake_anim_use_nla_strips": "and this as well",
     },
     "EXPORT_SCENE_OT_gltf": {},
     "WM_OT_collada_export": {},

@@ -80,6 +80,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Remove them."""
+    """Remove the handlers."""
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).remove(handler)

@@ -115,7 +115,7 @@ class JAW_OT_bake_to_keys(bpy.types.Operator):
     }
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Bake."""
+        """Bake the mandibles of the chosen actors."""
         chosen, scene = [found for found in jaw.actors() if self.actor in ("", found.name)], context.scene
         if not chosen:
             self.report({"ERROR"}, f"There is no jaw rig {self.actor or 'in the file'}. Import one from USD.")
@@ -160,6 +160,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Unregister them."""
+    """Unregister the operators."""
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)

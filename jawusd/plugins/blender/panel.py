@@ -102,6 +102,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Unregister them."""
+    """Unregister the panels."""
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)
