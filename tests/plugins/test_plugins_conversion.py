@@ -1,4 +1,4 @@
-"""FBX and glTF without Blender, or with something else in its place: one clear message each."""
+"""FBX and glTF without Blender, or with another program in its place: one clear message each."""
 
 import math
 import sys

@@ -1,4 +1,4 @@
-"""The Blender extension is one zip with everything in it."""
+"""The Blender extension is one self-contained zip."""
 
 import ast
 import subprocess
@@ -41,7 +41,7 @@ def test_zip_holds_manifest_modules_and_reader(tmp_path):
 
 
 def test_vendored_modules_work_where_no_jawusd_is(tmp_path):
-    """Below another package, in an interpreter that cannot import jawusd."""
+    """Inside another package, in an interpreter that cannot import jawusd."""
     build_extension(tmp_path / "a.zip")
     with zipfile.ZipFile(tmp_path / "a.zip") as archive:
         archive.extractall(tmp_path / "inside")

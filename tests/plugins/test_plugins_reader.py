@@ -1,4 +1,4 @@
-"""The single-file reader against the evaluator, in this Python and, as one file, in a bare one."""
+"""The single-file reader against the evaluator, in this Python and, packed, in one without packages."""
 
 import ast
 import io
@@ -103,7 +103,7 @@ print(json.dumps(told))
 
 
 def bare_python(version):
-    """Return an interpreter of a version, of this system or of pyenv; skip without one."""
+    """Return an interpreter of a version, from the system or pyenv; skip if there is none."""
     kept = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     places = [shutil.which(f"python{version}"), *sorted(kept.glob(f"{version}.*/bin/python"))]
     for place in filter(None, places):
@@ -115,7 +115,7 @@ def bare_python(version):
 
 
 def assert_read_bare(python, files, folder):
-    """Compare what a bare interpreter reads from model files with the evaluator, everywhere and far outside."""
+    """Compare the reader in an interpreter without packages with the evaluator, everywhere and far outside."""
     (folder / "jawusd_reader.py").write_text(packed_reader())
     rigs = {str(path): load(path) for path in files}
     asked = {}
@@ -142,7 +142,7 @@ def assert_read_bare(python, files, folder):
 
 
 def assert_projected(rig, d, found):
-    """Valid ones stay; the others come to the bound, no farther than the evaluator brings them."""
+    """Valid parameters stay; others move to the bound, no farther than by the evaluator."""
     out = rig.margin(d) < 0
     assert out.any() and not out.all()
     np.testing.assert_array_equal(found[~out], d[~out])
@@ -291,7 +291,7 @@ def test_newer_and_missing_rigs_in_usd_are_refused(tmp_path):
 
 
 def test_ranges_reach_to_the_ends_of_the_opening():
-    """As the evaluator's: where the bound has closed already, the section at the last opening inside."""
+    """As in the evaluator: where the bound is closed, the section at the last valid opening."""
     wider = example_arrays() | {"d_range": example_arrays()["d_range"] + [[-0.8, 0.8], [0, 0], [0, 0]]}
     expected = JawRig(wider, example_meta())
     flat = {name: np.ravel(value).tolist() for name, value in wider.items()}

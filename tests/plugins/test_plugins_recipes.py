@@ -1,4 +1,4 @@
-"""The recipes on rigs, those of builds among them, with stand-ins that take matrices apart as the programs do."""
+"""The recipes on rigs, including built ones, with fakes that decompose matrices like the programs."""
 
 import importlib
 import json
@@ -29,7 +29,7 @@ MAYA_ORDERS = ("xyz", "yzx", "zxy", "xzy", "yxz", "zyx")
 
 @pytest.fixture
 def recipes(tmp_path, monkeypatch):
-    """Return the recipes as `python -m jawusd.plugins` writes them, with the reader beside them."""
+    """Return the recipes as `python -m jawusd.plugins` writes them, next to the reader."""
     copy_scripts(tmp_path / "scripts")
     monkeypatch.syspath_prepend(tmp_path / "scripts")
     for name in ("jawusd_recipes", "jawusd_reader"):
@@ -41,7 +41,7 @@ def recipes(tmp_path, monkeypatch):
 
 @pytest.fixture(params=["example", "turned", pytest.param("build", marks=pytest.mark.slow)])
 def model(request, tmp_path):
-    """Return a model file: of the example, of one whose scans lie on their backs, of a build."""
+    """Return a model file: of the example, of one with rotated scans, of a build."""
     if request.param == "build":
         return request.getfixturevalue("example_build")[0] / "model.npz"
     rig = example_rig()
@@ -53,7 +53,7 @@ def model(request, tmp_path):
 
 @pytest.fixture
 def told():
-    """Return what the stand-ins note: limits, and values by name and frame."""
+    """Return what the fakes record: limits, and values by name and frame."""
     return SimpleNamespace(limits=[], keys={}, range=None)
 
 
@@ -66,7 +66,7 @@ def motion(model):
 
 
 def stand_in_maya(told, motion, order):
-    """Return `maya.cmds` with the calls the recipes make and the signatures it documents; angles in degrees."""
+    """Return a fake `maya.cmds` with the functions that the recipes call, by its documentation; angles in degrees."""
     now = {}
 
     def xform(node, matrix, objectSpace):
@@ -99,7 +99,7 @@ def stand_in_maya(told, motion, order):
 
 
 def stand_in_houdini(told, motion, order):
-    """Return `hou`."""
+    """Return a fake `hou`."""
 
     class Matrix4:
         def __init__(self, values):
@@ -158,7 +158,7 @@ def stand_in_houdini(told, motion, order):
 
 
 def stand_in_unreal(told):
-    """Return `unreal`; its rotator holds angles about z, y and x in degrees, as three numbers that SciPy takes back."""
+    """Return a fake `unreal`, whose rotator has angles about z, y and x in degrees."""
 
     class Channel:
         def __init__(self, index):
@@ -196,12 +196,12 @@ def stand_in_unreal(told):
 
 
 def limits(model):
-    """Return what the controls must say."""
+    """Return the expected values of the controls."""
     return [[f"d{i}", *row] for i, row in enumerate(load(model).d_range.tolist(), start=1)]
 
 
 def assert_shown(told, names, order, rig, motion, scale=1.0):
-    """Compare where the keys carry points with the model, at every frame; no angle turns over on the way."""
+    """Compare points moved by the keys with the model at every frame, and check that angles are continuous."""
     values = np.array([[told.keys[name][frame] for name in names] for frame in motion])
     assert all(set(told.keys[name]) == set(motion) for name in names)
     angles = values[:, [3 + "xyz".index(axis) for axis in order]]
@@ -237,7 +237,7 @@ def test_houdini_keys_the_mandible(recipes, model, motion, told, order, monkeypa
 
 
 def test_unreal_gets_a_key_at_every_frame_in_its_axes(recipes, model, told, monkeypatch):
-    """Unreal's quaternions turn about a vector as everybody's do; its points are those of USD with y and z swapped."""
+    """Unreal's quaternions follow the usual convention; its points are those of USD with y and z swapped."""
     unreal = stand_in_unreal(told)
     monkeypatch.setitem(sys.modules, "unreal", unreal)
     rig = load(model)
@@ -275,7 +275,7 @@ def test_parameters_outside_the_bound_are_named_and_moved_inside(recipes, model)
 
 @pytest.mark.parametrize("order", ["XYZ", "ZYX", "YXZ", "zxy"])
 def test_angles_go_on_through_every_turn(recipes, order):
-    """Random turns in small steps, often near where two axes fall together: the angles never jump by half a turn."""
+    """Random rotations in small steps, often near gimbal lock: the angles never jump by half a turn."""
     rng = np.random.default_rng(3)
     turn, previous, before, jumps, unfiltered = Rotation.random(random_state=1), None, None, [], []
     for _ in range(4000):
@@ -297,7 +297,7 @@ def test_keys_between_are_on_straight_lines(recipes):
 
 
 def test_the_recipes_run_bare(recipes, tmp_path):
-    """Isolated, without site packages: neither numpy nor jawusd is there."""
+    """Isolated, without site packages: neither numpy nor jawusd is available."""
     path = save(example_rig(), tmp_path / "model.npz")
     code = f"""
 import sys; sys.path.insert(0, {str(tmp_path / "scripts")!r})

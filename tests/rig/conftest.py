@@ -1,4 +1,4 @@
-"""Baked example rigs: made once per run, copied into a fresh folder for every test."""
+"""Baked example rigs, made once per run and copied to a new folder for every test."""
 
 import shutil
 

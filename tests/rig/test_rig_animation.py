@@ -50,7 +50,7 @@ def test_lost_frames_are_bridged_and_listed(folder):
 
 
 def test_fast_motion_gets_samples_between_frames(folder, kind):
-    """Fifteen millimetres in one frame: the ops alone would cut the corner of the curved path."""
+    """15 mm in one frame: interpolating only between frames would leave the curved path."""
     out = write_animation(folder / "anim_fast.usdc", folder / "actor.usda", [0, 1], [[0, 0, 0], [15, 2, 1]], 24)
     assert_valid_usd(out)
     stage = Usd.Stage.Open(str(out))

@@ -1,4 +1,4 @@
-"""Shots that break an actor are named, each for what it does; ordinary shots raise no alarm."""
+"""Shots that break an actor are reported with the reason; ordinary shots are not reported."""
 
 import json
 
@@ -284,7 +284,7 @@ def retime(stage, actor):
 
 
 def walk(stage, actor):
-    """Key the actor and the set above it at every frame, as layout does."""
+    """Key the actor and the set above it at every frame, as layout artists do."""
     for prim, way in ((actor, (3, 0, 1)), (actor.GetParent(), (0, 1, 0))):
         move = UsdGeom.Xformable(prim).AddTranslateOp()
         turn = UsdGeom.Xformable(prim).AddRotateXYZOp()
@@ -294,7 +294,7 @@ def walk(stage, actor):
 
 
 def reset_the_actor(stage, actor):
-    """It stays whole: its jaw follows it."""
+    """Allowed: the jaw follows the actor."""
     walk(stage, actor)
     UsdGeom.Xformable(actor).SetResetXformStack(True)
 
@@ -313,7 +313,7 @@ def second_rig(stage, actor):
 
 
 def enter_later(stage, actor):
-    """Hide the whole actor for the first frames, by its visibility and by its size."""
+    """Hide the whole actor in the first frames, by visibility and by scale."""
     seen, size = UsdGeom.Imageable(actor).CreateVisibilityAttr(), UsdGeom.Xformable(actor).AddScaleOp()
     for time, visible, scale in ((30, "invisible", 0), (40, "inherited", 1)):
         seen.Set(visible, time)
@@ -330,7 +330,7 @@ def hide_the_bone_but_not_the_teeth(stage, actor):
 
 
 def clip(stage, actor):
-    """Take the motion from value clips."""
+    """Read the motion from value clips."""
     flat = Usd.Stage.Open(str(stage.GetRootLayer().realPath).replace("shot.usda", "anim_capture.usdc")).Flatten()
     flat.Export(str(stage.GetRootLayer().realPath).replace("shot.usda", "clip.usdc"))
     actor.GetReferences().SetReferences([Sdf.Reference("./actor.usda")])

@@ -1,4 +1,4 @@
-"""What bake_rig writes: valid USD whose motion, table and geometry are those of the model."""
+"""Files of bake_rig: valid USD whose motion, table and geometry match the model."""
 
 import numpy as np
 import pytest
@@ -90,7 +90,7 @@ def test_between_frames_the_mandible_stays_rigid_and_near_the_model(folder, kind
 
 
 def test_table_in_the_file_agrees_with_the_model(folder, kind):
-    """Read with scipy's interpolator and Rodrigues vectors, at every mandible vertex, 1,000 random valid d."""
+    """Evaluated with scipy's interpolator and Rodrigues vectors, at every mandible vertex, 1,000 random valid d."""
     rig = example_rig(kind)
     stage = Usd.Stage.Open(str(folder / "actor.usda"))
     prim = stage.GetPrimAtPath("/Actor")

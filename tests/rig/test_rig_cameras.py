@@ -1,4 +1,4 @@
-"""The take: USD's cameras see points where the calibrated ones see them."""
+"""The take: USD cameras project points like the calibrated cameras."""
 
 import numpy as np
 import pytest
@@ -74,7 +74,7 @@ def test_the_actor_stands_upright_and_distortion_is_kept(anchored_folder):
 
 
 def test_no_samples_lie_in_text(anchored_folder):
-    """NVIDIA's validator flags them; and the binary layer must not outlive its rewriting."""
+    """NVIDIA's validator reports them, and rewriting must replace the binary layer."""
     actor = anchored_folder / "actor.usda"
     for count in (40, 12):
         motion, out = write_cameras(

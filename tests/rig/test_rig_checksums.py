@@ -1,4 +1,4 @@
-"""Damage of a rig's binary layers is found when the rig is opened; rigs without checksums open as before."""
+"""Damage in a rig's binary layers is found when it is opened; rigs without checksums still open."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from jawusd.rig.publish import publish_rig
 
 
 def flip_bits(file):
-    """Damage one byte in the middle, as disks and copies do."""
+    """Damage one byte in the middle, like a faulty disk or copy."""
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 0x10
     file.write_bytes(data)

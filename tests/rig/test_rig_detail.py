@@ -1,4 +1,4 @@
-"""The variant `detail`: by default a rig is what it was without it; proxies replace meshes, or lie beside them."""
+"""The variant `detail`: no change by default; proxies replace meshes, or are added next to them."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def baked(tmp_path_factory):
 
 
 def shot(folder, source="anim_capture.usdc"):
-    """Write a layer beside a rig that selects the proxy; return its path."""
+    """Write a layer next to a rig that selects the proxy; return its path."""
     return choose_variants(folder / source, folder / f"crowd_{source.split('.')[0]}.usda", detail="proxy")
 
 
@@ -54,7 +54,7 @@ def test_by_default_nothing_is_different(baked):
 
 
 def test_fields_of_proxies_are_in_the_order_of_their_text(baked, tmp_path):
-    """Copies have them in the order of addresses in memory, which differs from one run of a program to the next."""
+    """Copied fields are in the order of memory addresses, which differs between runs."""
     stored = baked / "with" / "proxy.usdc"
     again = Sdf.Layer.CreateAnonymous(".usda")
     again.ImportFromString(Sdf.Layer.FindOrOpen(str(stored)).ExportToString())
@@ -107,7 +107,7 @@ def test_scans_are_for_rendering_and_proxies_for_showing(baked):
     for name, place in MESH_PATHS.items():
         scan = UsdGeom.Mesh(stage.GetPrimAtPath(place))
         assert len(scan.GetPointsAttr().Get()) == len(scans[name].vertices)
-        if name not in PROXIES:  # it has few faces as it is
+        if name not in PROXIES:  # it already has few faces
             assert scan.ComputePurpose() == "default"
             continue
         found, purpose = scan.ComputeProxyPrim()
@@ -118,7 +118,7 @@ def test_scans_are_for_rendering_and_proxies_for_showing(baked):
         materials = [UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0] for mesh in (scan, proxy)]
         assert materials[0] and materials[0].GetPath() == materials[1].GetPath()
     names = [prim.GetName() for prim in Usd.PrimRange(stage.GetPrimAtPath("/Actor/geo"))]
-    assert len(names) == len(set(names))  # Blender and others mix up equal ones
+    assert len(names) == len(set(names))  # Blender and other programs confuse equal names
     stage.Unload("/Actor")
     assert not [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
 

@@ -1,4 +1,4 @@
-"""Meshes written into a rig come back as they were; a placeholder does not."""
+"""Meshes written to a rig are read back unchanged; placeholders are not returned."""
 
 from dataclasses import replace
 
@@ -81,7 +81,7 @@ def test_one_colour_all_over_says_nothing(tmp_path, colors):
 
 
 def test_colours_are_linear_in_usd():
-    """Values of the sRGB standard's own curve: 128 of 255 is 0.2159 of light; and all codes come back."""
+    """The curve of the sRGB standard: 128 of 255 is linear 0.2159, and all codes survive a round trip."""
     np.testing.assert_allclose(linear_from_srgb(np.array([0, 10, 128, 255])), [0, 0.003035, 0.215861, 1], atol=1e-6)
     codes = np.arange(256, dtype=np.uint8)
     np.testing.assert_array_equal(srgb_from_linear(linear_from_srgb(codes).astype(np.float32)), codes)

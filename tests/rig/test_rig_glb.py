@@ -24,7 +24,7 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 class Parsed:
-    """Read a .glb as the specification says."""
+    """Read a .glb according to the specification."""
 
     def __init__(self, path):
         data = path.read_bytes()
@@ -68,7 +68,7 @@ class Parsed:
 
 
 def actor(folder, meshes):
-    """Write what an actor needs to be shown; return its file."""
+    """Write the layers that display an actor; return its file."""
     rig = example_rig()
     write_layer(build_geometry(meshes, rig.T_rest), folder / "geo.usdc")
     write_layer(decoder_layer(rig, build_table(rig, mandible_vertices(), 17)), folder / "rig.usdc")
@@ -92,7 +92,7 @@ def test_the_mandible_moves_as_the_model_does(take):
     points = mandible_vertices()
     exact = moved(example_rig().pose(d), points)
     assert np.linalg.norm(moved(poses[rows], points) - exact, axis=2).max() < 1e-4
-    # between keys, as readers show it: a straight line, and slerp
+    # between keys, as readers interpolate: linear, and slerp
     at = np.linspace(times[0], times[-1], 997)
     turned = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(np.clip(at, times[0], times[-1])).as_matrix()
     placed = np.stack([np.interp(at, times, column) for column in poses[:, :3, 3].T], axis=1)
@@ -103,7 +103,7 @@ def test_the_mandible_moves_as_the_model_does(take):
 
 
 def test_trimesh_shows_the_meshes_at_rest(take, tmp_path):
-    """Painted scans: crowns and gum apart, in metres, the mandible in the closed bite."""
+    """Painted scans: crowns and gum separately, in metres, the mandible in the closed bite."""
     meshes, rig = example_meshes(), example_rig()
     path = write_glb(tmp_path / "a.glb", actor(tmp_path, meshes), rig, [0, 1], [[0, 0, 0], [5, 0, 0]], FPS)
     scene = trimesh.load_scene(path)
@@ -157,7 +157,7 @@ def test_frame_numbers_are_kept(take, tmp_path, first):
 
 @pytest.mark.parametrize("first", [-5, 2_073_600])
 def test_numbers_that_gltf_cannot_keep_start_at_zero(take, tmp_path, first):
-    """Before frame 0, and a time of day at 24 per second, which single precision knows to a quarter of a frame."""
+    """Before frame 0, and a time of day at 24 fps, which single precision resolves to a quarter of a frame."""
     path = write_glb(tmp_path / "a.glb", take[0], example_rig(), [first, first + 2], [[0, 0, 0], [5, 0, 0]], FPS)
     times, _ = Parsed(path).motion()
     np.testing.assert_allclose(times[[0, -1]], [0, 2 / FPS], atol=1e-6)

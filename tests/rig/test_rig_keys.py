@@ -1,4 +1,4 @@
-"""Times and values of attributes: samples, splines, and which of them count where layers hold both."""
+"""Times and values of attributes: samples, splines, and their priority if layers have both."""
 
 import pytest
 from pxr import Sdf, Ts, Usd
@@ -8,7 +8,7 @@ from jawusd.rig.attributes import key_and_frame_times, key_times, values_at
 
 @pytest.fixture
 def stage():
-    """Return a stage whose weaker layer holds a spline of 0 to 8 over frames 1 to 5, and that layer."""
+    """Return a stage whose weaker layer has a spline from 0 to 8 over frames 1 to 5, and that layer."""
     weak = Sdf.Layer.CreateAnonymous(".usda")
     below = Usd.Stage.Open(weak)
     attribute = below.DefinePrim("/A").CreateAttribute("x", Sdf.ValueTypeNames.Double)

@@ -1,4 +1,4 @@
-"""Poses read from stages that anybody may have made."""
+"""Poses read from stages of other programs."""
 
 import json
 

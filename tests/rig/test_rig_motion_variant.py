@@ -1,4 +1,4 @@
-"""The variant `motion`: by default a rig is what it was without it; `skeleton` moves it by bones, and is read so."""
+"""The variant `motion`: no change by default; `skeleton` moves the rig by bones, and is read from them."""
 
 import numpy as np
 import pytest
@@ -117,7 +117,7 @@ def test_edited_bones_are_read_and_baked_to_transforms(anchored_folder, tmp_path
     rig, wanted = example_rig(), np.array([6.0, -1.0, 0.5])
 
     def raise_keys(actor):
-        """Key two other poses over those of the take, by the joint's own keys elsewhere."""
+        """Key two other poses over those of the take, as keys of the joint."""
         bake_rig(tmp_path / "other", rig, example_meshes(), name="x", fps=FPS, frames=[30, 69], d=[wanted, wanted / 2])
         other = Sdf.Layer.FindOrOpen(str(tmp_path / "other" / "actor_skel.usdc"))
         animation = UsdSkel.Animation(actor.GetPrimAtPath("geo/Skel/Motion"))

@@ -1,4 +1,4 @@
-"""Actors are named after themselves, in every layer, and older rigs are read under the name they have."""
+"""Prims are named after the actor in every layer, and older rigs are read under their old name."""
 
 import json
 from pathlib import Path
@@ -32,7 +32,7 @@ def run(*arguments, code=0):
 
 @pytest.fixture
 def hero(tmp_path):
-    """Return a rig with all layers there are, whose prim is called hero."""
+    """Return a rig with all layers, whose prim is called hero."""
     options = {"proxies": example_proxies(), "table_size": 17, "prim_name": "hero"}
     bake_rig(tmp_path / "hero", example_rig(), example_meshes(), name="Anna", fps=FPS, frames=FRAMES, d=D, **options)
     write_animation(tmp_path / "hero" / "anim.usdc", tmp_path / "hero" / "actor.usda", FRAMES, D, FPS)

@@ -1,4 +1,4 @@
-"""NVIDIA's validator through its report; the program here is a stand-in that writes reports of its form."""
+"""NVIDIA's validator, replaced by a fake program that writes reports in its format."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The ONNX sidecar against the evaluator, run by onnxruntime."""
+"""The ONNX sidecars, run by onnxruntime, against the evaluator."""
 
 import pickle
 import shutil
@@ -64,7 +64,7 @@ def test_graphs_of_other_rigs_equal_the_evaluator(name):
 
 @pytest.mark.parametrize("name", ["anchored, touching", "additive, touching"])
 def test_what_overflows_far_away_spoils_nothing_nearer(name):
-    """At ten metres the series of large angles overflow in single precision; the pose does not use them there."""
+    """At 10 m the series of large angles overflow in single precision, where the pose does not use them."""
     d = 1e4 * np.random.default_rng(2).normal(size=(100, 3))
     for found in run(RIGS[name](), d, np.float32):
         assert np.isfinite(found).all()
@@ -72,7 +72,7 @@ def test_what_overflows_far_away_spoils_nothing_nearer(name):
 
 @pytest.mark.parametrize("scale", [0.0, 1e-12, 1e-7, 1e-3, 3.0])
 def test_small_and_large_parameters(kind, scale):
-    """Far outside the bounds too: a solver passes there, and nothing may divide by zero or turn to NaN."""
+    """Far outside the bounds too, where solvers may pass: no division by zero, no NaN."""
     rig = example_rig(kind)
     d = scale * np.random.default_rng(1).normal(size=(50, 3)) * [14, 4, 3]
     pose, twist, margin = run(rig, d, np.float64)
@@ -209,7 +209,7 @@ def folder(tmp_path_factory):
 
 
 def outside_and_inside(rig):
-    """Return parameters everywhere and far outside."""
+    """Return parameters everywhere and far outside the bound."""
     low, high = rig.d_range.T
     return np.random.default_rng(5).uniform(low - 5, high + 5, (300, 3))
 
@@ -229,7 +229,7 @@ def test_a_rig_of_its_onnx_file_poses_and_judges(folder):
         np.testing.assert_array_equal(found.valid, wanted.valid)
         np.testing.assert_array_equal(found.reason, wanted.reason)
     np.testing.assert_allclose(rig.encode(T).d, d, atol=1e-3)
-    assert rig.is_inside(rig.project(d)).all()  # on the bound, too
+    assert rig.is_inside(rig.project(d)).all()  # including the bound
     for single in d[:5]:
         np.testing.assert_allclose(rig.pose(single), exact.pose(single), atol=1e-3)
         assert rig.is_inside(single) == exact.is_inside(single)
@@ -269,7 +269,7 @@ def test_onnx_files_that_cannot_pose_are_refused(folder, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
 def test_nothing_is_sent_anywhere(anchored_folder, tmp_path):
-    """Onnxruntime 1.31 looks for a machine of its maker some ten seconds after it was loaded."""
+    """Onnxruntime 1.31 contacts a telemetry server about ten seconds after it is loaded."""
     code = "import sys, time; from jawusd.rig import validate_stage; validate_stage(sys.argv[1]); time.sleep(15)"
     log = tmp_path / "calls"
     line = ["strace", "-f", "-qq", "-e", "trace=connect", "-o", log, sys.executable, "-c", code]

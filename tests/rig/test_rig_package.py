@@ -1,4 +1,4 @@
-"""The package for viewers: flat, complete but for the ONNX file."""
+"""The package for viewers: flat, complete except for the ONNX files."""
 
 import zipfile
 
@@ -85,7 +85,7 @@ def test_no_transform_of_a_shot_is_whole(anchored_folder, tmp_path):
 
 
 def test_actors_inside_instances_are_packed(anchored_folder, tmp_path):
-    """What instances share lies elsewhere in a flat layer: its ONNX files stay outside all the same."""
+    """Prototypes have other paths in a flattened layer; their ONNX files are left out as well."""
     for name, source, below in (("unit", "anim_capture.usdc", "Person"), ("shot", "unit.usda", "Unit")):
         stage = Usd.Stage.CreateNew(str(anchored_folder / f"{name}.usda"))
         UsdGeom.SetStageUpAxis(stage, "Y")

@@ -1,4 +1,4 @@
-"""The stand-in for a missing mandible: closed, where the jaw is, condyles from the motion, and marked everywhere."""
+"""The placeholder for a missing mandible: closed, in the place of the jaw, condyles from the motion, and marked."""
 
 import types
 
@@ -14,12 +14,12 @@ from jawusd.rig import describe
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.placeholder import find_condyles, grow_placeholder
 
-MEAN = np.array([[50.0, 36.0, -80.0], [-50.0, 36.0, -80.0]])  # the mean adult places
+MEAN = np.array([[50.0, 36.0, -80.0], [-50.0, 36.0, -80.0]])  # the mean adult positions
 INFERRED = {"inferred": ["condyle_left, at mean adult places", "condyle_right, at mean adult places"]}
 
 
 def sliding_jaw(condyles, meta=INFERRED, travel_mm=9.0, noise_mm=0.05):
-    """Return what a jaw of known condyles would be as a rig: they ride an arc, while the jaw opens to any angle.
+    """Return a fake rig with known condyles, which move along an arc while the jaw opens to any angle.
 
     Both condyles slide alike along a circle of 12 mm about a crest below and in front of them.
     """
@@ -59,14 +59,14 @@ def test_given_condyles_stay():
 
 
 def closed(mesh):
-    """Return the mesh in trimesh, which says whether it is closed and turned outward."""
+    """Return the mesh in trimesh, which can check that it is closed and oriented outward."""
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert made.is_watertight and made.is_winding_consistent and made.volume > 20_000
     return made
 
 
 def winding(mesh, point):
-    """Return how often a surface goes round a point: its solid angle over 4 pi (van Oosterom & Strackee 1983)."""
+    """Return the winding number of a surface about a point: solid angle / 4 pi (van Oosterom & Strackee 1983)."""
     a, b, c = np.moveaxis(mesh.triangles - point, 1, 0)
     la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
     dots = (np.einsum("ij,ij->i", x, y) for x, y in ((b, c), (a, c), (a, b)))

@@ -1,4 +1,4 @@
-"""Rigs under names of their own: nothing refers to the old names, and actors packed together keep their data."""
+"""Published rigs: nothing refers to the old names, and actors packed together keep their data."""
 
 import os
 
@@ -86,7 +86,7 @@ def test_splines_are_published_without_a_warning_of_openusd(anchored_folder, tmp
 
 @pytest.mark.parametrize("file", ["actor.usda", "anim_capture.usdc"])
 def test_actors_mixed_up_by_a_packager_are_refused(tmp_path, file):
-    """Built folders, not published: OpenUSD's packager flattens their names, and two actors share one's files."""
+    """Built folders that were not published: OpenUSD's packager flattens names, so that two actors share files."""
     stage = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
     stage.SetDefaultPrim(stage.DefinePrim("/Shot", "Xform"))
     frames, d = example_motion(8)

@@ -1,4 +1,4 @@
-"""Reading rigs: exact round trip, refusals that name the field, shots with several actors."""
+"""Reading rigs: exact round trip, errors that name the field, shots with several actors."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from jawusd.rig.bake import bake_rig
 
 
 def edit(path, change):
-    """Change a layer on disk, without keeping it open."""
+    """Change a layer on disk and close it."""
     layer = Sdf.Layer.OpenAsAnonymous(str(path))
     change(layer)
     layer.Export(str(path))
@@ -266,7 +266,7 @@ def test_instanced_actors_move_as_one_and_load(anchored_folder, tmp_path):
 
 @pytest.mark.parametrize("instanced", [False, True])
 def test_two_animations_in_one_shot_moved_scaled_and_instanced(anchored_folder, tmp_path, instanced):
-    """Each actor has its own motion file, place and turn; the shot is in centimetres."""
+    """Each actor has its own motion file, position and rotation; the shot is in centimetres."""
     rig, (frames, d) = example_rig(), example_motion()
     motions = {"One": d, "Two": d[::-1] * [0.8, -1, 0.5]}
     shot = Usd.Stage.CreateInMemory()

@@ -1,4 +1,4 @@
-"""Shots in which d alone, or the mandible alone, was keyed: found, and baked again."""
+"""Shots in which only d or only the mandible was keyed are found and baked again."""
 
 import json
 
@@ -27,7 +27,7 @@ def run(*arguments, code=0):
 
 
 def shot(folder, change, name="shot.usda", actors=("Person",), source="actor.usda"):
-    """Write a shot that references the actor, once or more, and is changed."""
+    """Write a changed shot that references the actor one or more times."""
     stage = Usd.Stage.CreateNew(str(folder / name))
     stage.SetStartTimeCode(1)
     stage.SetEndTimeCode(25)
@@ -103,7 +103,7 @@ def test_a_mandible_moved_by_hand_gives_d_inside_the_bound(folder, kind):
     assert found["worst_margin_mm"] == pytest.approx(float(rig.margin(wanted[20])), abs=1e-3)
     times, d, _ = read_parameters_of_stage(folder / "baked.usdc")
     assert rig.is_inside(d).all()
-    # the way back inside is continuous, so neighbours of the pose outside may move, too
+    # moving inside is continuous in time, so neighbours of the pose outside may move as well
     far = [k for k in range(25) if abs(k - 20) > 3]
     np.testing.assert_allclose(d[np.searchsorted(times, np.array(far) + 1)], wanted[far], atol=1e-3)
     run("validate", folder / "actor.usda", folder / "baked.usdc")
@@ -111,7 +111,7 @@ def test_a_mandible_moved_by_hand_gives_d_inside_the_bound(folder, kind):
 
 
 def test_what_was_edited_last_counts(folder, kind):
-    """In a layer over an animation: its own keys; in the animation itself nothing tells."""
+    """A layer over an animation has its own keys; in the animation itself the edit cannot be detected."""
     rig, (frames, d) = example_rig(kind), example_motion()
     animation = write_animation(folder / "anim.usdc", folder / "actor.usda", frames, d, 24)
     for name, expected in (("xformOp:translate", "mandible"), ("jaw:d1", "d")):
@@ -167,7 +167,7 @@ def test_an_instance_is_made_editable(folder, kind):
 
 @pytest.mark.parametrize("source", ["actor.usda", "anim_capture.usdc"])
 def test_a_d_that_is_held_is_found_and_baked(anchored_folder, source):
-    """One value in the shot, no keys: over a still jaw, and over a captured motion, it is what the animator wants."""
+    """A single value in the shot overrides a still jaw and a captured motion, as the animator intends."""
     folder = anchored_folder
     path = shot(folder, hold_d, source=source)
     run("validate", path, code=1)
@@ -182,7 +182,7 @@ def test_a_d_that_is_held_is_found_and_baked(anchored_folder, source):
 
 
 def test_a_mandible_that_departs_from_d_between_keys_is_found(anchored_folder):
-    """Equal at both keys, but a straight way between them, which no jaw goes."""
+    """Equal at both keys, but linear between them, unlike a jaw."""
     folder = anchored_folder
     rig = example_rig()
 
@@ -252,7 +252,7 @@ def test_the_rig_of_another_person_is_refused(anchored_folder):
 
 
 def test_a_motion_made_for_another_model_is_found(anchored_folder):
-    """As where a packager has put one actor's files in the place of another's: even where the jaw keeps still."""
+    """As if a packager had replaced one actor's files by another's, even if the jaw does not move."""
     folder = anchored_folder
     rig = example_rig()
     other = JawRig({**rig.arrays, "landmarks": rig.landmarks + 0.01}, rig.meta)
@@ -263,7 +263,7 @@ def test_a_motion_made_for_another_model_is_found(anchored_folder):
 
 
 def test_an_actor_inside_an_instance_is_found(anchored_folder):
-    """A unit of scenery that holds the actor, itself an instance, three times: judged once."""
+    """A set that contains the actor, itself an instance, three times: reported once."""
     folder = anchored_folder
     unit = shot(folder, key_d, name="unit.usda")
 
@@ -290,7 +290,7 @@ def test_an_actor_inside_an_instance_is_found(anchored_folder):
 
 
 def department_shot(folder, change, actors=("Anna", "Ben"), metres=0.001):
-    """Write a shot as studios have them: a root that holds sublayers alone, the animation in one of them."""
+    """Write a shot as in studios: a root with sublayers only, the animation in one of them."""
     shot(folder, change, name="anim.usda", actors=actors)
     layer = Sdf.Layer.FindOrOpen(str(folder / "anim.usda"))
     root = Sdf.Layer.CreateNew(str(folder / "shot.usda"))
@@ -312,7 +312,7 @@ def inserted(path, layer):
 
 
 def farthest_mm(stage, actor, rig, d):
-    """Return the largest distance of a vertex from where the model puts it, at whole frames, in the world."""
+    """Return the largest distance of a vertex from its position by the model, at whole frames, in the world."""
     worst, points = 0.0, example_meshes()["lower_teeth"].vertices
     for frame, T in zip(range(1, 26), rig.pose(d), strict=True):
         cache = UsdGeom.XformCache(frame)
@@ -326,7 +326,7 @@ def farthest_mm(stage, actor, rig, d):
 
 
 def placed(prim):
-    """Place both actors somewhere, one of them walking."""
+    """Place both actors, one of them walking."""
     move = UsdGeom.Xformable(prim).AddTranslateOp()
     for frame in (1, 25):
         move.Set(Gf.Vec3d(frame, 20, 7), frame)
@@ -369,7 +369,7 @@ def test_some_actors_of_a_shot_are_named(anchored_folder):
 
 
 def test_what_a_sublayer_cannot_change_is_said(anchored_folder):
-    """The shot's own layer is stronger than its sublayers: what it says of the mandible stays."""
+    """The shot's own layer is stronger than its sublayers: its opinions about the mandible persist."""
 
     def move(prim):
         prim.GetStage().GetPrimAtPath(f"{prim.GetPath()}/geo/Mandible").GetAttribute("xformOp:translate").Set(
@@ -389,7 +389,7 @@ def test_what_a_sublayer_cannot_change_is_said(anchored_folder):
 
 
 def test_a_reset_mandible_shows_in_the_residual_and_is_baked_back(anchored_folder):
-    """It stays behind where the actor goes: encoding reads where it is in the world."""
+    """It does not move with the actor: encoding reads its pose in the world."""
 
     def reset(prim):
         placed(prim)

@@ -1,4 +1,4 @@
-"""The codeless schema: generated files, documentation, discovery in every kind of process."""
+"""The codeless schema: generated files, documentation, discovery in all kinds of processes."""
 
 import os
 import shutil

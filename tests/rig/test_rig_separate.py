@@ -1,6 +1,6 @@
-"""Hostile rigs: what limits a process of its own has, and what is counted before it is used.
+"""Hostile rigs: limits of the separate process, and sizes that are checked before use.
 
-What commands say of them is in tests/faults/attacks.py.
+Commands on them are tested in tests/faults/attacks.py.
 """
 
 import os
@@ -34,12 +34,12 @@ def doubling(levels):
 
 
 def nested(levels):
-    """Return a layer that OpenUSD recurses into until its stack ends."""
+    """Return a layer that makes OpenUSD overflow its stack."""
     return HEADER + 'def "a" {\n' * levels + "}\n" * levels
 
 
 def enlarged(folder, path, count):
-    """Give an array of a rig so many zeros; the binary layer stays small."""
+    """Fill an array of a rig with many zeros; the binary layer stays small."""
     for name in ("geo.usdc", "rig.usdc"):
         layer = Sdf.Layer.FindOrOpen(str(folder / name))
         spec = layer.GetAttributeAtPath(path)

@@ -1,4 +1,4 @@
-"""Keys as splines: the same motion, in a layer of their own."""
+"""Keys as splines: the same motion, in a separate layer."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Back to d from stages without a rig: Xforms, bones and point caches of the actor's meshes."""
+"""d from stages without a rig: Xforms, bones and point caches of the actor's meshes."""
 
 import json
 
@@ -24,7 +24,7 @@ def run(*arguments, code=0):
 
 
 def exported(path, T, cached=False, names=("UpperTeethMesh", "LowerTeethMesh"), size=0.1, change=None):
-    """Write what a program makes of a take: other units, axes and hierarchy; transforms, or points in every frame."""
+    """Write a take like an export of another program: other units, axes, hierarchy; transforms, or points per frame."""
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, "Z")
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -74,7 +74,7 @@ def test_exports_come_back_to_d_and_to_a_valid_layer(folder, kind, cached):
 
 @pytest.mark.parametrize("frames", [len(D), 1])
 def test_a_take_without_motion_is_said_to_have_none(frames, anchored_folder):
-    """As exports are whose drivers were not baked: all is well but that nothing moves."""
+    """Like an export whose drivers were not baked: valid, but nothing moves."""
     actor, path = anchored_folder / "actor.usda", anchored_folder / "still.usda"
     exported(path, np.tile(example_rig().pose(np.zeros(3)), (len(D), 1, 1)))
     if frames == 1:
@@ -93,7 +93,7 @@ def test_a_take_without_motion_is_said_to_have_none(frames, anchored_folder):
 
 
 def test_edited_bones_come_back(folder, kind):
-    """The skeleton variant with a key changed: one pose outside the bound, reported and brought inside."""
+    """The skeleton variant with a changed key: one pose outside the bound, reported and moved inside."""
     rig, (frames, d) = example_rig(kind), example_motion()
     stage = Usd.Stage.Open(str(folder / "actor_skel.usdc"))
     run("encode", folder / "actor.usda", folder / "actor_skel.usdc", "-o", folder / "d.csv")
@@ -111,7 +111,7 @@ def test_edited_bones_come_back(folder, kind):
 
 
 def test_a_point_cache_of_the_rig_itself_counts(folder, kind):
-    """Where the mandible mesh of a stage with the rig deforms, its points are what moves."""
+    """If the mandible mesh of a stage with the rig deforms, the motion is read from its points."""
     rig = example_rig(kind)
     stage = Usd.Stage.CreateNew(str(folder / "cached.usda"))
     stage.GetRootLayer().subLayerPaths.append("./actor.usda")
@@ -205,7 +205,7 @@ def test_of_two_copies_of_an_actor_one_has_to_be_named(anchored_folder):
 
 
 def test_a_point_cache_of_something_else_changes_no_rig(anchored_folder):
-    """As a cached face: of two actors of one person, each named, the transforms count."""
+    """Like a cached face: two actors of the same person, chosen by prim, moved by transforms."""
     stage = Usd.Stage.CreateNew(str(anchored_folder / "shot.usda"))
     frames, d = example_motion()
     stage.SetStartTimeCode(float(frames[0]))

@@ -1,4 +1,4 @@
-"""Rigs from strangers: no file outside their folder is read, whatever names it."""
+"""Rigs from unknown sources: no file outside their folder is read, by any kind of reference."""
 
 import os
 import subprocess
@@ -19,7 +19,7 @@ OUTSIDE = '#usda 1.0\nover "Actor" {\n    string jaw:actor = "evil"\n    double 
 
 @pytest.fixture
 def elsewhere(tmp_path):
-    """Return a folder with layers that no rig may read."""
+    """Return a folder with layers that rigs must not read."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     for name in ("evil.usda", "clip.1.usda", "clip.2.usda"):
@@ -32,7 +32,7 @@ def clips(values):
 
 
 def named_by(how, elsewhere):
-    """Return the text of a layer that names a file elsewhere."""
+    """Return the text of a layer that refers to a file in another folder."""
     template = f'string templateAssetPath = "{elsewhere}/clip.#.usda"\ndouble templateStartTime = 1'
     template += "\ndouble templateEndTime = 2\ndouble templateStride = 1"
     times = "double2[] active = [(0, 0)]\ndouble2[] times = [(0, 0), (9, 9)]"
@@ -76,7 +76,7 @@ def test_a_rig_reads_nothing_elsewhere(how, anchored_folder, elsewhere):
 
 
 def test_shots_pack_no_files_from_elsewhere(anchored_folder, elsewhere, tmp_path):
-    """A package that is passed on would hold them."""
+    """A package would contain them."""
     (elsewhere / "letter.png").write_text("between us")
     for name in (f"{elsewhere}/letter.png", "./link.png"):
         text = f'( defaultPrim = "Actor" )\ndef "Actor" ( references = @actor.usda@ ) {{\n    asset a = @{name}@\n}}\n'
@@ -113,7 +113,7 @@ def test_clips_in_the_own_folder_are_read(anchored_folder, elsewhere):
 
 
 def test_expressions_that_another_layer_turns_elsewhere_are_not_read(anchored_folder, elsewhere):
-    """Variables of a stronger layer decide which file an expression names."""
+    """Variables of a stronger layer determine the file of an expression."""
     inner = '#usda 1.0\n( expressionVariables = { string X = "./rig.usdc" }\n subLayers = [@`"${X}"`@] )\n'
     (anchored_folder / "inner.usda").write_text(inner)
     shot = anchored_folder / "shot.usda"
@@ -130,7 +130,7 @@ def test_variables_without_expressions_for_paths_are_read(anchored_folder):
 
 
 def test_files_of_package_paths():
-    """The package that OpenUSD opens, and of folders with brackets in their names the file itself."""
+    """The package that OpenUSD opens; for folders with brackets in their names, the file itself."""
     wanted = {
         "/a/rig.usdz[actor.usda]": "/a/rig.usdz",
         "/a/rig.usdz[in.usdz[actor.usda]]": "/a/rig.usdz",
@@ -210,7 +210,7 @@ def attack_by_dots_in_an_absolute_path(folder, elsewhere):
 
 
 def attack_by_a_search_path(folder, elsewhere):
-    """OpenUSD looks for it in the working directory first, whichever layer names it."""
+    """OpenUSD searches the working directory first, for references in any layer."""
     (folder / "below").mkdir()
     (folder / "below" / "inner.usda").write_text("#usda 1.0\n( subLayers = [@x/../../elsewhere/evil.usda@] )\n")
     return "#usda 1.0\n( subLayers = [@below/inner.usda@] )\n"
@@ -249,7 +249,7 @@ def test_a_search_path_leads_to_rigs_alone(anchored_folder, tmp_path):
 
 
 def test_a_path_that_is_found_beside_the_shot_is_read(anchored_folder):
-    """OpenUSD looks there for what a layer in another folder names."""
+    """OpenUSD searches there for references of layers in other folders."""
     (anchored_folder / "below").mkdir()
     (anchored_folder / "below" / "inner.usda").write_text("#usda 1.0\n( subLayers = [@actor.usda@] )\n")
     (anchored_folder / "shot.usda").write_text("#usda 1.0\n( subLayers = [@below/inner.usda@] )\n")
@@ -265,7 +265,7 @@ def test_a_flattened_shot_is_read(anchored_folder):
 
 
 def test_a_layer_in_a_subfolder_names_what_lies_above_in_the_rigs_folder(anchored_folder):
-    """A rig's folder is one unit: the way up to it leads nowhere else."""
+    """References from a subfolder up to the rig's folder are allowed, but not beyond it."""
     (anchored_folder / "layers").mkdir()
     (anchored_folder / "layers" / "look.usda").write_text('#usda 1.0\ndef "A" { asset a = @../geo.usdc@\n}\n')
     layer = Sdf.Layer.OpenAsAnonymous(str(anchored_folder / "actor.usda"))

@@ -1,4 +1,4 @@
-"""Every rule finds what it is there for, and UsdValidation runs them all."""
+"""Every rule finds its fault, and UsdValidation runs them all."""
 
 import numpy as np
 import onnx
@@ -63,7 +63,7 @@ def break_onnx_hash(folder):
 
 
 def forget_hashes(folder):
-    """Make the rig one that recorded no hashes, as before 0.1.0."""
+    """Remove the recorded hashes, as in rigs before 0.1.0."""
 
     def change(layer):
         for name in ("jaw:onnx", "jaw:onnx:encode"):
@@ -97,7 +97,7 @@ def break_onnx_agreement(folder):
 
 
 def break_encoder_agreement(folder):
-    """The right label on the graph of another jaw."""
+    """The graph of another jaw with the correct metadata."""
     forget_hashes(folder)
     rig = example_rig()
     model = encode_model(JawRig({**rig.arrays, "incisor": rig.incisor + 0.5}, rig.meta))

@@ -1,4 +1,4 @@
-"""Rigs of older versions: read through the steps, in memory, by everything that reads rigs; the files stay."""
+"""Rigs of older versions are upgraded in memory by all readers; the files are unchanged."""
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ OLD_NAME, NEW_NAME = "jaw:decoder:error", "jaw:decoder:maxError"
 
 @pytest.fixture
 def older(anchored_folder, monkeypatch):
-    """Return a rig as a version before the present one would have been: another name, inches in the incisal point.
+    """Return a rig of a fictitious older version: another name, incisal point in inches.
 
-    What is present becomes the next version, and UPGRADES gets the step to it.
+    The current format becomes the next version, and UPGRADES gets the upgrade to it.
     """
     for file, change in (("rig.usdc", _rename), ("rig.usdc", _to_inches)):
         layer = Sdf.Layer.OpenAsAnonymous(str(anchored_folder / file))
@@ -56,7 +56,7 @@ def test_an_older_rig_gives_the_same_poses(older):
 
 def test_an_older_rig_is_validated_as_it_is_read(older):
     findings = validate_stage(older / "actor.usda")
-    assert {finding.rule for finding in findings} <= {"Onnx"}  # the sidecar was hashed with the present arrays
+    assert {finding.rule for finding in findings} <= {"Onnx"}  # the sidecar was hashed with the current arrays
 
 
 def test_reading_twice_on_one_stage_upgrades_once(older):
