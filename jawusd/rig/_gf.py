@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Gf, Vt
 
-from jawusd.base.arrays import Array
-from jawusd.geometry.quaternion import continuous_wxyz, matrix_from_wxyz
+from jawusd.geometry.quaternion import continuous_wxyz
 
 
 def double_array(values: ArrayLike) -> Vt.DoubleArray:
@@ -61,11 +60,3 @@ def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
 def row_matrix(T: ArrayLike) -> Gf.Matrix4d:
     """Return a transform (4, 4) for column vectors as a Gf.Matrix4d, which acts on row vectors."""
     return Gf.Matrix4d(np.asarray(T, dtype=np.float64).T.tolist())
-
-
-def transform_from_ops(translation: Gf.Vec3d, rotation: Gf.Quatd) -> Array:
-    """Return the transform (4, 4) given by a translate op and an orient op."""
-    T = np.eye(4)
-    T[:3, :3] = matrix_from_wxyz([rotation.GetReal(), *rotation.GetImaginary()])
-    T[:3, 3] = translation
-    return T
