@@ -274,7 +274,7 @@ class Rig:
     def ranges(self, d1: float, d2: float = 0.0, d3: float = 0.0) -> tuple[Pair, Pair]:
         """Return the valid (min, max) of d2 at this d3, and of d3 at this d2 [mm]; (nan, nan) if there is none.
 
-        The bound closes some tenths of a mm before the ends of the opening; there the last valid opening is used.
+        The bound ends some tenths of a mm inside the range of d1; between, the last valid opening is used.
         """
         d1 = self._nearest_opening(d1, d2, d3)
         along_d2 = _chord(lambda x: self.margin(d1, x, d3), *self.d_range[1])

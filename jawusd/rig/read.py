@@ -25,7 +25,7 @@ PathArg = str | os.PathLike[str]
 
 
 def load_rig(path: PathArg, prim_path: str | None = None) -> JawRig:
-    """Load the evaluator of a rig from a layer or package that carries it.
+    """Load the evaluator of a rig from a layer or package that contains it.
 
     Args:
         path: `actor.usda`, an animation layer, a package, or any stage that references an actor.

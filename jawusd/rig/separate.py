@@ -44,8 +44,8 @@ def load_separately(path: Path, prim: str | None = None) -> JawRig:
             arrays = dict(found)
         return JawRig(arrays, json.loads(str(arrays.pop("meta"))))
     with contextlib.suppress(ValueError):
-        error = json.loads(done.stdout)
-        raise getattr(errors, error.pop("kind"))(error.pop("message"), **error)
+        reported = json.loads(done.stdout)
+        raise getattr(errors, reported.pop("kind"))(reported.pop("message"), **reported)
     if -done.returncode == getattr(signal, "SIGXCPU", None):
         raise errors.RigError(f"takes more than {MAX_CPU_S} s of processor time to read: {_DAMAGED}", path=path)
     raise errors.RigError(f"crashes the process that reads it (exit code {done.returncode}): {_DAMAGED}", path=path)

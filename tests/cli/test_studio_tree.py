@@ -71,7 +71,7 @@ def shot(library, tmp_path):
 def test_a_library_is_refused_until_it_is_allowed(shot, monkeypatch):
     allow = ("--allow", shot.parents[1] / "lib")
     refused = CliRunner().invoke(app, ["info", str(shot), "--prim", "/Shot/hero"])
-    assert "--allow" in refused.exception.hint and "no rig" in str(refused.exception)
+    assert "--allow" in refused.exception.hint and "not a rig" in str(refused.exception)
     for name, kind in KINDS.items():
         found = json.loads(run("info", shot, "--prim", f"/Shot/{name}", *allow, "--json"))
         assert found["actor"] == name and found["model"]["kind"] == kind

@@ -197,7 +197,7 @@ def without_proc() -> None:
 DEEP = 'def "a" {\n' * 40_000 + "}\n" * 40_000
 ASCII = (("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0"))
 ATTACKS = {
-    "300 million corners": Attack(many_faces, FORMAT, "values, at most", 1800),
+    "300 million corners": Attack(many_faces, FORMAT, "values, more than the limit", 1800),
     "40,000 prims deep, info": Attack(partial(layer, "info", DEEP), ENDED, "a library crashed"),
     "40,000 prims deep, validate": Attack(partial(layer, "validate", DEEP), ENDED, "a library crashed"),
     "40,000 prims deep, view": Attack(partial(layer, "view", DEEP), ENDED, "a library crashed"),

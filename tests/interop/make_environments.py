@@ -1,8 +1,8 @@
-"""Make the environments of the programs that the interop tests try rigs in.
+"""Install the programs that the interop tests run, each in its own environment.
 
 Usage: python tests/interop/make_environments.py FOLDER [NAME ...]
-Then run the tests with JAWUSD_INTEROP=FOLDER. Without names all are made; Blender's take 1 GB each, all together 3 GB
-and about five minutes. One that cannot be made in its time is left out and named, and the exit code is 1.
+Then run the tests with JAWUSD_INTEROP=FOLDER. Without names, all are installed: 3 GB, of which each Blender takes 1 GB,
+in about five minutes. An environment that fails or takes too long is skipped and named, and the exit code is 1.
 """
 
 import shutil
@@ -29,12 +29,12 @@ STEP_LIMIT_S = 300
 
 
 def run(*command):
-    """Run one step of making an environment."""
+    """Run one step of an installation."""
     subprocess.run([str(part) for part in command], check=True, timeout=STEP_LIMIT_S)
 
 
 def make(folder, name):
-    """Make one environment."""
+    """Install one environment."""
     target = folder / name
     if name in NODE_PACKAGES:
         target.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ def make(folder, name):
 
 
 def main(folder, names):
-    """Make environments; return the names of those that could not be made."""
+    """Install environments; return the names of those that failed."""
     missing = []
     for name in names:
         print(name, flush=True)

@@ -24,7 +24,7 @@ MESHES = {"MandibleMesh": "mandible", "LowerTeethMesh": "lower_teeth", "SkullMes
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return a baked example rig, whose scans are not quite in occlusion."""
+    """Return a baked example rig whose scans are not quite in occlusion."""
     frames, d = example_motion()
     made = tmp_path_factory.mktemp("actor")
     options = {"name": "example", "fps": FPS, "proxies": example_proxies()}

@@ -42,7 +42,7 @@ def actor(request, tmp_path_factory):
 
 
 def distance_mm(matrices, rig, d):
-    """Return the largest distance of the mandible's vertices from where the evaluator puts them."""
+    """Return the largest distance of the mandible's vertices from their positions by the evaluator."""
     points = mandible_vertices()
     return np.linalg.norm(moved(np.array(matrices), points) - moved(rig.pose(d), points), axis=-1).max()
 
@@ -50,14 +50,14 @@ def distance_mm(matrices, rig, d):
 @pytest.mark.slow
 @pytest.mark.parametrize("blender", BLENDERS)
 def test_takes_play_as_the_evaluator_says(tmp_path, archive, actor, blender):
-    """Imported at 59.94 per second, and keyed, in any order of frames, and after saving on any frame."""
+    """Imported at 59.94 fps, and keyed; frames in any order; saved on any frame and reopened."""
     rig, folder = actor
     frames, d = example_motion()
     write_animation(tmp_path / "anim.usdc", folder / "actor.usda", frames, d, 60000 / 1001)
     keyed = []
     for seed in range(30):
         times = np.cumsum(np.random.default_rng(seed).integers(2, 9, 6))
-        # 0, 6, 0 was shown as 0, 2.83, 0 once; beyond the limits of the sliders nothing may be clamped either
+        # 0, 6, 0 was once shown as 0, 2.83, 0; values beyond the slider limits must not be clamped either
         keyed.append(np.column_stack([times, sample_valid(rig, 6, seed=seed)]).tolist())
     (tmp_path / "keyed.json").write_text(json.dumps(keyed))
     arguments = (archive, tmp_path, tmp_path / "anim.usdc", tmp_path / "keyed.json", "30,42,69")
@@ -79,7 +79,7 @@ def test_sliders_bound_handle_export_and_two_actors(tmp_path, archive, actor, bl
     rig, folder = actor
     frames, d = example_motion()
     poses = {
-        # near the closed bite as well: its quaternions are nearly whole numbers
+        # also near the closed bite, where quaternions are nearly integers
         "inside": np.concatenate([sample_valid(rig, 30, seed=5), 0.1 * sample_valid(rig, 10, seed=6)]),
         "outside": np.array([[20.0, 9.0, 1.0], [0.0, 6.0, 0.0], [60.0, 0.0, 0.0], [5.0, -8.0, -5.0]]),
     }
@@ -101,11 +101,11 @@ def test_sliders_bound_handle_export_and_two_actors(tmp_path, archive, actor, bl
     assert found["shown_ranges"] == [line.format(*row) for row in found["ranges"]]
     kept = np.array([rig.keep_inside([0.0], row[None]).d[0] for row in poses["outside"]])
     assert distance_mm(found["kept"], rig, kept) < EXACT_MM
-    np.testing.assert_allclose(found["sliders"], poses["outside"][-1])  # only what is shown is brought inside
+    np.testing.assert_allclose(found["sliders"], poses["outside"][-1])  # only the displayed pose is moved inside
     check_two_actors(rig, found["two"], poses["inside"])
     disabled, enabled = (distance_mm([found["enabled"][k]], rig, poses["inside"][[1]]) for k in (0, 1))
     assert disabled > 0.1 and enabled < EXACT_MM
-    # what bones move already is left to them
+    # rigs moved by bones get no sliders
     assert found["bones"]["actors"] == []
     expected = moved(rig.pose(d[[42 - frames[0]]]), example_meshes()["mandible"].vertices)[0]
     assert np.linalg.norm(np.array(found["bones"]["places"]) - expected, axis=1).max() < EXACT_MM
@@ -127,7 +127,7 @@ def test_sliders_bound_handle_export_and_two_actors(tmp_path, archive, actor, bl
 
 
 def check_two_actors(rig, two, inside):
-    """Check that two imports of one actor are two actors, the second playing, each posed by its own sliders."""
+    """Check that two imports of one actor are separate: each is posed by its own sliders, and the second plays."""
     frames, d = example_motion()
     assert two["names"] == ["Actor", "Actor.001"]
     assert distance_mm(two["played"][1:], rig, d[[42 - frames[0]]]) < EXACT_MM

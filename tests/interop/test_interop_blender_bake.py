@@ -1,4 +1,4 @@
-"""Jaws that leave Blender's add-on: baked to keys, opened without it, exported as FBX and glTF, from splines."""
+"""Jaws of the Blender add-on: baked to keys, opened without the add-on, exported as FBX and glTF, keyed by splines."""
 
 import json
 import re
@@ -36,7 +36,7 @@ def run(*arguments):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return a folder with a baked rig, layers of splines over it, instances of it, and the add-on."""
+    """Return a folder with a baked rig, spline layers over it, instances of it, and the add-on."""
     made = tmp_path_factory.mktemp("actor")
     bake_rig(made, RIG, scanned_meshes(), name="x", fps=FPS, frames=FRAMES, d=D, table_size=17)
     (made / "keys.json").write_text(json.dumps(KEYS))
@@ -50,10 +50,10 @@ def folder(tmp_path_factory):
         made / "splines.usda",
     )
     alone = (made / "splines.usda").read_text()
-    # splines where no samples lie below, and samples below that say something else
+    # splines without samples below, and over samples with other values
     (made / "alone.usda").write_text(alone.replace("keyed.usdc", "actor.usda"))
     (made / "edited.usda").write_text(alone.replace("13: 20;", "13: 15;"))
-    # samples and a value of a layer above the splines
+    # samples, and a value, in a layer above the splines
     over = Usd.Stage.CreateNew(str(made / "over.usda"))
     over.GetRootLayer().subLayerPaths.append("./splines.usda")
     over.SetDefaultPrim(over.GetPrimAtPath("/Actor"))
@@ -81,7 +81,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module", params=BLENDERS)
 def session(request, folder, tmp_path_factory):
-    """Return a Blender, the folder it left its files in, and what it said."""
+    """Return a Blender, the folder of its files, and its output."""
     left = tmp_path_factory.mktemp(request.param)
     splines = ",".join(str(folder / f"{name}.usda") for name in SPLINES)
     arguments = (left, folder / "anim_capture.usdc", splines, folder / "instances.usda", FRAMES[15])
@@ -89,7 +89,7 @@ def session(request, folder, tmp_path_factory):
 
 
 def distance_mm(matrices, d):
-    """Return the largest distance of the mandible's vertices from where the evaluator puts them."""
+    """Return the largest distance of the mandible's vertices from their positions by the evaluator."""
     points = mandible_vertices()
     return np.linalg.norm(moved(np.array(matrices), points) - moved(RIG.pose(d), points), axis=-1).max()
 
@@ -141,7 +141,7 @@ def test_what_cannot_be_baked_is_named(session):
 
 @pytest.mark.parametrize("scripts", [0, 1])
 def test_files_open_without_the_add_on(session, scripts):
-    """A live jaw is in its rest pose there, a baked one moves."""
+    """A driven jaw is in its rest pose, a baked one moves."""
     blender, left, _ = session
     opened = run_in(blender, "blender_reopen.py", left / "live.blend", scripts)
     assert distance_mm(list(opened.values()), np.zeros((len(opened), 3))) < 1e-4
@@ -161,7 +161,7 @@ def test_exports_of_live_sliders_are_warned_of(session):
 
 @pytest.mark.parametrize("file", ["baked.fbx", "baked.glb", "jaws.fbx", "scene.fbx", "scene_live.fbx"])
 def test_exports_come_back_to_d(session, folder, tmp_path, monkeypatch, file):
-    """With the exporters' default settings; where a camera moves too, FBX as one take, which needs no bake."""
+    """With default export settings. If a camera moves as well, FBX is exported as one take; that needs no baking."""
     blender, left, _ = session
     monkeypatch.setenv("JAWUSD_BLENDER", str(environment(blender) / "bin" / "python"))
     options = () if file.startswith("baked") else JAW
@@ -178,7 +178,7 @@ def assert_holds_take(rig, file, out, *options):
 
 
 def test_takes_of_other_objects_are_not_taken_for_the_jaws(session, folder, tmp_path, monkeypatch):
-    """By default FBX plays the camera's action on the jaw: Blender 4.5 as a take at rest, 5.0 as one that moves."""
+    """By default FBX applies the camera's action to the jaw: in Blender 4.5 it is at rest, in 5.0 it moves."""
     blender, left, _ = session
     monkeypatch.setenv("JAWUSD_BLENDER", str(environment(blender) / "bin" / "python"))
     arguments = (folder / "actor.usda", left / "scene_default.fbx", tmp_path / "d.csv", *JAW)

@@ -1,4 +1,4 @@
-"""Blender shows a take as the cameras recorded it: through its own cameras the jaw is where the calibration sees it."""
+"""In Blender, the jaw is at the same pixels of the take's cameras as by the calibration."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ SIZE = (1920, 1080)
 
 
 def cameras():
-    """Return two cameras with square pixels and an off-centre axis, before and beside the face."""
+    """Return two cameras with square pixels and an off-centre axis, in front of the face and beside it."""
     found = []
     for i, (f, cx, cy) in enumerate(((2100, 959.5, 539.5), (1800, 930.0, 610.25))):
         K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]])

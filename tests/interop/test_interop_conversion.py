@@ -1,4 +1,4 @@
-"""FBX and glTF, written by Blender and by jawusd, come back to d through Blender."""
+"""FBX and glTF, written by Blender and by jawusd, are converted back to d through Blender."""
 
 import json
 import os
@@ -26,7 +26,7 @@ def run(*arguments, code=0):
 
 @pytest.fixture(scope="module", params=[True, False], ids=["bones", "teeth"])
 def folder(request, tmp_path_factory):
-    """Return a baked rig; one with bones, of which vertices are never split, and one of teeth alone."""
+    """Return a baked rig: with bones, whose vertices are never split, or with teeth scans only."""
     made, meshes = tmp_path_factory.mktemp("actor"), scanned_meshes()
     if not request.param:
         meshes = {name: mesh for name, mesh in meshes.items() if name.endswith("teeth")}
@@ -51,7 +51,7 @@ def test_what_blender_exports_comes_back(folder, tmp_path, monkeypatch, blender,
 def test_own_glb_becomes_a_layer_again(folder, tmp_path, monkeypatch, blender):
     glb = write_glb(tmp_path / "take.glb", folder / "actor.usda", example_rig(), FRAMES, D, FPS)
     python = environment(blender) / "bin" / "python"
-    program = tmp_path / "blender-5"  # what Blender itself is given, read as its own Python would see it
+    program = tmp_path / "blender-5"  # the arguments of Blender, parsed as its own Python would
     program.write_text(
         f'#!/bin/sh\n[ "$1" = --background ] && [ "$5" = --python ] || exit 3\nshift 5\nexec {python} "$@"\n'
     )

@@ -1,4 +1,4 @@
-"""Programs that never heard of jawusd read its rigs: other OpenUSD versions, tinyusdz, three.js, NVIDIA's validator."""
+"""Programs without jawusd read its rigs: other OpenUSD versions, tinyusdz, three.js, NVIDIA's validator."""
 
 import json
 import shutil
@@ -47,7 +47,7 @@ def folder(tmp_path_factory):
 
 
 def expected_poses():
-    """Return the frames tried and the poses the evaluator gives there."""
+    """Return the tested frames and their poses by the evaluator."""
     frames, d = example_motion()
     rows = list(SHOWN)
     return frames[rows], example_rig().pose(d[rows])
@@ -85,7 +85,7 @@ def test_the_single_file_reader_reads_usd_with_every_openusd(folder, tmp_path, n
 
 @pytest.mark.parametrize("name", ["usd2411", "usd255"])
 def test_jawusd_itself_runs_on_older_openusd(folder, tmp_path, name, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # beside an installed jawusd lies another OpenUSD
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # the installed jawusd comes with another OpenUSD
     found = run_in(name, "jawusd_read.py", shutil.copytree(folder, tmp_path / "actor"))
     np.testing.assert_allclose(found["poses"], example_rig().pose([[10.0, 1.0, 0.5], [0.0, 0.0, 0.0]]), atol=1e-12)
     assert found["kind"] == "anchored"
@@ -105,7 +105,7 @@ def test_tinyusdz_reads_rig_and_motion(folder):
 
 
 def test_tinyusdz_reads_the_interface_layer(folder):
-    """It follows no sublayers, but must not choke on the text."""
+    """It ignores sublayers, but must parse the text."""
     environment("tinyusdz")
     code = "import sys, tinyusdz; p = tinyusdz.load(sys.argv[1]).get_prim_at_path('/Actor');"
     code += "import json; print('RESULT ' + json.dumps([p.api_schemas(), p.get_attribute('jaw:d1').value.as_scalar()]))"
@@ -138,7 +138,7 @@ def test_three_js_plays_glb(folder, tmp_path):
 
 
 def test_three_js_reads_whole_numbers(tmp_path):
-    """A closed bite that is the identity, as scans in occlusion give: all of its translation is whole."""
+    """The closed bite of scans in occlusion is the identity: its translation is made of integers."""
     rig = JawRig({**example_rig().arrays, "T_rest": np.eye(4)}, example_rig().meta)
     d = np.array([[0.0, 0, 0], [8, 1, 0.5], [0, 0, 0]])
     bake_rig(tmp_path, rig, example_meshes(), name="x", fps=FPS, frames=[0, 1, 2], d=d, table_size=17)

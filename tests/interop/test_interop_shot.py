@@ -1,4 +1,4 @@
-"""A packed shot in other programs: every actor moves as its own model says."""
+"""A packed shot in other programs: every actor moves by its own model."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ KINDS, OFFSET, COUNT = {"hero": "anchored", "villain": "additive"}, 10, 12
 
 @pytest.fixture(scope="module")
 def pack(tmp_path_factory):
-    """Return a function that packs a shot in cm with the actors named, each later than the one before."""
+    """Return a function that packs a shot in cm of the given actors, each of which starts later than the one before."""
     folder, (frames, d) = tmp_path_factory.mktemp("shot"), example_motion(COUNT)
     for name, kind in KINDS.items():
         options = {"name": name, "fps": FPS, "frames": frames, "d": d, "table_size": 17}
@@ -31,7 +31,7 @@ def pack(tmp_path_factory):
         for k, name in enumerate(names):
             prim = stage.DefinePrim(f"/Shot/{name}", "Xform")
             prim.GetReferences().AddReference(f"./{name}/anim_capture.usdc", Sdf.LayerOffset(k * OFFSET))
-            place = UsdGeom.XformCommonAPI(prim)  # whole numbers, which three.js does not read from binary layers
+            place = UsdGeom.XformCommonAPI(prim)  # integers, which three.js cannot read from binary layers
             place.SetTranslate(Gf.Vec3d(30 * k, 3, 4))
             place.SetRotate(Gf.Vec3f(0, 90, 0))
             place.SetScale(Gf.Vec3f(0.1))
@@ -42,7 +42,7 @@ def pack(tmp_path_factory):
 
 
 def d_at(name, frame):
-    """Return d of an actor in a frame of the shot: that of the nearest end before and after its motion."""
+    """Return d of an actor in a frame of the shot; before and after its motion, that of the nearest end."""
     frames, d = example_motion(COUNT)
     late = OFFSET * list(KINDS).index(name)
     return d[np.clip(frame - late - frames[0], 0, COUNT - 1)]
@@ -67,7 +67,7 @@ def test_tinyusdz_finds_all_meshes_and_motions(pack):
 
 
 def test_three_js_moves_an_actor_in_its_place(pack):
-    """One actor: it moves nodes by their names, which several actors share."""
+    """One actor only: animations refer to nodes by names, which several actors share."""
     frames = example_motion(COUNT)[0][[0, 5, 11]]
     times, modules = ",".join(str(frame / FPS) for frame in frames), environment("threejs") / "node_modules"
     found = run(["node", SCRIPTS / "three_read.mjs", modules, pack("hero"), times, "MandibleMesh"])
@@ -78,7 +78,7 @@ def test_three_js_moves_an_actor_in_its_place(pack):
 
 
 def placed(translation):
-    """Return the actor's place in the shot: a quarter turn about y, a tenth of its size."""
+    """Return the actor's transform in the shot: a quarter turn about y and a scale of 0.1."""
     return np.array(
         [[0, 0, 0.1, translation[0]], [0, 0.1, 0, translation[1]], [-0.1, 0, 0, translation[2]], [0, 0, 0, 1]]
     )

@@ -41,7 +41,7 @@ def recipes(tmp_path, monkeypatch):
 
 @pytest.fixture(params=["example", "turned", pytest.param("build", marks=pytest.mark.slow)])
 def model(request, tmp_path):
-    """Return a model file: of the example, of one with rotated scans, of a build."""
+    """Return a model file: of the example, with rotated scans, or of a build."""
     if request.param == "build":
         return request.getfixturevalue("example_build")[0] / "model.npz"
     rig = example_rig()

@@ -189,7 +189,7 @@ def bent(actor):
         (binding("upper_teeth", "geomBindTransform", Gf.Matrix4d().SetTranslate((0, 1, 0))), "differently", True),
         (binding("lower_teeth", "jointIndices", Vt.IntArray([0])), "differently", False),
         (unbound, "but not /Actor/geo/Mandible/LowerTeethMesh", False),
-        (bent, "bend /Actor/geo/Mandible/MandibleMesh", False),
+        (bent, "deform /Actor/geo/Mandible/MandibleMesh", False),
     ],
     ids=["key", "skull", "upper teeth", "lower teeth", "unbound", "bent"],
 )

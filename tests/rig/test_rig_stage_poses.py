@@ -93,7 +93,7 @@ def test_a_take_without_motion_is_said_to_have_none(frames, anchored_folder):
 
 
 def test_edited_bones_come_back(folder, kind):
-    """The skeleton variant with a changed key: one pose outside the bound, reported and moved inside."""
+    """The skeleton variant with a changed key: one pose outside the bound is reported and moved inside."""
     rig, (frames, d) = example_rig(kind), example_motion()
     stage = Usd.Stage.Open(str(folder / "actor_skel.usdc"))
     run("encode", folder / "actor.usda", folder / "actor_skel.usdc", "-o", folder / "d.csv")

@@ -35,8 +35,8 @@ def read_rig(place, path):
             read_parameters_of_stage(shown)
             read_poses_of_stage(shown)
     except JawusdError as refusal:
-        # What uses a rig may name a layer elsewhere: that one alone is opened, to see that it is no rig.
-        if not (uses_a_rig and "outside its own folder and no rig" in str(refusal)):
+        # A shot may refer to a layer elsewhere, which is opened only to find that it is not a rig.
+        if not (uses_a_rig and "outside its own folder and not a rig" in str(refusal)):
             _check_inside(place)
         raise
     _check_inside(place)

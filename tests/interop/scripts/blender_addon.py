@@ -1,4 +1,4 @@
-"""Run inside Blender's Python: try what the add-on offers on an imported take, print what came out as JSON.
+"""Run inside Blender's Python: use all features of the add-on on an imported take; print the results as JSON.
 
 Usage: python blender_addon.py ZIP FOLDER TAKE.usd POSES.json BONES.usd
 BONES is the same take with its skeleton selected.
@@ -39,7 +39,7 @@ def readout(package, d):
 
 
 def two_actors(package, take, poses):
-    """Import the take again; return both actors, the second as it plays, and both posed in different ways."""
+    """Import the take again; return both actors, the playback of the second, and both in different poses."""
     bpy.ops.wm.usd_import(filepath=take)
     actors = package.jaw.actors()
     names = [(actor.name, package.jaw.mandible_of(actor).name) for actor in actors]
@@ -54,7 +54,7 @@ def two_actors(package, take, poses):
 
 
 def without_rig_file(package, folder):
-    """Export after the rig's file has gone; return what Blender says."""
+    """Export after the rig's file was deleted; return the message of Blender."""
     actor = bpy.data.objects["Actor"]
     source, actor[package.jaw.SOURCE] = actor[package.jaw.SOURCE], os.path.join(folder, "gone", "actor.usda")
     try:
@@ -66,7 +66,7 @@ def without_rig_file(package, folder):
 
 
 def overridden(package, folder, take, d):
-    """Link an actor from another file and override it; return its mandible posed by d, kept valid, after reopening."""
+    """Override an actor linked from a file; return its mandible posed by d, with "Keep valid", and after reopening."""
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.usd_import(filepath=take)
     actor, made = package.jaw.actors()[0], bpy.data.collections.new("Rig")
@@ -96,7 +96,7 @@ def overridden(package, folder, take, d):
 
 
 def by_bones(package, take):
-    """Import a take that bones move into an empty scene; return its actors and the vertices of the mandible."""
+    """Import a take moved by bones into an empty scene; return its actors and the vertices of the mandible."""
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.usd_import(filepath=take)
     bpy.context.scene.frame_set(42)
@@ -110,13 +110,13 @@ def enabled_again(d):
     found = [posed(d)]
     bpy.ops.preferences.addon_enable(module=module)
     jaw = sys.modules[f"{module}.jaw"]
-    if bpy.app.timers.is_registered(jaw._install):  # Blender calls it as soon as it waits for events
+    if bpy.app.timers.is_registered(jaw._install):  # Blender calls it when it waits for events
         jaw._install()
     return [*found, posed(d)]
 
 
 def dragged(way):
-    """Drag a handle at the incisor by a way [mm]; return the sliders and where handle and its target are."""
+    """Drag a handle at the incisor by a distance [mm]; return the sliders, the handle's position and its target."""
     bpy.ops.jawusd.handle(actor="Actor", at="INCISOR")
     handle = bpy.data.objects["Actor incisor"]
     target = [a + b for a, b in zip(handle.location, way)]
@@ -130,7 +130,7 @@ def dragged(way):
 
 
 def from_older_version(package, folder, take, d):
-    """Reopen a file as the add-on before 0.3.0 saved it; return the mandible posed by d."""
+    """Reopen a file saved by an add-on before 0.3.0; return the mandible posed by d."""
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.usd_import(filepath=take)
     mandible, actor = bpy.data.objects["Mandible"], bpy.data.objects["Actor"]
@@ -157,7 +157,7 @@ def vertices():
 
 
 def main(archive, folder, take, poses, bones):
-    """Try everything."""
+    """Run all checks."""
     bpy.ops.wm.read_homefile(use_empty=True)
     package = install(archive, folder)
     with open(poses) as opened:

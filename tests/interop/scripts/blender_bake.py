@@ -1,7 +1,7 @@
-"""Run inside Blender's Python: bake jaws to keys with the add-on, export them, print what came out as JSON.
+"""Run inside Blender's Python: bake jaws to keys with the add-on and export them; print the results as JSON.
 
 Usage: python blender_bake.py ZIP FOLDER TAKE.usd SPLINES.usd,SPLINES.usd INSTANCES.usd FRAME
-Matrices are the mandible's in the actor [mm]. Leaves live and baked .blend, .fbx and .glb files in FOLDER.
+Matrices are the mandible's in the actor [mm]. Writes driven and baked .blend, .fbx and .glb files to FOLDER.
 """
 
 import json
@@ -33,7 +33,7 @@ def played():
 
 
 def exported(folder, name):
-    """Export the scene with default settings; return what the glTF exporter logs."""
+    """Export the scene with default settings; return the log of the glTF exporter."""
     heard, logger = [], logging.getLogger("glTFImporter")
     listener = logging.Handler()
     listener.emit = lambda record: heard.append(record.getMessage())
@@ -46,7 +46,7 @@ def exported(folder, name):
 
 
 def dialogs(package):
-    """Return for which exporters the file browser shows the jaw's panel, and what exports would lose."""
+    """Return the exporters for which the file browser shows the jaw's panel, and the warning about lost motion."""
     scene, names = bpy.context.scene, ("EXPORT_SCENE_OT_fbx", "EXPORT_SCENE_OT_gltf", "WM_OT_usd_export")
     contexts = [
         SimpleNamespace(space_data=SimpleNamespace(active_operator=SimpleNamespace(bl_idname=x))) for x in names
@@ -69,7 +69,7 @@ def state(package):
 
 
 def refused(call, **arguments):
-    """Return what an operator reports as an error."""
+    """Return the error message of an operator."""
     try:
         return str(call(**arguments))
     except RuntimeError as error:
@@ -77,7 +77,7 @@ def refused(call, **arguments):
 
 
 def several(package, folder, take):
-    """Export two jaws and a keyed camera, whose action FBX plays on the jaws too, in both ways."""
+    """Export two jaws and a keyed camera to FBX, whose action FBX applies to the jaws too, in both modes."""
     opened(take)
     bpy.ops.wm.usd_import(filepath=take)
     bpy.data.objects["Actor.001"].animation_data_clear()
@@ -96,7 +96,7 @@ def several(package, folder, take):
 
 
 def main(archive, folder, take, splines, instances, shown):
-    """Try everything."""
+    """Run all checks."""
     bpy.ops.wm.read_homefile(use_empty=True)
     package = install(archive, folder)
     result = {"splines": []}
@@ -105,7 +105,7 @@ def main(archive, folder, take, splines, instances, shown):
         result["splines"].append(played())
     result["nothing"] = refused(bpy.ops.jaw.bake_to_keys, actor="Nobody")
     opened(take)
-    bpy.context.scene.frame_start = 20  # before the take, where the sliders stay at its first key
+    bpy.context.scene.frame_start = 20  # before the take: the sliders have the value of their first key
     result["played"] = played()
     bpy.context.scene.frame_set(int(shown))
     result["live"] = [exported(folder, "live"), *dialogs(package), state(package)]

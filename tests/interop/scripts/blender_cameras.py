@@ -1,7 +1,7 @@
-"""Run inside Blender's Python: import a take and print where its cameras see the vertices of a mesh, as JSON.
+"""Run inside Blender's Python: import a take and print the projections of a mesh's vertices, as JSON.
 
 Usage: python blender_cameras.py FILE WIDTH HEIGHT FRAME,FRAME,... MESH CAMERA,CAMERA,...
-Prints {frame: {camera: [[x, y], ...]}} in pixels of the picture, (0, 0) in the middle of the top left one.
+Prints {frame: {camera: [[x, y], ...]}} in pixels, (0, 0) at the centre of the top left pixel.
 """
 
 import json
@@ -13,7 +13,7 @@ from bpy_extras.object_utils import world_to_camera_view
 
 
 def main(path, width, height, frames, name, cameras):
-    """Import the take and print what the cameras see."""
+    """Import the take and print the projections."""
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.usd_import(filepath=path)
     scene = bpy.context.scene

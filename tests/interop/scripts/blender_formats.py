@@ -1,4 +1,4 @@
-"""Run inside Blender's Python: import a USD file, key what moves, and export the scene as FBX or glTF.
+"""Run inside Blender's Python: import a USD file, key its motion, and export the scene as FBX or glTF.
 
 Usage: python blender_formats.py FILE OUT FIRST LAST
 """
@@ -11,7 +11,7 @@ import bpy
 
 
 def key(objects, frames):
-    """Turn the motion that constraints read from a cache into keys, which other formats can hold."""
+    """Convert motion from cache constraints to keys, which other formats support."""
     seen = {}
     for frame in frames:
         bpy.context.scene.frame_set(frame)

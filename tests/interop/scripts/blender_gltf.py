@@ -1,8 +1,8 @@
-"""Run inside Blender's Python: import a .glb and print where the vertices of a mesh are, as JSON.
+"""Run inside Blender's Python: import a .glb and print the vertices of a mesh, as JSON.
 
 Usage: python blender_gltf.py FILE FPS FRAME,FRAME,... MESH     (frame 0 is the start of the file's animation)
-Prints {"frames": {frame: [[x, y, z], ...]}, "looks": {mesh: [colours, texture coordinates]}}, places in the axes of the
-file [mm].
+Prints {"frames": {frame: [[x, y, z], ...]}, "looks": {mesh: [colours, texture coordinates]}}, positions in the axes of
+the file [mm].
 """
 
 import json
@@ -13,7 +13,7 @@ import bpy
 
 
 def main(path, fps, frames, name):
-    """Import the file and print what became of it."""
+    """Import the file and print the results."""
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.preferences.addon_enable(module="io_scene_gltf2")
     bpy.context.scene.render.fps = fps

@@ -1,8 +1,8 @@
-"""Run inside Blender's Python: import a USD file and print where the vertices of meshes are, as JSON.
+"""Run inside Blender's Python: import a USD file and print the vertices of meshes, as JSON.
 
 Usage: python blender_import.py FILE FRAME,FRAME,... MESH,MESH,...
 Prints {"version", "actions", "properties", "looks": {mesh: {"colors", "uv"}}, "frames": {frame: {mesh: [[x, y, z],
-...]}}}, places in the frame of /Actor [mm].
+...]}}}, positions in the frame of /Actor [mm].
 """
 
 import json
@@ -21,7 +21,7 @@ def vertices(name, root, depsgraph):
 
 
 def editable_keys():
-    """Return per action the number of keys of its longest curve."""
+    """Return the number of keys of each action's longest curve."""
     found = {}
     for action in bpy.data.actions:
         curves = list(getattr(action, "fcurves", []))
@@ -34,7 +34,7 @@ def editable_keys():
 
 
 def look(name):
-    """Return linear colours per vertex and texture coordinates per corner of a mesh object, None without."""
+    """Return linear colours per vertex and texture coordinates per corner of a mesh object; None if missing."""
     mesh = bpy.data.objects[name].data
     colors, layers = mesh.color_attributes.get("displayColor"), mesh.uv_layers
     return {
@@ -44,7 +44,7 @@ def look(name):
 
 
 def main(path, frames, meshes):
-    """Import the file and print what became of it."""
+    """Import the file and print the results."""
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.usd_import(filepath=path)
     root = bpy.data.objects["Actor"]

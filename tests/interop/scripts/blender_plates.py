@@ -1,4 +1,4 @@
-"""Run inside Blender's Python: import a take with the add-on and print what lies behind its cameras, as JSON.
+"""Run inside Blender's Python: import a take with the add-on and print its camera backgrounds, as JSON.
 
 Usage: python blender_plates.py ZIP FOLDER FILE
 """

@@ -1,7 +1,7 @@
-"""Run inside Blender's Python: play takes with the add-on and print where the mandible is in every frame, as JSON.
+"""Run inside Blender's Python: play takes with the add-on and print the mandible in every frame, as JSON.
 
 Usage: python blender_playback.py ZIP FOLDER TAKE.usd KEYS.json FRAME,FRAME,...
-KEYS is a list of takes, each [[frame, d1, d2, d3], ...]; every one but the imported motion is keyed on the sliders.
+KEYS is a list of takes, each [[frame, d1, d2, d3], ...]; all except the imported motion are keyed on the sliders.
 Each take is played forward, backward, and again after the file was saved on each of FRAMES and reopened. Prints
 {"takes": [{"FRAME": [matrix forward, backward, ...reopened]}], "d": [{"FRAME": [d1, d2, d3]}]}.
 """
@@ -26,7 +26,7 @@ def matrix(name="Mandible"):
 
 
 def played(frames, found, values=None):
-    """Show frames in turn; note the mandible and, if asked, the sliders."""
+    """Show frames in the given order; record the mandible and, if asked, the sliders."""
     for frame in frames:
         bpy.context.scene.frame_set(frame)
         found.setdefault(str(frame), []).append(matrix())
@@ -46,7 +46,7 @@ def key(keys):
 
 
 def main(archive, folder, take, takes, saved_on):
-    """Play all takes and print what was shown."""
+    """Play all takes and print the displayed poses."""
     bpy.ops.wm.read_homefile(use_empty=True)
     package = install(archive, folder)
     result = {"takes": [], "d": []}

@@ -1,7 +1,7 @@
 """Run inside Blender's Python: open a file as a render farm does, without the add-on, and print its mandible, as JSON.
 
 Usage: python blender_reopen.py FILE.blend SCRIPTS     (SCRIPTS: 0 or 1, whether Blender may run scripts of files)
-Prints {"FRAME": matrix in the actor [mm]}, first of all of the frame the file was saved on, then of every frame.
+Prints {"FRAME": matrix in the actor [mm]}, first of the frame on which the file was saved, then of every frame.
 """
 
 import json

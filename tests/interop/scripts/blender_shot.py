@@ -1,7 +1,7 @@
-"""Run inside Blender's Python: import a shot with several actors and print where their mandibles are, as JSON.
+"""Run inside Blender's Python: import a shot with several actors and print their mandibles, as JSON.
 
 Usage: python blender_shot.py FILE FRAME,FRAME,... ACTOR,ACTOR,...
-Prints {frame: {actor: [[x, y, z], ...]}}, places of the vertices of each actor's mandible in its own frame.
+Prints {frame: {actor: [[x, y, z], ...]}}, vertices of each actor's mandible in the actor's frame.
 """
 
 import json

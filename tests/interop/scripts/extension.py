@@ -1,4 +1,4 @@
-"""Install the extension from its zip as "Install from Disk" does, in folders of its own, inside Blender's Python."""
+"""Install the extension from its zip like "Install from Disk", in separate folders, inside Blender's Python."""
 
 import importlib
 import os
@@ -7,7 +7,7 @@ import bpy
 
 
 def install(archive, folder):
-    """Install and enable it; return the module of its package."""
+    """Install and enable the extension; return its module."""
     repository = os.path.join(folder, "extensions")
     os.makedirs(repository, exist_ok=True)
     repositories = bpy.context.preferences.extensions.repos

@@ -1,4 +1,4 @@
-"""Run where some usd-core is, with jawusd on the path: load, describe, validate and animate a rig; print JSON.
+"""Run with any usd-core and jawusd on the path: load, describe, validate and animate a rig; print JSON.
 
 Usage: python jawusd_read.py FOLDER
 """

@@ -1,4 +1,4 @@
-// Run by node: parse a .usdz or .glb with three.js and print where the mandible's mesh is, as JSON.
+// Run by node: parse a .usdz or .glb with three.js and print the matrices of the mandible's mesh, as JSON.
 // Usage: node three_read.mjs NODE_MODULES FILE TIME,TIME,... MESH     (times in seconds)
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";

@@ -1,4 +1,4 @@
-"""Run where tinyusdz is: print what it reads of a rig, as JSON.
+"""Run in an environment with tinyusdz: print what it reads from a rig, as JSON.
 
 Usage: python tinyusdz_read.py FILE
 Prints {"schemas", "shape", "range", "channels": {"translation" | "rotation": {"times", "values"}}}.

@@ -1,4 +1,4 @@
-"""Run where some usd-core is: print the poses it shows of an animated rig, as JSON.
+"""Run in an environment with any usd-core: print the poses of an animated rig, as JSON.
 
 Usage: python usd_read.py FILE FRAME,FRAME,...
 """
