@@ -158,15 +158,17 @@ def _checked(
     try:
         value = np.array(arrays[name], dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise EvaluatorError(f'"{name}" does not hold numbers ({error}).') from error
+        raise EvaluatorError(f'"{name}" is not numeric ({error}).') from error
     wanted = [lengths.get(size, size) if isinstance(size, str) else size for size in shape]
     fits = value.ndim == len(shape) and all(isinstance(w, str) or w == n for w, n in zip(wanted, value.shape))
     if not fits:
         raise EvaluatorError(f'"{name}" has shape {value.shape}, expected ({", ".join(map(str, wanted))}).')
     if not np.isfinite(value).all():
-        raise EvaluatorError(f'"{name}" holds values that are not finite.')
+        raise EvaluatorError(f'"{name}" contains values that are not finite.')
     if (np.abs(value) > _LARGEST).any():
-        raise EvaluatorError(f'"{name}" holds values up to {np.abs(value).max():.3g}, at most {_LARGEST:g} is allowed.')
+        raise EvaluatorError(
+            f'"{name}" contains values up to {np.abs(value).max():.3g}, at most {_LARGEST:g} is allowed.'
+        )
     lengths.update((size, n) for size, n in zip(shape, value.shape) if isinstance(size, str))
     value.flags.writeable = False
     return value
@@ -184,7 +186,7 @@ def _check_values(arrays: dict[str, Array]) -> None:
         if name in arrays and (len(arrays[name]) < 2 or (np.diff(arrays[name]) <= 0).any()):
             raise EvaluatorError(f'"{name}" must hold at least two rising values.')
     if len(arrays["landmarks"]) < 3:
-        raise EvaluatorError(f'"landmarks" holds {len(arrays["landmarks"])} points; at least 3 are needed.')
+        raise EvaluatorError(f'"landmarks" has {len(arrays["landmarks"])} points; at least 3 are needed.')
     low, high = arrays["d_range"].T
     if not (low < high).all() or high[0] <= 0:
         raise EvaluatorError(f'"d_range" is {arrays["d_range"].tolist()} mm; rows must be (low, high), opening > 0.')

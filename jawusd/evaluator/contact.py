@@ -161,7 +161,7 @@ class ContactField:
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-class TouchingTeeth:
+class RigClearance:
     """The clearances of a rig.
 
     Attributes:

@@ -51,7 +51,7 @@ def handle_vectors(points: Array, weights: ArrayLike | None) -> Array:
     return np.column_stack([points, np.ones(len(points))]).T * np.sqrt(share / share.sum())
 
 
-def carried(R: Array, t: Array, vectors: Array) -> Array:
+def vector_images(R: Array, t: Array, vectors: Array) -> Array:
     """Return the images (n, 3, m) of homogeneous vectors (4, m) under motions R (n, 3, 3), t (n, 3) [mm]."""
     return R @ vectors[:3] + t[:, :, None] * vectors[3]
 
@@ -75,7 +75,7 @@ def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> 
 
     def residual(x: Array, rows: Indices) -> tuple[Array, Array]:
         R, t, S = derivative(x)
-        image = carried(R, t, vectors)
+        image = vector_images(R, t, vectors)
         # a vector (b, h) moves by w x image + v h under the spatial velocity (w, v)
         by_velocity = np.zeros((len(x), 3, count, 6))
         by_velocity[:, 0, :, 1], by_velocity[:, 1, :, 0] = image[:, 2], -image[:, 2]
@@ -115,11 +115,11 @@ class Encoder:
 
     def targets(self, T: Array) -> Array:
         """Return the images (n, 3, 4) of the vectors under poses T_skull_mandible (n, 4, 4), anatomical frame."""
-        return carried(*self._frames.motions(T), self._vectors)
+        return vector_images(*self._frames.motions(T), self._vectors)
 
     def residual_mm(self, d: Array, T: Array) -> Array:
         """Return the landmark distances (n,) [mm] between the poses of d (n, 3) and T (n, 4, 4)."""
-        difference = carried(*self._model.decode(d), self._vectors) - self.targets(T)
+        difference = vector_images(*self._model.decode(d), self._vectors) - self.targets(T)
         return np.sqrt(np.einsum("nij,nij->n", difference, difference))
 
     def nearest(self, T: Array) -> Array:
@@ -151,7 +151,7 @@ class Encoder:
 
 def nearest_in_chart(model: JawModelForm, R: Array, t: Array, vectors: Array) -> Array:
     """Return the chart coordinates (n, 3) whose motions are nearest to motions R (n, 3, 3), t (n, 3) [mm]."""
-    residual = distance_residual(model.chart_derivative, vectors, carried(R, t, vectors))
+    residual = distance_residual(model.chart_derivative, vectors, vector_images(R, t, vectors))
     return minimise(residual, model.chart_start(R, t))
 
 

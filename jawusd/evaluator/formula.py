@@ -223,7 +223,7 @@ class JawFormula(Protocol):
 
     @property
     def numbers(self) -> Numbers:
-        """The single floats it needs, in tuples."""
+        """The scalars it needs, in nested tuples."""
 
     def motion(
         self,
@@ -243,7 +243,7 @@ class JawFormula(Protocol):
 
 
 class AnchoredNumbers(NamedTuple):
-    """The single numbers of an anchored model, see `AnchoredModel`; linear: 3 inputs times 3 outputs [rad]."""
+    """The scalars of an anchored model, see `AnchoredModel`; linear: 3 inputs times 3 outputs [rad]."""
 
     gauge: GaugeNumbers
     incisor: Triple[float]
@@ -314,7 +314,7 @@ class AdditiveFormula:
         ops: Operations[N, Table],
         numbers: Numbers | None = None,
     ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite, see `JawFormula`; there are no single numbers."""
+        """Return the motion away from the closed bite, see `JawFormula`; the model has no scalars."""
         first, second, third = (curve(f"curve{i}", x, tables, ops) for i, x in enumerate(d, start=1))
         twist = ops.split([x + y + z for x, y, z in zip(first, second, third)], 6)
         return twist_motion(triple(twist[:3]), triple(twist[3:]), ops)
@@ -324,7 +324,7 @@ MODELS: dict[str, type[JawFormula]] = {"anchored": AnchoredFormula, "additive": 
 
 
 class BoundNumbers(NamedTuple):
-    """The single numbers of a bound: ends of the captured openings, rounding and offset, all in mm."""
+    """The scalars of a bound: ends of the captured openings, rounding and offset, all in mm."""
 
     first_mm: float
     last_mm: float

@@ -29,7 +29,7 @@ from jawusd.geometry.rodrigues import N, Triple
 
 INVERSE_TOLERANCE_MM = 1e-13
 INVERSE_ITERATIONS = 120
-PATIENCE = 8  # iterations before Newton counts as stalled; then steps double until there is a bracket, which is halved
+PATIENCE = 8  # iterations before Newton counts as stalled: then steps double, or an existing bracket is halved
 INVERSE_STEP_MM = 20.0
 MIN_INVERSE_SLOPE = 0.2  # smaller slopes lead away from the root
 MAX_DOUBLINGS = 64

@@ -1,4 +1,4 @@
-"""The kernels of a rig, which compute rows: an interface with a numpy and a compiled implementation.
+"""The kernels of a rig: the functions that compute rows.
 
 Rows are float64 arrays; rows with a value that is not finite, or above 1e9, give NaN.
 """
@@ -6,7 +6,6 @@ Rows are float64 arrays; rows with a value that is not finite, or above 1e9, giv
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -46,68 +45,8 @@ class RigParts:
         return landmark_vectors(transform_points(self.frames.T_anatomical_mandible_rest, self.landmarks))
 
 
-class Kernels(Protocol):
-    """The functions of a rig that are computed row by row."""
-
-    def pose(self, d1: float, d2: float, d3: float) -> Array:
-        """Return T_skull_mandible (4, 4) of one d [mm], finite and below 1e4."""
-
-    def margin(self, d1: float, d2: float, d3: float) -> float:
-        """Return the margin [mm] of one d [mm], finite and below 1e4."""
-
-    def poses(self, d: Array) -> Array:
-        """Return the poses T_skull_mandible (n, 4, 4) of d (n, 3) [mm]."""
-
-    def twists(self, d: Array) -> Array:
-        """Return the twists (n, 6) log(pose(d) rest^-1), skull frame, of d (n, 3) [mm]."""
-
-    def jacobians(self, d: Array) -> Array:
-        """Return the derivatives (n, 6, 3) of the twists by d (n, 3) [mm]."""
-
-    def margins(self, d: Array) -> Array:
-        """Return the margins (n,) [mm] of d (n, 3) [mm]."""
-
-    def margin_gradients(self, d: Array) -> Array:
-        """Return the derivatives (n, 3) of the margins by d (n, 3) [mm]."""
-
-    def encode(self, T: Array) -> tuple[Array, Array]:
-        """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm].
-
-        Matrices that are not rigid to `RIGID_TOLERANCE` give NaN.
-        """
-
-    def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
-        """Return verdicts on poses T_skull_mandible (n, 4, 4); the speed limit is ignored."""
-
-    def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
-        """Return verdicts on d (n, 3) [mm], all with the residual 0; the speed limit is ignored."""
-
-    def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
-        """Search inside the bound for the points nearest to given ones.
-
-        Args:
-            wanted: Given d [mm], shape (n, 3).
-            start: Initial d [mm] inside the bound, shape (n, 3).
-
-        Returns:
-            The local minima (n, 3) [mm] around the starts, and the squared distances (n,).
-        """
-
-    def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
-        """Search inside the bound for the motions that move homogeneous vectors nearest to their targets.
-
-        Args:
-            vectors: Points of the mandible at rest, anatomical frame [mm], scaled by their weights, shape (4, m).
-            targets: Their target positions, scaled likewise, shape (n, 3, m).
-            start: Initial d [mm] inside the bound, shape (n, 3).
-
-        Returns:
-            The local minima (n, 3) [mm] around the starts, and the remaining squared distances (n,).
-        """
-
-
 class NumpyKernels:
-    """`Kernels` in numpy, in chunks of rows."""
+    """The kernels of a rig in numpy; subclasses replace some of them with compiled code or graphs."""
 
     def __init__(self, parts: RigParts) -> None:
         self._model, self._bound, self._frames = parts.model, parts.bound, parts.frames
@@ -115,11 +54,11 @@ class NumpyKernels:
         self._encoder = Encoder(parts.model, parts.frames, parts.vectors())
 
     def pose(self, d1: float, d2: float, d3: float) -> Array:
-        """Return T_skull_mandible (4, 4) of one d [mm]."""
+        """Return T_skull_mandible (4, 4) of one d [mm], finite and below 1e4."""
         return self._frames.pose(self._single.motion(d1, d2, d3))
 
     def margin(self, d1: float, d2: float, d3: float) -> float:
-        """Return the margin [mm] of one d [mm]."""
+        """Return the margin [mm] of one d [mm], finite and below 1e4."""
         return -float(self._bound.signed_distance(np.array([(d1, d2, d3)]))[0])
 
     def poses(self, d: Array) -> Array:
@@ -143,7 +82,10 @@ class NumpyKernels:
         return -in_chunks(lambda d: self._bound.signed_distance_gradient(d)[1], usable_rows(d))
 
     def encode(self, T: Array) -> tuple[Array, Array]:
-        """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
+        """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm].
+
+        Matrices that are not rigid to `RIGID_TOLERANCE` give NaN.
+        """
         T = usable_rows(T)
         known = np.isfinite(T[:, :1, :1])
         rigid = known[:, 0, 0] & (in_chunks(rigidity_defect, np.where(known, T, np.eye(4))) <= RIGID_TOLERANCE)
@@ -154,7 +96,7 @@ class NumpyKernels:
         return pairs_in_chunks(self._encoder.encode, T)
 
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
-        """Return verdicts on poses T_skull_mandible (n, 4, 4)."""
+        """Return verdicts on poses T_skull_mandible (n, 4, 4); the speed limit is ignored."""
         T = usable_rows(T)
         finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
         rigid = in_chunks(rigidity_defect, np.where(finite[:, None, None], T, np.eye(4))) <= RIGID_TOLERANCE
@@ -162,13 +104,21 @@ class NumpyKernels:
         return judge(finite, rigid, residual_mm, self.margins(d), d, limits)
 
     def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
-        """Return verdicts on d (n, 3) [mm]."""
+        """Return verdicts on d (n, 3) [mm], all with the residual 0; the speed limit is ignored."""
         d = usable_rows(d)
         finite = np.isfinite(d[:, 0])
         return judge(finite, np.ones_like(finite), np.where(finite, 0.0, np.nan), self.margins(d), d, limits)
 
     def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
-        """Return the valid points (n, 3) [mm] nearest to those wanted, and the squared distances (n,)."""
+        """Search inside the bound for the points nearest to given ones.
+
+        Args:
+            wanted: Given d [mm], shape (n, 3).
+            start: Initial d [mm] inside the bound, shape (n, 3).
+
+        Returns:
+            The local minima (n, 3) [mm] around the starts, and the squared distances (n,).
+        """
         if len(start) <= _FEW_ROWS:
             pairs = zip(wanted.tolist(), start.tolist())
             each = [nearest_in_valley(self._bound.formula, triple(to), triple(x)) for to, x in pairs]
@@ -182,7 +132,16 @@ class NumpyKernels:
         return self._bottom(residual, start)
 
     def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
-        """Return the valid d (n, 3) [mm] that move vectors nearest to targets, and the squared distances (n,)."""
+        """Search inside the bound for the motions that move homogeneous vectors nearest to their targets.
+
+        Args:
+            vectors: Points of the mandible at rest, anatomical frame [mm], scaled by their weights, shape (4, m).
+            targets: Their target positions, scaled likewise, shape (n, 3, m).
+            start: Initial d [mm] inside the bound, shape (n, 3).
+
+        Returns:
+            The local minima (n, 3) [mm] around the starts, and the remaining squared distances (n,).
+        """
         if len(start) == 1:
             residual = distance_residual(self._model.decode_derivative, vectors, targets)
 

@@ -16,9 +16,9 @@ from jawusd.base.npz import read_npz, upgraded_model
 from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import PolygonBound, SliceHull
-from jawusd.evaluator.contact import ContactField, TouchingTeeth
-from jawusd.evaluator.encoding import Encoder, Encoding, carried, handle_vectors, point_velocities, whitening_of
-from jawusd.evaluator.kernels import Kernels, NumpyKernels, RigParts
+from jawusd.evaluator.contact import ContactField, RigClearance
+from jawusd.evaluator.encoding import Encoder, Encoding, handle_vectors, point_velocities, vector_images, whitening_of
+from jawusd.evaluator.kernels import NumpyKernels, RigParts
 from jawusd.evaluator.models import FORMS
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.search import BoundedSearch, IkResult
@@ -33,7 +33,7 @@ _scalar = cast("Callable[[float], Array]", np.float64)  # numpy's stubs do not t
 _SINGLE_LIMIT_MM = 1e4  # beyond this, float functions may raise where array functions give infinities
 
 
-class JawRig(TouchingTeeth, RigAuthoring):
+class JawRig(RigClearance, RigAuthoring):
     """One person's jaw: pure functions from d = (opening, laterotrusion, protrusion) [mm] to poses and back.
 
     ``pose(d) = A^-1 M(d) A rest`` with A = T_anatomical_skull and rest = T_skull_mandible of the closed bite;
@@ -56,7 +56,7 @@ class JawRig(TouchingTeeth, RigAuthoring):
         arrays: Mapping[str, ArrayLike],
         meta: Mapping[str, object],
         *,
-        kernels: Callable[[RigParts], Kernels] = NumpyKernels,
+        kernels: Callable[[RigParts], NumpyKernels] = NumpyKernels,
     ) -> None:
         """Build the rig.
 
@@ -345,13 +345,13 @@ class JawRig(TouchingTeeth, RigAuthoring):
             chunked = len(scaled) > CHUNK_ROWS
             each = np.arange(len(scaled))
             d = in_chunks(lambda i: find(scaled[i], first[i]), each) if chunked else find(scaled, first)
-        left = carried(*self.model.decode(d), vectors) - scaled
+        left = vector_images(*self.model.decode(d), vectors) - scaled
         distance_mm = np.sqrt(np.einsum("nij,nij->n", left, left))
         return IkResult(d.reshape(*batch, 3), distance_mm.reshape(batch))
 
 
 def _rebuilt(
-    arrays: Mapping[str, ArrayLike], meta: Mapping[str, object], kernels: Callable[[RigParts], Kernels]
+    arrays: Mapping[str, ArrayLike], meta: Mapping[str, object], kernels: Callable[[RigParts], NumpyKernels]
 ) -> JawRig:
     return JawRig(arrays, meta, kernels=kernels)
 

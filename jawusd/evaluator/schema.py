@@ -1,4 +1,4 @@
-"""The named arrays of a rig: shapes, model kinds, and the USD attribute that holds each.
+"""The named arrays of a rig: shapes, model kinds and USD attributes.
 
 This file imports only the standard library: it is copied into the single-file reader.
 """

@@ -12,7 +12,7 @@ from jawusd.base.arrays import Array, Indices
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.kernels import Kernels
+from jawusd.evaluator.kernels import NumpyKernels
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.solver import pulled_inside
 
@@ -39,7 +39,7 @@ class BoundedSearch:
     search is started in each of the deepest.
     """
 
-    def __init__(self, model: JawModelForm, bound: SliceHull, kernels: Kernels) -> None:
+    def __init__(self, model: JawModelForm, bound: SliceHull, kernels: NumpyKernels) -> None:
         self._model, self._bound, self._kernels = model, bound, kernels
 
     @cached_property

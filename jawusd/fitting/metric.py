@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator.encoding import carried, landmark_vectors, nearest_in_chart
+from jawusd.evaluator.encoding import landmark_vectors, nearest_in_chart, vector_images
 from jawusd.evaluator.models import JawModelForm
 from jawusd.geometry import hat, make_transform
 
@@ -39,7 +39,7 @@ class MandibleMetric:
 
     def rms(self, M: Array, target: Array) -> Array:
         """Return the root mean square displacement between motions (N, 4, 4) [mm], shape (N,)."""
-        difference = carried(*_parts(M), self.vectors) - carried(*_parts(target), self.vectors)
+        difference = vector_images(*_parts(M), self.vectors) - vector_images(*_parts(target), self.vectors)
         return np.linalg.norm(difference, axis=(1, 2))
 
     def largest(self, M: Array, target: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The anatomical frame, the named landmarks and the mandible metric, found from the scans.
+"""The anatomical frame, the named landmarks and the mandible metric, computed from the scans.
 
 Anatomical axes: x to the subject's left, y up, z anterior, origin at the upper incisal point.
 """
@@ -19,14 +19,14 @@ LANDMARKS = ("incisor", "molar_left", "molar_right", "condyle_left", "condyle_ri
 # the Bonwill triangle (about 100 mm between the condyles and from each to the incisal point), condyles 37 mm above
 # the occlusal plane.
 _CONDYLE_FROM_INCISOR_MM = np.array([50.0, 36.0, -80.0])
-# The first molars sit about this far behind the incisal point along the anterior axis.
+# Typical position of the first molars, behind the incisal point and to the side.
 _MOLAR_BEHIND_INCISOR_MM = 25.0
 _MOLAR_ASIDE_MM = 22.0
-_MIDLINE_MM = 4.0
-_FEWEST_FRONT = 40  # points that make a front edge
-_FEWEST_SLABS = 4
-# Places at which the heights of both arches are compared, and how many of them say more than the mean heights do.
-_CELL_MM, _FEWEST_CELLS = 4.0, 6
+_MIDLINE_MM = 4.0  # half width of the front edge
+_MIN_FRONT = 40  # points of a front edge
+_MIN_SLABS = 4  # coronal slabs with teeth on both sides, for the midline
+# Cell size of the height comparison of both arches, and the shared cells needed to prefer it over mean heights.
+_CELL_MM, _MIN_CELLS = 4.0, 6
 
 
 def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
@@ -48,7 +48,7 @@ def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Ar
     flat = np.stack([(both - centre) @ e1, (both - centre) @ np.cross(normal, e1)], axis=-1)
     angle = _mirror_angle(flat)
     anterior = np.cos(angle) * e1 + np.sin(angle) * np.cross(normal, e1)
-    # The arch is wide and open at the back: its lateral spread grows away from the front.
+    # the arch is wide and open at the back: its lateral spread grows away from the front
     depth = (both - centre) @ anterior
     lateral = np.abs((both - centre) @ np.cross(normal, anterior))
     if np.corrcoef(depth, lateral)[0, 1] > 0:
@@ -63,8 +63,8 @@ def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Ar
 def bite_normal(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
     """Return the normal of the common plane of two arches in occlusion, from the lower to the upper one, shape (3,).
 
-    Which way is up is decided tooth by tooth, where crowns of one arch stand over those of the other: over the whole
-    arches, heights of missing, short or deeply overlapping teeth would mix with those of others.
+    The sign is decided by local heights, in cells where crowns of both arches overlap. Mean heights of whole arches are
+    misleading with missing, short or deeply overlapping teeth.
 
     Args:
         upper_vertices, lower_vertices: crown vertices [mm], shapes (N, 3) and (M, 3).
@@ -76,23 +76,23 @@ def bite_normal(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
     heights = []
     for points in (upper, lower):
         cells = np.floor(np.stack([points @ e1, points @ e2], 1) / _CELL_MM).astype(int)
-        there, index = np.unique(cells, axis=0, return_inverse=True)
+        unique, index = np.unique(cells, axis=0, return_inverse=True)
         mean = np.bincount(index.ravel(), points @ normal) / np.bincount(index.ravel())
-        heights.append(dict(zip(map(tuple, there.tolist()), mean.tolist())))
+        heights.append(dict(zip(map(tuple, unique.tolist()), mean.tolist())))
     shared = [heights[0][cell] - heights[1][cell] for cell in heights[0].keys() & heights[1].keys()]
-    above = np.median(shared) if len(shared) >= _FEWEST_CELLS else normal @ (upper.mean(0) - lower.mean(0))
+    above = np.median(shared) if len(shared) >= _MIN_CELLS else normal @ (upper.mean(0) - lower.mean(0))
     return -normal if above < 0 else normal
 
 
 def _front_edge(crown: Array, side: float, within_mm: float) -> Array:
-    """Return the points of the incisal edge next to the midline, or of the teeth next to it where incisors lack.
+    """Return the points of the incisal edge near the midline, or of the nearest teeth if incisors are missing.
 
     Args:
-        crown: crown points, x across from the midline, y up, z to the front [mm], shape (N, 3).
-        side: 1 if the edge is the upper end of the crowns, -1 if it is the lower one.
-        within_mm: of the extreme point of the edge.
+        crown: Crown points, x from the midline, y up, z anterior [mm], shape (N, 3).
+        side: 1 if the edge is the upper end of the crowns, -1 if the lower one.
+        within_mm: Largest height difference to the extreme point of the edge.
     """
-    reach = max(_MIDLINE_MM, float(np.sort(np.abs(crown[:, 0]))[min(_FEWEST_FRONT, len(crown) - 1)]))
+    reach = max(_MIDLINE_MM, float(np.sort(np.abs(crown[:, 0]))[min(_MIN_FRONT, len(crown) - 1)]))
     front = crown[np.abs(crown[:, 0]) <= reach]
     front = front[front[:, 2] > front[:, 2].max() - 5.0]
     height = side * front[:, 1]
@@ -100,14 +100,14 @@ def _front_edge(crown: Array, side: float, within_mm: float) -> Array:
 
 
 def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
-    """Turn the lateral axis until the middle between the buccal outlines is a straight sagittal line.
+    """Rotate the lateral axis until the middle between the buccal outlines is a sagittal line.
 
     Args:
         points: crown vertices [mm], shape (N, 3).
-        R: rows are the first guess of left, up and anterior, shape (3, 3).
+        R: Initial left, up and anterior axes as rows, shape (3, 3).
 
     Returns:
-        The corrected rotation (3, 3) and the midline's lateral coordinate in it [mm].
+        The corrected rotation (3, 3) and the lateral coordinate of the midline [mm].
     """
     midline = float(np.percentile(points @ R[0], [2, 98]).mean())
     for _ in range(8):
@@ -116,11 +116,11 @@ def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
         depth, middle = [], []
         for low, high in zip(bins[:-1], bins[1:], strict=True):
             slab = x[(z >= low) & (z < high)]
-            # A side without teeth tells nothing of the middle.
+            # a slab with teeth on one side only does not define the middle
             if min(np.count_nonzero(slab > midline), np.count_nonzero(slab < midline)) >= 10:
                 depth.append(0.5 * (low + high))
                 middle.append(0.5 * (np.percentile(slab, 1.5) + np.percentile(slab, 98.5)))
-        if len(depth) < _FEWEST_SLABS:
+        if len(depth) < _MIN_SLABS:
             break
         slope, midline = np.polyfit(depth, middle, 1)
         if abs(slope) < 1e-6:
@@ -137,7 +137,7 @@ def _thin(points: Array, count: int = 3000) -> Array:
 
 def _mirror_angle(flat: Array) -> float:
     """Return the angle of the axis about which a planar point set is most nearly symmetric, shape (N, 2) -> rad."""
-    # Compare angular-radial histograms of the outline with their mirror image; robust to uneven sampling.
+    # compare the radial outline, by angle, with its mirror image: robust to uneven sampling
     flat = flat - 0.5 * (np.percentile(flat, 1, axis=0) + np.percentile(flat, 99, axis=0))
     bins = 360
     polar = np.arctan2(flat[:, 1], flat[:, 0])
@@ -148,13 +148,13 @@ def _mirror_angle(flat: Array) -> float:
     kernel = np.hanning(13)
     profile = np.convolve(np.pad(profile, 12, mode="wrap"), kernel / kernel.sum(), mode="same")[12:-12]
     angles = -np.pi + (np.arange(bins) + 0.5) * 2 * np.pi / bins
-    # Mirroring at angle a maps direction phi to 2a - phi; with phi at bin centres this permutes the bins.
+    # mirroring at angle a maps direction phi to 2a - phi, which permutes the bins
     cost = np.array([np.mean((profile - profile[(shift - np.arange(bins)) % bins]) ** 2) for shift in range(bins)])
     shift = int(np.argmin(cost))
     around = [cost[(shift + k) % bins] for k in (-1, 0, 1)]
     bend = around[0] - 2 * around[1] + around[2]
     fraction = 0.0 if bend <= 0 else 0.5 * (around[0] - around[2]) / bend
-    # bins i and shift - i are images of each other: a = (phi_i + phi_{shift-i}) / 2.
+    # bins i and shift - i are mirror images: a = (phi_i + phi_{shift-i}) / 2
     return float(0.5 * (2 * angles[0] + (shift + fraction) * 2 * np.pi / bins))
 
 
@@ -167,7 +167,7 @@ def find_landmarks(
 
     Args:
         lower_vertices: crown vertices of the lower scan, scan frame [mm], shape (N, 3).
-        mandible_vertices: mandible mesh in the same frame [mm], shape (M, 3); without it the condyles are placed at
+        mandible_vertices: mandible mesh in the same frame [mm], shape (M, 3); without it, the condyles are placed at
             mean adult distances from the incisal point.
         T_anatomical_skull: scan frame to anatomical frame with the teeth in occlusion, shape (4, 4).
     """
@@ -181,7 +181,7 @@ def find_landmarks(
         near = lower[(lower[:, 0] * side > 0) & (np.abs(lower[:, 2] - z) < 3.0)]
         if len(near):
             out[row] = near[near[:, 1] >= np.percentile(near[:, 1], 70)].mean(0)
-        else:  # no tooth there
+        else:  # no tooth in this region
             out[row] = [side * _MOLAR_ASIDE_MM, out[0, 1], z]
     if mandible_vertices is None:
         for row, side in ((3, 1.0), (4, -1.0)):
@@ -193,9 +193,9 @@ def find_landmarks(
 
 
 def landmark_frame(landmarks: ArrayLike) -> Array:
-    """Return the transform (4, 4) from the landmarks' frame to the anatomical frame, found from landmarks alone.
+    """Return the transform (4, 4) from the landmarks' frame to an anatomical frame defined by the landmarks alone.
 
-    The occlusal plane goes through the incisal point and the molars; the origin is the lower incisal point.
+    The occlusal plane contains the incisal point and the molars; the origin is the lower incisal point.
 
     Args:
         landmarks: in the order of `LANDMARKS`, teeth in occlusion [mm], shape (5, 3).
@@ -212,7 +212,7 @@ def landmark_frame(landmarks: ArrayLike) -> Array:
 def _condyle(mandible: Array, side: float) -> Array:
     """Return the centre of one condylar head in anatomical coordinates, shape (3,)."""
     half = mandible[mandible[:, 0] * side > 0]
-    # The coronoid process may be as high as the condyle but lies well in front of it.
+    # the coronoid process may be as high as the condyle but lies well in front of it
     posterior = half[half[:, 2] < half[:, 2].min() + 0.28 * np.ptp(half[:, 2])]
     top = posterior[:, 1].max()
     head = posterior[posterior[:, 1] > top - 8.0]

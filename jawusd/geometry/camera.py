@@ -20,9 +20,9 @@ _ALLOWED_COEFFICIENTS = (0, 4, 5, 8)
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Describe one calibrated camera."""
+    """A calibrated camera: pose, intrinsics and distortion."""
 
-    name: str  # the camera's name in the capture
+    name: str  # name in the capture
     size_px: tuple[int, int]  # image width and height [px]
     K: Array  # intrinsic matrix [px], shape (3, 3)
     distortion: Array  # OpenCV coefficients, shape (0,), (4,), (5,) or (8,)
@@ -60,18 +60,18 @@ class Camera:
         return self.distort_pixels(self.project_pinhole(points_world))
 
     def distort_pixels(self, pinhole_px: ArrayLike) -> Array:
-        """Map ideal pinhole pixels (..., 2) to pixels of the recorded picture."""
+        """Map ideal pinhole pixels (..., 2) to pixels of the recorded image."""
         x = self._normalised(np.asarray(pinhole_px, dtype=np.float64))
         return self._pixels(self._distort(x))
 
     def undistort_pixels(self, pixels: ArrayLike) -> Array:
-        """Map pixels (..., 2) of the recorded picture to ideal pinhole pixels (Newton, to 1e-10 px for real lenses)."""
+        """Map pixels (..., 2) of the recorded image to ideal pinhole pixels (Newton, to 1e-10 px for real lenses)."""
         target = self._normalised(np.asarray(pixels, dtype=np.float64))
         x = target.copy()
         h = 1e-6
         for _ in range(12):
             f = self._distort(x) - target
-            # A numeric Jacobian keeps one formula for all coefficient counts; Newton squares its 1e-6 error away.
+            # a numeric Jacobian works for all coefficient counts; Newton removes its 1e-6 error
             jx = (self._distort(x + [h, 0]) - self._distort(x - [h, 0])) / (2 * h)
             jy = (self._distort(x + [0, h]) - self._distort(x - [0, h])) / (2 * h)
             det = jx[..., 0] * jy[..., 1] - jy[..., 0] * jx[..., 1]
@@ -88,20 +88,20 @@ class Camera:
         return self._pixels(x)
 
     def scaled(self, size_px: tuple[int, int]) -> Camera:
-        """Return the camera of the same picture resized to a width and height [px] (pixel centres at integers)."""
+        """Return the camera of the image resized to a width and height [px] (pixel centres at integers)."""
         sx, sy = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
         K = self.K.copy()
         K[0] *= sx
         K[1] *= sy
-        # The centre of the first pixel moves: u' + 0.5 = sx (u + 0.5).
+        # the centre of the first pixel moves: u' + 0.5 = sx (u + 0.5)
         K[0, 2] += 0.5 * sx - 0.5
         K[1, 2] += 0.5 * sy - 0.5
         return replace(self, size_px=(int(size_px[0]), int(size_px[1])), K=K)
 
     def cropped(self, x0_px: int, y0_px: int, size_px: tuple[int, int]) -> Camera:
-        """Return the camera of a part of the picture: size_px is its width and height, (x0_px, y0_px) its first pixel.
+        """Return the camera of a crop with width and height ``size_px`` and first pixel (x0_px, y0_px).
 
-        The crop's own distortion stays exact because it acts on normalised coordinates.
+        Distortion stays exact, since it acts on normalised coordinates.
         """
         K = self.K.copy()
         K[0, 2] -= x0_px
@@ -139,22 +139,22 @@ class Camera:
 
 
 def _paired(x: Array, y: Array) -> Array:
-    """Return two coordinates of any shape as one array (..., 2); quicker than `np.stack` for few."""
+    """Return two coordinate arrays as one of shape (..., 2); faster than `np.stack` for small arrays."""
     out = np.empty((*x.shape, 2))
     out[..., 0], out[..., 1] = x, y
     return out
 
 
-_SAMPLES = 400
-_BEYOND = 1.1  # the undistorted picture may reach farther than the recorded one
-_CLOSE_PX = 0.005  # a fit that is this close needs no other K
-_ROUNDS, _MOST_DAMPING = 200, 1e12
+_SAMPLES = 400  # radii of the fit
+_RADIUS_FACTOR = 1.1  # of the fitted image radius: the undistorted image may be larger than the recorded one
+_TOLERANCE_PX = 0.005  # largest error of a fit that keeps K
+_ROUNDS, _MAX_DAMPING = 200, 1e12
 
 
 def opencv_radial(K: Array, size_px: tuple[int, int], radial: Array) -> tuple[Array, float]:
     """Return OpenCV's radial coefficients k1, k2, k3[, k4, k5, k6] of 1 + a1 r^2 + a2 r^4 + a3 r^6 + a4 r^8.
 
-    With a fourth term a ratio of two polynomials is fitted to it over the picture.
+    With a fourth term, a ratio of two polynomials is fitted over the image.
 
     Args:
         K: intrinsic matrix (3, 3) [px].
@@ -162,16 +162,16 @@ def opencv_radial(K: Array, size_px: tuple[int, int], radial: Array) -> tuple[Ar
         radial: a1 to a4, shape (4,).
 
     Returns:
-        The coefficients, shape (3,) or (6,), and how far they are off at most [px].
+        The coefficients, shape (3,) or (6,), and their largest error [px].
     """
     if radial[3] == 0:
         return radial[:3].copy(), 0.0
     corners = np.array([[x, y] for x in (0, size_px[0]) for y in (0, size_px[1])], np.float64)
     reach = np.abs((corners - K[:2, 2]) / np.diag(K)[:2]).max(0)
-    r2 = np.linspace(0, (_BEYOND * float(np.linalg.norm(reach))) ** 2, _SAMPLES)[1:]
+    r2 = np.linspace(0, (_RADIUS_FACTOR * float(np.linalg.norm(reach))) ** 2, _SAMPLES)[1:]
     g = 1 + sum(a * r2 ** (k + 1) for k, a in enumerate(radial))
     powers = np.stack([r2, r2**2, r2**3], axis=1)
-    # n = g d is linear in the coefficients of both; weighed by r, as pixels are.
+    # n = g d is linear in the coefficients of both; weighted by r, as pixel errors are
     weight = np.sqrt(r2)[:, None]
     found = np.linalg.lstsq(weight * np.hstack([powers, -g[:, None] * powers]), weight[:, 0] * (g - 1), rcond=None)[0]
     n, d = 1 + powers @ found[:3], 1 + powers @ found[3:]
@@ -180,26 +180,26 @@ def opencv_radial(K: Array, size_px: tuple[int, int], radial: Array) -> tuple[Ar
 
 
 def opencv_lens(K: Array, recorded_px: Array, ideal: Array) -> tuple[Array, Array, Array, float]:
-    """Return K and OpenCV's eight coefficients of a lens that is known by points in the picture and without distortion.
+    """Return K and OpenCV's eight coefficients, fitted to a lens given by distorted and undistorted points.
 
-    K is kept where the coefficients alone follow the lens closely; else it takes what is linear in the lens, as the
-    bending of a cylinder or a squeeze, and at last the camera turns: with the principal point, that moves the middle of
-    the distortion.
+    K is kept if the coefficients alone fit the lens. Otherwise K is fitted too, which covers linear effects such as an
+    anamorphic squeeze; finally the camera rotation, which together with the principal point moves the centre of
+    distortion.
 
     Args:
-        K: intrinsic matrix (3, 3) [px] to begin with.
-        recorded_px: points of the picture (N, 2) [px].
-        ideal: the same on the plane at depth 1 of a pinhole, x right, y down, shape (N, 2).
+        K: Initial intrinsic matrix (3, 3) [px].
+        recorded_px: Points of the recorded image (N, 2) [px].
+        ideal: The same points without distortion, on the plane at depth 1, x right, y down, shape (N, 2).
 
     Returns:
-        K (3, 3), the coefficients (8,), the rotation vector (3,) [rad] by which the ideal points turn before, and how
-        far pixels are off at most; infinite where the fit does not hold.
+        K (3, 3), the coefficients (8,), the rotation vector (3,) [rad] applied to the ideal points first, and the
+        largest error [px], infinite if the fit fails.
     """
     best, off = np.concatenate([K[[0, 1, 0, 0, 1], [0, 1, 1, 2, 2]], np.zeros(11)]), np.inf
     for free in (np.arange(5, 13), np.arange(13), np.arange(16)):
         best = _least_squares(best, free, recorded_px, ideal)
         off = float(np.abs(_through(best, ideal) - recorded_px).max())
-        if off <= _CLOSE_PX:
+        if off <= _TOLERANCE_PX:
             break
     fx, fy, skew, cx, cy = best[:5]
     fitted = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -207,7 +207,7 @@ def opencv_lens(K: Array, recorded_px: Array, ideal: Array) -> tuple[Array, Arra
 
 
 def _least_squares(values: Array, free: npt.NDArray[np.intp], recorded_px: Array, ideal: Array) -> Array:
-    """Return the values with those of the free indices fitted: Levenberg-Marquardt with slopes by differences."""
+    """Return the values with the free ones fitted by Levenberg-Marquardt with numeric derivatives."""
     values, damping = values.copy(), 1e-3
     steps = np.where(np.arange(16) < 5, 1e-4 * values[0], 1e-6)
     residual = (_through(values, ideal) - recorded_px).ravel()
@@ -223,7 +223,7 @@ def _least_squares(values: Array, free: npt.NDArray[np.intp], recorded_px: Array
         after = (_through(moved, ideal) - recorded_px).ravel()
         if not np.isfinite(after).all() or after @ after > residual @ residual:
             damping *= 10
-            if damping > _MOST_DAMPING:
+            if damping > _MAX_DAMPING:
                 break
             continue
         gained = residual @ residual - after @ after
@@ -234,7 +234,7 @@ def _least_squares(values: Array, free: npt.NDArray[np.intp], recorded_px: Array
 
 
 def _through(values: Array, ideal: Array) -> Array:
-    """Return the pixels (N, 2) of ideal points through K and OpenCV's lens, as `Camera` states them."""
+    """Return the pixels (N, 2) of ideal points through K and OpenCV's lens model, as in `Camera`."""
     fx, fy, skew, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6 = values[:13]
     turned = so3_exp(values[13:]) @ np.vstack([ideal.T, np.ones(len(ideal))])
     x, y = turned[:2] / turned[2]

@@ -16,7 +16,7 @@ def wxyz_from_matrix(R: ArrayLike) -> Array:
     """Return the unit quaternions (..., 4) with w >= 0 of rotation matrices (..., 3, 3) (Shepperd 1978).
 
     Raises:
-        ValueError: another shape.
+        ValueError: a wrong shape.
     """
     R = np.asarray(R, dtype=np.float64)
     if R.shape[-2:] != (3, 3):
@@ -34,9 +34,9 @@ def wxyz_from_matrix(R: ArrayLike) -> Array:
 
 
 def _multiples(R: Sequence[Sequence[N]] | Array) -> list[list[N]]:
-    """Return 4 q q^T from rows of entries, floats or arrays: every row is a multiple of q.
+    """Return 4 q q^T from rows of matrix entries, floats or arrays. Every row is a multiple of q.
 
-    The row with the largest diagonal keeps all digits.
+    The row with the largest diagonal entry loses no digits.
     """
     a, b, c = R[0][0], R[1][1], R[2][2]
     x, y, z = R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]
@@ -51,9 +51,9 @@ def _multiples(R: Sequence[Sequence[N]] | Array) -> list[list[N]]:
 
 
 def continuous_wxyz(R: ArrayLike) -> Array:
-    """Return the unit quaternions (n, 4) of rotations (n, 3, 3) of a motion, each in the half-space of its predecessor.
+    """Return the unit quaternions (n, 4) of rotations (n, 3, 3), with signs chosen for continuity.
 
-    Slerp follows the shorter arc between two samples, but readers that interpolate the four numbers do not.
+    Slerp takes the shorter arc between two samples, but readers that interpolate the four numbers do not.
     """
     wxyz = wxyz_from_matrix(R)
     if len(wxyz) > 1:
@@ -66,7 +66,7 @@ def matrix_from_wxyz(q: ArrayLike) -> Array:
     """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), which are normalised first.
 
     Raises:
-        ValueError: another shape.
+        ValueError: a wrong shape.
     """
     unit: Array = np.asarray(q, dtype=np.float64)
     if unit.shape[-1:] != (4,):

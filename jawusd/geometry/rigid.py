@@ -1,4 +1,4 @@
-"""Rigid alignment of point sets, of which some may be missing, and triangulation of image points."""
+"""Rigid alignment of point sets, with missing points, and triangulation of image points."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry.se3 import make_transform, transform_points
 
-_FLATTEST = 1e-6  # of points in a line: their second extent over the first
+_MIN_ASPECT = 1e-6  # ratio of second to first extent, below which points count as collinear
 
 
 def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:
     """Return the rigid T (..., 4, 4) minimising sum w |T source - target|^2 (Arun et al. 1987, Umeyama 1991).
 
     Args:
-        source: points [mm], shape (N, 3), N >= 3, not on one line.
+        source: Points [mm], shape (N, 3), N >= 3, not collinear.
         target: points [mm], one set or many, shape (..., N, 3).
         weights: non-negative, shape (N,).
 
     Raises:
-        ValueError: wrong shapes, fewer than three points, or points on one line.
+        ValueError: wrong shapes, fewer than three points, or collinear points.
     """
     P, Q = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
     if P.shape != Q.shape[-2:] or P.ndim != 2 or P.shape[1] != 3 or len(P) < 3:
@@ -30,7 +30,7 @@ def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
     p0, q0 = w @ P, w @ Q
     spread = np.linalg.svd((P - p0) * np.sqrt(w)[:, None], compute_uv=False)
     if spread[1] < 1e-9 * max(spread[0], 1e-300):
-        raise ValueError("the source points lie on one line: their rotation about it is free")
+        raise ValueError("the source points are collinear: the rotation about their line is undetermined")
     U, _, Vt = np.linalg.svd(((P - p0) * w[:, None]).T @ (Q - q0[..., None, :]))
     sign = np.ones((*U.shape[:-2], 1, 3))
     sign[..., 0, 2] = np.sign(np.linalg.det(U @ Vt))
@@ -39,15 +39,15 @@ def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
 
 
 def rigid_fits(source: ArrayLike, targets: ArrayLike) -> tuple[Array, Array]:
-    """Return the rigid motions of a set of points whose copies are partly missing, each by `rigid_fit`.
+    """Return the rigid motions of a point set in frames with missing points, each by `rigid_fit`.
 
     Args:
         source: points [mm], shape (N, 3).
-        targets: the points after each motion [mm], shape (F, N, 3), NaN where one is missing.
+        targets: The points after each motion [mm], shape (F, N, 3), NaN if missing.
 
     Returns:
-        T (F, 4, 4), NaN where fewer than three points are there or those that are lie on one line, and the root mean
-        square distance (F,) [mm] of the points that are there, NaN likewise.
+        T (F, 4, 4), NaN with fewer than three points or collinear ones, and the rms distance (F,) [mm] of the present
+        points, NaN likewise.
 
     Raises:
         ValueError: wrong shapes.
@@ -56,11 +56,11 @@ def rigid_fits(source: ArrayLike, targets: ArrayLike) -> tuple[Array, Array]:
     if P.ndim != 2 or P.shape[1] != 3 or Q.ndim != 3 or Q.shape[1:] != P.shape:
         raise ValueError(f"need source (N, 3) and targets (F, N, 3), got {P.shape} and {Q.shape}")
     T, rms = np.full((len(Q), 4, 4), np.nan), np.full(len(Q), np.nan)
-    there = np.isfinite(Q).all(axis=-1)
-    for seen in np.unique(there, axis=0):
+    present = np.isfinite(Q).all(axis=-1)
+    for seen in np.unique(present, axis=0):
         if seen.sum() < 3 or _on_a_line(P[seen]):
             continue
-        rows = np.flatnonzero((there == seen).all(axis=1))
+        rows = np.flatnonzero((present == seen).all(axis=1))
         found = Q[rows][:, seen]
         T[rows] = rigid_fit(P[seen], found)
         off = transform_points(T[rows], P[seen]) - found
@@ -70,14 +70,14 @@ def rigid_fits(source: ArrayLike, targets: ArrayLike) -> tuple[Array, Array]:
 
 def _on_a_line(points: Array) -> bool:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] < _FLATTEST * spread[0] or spread[0] == 0)
+    return bool(spread[1] < _MIN_ASPECT * spread[0] or spread[0] == 0)
 
 
 def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:
     """Return the world point (3,) [mm] seen at the given pixels.
 
-    A linear start (Hartley & Zisserman, Multiple View Geometry, section 12.2), then Gauss-Newton on the reprojection
-    error.
+    A linear estimate (Hartley & Zisserman, Multiple View Geometry, section 12.2), refined by Gauss-Newton on
+    the reprojection error.
 
     Args:
         projections: pinhole projection matrices (world mm -> px), shape (C, 3, 4), C >= 2.

@@ -2,8 +2,8 @@
 
 With W the skew matrix of a rotation vector omega and x = |omega|^2, the rotation is ``I + a W + b W W`` and its left
 Jacobian ``I + b W + c W W``, where a = sin t / t, b = (1 - cos t) / t^2, c = (t - sin t) / t^3 and t = sqrt(x) (Sola,
-Deray, Atchuthan 2018, eqs. 132 to 148). This file imports nothing but the standard library: it is copied into the
-reader that runs inside other programs.
+Deray, Atchuthan 2018, eqs. 132 to 148). This file imports only the standard library: it is copied into the
+single-file reader.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from typing import Protocol, TypeVar
 
-SMALL_SQUARED_ANGLE = 1e-4  # rad^2; below, the closed forms lose digits and the series are exact to double precision
+SMALL_SQUARED_ANGLE = 1e-4  # [rad^2] below, closed forms lose digits and the series are exact to double precision
 
 
 class Number(Protocol):
-    """What the formulas ask of a number: arithmetic with its own kind and with floats."""
+    """The arithmetic that formulas need: with the same number type and with floats."""
 
     def __add__(self: N, other: N | float, /) -> N: ...
     def __radd__(self: N, other: float, /) -> N: ...
@@ -75,7 +75,7 @@ def apply_series(omega: Triple[N], v: Triple[N], first: N | float, second: N | f
 
 
 def turning(omega: Triple[N], a: N | float, b: N | float) -> tuple[Triple[N], Triple[N], Triple[N]]:
-    """Return the rows of ``a W + b W W``, the rotation less the identity: small rotations lose no digits."""
+    """Return the rows of ``a W + b W W``, the rotation minus the identity, which is accurate for small rotations."""
     x, y, z = omega
     ax, ay, az = x * a, y * a, z * a
     bx, by, bz = x * b, y * b, z * b

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry.so3 import hat, so3_exp, so3_left_jacobian, so3_left_jacobian_inverse, so3_log
 
-# Below this angle [rad] the coupling block uses its series; the closed form loses digits like a^-5 there.
+# Below this angle [rad] the coupling block uses its series: the closed form loses digits as a^-5.
 _COUPLING_SERIES_RAD = 0.3
 
 
@@ -33,9 +33,9 @@ def se3_inverse(T: ArrayLike) -> Array:
 
 
 def transform_point(T: ArrayLike, p: ArrayLike) -> Array:
-    """Apply each transform (..., 4, 4) to its own point (..., 3) [mm], ``p_a = T_a_b p_b``, shape (..., 3).
+    """Apply transforms (..., 4, 4) to points (..., 3) [mm], one each, ``p_a = T_a_b p_b``, shape (..., 3).
 
-    The leading axes are broadcast: one point may go with many transforms.
+    The leading axes are broadcast.
     """
     T, p = np.asarray(T, dtype=np.float64), np.asarray(p, dtype=np.float64)
     return np.einsum("...ij,...j->...i", T[..., :3, :3], p) + T[..., :3, 3]
@@ -44,7 +44,7 @@ def transform_point(T: ArrayLike, p: ArrayLike) -> Array:
 def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
     """Apply each transform (..., 4, 4) to all points (N, 3) [mm], ``p_a = T_a_b p_b``, shape (..., N, 3).
 
-    Points (..., N, 3) are a set per transform: all axes before the last two are broadcast against those of `T`.
+    With points (..., N, 3), one set per transform, the leading axes are broadcast.
 
     Raises:
         ValueError: a single point, see `transform_point`.
@@ -117,7 +117,7 @@ def se3_exp(twist: ArrayLike) -> Array:
     """Map twists (omega [rad], v [mm]), shape (..., 6), to rigid transforms (..., 4, 4).
 
     Raises:
-        ValueError: another shape.
+        ValueError: a wrong shape.
     """
     twist = np.asarray(twist, dtype=np.float64)
     if twist.shape[-1:] != (6,):
@@ -130,7 +130,7 @@ def se3_log(T: ArrayLike) -> Array:
     """Map rigid transforms (..., 4, 4) to twists (omega [rad], v [mm]), shape (..., 6), of rotation angle in [0, pi].
 
     Raises:
-        ValueError: another shape.
+        ValueError: a wrong shape.
     """
     T = np.asarray(T, dtype=np.float64)
     if T.shape[-2:] != (4, 4):
@@ -160,10 +160,9 @@ def orthonormalise(T: ArrayLike) -> Array:
 
 
 def rigidity_defect(T: ArrayLike) -> Array:
-    """Measure how far transforms (..., 4, 4) are from rigid, shape (...).
+    """Return the deviation of transforms (..., 4, 4) from rigidity, shape (...).
 
-    The defect is the largest absolute entry of R R^T - I and of the bottom row's error, and at least 2 for
-    reflections.
+    The largest absolute entry of R R^T - I and of the error of the bottom row; at least 2 for reflections.
     """
     T = np.asarray(T, dtype=np.float64)
     R = T[..., :3, :3]

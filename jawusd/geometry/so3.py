@@ -1,7 +1,7 @@
 """Rotations: exponential, logarithm and their Jacobians.
 
 Formulas: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018), eqs. 132-148.
-The logarithm goes through the unit quaternion (Shepperd 1978), which has no loss of digits near 0 or pi.
+The logarithm uses the unit quaternion (Shepperd 1978), which is accurate near 0 and pi.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def vee(W: ArrayLike) -> Array:
 
 def batched_angle_coefficients(squared: Array) -> tuple[Array, Array, Array]:
     """Return a, b and c of `jawusd.geometry.rodrigues` at squared angles [rad^2] of any shape."""
-    if np.ndim(squared) == 0 and squared < np.inf:  # one rotation, in floats: numpy takes most of its time for calls
+    if np.ndim(squared) == 0 and squared < np.inf:  # one rotation: floats avoid the call overhead of numpy
         a, b, c = map(np.asarray, rodrigues.angle_coefficients(float(squared)))
         return a, b, c
     small = squared < SMALL_SQUARED_ANGLE
@@ -72,7 +72,7 @@ def so3_log(R: ArrayLike) -> Array:
     norm = np.linalg.norm(q[..., 1:], axis=-1)
     angle = 2 * np.arctan2(norm, q[..., 0])
     small = norm < 1e-7
-    # angle / norm -> 2 / w for a vanishing vector part; w >= 0 keeps the angle in [0, pi].
+    # angle / norm -> 2 / w for a vanishing vector part; w >= 0 keeps the angle in [0, pi]
     scale = np.where(small, 2.0 / np.where(small, q[..., 0], 1.0), angle / np.where(small, 1.0, norm))
     return scale[..., None] * q[..., 1:]
 

@@ -1,1 +1,4 @@
-"""An index of a folder of rigs, and jaw motion for a person without a capture."""
+"""Libraries of rigs: an index of a folder, and jaw motion for a person without a capture.
+
+Imports only `base`, `geometry`, `formats` and `evaluator`.
+"""

@@ -1,7 +1,7 @@
 """The index of a folder of rigs: `library.json`, format jawusd-library/1.
 
-The index is only a cache of the scan: paths in it are never opened. Rigs are searched below the folder only, and read
-again when their content has changed.
+The index is only a cache of the scan: paths in it are never opened. Rigs are searched below the folder only, and
+reread when their content has changed.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ INDEX_FILE = "library.json"
 MODEL_FILE, ACTOR_FILE = "model.npz", "actor.usda"
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
 
-_MOST_FOLDERS = 20_000
-_MOST_INDEX_BYTES = 64 << 20
+_MAX_FOLDERS = 20_000
+_MAX_INDEX_BYTES = 64 << 20
 _CHUNK_BYTES = 1 << 20
 
-#: Reads the rig of a file.
+#: Reads a rig from a file.
 Loader = Callable[[Path], JawRig]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """Hold the index entry of one rig."""
+    """The index entry of one rig."""
 
-    path: str  # of the rig's file, relative to the folder, with slashes
+    path: str  # file of the rig, relative to the folder, with slashes
     actor: str  # name of the person
-    kind: str  # form of the model
+    kind: str  # kind of the model
     content: str  # SHA-256 of the rig's files
     ranges_mm: dict[str, list[float]]  # lowest and highest value of each parameter
     # in the person's own landmark frame (occlusal plane, origin at the lower incisal point)
     landmarks_mm: dict[str, list[float]]
     condylar_distance_mm: float  # between the condyle centres
     condyle_incisor_mm: float  # from the middle between the condyles to the incisal point
-    errors_mm: dict[str, object]  # the model's error tables, as its header has them
-    not_shown: bool  # the person's capture lacks a movement: not usable for others
+    errors_mm: dict[str, object]  # error tables from the model's header
+    not_shown: bool  # the capture lacks a movement: not usable for transfer
 
     def landmarks(self) -> Array:
         """Return the landmarks in the order of `LANDMARKS` [mm], shape (5, 3)."""
@@ -63,43 +63,43 @@ class Library:
 
     folder: Path  # the folder, resolved
     entries: tuple[Entry, ...]  # its rigs, by path
-    skipped: dict[str, str]  # files that could not be read, by path, and why
-    reread: int  # how many rigs were new or had changed
+    skipped: dict[str, str]  # reasons, by path, of files that could not be read
+    reread: int  # number of new or changed rigs
 
     def find(self, name: str) -> Entry:
-        """Return the rig of a person, by name or by path.
+        """Return the rig of a person, by name or path.
 
         Raises:
-            FormatError: there is none, or there are several.
+            FormatError: no rig matches, or several do.
         """
         found = [entry for entry in self.entries if name in (entry.path, entry.actor, str(Path(entry.path).parent))]
         if not found:
-            known = ", ".join(entry.actor for entry in self.entries) or "nobody"
-            raise FormatError(f'has no rig of "{name}"; it holds {known}.', path=self.folder)
+            known = ", ".join(entry.actor for entry in self.entries) or "no rigs"
+            raise FormatError(f'has no rig of "{name}"; it contains {known}.', path=self.folder)
         if len(found) > 1:
             paths = ", ".join(entry.path for entry in found)
-            raise FormatError(f'has several rigs of "{name}": {paths}.', path=self.folder, hint="Name the path.")
+            raise FormatError(f'has several rigs of "{name}": {paths}.', path=self.folder, hint="Give the path.")
         return found[0]
 
     def search(self, text: str) -> tuple[Entry, ...]:
-        """Return the rigs whose name or path contains a text, whatever its case."""
+        """Return the rigs whose name or path contains a text, ignoring case."""
         return tuple(e for e in self.entries if text.lower() in e.actor.lower() or text.lower() in e.path.lower())
 
 
 def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
-    """Bring the index of a folder up to date.
+    """Scan a folder and update its index.
 
-    Every subfolder counts as one person: its `model.npz`, else its `actor.usda`. Links that leave the folder are not
+    Every subfolder is one person, with a `model.npz` or otherwise an `actor.usda`. Links out of the folder are not
     followed.
 
     Raises:
-        FormatError: no such folder, too many folders, or an index that is damaged.
+        FormatError: a missing folder, too many folders, or a corrupt index.
         VersionError: an index written by a newer version.
-        OutputError: the index has changed and cannot be written.
+        OutputError: the updated index cannot be written.
     """
     root = Path(folder).resolve()
     if not root.is_dir():
-        raise FormatError("there is no such folder.", path=folder)
+        raise FormatError("the folder does not exist.", path=folder)
     known = _read_index(root / INDEX_FILE)
     entries, skipped, reread = [], {}, 0
     for path in sorted(_rig_files(root)):
@@ -119,7 +119,7 @@ def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
 
 
 def load_donors(library: Library, load: Loader) -> list[Donor]:
-    """Read the rigs of all persons whose captures show every movement, named by their paths.
+    """Read the rigs of all persons whose captures include every movement, named by their paths.
 
     Raises:
         JawusdError: a rig has become unreadable since the scan.
@@ -129,8 +129,8 @@ def load_donors(library: Library, load: Loader) -> list[Donor]:
 
 def _rig_files(root: Path) -> Iterator[Path]:
     for count, (where, folders, files) in enumerate(os.walk(root, followlinks=False)):
-        if count >= _MOST_FOLDERS:
-            raise FormatError(f"has more than {_MOST_FOLDERS} folders below it; that is no library.", path=root)
+        if count >= _MAX_FOLDERS:
+            raise FormatError(f"has more than {_MAX_FOLDERS} subfolders, too many for a library.", path=root)
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in (MODEL_FILE, ACTOR_FILE):
             if name in files:
@@ -142,15 +142,15 @@ def _content(path: Path, root: Path) -> str:
     """Return the SHA-256 of the files a rig is read from.
 
     Raises:
-        FormatError: one of them is not a plain file inside the library, or cannot be read.
+        FormatError: one of them is not a regular file inside the library, or cannot be read.
     """
     total = hashlib.sha256()
     parts = [path]
-    if path.name == ACTOR_FILE:  # OpenUSD opens what the interface refers to, in its folder: no link may lead it away
+    if path.name == ACTOR_FILE:  # OpenUSD opens the files referenced by the interface layer, in its folder
         parts += sorted(p for p in path.parent.iterdir() if p.suffix.startswith(".usd") and p != path)
     for part in parts:
         if not part.resolve().is_relative_to(root):
-            raise FormatError(f"{part.name} is a link out of the library; it is not followed.", path=path)
+            raise FormatError(f"{part.name} is a link out of the library and is not followed.", path=path)
         if not part.is_file():
             raise FormatError(f"{part.name} is not a file.", path=path)
         total.update(part.name.encode() + b"\0")
@@ -183,28 +183,28 @@ def _entry(name: str, content: str, rig: JawRig) -> Entry:
 
 
 def _read_index(path: Path) -> dict[str, Entry]:
-    """Return the entries of an index by path; none if there is no index yet."""
+    """Return the entries of an index by path; empty if there is no index."""
     if path.is_symlink():
-        raise FormatError("is a link; an index is a file of the library.", path=path)
+        raise FormatError("is a link; the index must be a regular file.", path=path)
     if not path.exists():
         return {}
     try:
-        if path.stat().st_size > _MOST_INDEX_BYTES:
+        if path.stat().st_size > _MAX_INDEX_BYTES:
             raise ValueError(f"{path.stat().st_size} bytes")
         data = json.loads(path.read_text(encoding="utf-8"))
         check_format(data.get("format"), FAMILY, VERSION, path)
         return {entry.path: entry for entry in map(_entry_of, data["rigs"])}
     except (OSError, ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError) as error:
-        raise FormatError(f"is damaged ({error}).", path=path, hint="Delete it; it is made anew.") from error
+        raise FormatError(f"is corrupt ({error}).", path=path, hint="Delete it; it will be rebuilt.") from error
 
 
 def _entry_of(record: object) -> Entry:
     if not isinstance(record, dict):
-        raise TypeError("an entry is no object")
+        raise TypeError("an entry is not an object")
     entry = Entry(**record)
     text = [field.name for field in fields(Entry) if field.type == "str"]
     if not all(isinstance(getattr(entry, name), str) for name in text):
-        raise ValueError("a text is none")
+        raise ValueError("a text field is not a string")
     numbers = [*entry.ranges_mm[PARAMETERS[0]], entry.condylar_distance_mm, entry.condyle_incisor_mm]
     numbers += [*entry.ranges_mm[PARAMETERS[1]], *entry.ranges_mm[PARAMETERS[2]]]
     if len(numbers) != 8 or not np.isfinite(np.array(numbers, dtype=np.float64)).all():

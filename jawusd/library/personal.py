@@ -27,7 +27,7 @@ from jawusd.geometry import LANDMARKS, landmark_frame, rigid_fit, transform_poin
 class Donor:
     """One person of a library."""
 
-    name: str  # of the person, for reports
+    name: str  # name of the person, for reports
     rig: JawRig  # the person's rig
 
     @property
@@ -47,17 +47,17 @@ def condyle_incisor_mm(landmarks: Array) -> float:
 
 
 def landmark_distance_mm(a: Array, b: Array) -> float:
-    """Return the rms distance [mm] that the best rigid fit leaves between two persons' landmarks (5, 3) [mm]."""
+    """Return the rms distance [mm] between two persons' landmarks (5, 3) [mm] after a rigid fit."""
     left = transform_points(rigid_fit(a, b), a) - b
     return float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
 def displacements(donor: Donor, target: Array, shares: Array) -> Array:
-    """Return how the target's landmarks move when a donor's motion is carried over, target's frame [mm], (K, 5, 3).
+    """Return the target's landmark displacements for a donor's motion, target's frame [mm], shape (K, 5, 3).
 
     Args:
-        target: the other person's landmarks with the teeth together [mm], shape (5, 3).
-        shares: parameters as shares of the ranges, see `JawRig.normalized`, shape (K, 3).
+        target: Landmarks of the target person with the teeth together [mm], shape (5, 3).
+        shares: Parameters as fractions of the ranges, see `JawRig.normalized`, shape (K, 3).
     """
     rest = donor.landmarks
     d = donor.rig.denormalized(shares)
@@ -69,19 +69,19 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
     return moved @ to_target.T
 
 
-# Landmark distances [mm] at which a person's weight falls to exp(-1/2); inf: equal weights.
+# Candidate bandwidths [mm]: landmark distance at which a weight falls to exp(-1/2); inf means equal weights.
 BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)
-_POSES = 1600
+_POSES = 1600  # poses of the result
 _POSES_LEFT_OUT = 120  # poses per person in leave-one-out
-_FEWEST_DONORS = 2  # with two persons each can be predicted from the other
+_MIN_DONORS = 2  # for leave-one-out
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Hold the errors found by leaving one person out."""
+    """Leave-one-out errors."""
 
-    # by name of the person left out, the landmark errors [mm], shape (K, 5), at equal shares of the ranges: both the
-    # shape of the motion and the ranges count
+    # landmark errors [mm], shape (K, 5), by name of the person left out, at equal fractions of the ranges: they include
+    # errors of the shape of the motion and of the ranges
     errors_mm: dict[str, Array]
 
     def pooled(self) -> Array:
@@ -100,7 +100,7 @@ class Expected:
         }
 
     def table(self) -> dict[str, dict[str, float]]:
-        """Return mean, median, p95 and max by landmark [mm], as the error tables of models have them."""
+        """Return mean, median, p95 and max by landmark [mm], in the form of a model's error tables."""
         return {
             name: {
                 "mean": float(column.mean()),
@@ -115,36 +115,36 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """Hold what leave-one-out found for a library."""
+    """Result of leave-one-out over a library."""
 
-    # landmark distance over which a person's weight falls by exp(-1/2), inf for equal weights; None when only the
-    # closest person is used
+    # landmark distance at which a weight falls to exp(-1/2), inf for equal weights; None if only the closest person is
+    # used
     bandwidth_mm: float | None
-    expected: Expected | None  # error to be expected; None when the library has a single person
+    expected: Expected | None  # None if the library has a single person
 
 
 @dataclass(frozen=True, eq=False)
 class PersonalMotion:
-    """Hold the motion made for a person."""
+    """The motion predicted for a person."""
 
-    # T_skull_mandible in the frame of the landmarks, the identity with the teeth together, shape (N, 4, 4)
+    # T_skull_mandible in the landmark frame, the identity with the teeth together, shape (N, 4, 4)
     poses: Array
-    weights: dict[str, float]  # of the library persons; they sum to 1
+    weights: dict[str, float]  # of the library's persons; they sum to 1
     learned: Learned  # the source of the weights and the expected error
 
 
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
-    """Predict every person of a library from the others, and choose how fast weights fall with landmark distance.
+    """Predict every person of a library from the others, and choose the bandwidth of the weights.
 
     Args:
-        closest: use the person with the most similar landmarks instead of an average.
+        closest: Use only the person with the most similar landmarks instead of an average.
 
     Raises:
         FittingError: no donors.
     """
     if not donors:
-        raise FittingError("the library has no person whose motion could be carried over.")
-    if len(donors) < _FEWEST_DONORS:
+        raise FittingError("the library has no person whose motion can be transferred.")
+    if len(donors) < _MIN_DONORS:
         return Learned(None, None)
     choices: tuple[float | None, ...] = (None,) if closest else BANDWIDTHS_MM
     errors: list[dict[str, Array]] = [{} for _ in choices]
@@ -164,11 +164,11 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
 
 
 def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) -> PersonalMotion:
-    """Make the motion of a person from landmarks and a library.
+    """Predict the motion of a person from landmarks and a library.
 
     Args:
-        target: the person's landmarks with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
-        learned: what `leave_one_out` returns for these donors.
+        target: Landmarks of the person with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
+        learned: Result of `leave_one_out` for these donors.
     """
     weights = _weights(donors, target, learned.bandwidth_mm)
     used = [(donor, weight) for donor, weight in zip(donors, weights, strict=True) if weight > 0]
@@ -180,14 +180,14 @@ def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) ->
 
 
 def _captured_shares(donor: Donor, count: int) -> Array:
-    """Return about `count` of a person's captured poses, in the order of time, as shares of the ranges."""
+    """Return about `count` of a person's captured poses, in time order, as fractions of the ranges."""
     codes = donor.rig.captured_d
     step = -(-len(codes) // max(count, 1))
     return donor.rig.normalized(codes[::step])
 
 
 def _weights(donors: Sequence[Donor], target: Array, bandwidth_mm: float | None) -> Array:
-    """Return the weights (n,), which sum to 1; without a bandwidth, of the closest person only."""
+    """Return the weights (n,), which sum to 1; without a bandwidth, only the closest person counts."""
     distance = np.array([landmark_distance_mm(donor.landmarks, target) for donor in donors])
     if bandwidth_mm is None:
         return (np.arange(len(donors)) == distance.argmin()).astype(np.float64)

@@ -1,11 +1,11 @@
-"""Keep the timing of a curve that is carried to another person: it rises and falls where its original does.
+"""Preserve the timing of a retargeted curve: it rises and falls where the original does.
 
-What a share of a range amounts to changes with the opening, so that a curve carried share by share may peak frames
-before or after the original. The curve kept is the nearest to it, in least squares, among those that move the same way
-as the original between any two samples: isotonic regression (Barlow et al. 1972) whose direction changes with the sign
-of the original's steps. It is solved exactly by passing along the samples the cost of all samples so far as a function
-of the value of the last one; the derivative of that cost is piecewise linear and rising, and each step cuts off one end
-of it, as in R. Tibshirani, H. Hoefling, R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
+Ranges depend on the opening, so a curve retargeted by fractions of the ranges may peak some frames before or after the
+original. The result is the least-squares nearest curve that moves in the same direction as the original between any two
+samples: isotonic regression (Barlow et al. 1972) whose direction follows the sign of the original's steps. It is solved
+exactly by dynamic programming over the cost of all samples so far as a function of the last value. The derivative of
+that cost is piecewise linear and increasing, and each step truncates one end of it, as in R. Tibshirani, H. Hoefling,
+R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 
-STILL_MM = 1e-6  # a smaller step of the original has no direction
+STILL_MM = 1e-6  # smaller steps of the original have no direction
 
 
 def follow(original: Array, carried: Array, least: float) -> Array:
-    """Return the curve [mm] (F,) nearest to a carried one that rises and falls where the original (F,) does.
+    """Return the curve [mm] (F,) nearest to a retargeted one that rises and falls where the original (F,) does.
 
     Args:
-        least: smallest step of the result for a step of 1 mm of the original, > 0: keeps peaks from becoming plateaus.
+        least: Smallest step of the result per 1 mm step of the original, > 0: keeps peaks from becoming plateaus.
     """
     steps = np.diff(original)
     still = np.flatnonzero(np.abs(steps) < STILL_MM) + 1
@@ -36,7 +36,7 @@ def follow(original: Array, carried: Array, least: float) -> Array:
 
 
 def _zigzag(rising: Mask, wanted: Array) -> Array:
-    """Return the values z (n,) nearest to wanted ones (n,): z[i + 1] >= z[i] where ``rising`` (n - 1,), else <=."""
+    """Return the values z (n,) nearest to ``wanted`` (n,): z[i + 1] >= z[i] where ``rising`` (n - 1,), otherwise <=."""
     cost = _Slopes()
     cost.add(wanted[0])
     limits = np.empty(len(rising))
@@ -51,14 +51,14 @@ def _zigzag(rising: Mask, wanted: Array) -> Array:
 
 
 class _Slopes:
-    """The derivative of a convex, piecewise quadratic cost: lines, and bends between them.
+    """The derivative of a convex, piecewise quadratic cost, as line segments between knots.
 
-    Lines are (slope, offset); a bend is its place and how much slope and offset change there, from left to right.
+    Lines are (slope, offset); a knot is its position and the changes of slope and offset there, from left to right.
     """
 
     def __init__(self) -> None:
         self._first, self._last = (0.0, 0.0), (0.0, 0.0)
-        self._bends: deque[tuple[float, float, float]] = deque()
+        self._knots: deque[tuple[float, float, float]] = deque()
 
     def add(self, wanted: float) -> None:
         """Add half the squared distance to a value."""
@@ -66,19 +66,19 @@ class _Slopes:
         self._last = (self._last[0] + 1.0, self._last[1] - wanted)
 
     def cut(self, right: bool) -> float:
-        """Return where the cost is least, and make it constant from there to the right, or to the left."""
+        """Return the minimiser, and make the cost constant from there to the right, or to the left."""
         sign, end, (slope, offset) = (-1, -1, self._last) if right else (1, 0, self._first)
-        while self._bends:
-            place, bend, shift = self._bends[end]
-            if sign * (slope * place + offset) >= 0:
+        while self._knots:
+            position, bend, shift = self._knots[end]
+            if sign * (slope * position + offset) >= 0:
                 break
             slope, offset = slope + sign * bend, offset + sign * shift
-            self._bends.pop() if right else self._bends.popleft()
+            self._knots.pop() if right else self._knots.popleft()
         least = -offset / slope
         if right:
-            self._bends.append((least, -slope, -offset))
+            self._knots.append((least, -slope, -offset))
             self._last = (0.0, 0.0)
         else:
-            self._bends.appendleft((least, slope, offset))
+            self._knots.appendleft((least, slope, offset))
             self._first = (0.0, 0.0)
         return least

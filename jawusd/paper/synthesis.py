@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.bounds import PolygonBound, SliceHull
-from jawusd.evaluator.encoding import carried
+from jawusd.evaluator.encoding import vector_images
 from jawusd.fitting.bounds import PLANES, alpha_shapes, fit_slice_hull, valid_box
 from jawusd.fitting.metric import MandibleMetric
 
@@ -85,4 +85,4 @@ def captured_reference(metric: MandibleMetric, captured: Array, folds: int) -> A
 
 
 def _columns(metric: MandibleMetric, motion: Array) -> Array:
-    return carried(motion[:, :3, :3], motion[:, :3, 3], metric.vectors).reshape(len(motion), -1)
+    return vector_images(motion[:, :3, :3], motion[:, :3, 3], metric.vectors).reshape(len(motion), -1)

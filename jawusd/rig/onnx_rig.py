@@ -59,7 +59,7 @@ def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
 
 
 class OnnxKernels(NumpyKernels):
-    """`Kernels` that run ONNX graphs for poses, twists, margins and the nearest pose, and numpy for the rest."""
+    """Kernels that run ONNX graphs for poses, twists, margins and the nearest pose, and numpy for the rest."""
 
     def __init__(self, decode: bytes, encode: bytes | None, parts: RigParts) -> None:
         super().__init__(parts)

@@ -67,7 +67,7 @@ def test_persons_are_found_by_name_folder_and_path(folder):
     assert library.find("team/bert").path == "team/bert/model.npz"
     with pytest.raises(FormatError, match="several rigs"):
         library.find("Bert")
-    with pytest.raises(FormatError, match="it holds Anna"):
+    with pytest.raises(FormatError, match="it contains Anna"):
         library.find("Nobody")
     assert [entry.path for entry in library.search("BERT")] == ["other/model.npz", "team/bert/model.npz"]
 
@@ -145,7 +145,7 @@ def test_a_damaged_index_is_refused(folder, change):
     index = json.loads((folder / INDEX_FILE).read_text())
     change(index)
     (folder / INDEX_FILE).write_text(json.dumps(index))
-    with pytest.raises(FormatError, match="damaged"):
+    with pytest.raises(FormatError, match="corrupt"):
         scan_library(folder, load)
 
 
@@ -154,9 +154,9 @@ def test_other_files_in_its_place_are_refused(folder):
     with pytest.raises(VersionError):
         scan_library(folder, load)
     (folder / INDEX_FILE).write_text("[" * 100_000)
-    with pytest.raises(FormatError, match="damaged"):
+    with pytest.raises(FormatError, match="corrupt"):
         scan_library(folder, load)
-    with pytest.raises(FormatError, match="no such folder"):
+    with pytest.raises(FormatError, match="does not exist"):
         scan_library(folder / "nowhere", load)
 
 

@@ -13,7 +13,7 @@ import model_peers
 import numpy as np
 
 from jawusd.base.errors import FittingError
-from jawusd.evaluator.encoding import carried
+from jawusd.evaluator.encoding import vector_images
 from jawusd.fitting import FittingConfig
 from jawusd.fitting.checks import shown_parameters
 from jawusd.fitting.data import TrainingData, displacement
@@ -71,7 +71,7 @@ def nearest(
 
     def off(d: Array) -> Array:
         T = decode(d)
-        there = carried(T[:, :3, :3], T[:, :3, 3], metric.vectors) - carried(M[:, :3, :3], M[:, :3, 3], metric.vectors)
+        there = vector_images(T[:, :3, :3], T[:, :3, 3], metric.vectors) - vector_images(M[:, :3, :3], M[:, :3, 3], metric.vectors)
         return there.reshape(len(M), -1)
 
     for _ in range(STEPS):
