@@ -38,7 +38,7 @@ class RigAuthoring(RigArrays):
         """Return jaw parameters between keys.
 
         Args:
-            frames: Times of the keys, rising, shape (K,).
+            frames: Increasing key times, shape (K,).
             d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
             at: Query times, any shape; outside the keys the nearest key is used.
             method: "linear", straight lines in d as in the paper, or "smooth", a C1 curve, monotone between keys.

@@ -209,7 +209,7 @@ class SliceHull:
 
 
 def largest_share(outside: Callable[[Array], Mask], count: int, iterations: int) -> Array:
-    """Return the largest shares (count,) of [0, 1] that are not outside, by bisection."""
+    """Return the largest fractions (count,) in [0, 1] that are not outside, by bisection."""
     low, high = np.zeros(count), np.ones(count)
     for _ in range(iterations):
         share = 0.5 * (low + high)

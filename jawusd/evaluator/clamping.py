@@ -19,7 +19,7 @@ MAX_STRETCH = 1.045  # limit of how much longer a step may become: 5 %, with roo
 
 _SAMPLE_MM = 0.2  # sample spacing near the bound
 _MAX_PIECES = 400  # samples of one step
-_STEEPEST = 5.0  # upper limit of the slope of the margin along d: deeper steps than this many lengths stay inside
+_STEEPEST = 5.0  # upper limit of the slope of the margin: steps deeper than this many step lengths stay inside
 _STILL_MM = 1e-12
 _TIME_SHARE = 0.998  # of the available time; a path grows slightly when it is sampled finer
 _CHECK_MM, _NEAR_MM, _MAX_ROUNDS, _ROUNDING_MM = 0.03, 1e-3, 8, 1e-9

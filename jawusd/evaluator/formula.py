@@ -124,7 +124,7 @@ def drop(gauge: GaugeNumbers, d2: N, d3: N, ops: Operations[N, Table]) -> N:
 
 
 def fade(gauge: GaugeNumbers, d1: N, ops: Operations[N, Table]) -> N:
-    """Return the share of the glide surface felt at opening d1 [mm]."""
+    """Return the weight of the glide surface at opening d1 [mm]."""
     x = soft_ramp(d1, FADE_SOFTNESS_MM, ops) / gauge.fade_mm
     return ops.exp(-(x * x))
 

@@ -201,7 +201,7 @@ class Gauge:
 
     Attributes:
         path_coefficients: Coefficients of gx and gz: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm], shape (2, 5).
-        path_scale_mm: Length that makes the polynomials' argument of order one.
+        path_scale_mm: Length that scales the argument of the polynomials to order one.
         path_limits: d1 interval [mm] of the polynomials; outside they continue as straight lines (C1), and ``rho`` uses
             d1 softly clamped to the interval.
         glide_arch: Coefficients of rho, shape (7,).

@@ -1,4 +1,4 @@
-"""A rig's hot functions compiled with numba: the same results to 1e-10, 6 to 40 times faster.
+"""A rig's hot functions compiled with numba: the same results to 1e-10, several times faster.
 
 Poses, twists, margins, their derivatives, encoding and `validate` are compiled. Searches along the bound (`ik`,
 `project`, `interpolate`, `encode(inside=True)`) run in numpy as in `jawusd.evaluator`. Imports only `base`, `geometry`

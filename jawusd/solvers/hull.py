@@ -109,7 +109,7 @@ class Hull(Formula):
     def upper_margin(self, d: Tensor) -> Tensor:
         """Return an upper bound (n,) [mm] of the margins in the section of d (n, 3).
 
-        In every direction from d, some half-plane faces it and gets nearer.
+        Moving from d in any direction approaches some half-plane.
         """
         offset = self.singles[3]
         (reach,) = curve("support", d[:, :1], self.tables(), OPERATIONS)

@@ -71,8 +71,8 @@ def nearest(
 
     def off(d: Array) -> Array:
         T = decode(d)
-        there = vector_images(T[:, :3, :3], T[:, :3, 3], metric.vectors) - vector_images(M[:, :3, :3], M[:, :3, 3], metric.vectors)
-        return there.reshape(len(M), -1)
+        images = [vector_images(each[:, :3, :3], each[:, :3, 3], metric.vectors) for each in (T, M)]
+        return (images[0] - images[1]).reshape(len(M), -1)
 
     for _ in range(STEPS):
         r = off(d)
