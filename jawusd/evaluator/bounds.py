@@ -20,8 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.evaluator.curve_formula import catmull_rom
-from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.curves import HermiteCurve, flat_ended
 from jawusd.evaluator.formula import BoundFormula
 
 _ARRAYS = ("slice_d1", "slice_directions", "slice_support", "slice_softness_mm", "slice_margin_mm")
@@ -69,10 +68,8 @@ class SliceHull:
         """Build the bound from the named arrays of a rig."""
         knots = np.asarray(arrays["slice_d1"], dtype=float)
         values = np.asarray(arrays["slice_support"], dtype=float)
-        slopes = np.zeros_like(values)  # flat ends: the supports are constant beyond the captured openings
-        slopes[1:-1] = catmull_rom(values[:-2], values[2:], (knots[2:] - knots[:-2])[:, None])
         return cls(
-            supports=HermiteCurve(knots, values, slopes),
+            supports=flat_ended(knots, values),
             directions=np.asarray(arrays["slice_directions"], dtype=float),
             softness_mm=float(arrays["slice_softness_mm"]),
             offset_mm=float(arrays["slice_margin_mm"]),

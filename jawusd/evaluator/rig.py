@@ -110,7 +110,7 @@ class JawRig(RigClearance, RigAuthoring):
     def spatial_jacobian(self, d: ArrayLike) -> Array:
         """Return the spatial velocity (omega [rad/mm], v [mm/mm]) per unit of each d, skull frame, (..., 6, 3).
 
-        The left twists between the poses of d (..., 3) [mm] and of neighbouring parameters (Barfoot 2017, section 7.1.5).
+        The left twists between the poses of d (..., 3) [mm] and of adjacent parameters (Barfoot 2017, section 7.1.5).
         """
         rows, batch = as_rows(d, (3,), "d")
         spatial = in_chunks(lambda d: self._frames.adjoint @ self.model.decode_derivative(d)[2], rows)

@@ -11,8 +11,8 @@ from torch import Tensor
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.curve_formula import catmull_rom, curve, curve_tables
-from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.curve_formula import curve, curve_tables
+from jawusd.evaluator.curves import HermiteCurve, flat_ended
 from jawusd.solvers.hull import Hull
 from jawusd.solvers.motion import OPERATIONS, Formula
 from jawusd.solvers.solution import capturing, finished
@@ -38,10 +38,9 @@ class Interior(Formula):
     def __init__(self, arrays: Mapping[str, Array]) -> None:
         bound = SliceHull.from_arrays(arrays)
         knots, middles = bound.supports.knots, _middles(bound)
-        slopes = np.zeros_like(middles)
-        slopes[1:-1] = catmull_rom(middles[:-2], middles[2:], (knots[2:] - knots[:-2])[:, None])
-        ends = _ends(bound, HermiteCurve(knots, middles, slopes))
-        super().__init__(curve_tables("middle", knots.tolist(), middles.tolist(), slopes.tolist()), ends)
+        line = flat_ended(knots, middles)
+        tables = curve_tables("middle", knots.tolist(), middles.tolist(), line.slopes.tolist())
+        super().__init__(tables, _ends(bound, line))
 
     def mapped(self, hull: Hull, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return d (n, 3) [mm] of z (n, 3), and its derivative (n, 3, 3)."""
