@@ -232,7 +232,7 @@ class _Segmentation:
             if (record.status == LOST).any():  # do not learn colours from a wrong place
                 for name, model in colours.items():
                     model.restore(*known[name])
-            state.keep(frame, step)
+            state.save(frame, step)
             self._write(frame, record, shown.segments)
             self._advance("segment", len(self._journal.entries))
 

@@ -220,7 +220,7 @@ class ColourStates:
         """Use a folder for the files and the colours by camera."""
         self._folder, self._colours = folder, dict(colours)
 
-    def keep(self, frame: int, step: int) -> None:
+    def save(self, frame: int, step: int) -> None:
         """Save the colours after a frame.
 
         Raises:

@@ -10,8 +10,8 @@ import viser
 from jawusd.formats.tracks import Tracks
 from jawusd.viewer.motion import Player
 from jawusd.viewer.picking import SIDES, PickBook
-from jawusd.viewer.plots import plot_seek
-from jawusd.viewer.take_plots import CoveragePlot, SolvePlot, frame_words, frames_to_inspect
+from jawusd.viewer.plots import Plot, plot_seek, with_playhead
+from jawusd.viewer.take_plots import coverage_plot, frame_words, frames_to_inspect, solve_plot
 from jawusd.viewer.viewed import Look, ViewedCapture
 from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, enable, guarded, notify, small_text
 
@@ -63,7 +63,7 @@ class FootagePanel:
         self._look.on_update(guarded(client, self._redraw))
         if capture.tracks is not None:
             self._plot = self._draw_plot(capture.tracks)
-            gui.add_html(self._plot.definition)
+            gui.add_html(self._plot.definition())
         self._playhead = gui.add_html("")
         first, last = capture.frames
         self.slider = gui.add_slider("frame", first, max(last, first + 1), 1, self.frame)  # viser needs two values
@@ -95,10 +95,10 @@ class FootagePanel:
         """Return what is drawn into the pictures."""
         return _LOOKS[self._look.value]
 
-    def _draw_plot(self, tracks: Tracks) -> CoveragePlot | SolvePlot:
+    def _draw_plot(self, tracks: Tracks) -> Plot:
         if tracks.solved is not None:
-            return SolvePlot(tracks, tracks.solved, self._capture.frames)
-        return CoveragePlot(tracks, self._capture.frames, self.worst)
+            return solve_plot(tracks, tracks.solved, self._capture.frames)
+        return coverage_plot(tracks, self._capture.frames, self.worst)
 
     def go_to(self, frame: int) -> None:
         """Stop playback and show a frame."""
@@ -130,7 +130,7 @@ class FootagePanel:
         if self.view in capture.offsets and (own := frame - capture.offsets[self.view]) != frame:
             lines[0] += f" (frame {own} of this camera)"
         if capture.tracks is not None:
-            drawn = self._plot.with_playhead(frame)
+            drawn = with_playhead(self._plot, frame)
             self._playhead.content = plot_seek(drawn, capture.frames, self._plot.across, self.slider._impl.uuid)
             lines.append(frame_words(capture.tracks, frame))
         else:

@@ -46,7 +46,8 @@ class Plot:
 
     def definition(self) -> str:
         """Return hidden HTML that defines the static part; needed once per page."""
-        return svg_definition(self.name, self.static)
+        style = "position:absolute"
+        return f'<svg width="0" height="0" style="{style}"><defs><g id="{self.name}">{self.static}</g></defs></svg>'
 
     def with_point(self, x: float, y: float, inside: bool) -> str:
         """Return the SVG of the plot with the current pose marked."""
@@ -102,7 +103,7 @@ def curve_plot(clip: Clip | None, keys: KeyTrack, span: tuple[float, float]) -> 
     frames = np.union1d(np.linspace(first, last, _MOST_SAMPLES), [key.frame for key in keys])
     values = clip.at(frames)
     corners = np.stack([np.repeat([first, last], 2), np.tile([values.min(), values.max()], 2)], axis=1)
-    plot = framed(name, corners, "parameters over frames", "frame", "mm", pad_x=False)
+    plot = framed(name, corners, "parameters over frames", "frame", "mm", pad=(False, True))
     parts = []
     for axis, color in enumerate(CURVE_COLORS):
         line = path_through(place(plot, np.stack([frames, values[:, axis]], axis=1)))
@@ -148,11 +149,6 @@ def plot_seek(drawn: str, ends: tuple[float, float], across: tuple[float, float]
     return f'<div style="{style}" onpointerdown="{script}" onpointermove="{script}">{drawn}</div>'
 
 
-def svg_definition(name: str, content: str) -> str:
-    """Return hidden HTML that defines SVG content under an id."""
-    return f'<svg width="0" height="0" style="position:absolute"><defs><g id="{name}">{content}</g></defs></svg>'
-
-
 def _svg(content: str) -> str:
     return f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="100%" style="display:block">{content}</svg>'
 
@@ -170,11 +166,19 @@ def place(plot: Plot, points: Array) -> Array:
     return np.stack([x, y], axis=1)
 
 
-def framed(name: str, data: Array, title: str, x_label: str, y_label: str, pad_x: bool = True) -> Plot:
-    """Return a plot with axes, ticks and labels whose range contains data (n, 2)."""
+def framed(
+    name: str,
+    data: Array,
+    title: str,
+    x_label: str,
+    y_label: str,
+    *,
+    pad: tuple[bool, bool] = (True, True),
+) -> Plot:
+    """Return a plot with axes, ticks and labels whose range contains data (n, 2), padded along x and y if `pad`."""
     low, high = data.min(axis=0), data.max(axis=0)
-    pad = np.maximum(0.06 * (high - low), 0.5) * (float(pad_x), 1.0)
-    low, high = low - pad, high + pad
+    room = np.maximum(0.06 * (high - low), 0.5) * pad
+    low, high = low - room, high + room
     plot = Plot(name, "", (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
     area = (_WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM)
     parts = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.verdicts import place as place_of
@@ -12,7 +11,6 @@ from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks, unc
 from jawusd.viewer.plots import (
     BLUE,
     CURVE_COLORS,
-    GREY,
     ORANGE,
     VERMILION,
     Plot,
@@ -20,14 +18,9 @@ from jawusd.viewer.plots import (
     framed,
     path_through,
     place,
-    svg_definition,
-    with_playhead,
 )
 
 _MOST_WORST = 12
-_WIDTH, _HEIGHT = 330, 170
-_LEFT, _RIGHT, _TOP, _BOTTOM = 30, 8, 20, 26
-_COVERAGE_TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
 _STATUS: dict[int, str] = {
     LOST: "lost",
     TRACKED: "tracked",
@@ -72,116 +65,63 @@ def frame_words(tracks: Tracks, frame: int) -> str:
     return "<br>".join(parts)
 
 
-class CoveragePlot:
-    """Uncovered mask area of both arches over the frames: a static plot with a moving playhead.
-
-    Attributes:
-        definition: hidden HTML that defines the plot.
-        across: start and end of the axis as fractions of the plot's width.
-    """
-
-    across = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
-
-    def __init__(self, tracks: Tracks, span: tuple[int, int], worst: list[int]) -> None:
-        """Plot tracks over a range of frames and mark the worst ones."""
-        self._span = span
-        percent = uncovered_percent(tracks)
-        self._top = max(float(np.nanmax(percent, initial=0.1)) * 1.08, 0.1)
-        bottom = _HEIGHT - _BOTTOM
-        parts = [
-            f'<rect x="{_LEFT}" y="{_TOP}" width="{_WIDTH - _LEFT - _RIGHT}" height="{bottom - _TOP}" fill="none" '
-            f'stroke="{GREY}"/>',
-            f'<text x="{_LEFT}" y="13" {_COVERAGE_TEXT} font-weight="bold">uncovered mask area [%]</text>',
-        ]
-        lost = f'stroke="{VERMILION}" stroke-opacity=".4"'
-        parts += [self._vertical(int(frame), lost) for frame in tracks.frames[~tracks.tracked()]]
-        parts += [self._curve(tracks.frames, percent[:, k], color) for k, color in enumerate(_COLORS)]
-        for value in np.linspace(0, self._top / 1.08, 3):
-            y = self._y(value)
-            parts.append(f'<text x="{_LEFT - 4}" y="{y + 4:.1f}" text-anchor="end" {_COVERAGE_TEXT}>{value:.1f}</text>')
-        for frame in (span[0], (span[0] + span[1]) // 2, span[1]):
-            anchor = "start" if frame == span[0] else "end" if frame == span[1] else "middle"
-            place = f'x="{self._x(frame):.1f}" y="{bottom + 13}" text-anchor="{anchor}"'
-            parts.append(f"<text {place} {_COVERAGE_TEXT}>{frame}</text>")
-        for frame in worst:
-            x = self._x(frame)
-            parts.append(f'<path d="M{x:.1f} {_TOP}l-3 -5h6z" fill="{VERMILION}"/>')
-        self.definition = svg_definition("jaw-coverage", "".join(parts))
-
-    def with_playhead(self, frame: int) -> str:
-        """Return the SVG of the plot with a line at the current frame."""
-        line = self._vertical(frame, 'stroke="currentColor" stroke-width="1.5"')
-        box = f'viewBox="0 0 {_WIDTH} {_HEIGHT}" width="100%" style="display:block"'
-        return f'<svg {box}><use href="#jaw-coverage"/>{line}</svg>'
-
-    def _x(self, frame: float) -> float:
-        first, last = self._span
-        return _LEFT + (frame - first) / max(last - first, 1) * (_WIDTH - _LEFT - _RIGHT)
-
-    def _y(self, percent: float) -> float:
-        return _HEIGHT - _BOTTOM - percent / self._top * (_HEIGHT - _TOP - _BOTTOM)
-
-    def _vertical(self, frame: int, style: str) -> str:
-        return f'<path d="M{self._x(frame):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" {style}/>'
-
-    def _curve(self, frames: NDArray[np.int64], percent: Array, color: str) -> str:
-        """Return a curve with gaps where values are missing."""
-        steps, pen = [], "M"
-        for frame, value in zip(frames, percent, strict=True):
-            if np.isfinite(value):
-                steps.append(f"{pen}{self._x(frame):.1f} {self._y(value):.1f}")
-            pen = "L" if np.isfinite(value) else "M"
-        return f'<path d="{"".join(steps)}" fill="none" stroke="{color}" stroke-width="1.2"/>'
+def coverage_plot(tracks: Tracks, span: tuple[int, int], worst: list[int]) -> Plot:
+    """Plot the uncovered mask area of both arches over a range of frames, with lost and worst frames marked."""
+    percent = uncovered_percent(tracks)
+    top = max(float(np.nanmax(percent, initial=0.1)) * 1.08, 0.1)
+    plot = framed("jaw-coverage", _corners(span, 0.0, top), "uncovered mask area", "frame", "%", pad=(False, False))
+    high, low = plot.high[1], plot.low[1]
+    parts = []
+    for frame in tracks.frames[~tracks.tracked()]:
+        ends = place(plot, np.array([[frame, low], [frame, high]]))
+        parts.append(f'<path d="{path_through(ends)}" stroke="{VERMILION}" stroke-opacity=".4"/>')
+    for k, color in enumerate(_COLORS):
+        known = np.flatnonzero(np.isfinite(percent[:, k]))
+        pieces = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1) if len(known) else []
+        curve = np.stack([tracks.frames, percent[:, k]], axis=1)
+        steps = "".join(path_through(place(plot, curve[piece])) for piece in pieces)
+        parts.append(f'<path d="{steps}" fill="none" stroke="{color}" stroke-width="1.2"/>')
+    for x, y in place(plot, np.array([[frame, high] for frame in worst]).reshape(-1, 2)):
+        parts.append(f'<path d="M{x:.1f} {y:.1f}l-3 -5h6z" fill="{VERMILION}"/>')
+    return drawn(plot, parts)
 
 
-class SolvePlot:
-    """d of a solved take with its expected error: a static plot with a moving playhead.
+def solve_plot(tracks: Tracks, solved: SolvedJaw, span: tuple[int, int]) -> Plot:
+    """Plot d of a solved take over a range of frames, with bands of two sigma and a strip for the states."""
+    step = max(1, -(-len(tracks.frames) // _MOST_SAMPLES))
+    frames = tracks.frames[::step].astype(np.float64)
+    d, sigma = solved.d[::step], solved.sigma_mm[::step]
+    values = np.concatenate([d - _BAND * sigma, d + _BAND * sigma])
+    corners = _corners(span, values.min(initial=0.0), values.max(initial=1.0))
+    plot = framed("jaw-solve", corners, "solved jaw", "frame", "mm", pad=(False, True))
+    parts = [_band(plot, frames, d[:, k], sigma[:, k], color) for k, color in enumerate(CURVE_COLORS)]
+    for k, color in enumerate(CURVE_COLORS):
+        line = path_through(place(plot, np.stack([frames, d[:, k]], axis=1)))
+        parts.append(f'<path d="{line}" fill="none" stroke="{color}" stroke-width="1.5"/>')
+        label = f'<text x="{98 + 57 * k}" y="14" font-size="10" fill="{color}" font-weight="bold">'
+        parts.append(f"{label}{_NAMES[k]}</text>")
+    return drawn(plot, [*parts, *(_strip(plot, tracks, solved, state) for state in SolveState)])
 
-    Attributes:
-        definition: hidden HTML that defines the plot.
-        across: start and end of the axis as fractions of the plot's width.
-    """
 
-    across = Plot.across
+def _corners(span: tuple[int, int], low: float, high: float) -> Array:
+    """Return two corners (2, 2) of a range of frames, at least one frame wide, and a range of values."""
+    return np.array([[span[0], low], [max(span[1], span[0] + 1), high]], np.float64)
 
-    def __init__(self, tracks: Tracks, solved: SolvedJaw, span: tuple[int, int]) -> None:
-        """Plot a solved take over a range of frames, with bands of two sigma and a strip for the states."""
-        step = max(1, -(-len(tracks.frames) // _MOST_SAMPLES))
-        frames = tracks.frames[::step].astype(np.float64)
-        d, sigma = solved.d[::step], solved.sigma_mm[::step]
-        values = np.concatenate([d - _BAND * sigma, d + _BAND * sigma])
-        first, last = float(span[0]), float(max(span[1], span[0] + 1))
-        corners = np.array([[first, values.min(initial=0.0)], [last, values.max(initial=1.0)]])
-        plot = framed("jaw-solve", corners, "solved jaw", "frame", "mm", pad_x=False)
-        parts = [self._band(plot, frames, d[:, k], sigma[:, k], color) for k, color in enumerate(CURVE_COLORS)]
-        for k, color in enumerate(CURVE_COLORS):
-            line = path_through(place(plot, np.stack([frames, d[:, k]], axis=1)))
-            parts.append(f'<path d="{line}" fill="none" stroke="{color}" stroke-width="1.5"/>')
-            label = f'<text x="{98 + 57 * k}" y="14" font-size="10" fill="{color}" font-weight="bold">'
-            parts.append(f"{label}{_NAMES[k]}</text>")
-        parts += [self._strip(plot, tracks, solved, state) for state in SolveState]
-        self._plot = drawn(plot, parts)
-        self.definition = self._plot.definition()
 
-    def with_playhead(self, frame: int) -> str:
-        """Return the SVG of the plot with a line at the current frame."""
-        return with_playhead(self._plot, frame)
+def _band(plot: Plot, frames: Array, d: Array, sigma: Array, color: str) -> str:
+    above = place(plot, np.stack([frames, d + _BAND * sigma], axis=1))
+    below = place(plot, np.stack([frames, d - _BAND * sigma], axis=1))
+    return f'<path d="{path_through(np.concatenate([above, below[::-1]]))}Z" fill="{color}" fill-opacity=".2"/>'
 
-    @staticmethod
-    def _band(plot: Plot, frames: Array, d: Array, sigma: Array, color: str) -> str:
-        above = place(plot, np.stack([frames, d + _BAND * sigma], axis=1))
-        below = place(plot, np.stack([frames, d - _BAND * sigma], axis=1))
-        return f'<path d="{path_through(np.concatenate([above, below[::-1]]))}Z" fill="{color}" fill-opacity=".2"/>'
 
-    @staticmethod
-    def _strip(plot: Plot, tracks: Tracks, solved: SolvedJaw, state: SolveState) -> str:
-        """Return a bar along the axis for the frames in a state."""
-        rows = np.flatnonzero(solved.state == state)
-        runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
-        ends = [(float(tracks.frames[run[0]]) - 0.5, float(tracks.frames[run[-1]]) + 0.5) for run in runs]
-        pixels = [place(plot, np.array([[a, plot.low[1]], [b, plot.low[1]]])) for a, b in ends]
-        steps = "".join(f"M{a[0]:.1f} {a[1] - _STRIP_PX / 2:.1f}H{b[0]:.1f}" for a, b in pixels)
-        return f'<path d="{steps}" stroke="{_css(state)}" stroke-width="{_STRIP_PX}"/>'
+def _strip(plot: Plot, tracks: Tracks, solved: SolvedJaw, state: SolveState) -> str:
+    """Return a bar along the axis for the frames in a state."""
+    rows = np.flatnonzero(solved.state == state)
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
+    ends = [(float(tracks.frames[run[0]]) - 0.5, float(tracks.frames[run[-1]]) + 0.5) for run in runs]
+    pixels = [place(plot, np.array([[a, plot.low[1]], [b, plot.low[1]]])) for a, b in ends]
+    steps = "".join(f"M{a[0]:.1f} {a[1] - _STRIP_PX / 2:.1f}H{b[0]:.1f}" for a, b in pixels)
+    return f'<path d="{steps}" stroke="{_css(state)}" stroke-width="{_STRIP_PX}"/>'
 
 
 def solve_words(tracks: Tracks, solved: SolvedJaw, frame: int) -> str:

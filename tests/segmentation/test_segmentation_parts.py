@@ -249,7 +249,7 @@ def test_colours_go_on_where_they_stopped(tmp_path):
     rgb = painted(rng, (90, 120), (170, 104, 96))
     model = taught(rgb, true.any(0))
     for frame in (5, 6):
-        ColourStates(tmp_path, {"cam0": model}).keep(frame, 1)
+        ColourStates(tmp_path, {"cam0": model}).save(frame, 1)
     fresh = ColourModel(10.0)
     states = ColourStates(tmp_path, {"cam0": fresh})
     assert states.restore(9, 1) is None
@@ -264,7 +264,7 @@ def test_damaged_colours_are_done_again(tmp_path):
     model = taught(painted(np.random.default_rng(7), (90, 120), (170, 104, 96)), expect_disks()[1].any(0))
     states = ColourStates(tmp_path, {"cam0": model})
     for frame in (5, 6):
-        states.keep(frame, 1)
+        states.save(frame, 1)
     assert states.restore(6, 1) == 6
     for path in state_files(tmp_path):  # only that of frame 6, then both
         path.write_bytes(path.read_bytes()[:-40])

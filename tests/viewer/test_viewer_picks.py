@@ -9,7 +9,8 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, TRACKED, Tracks, uncovered_percent
 from jawusd.geometry import make_transform, random_rotation, transform_points
 from jawusd.viewer.picking import FOV_RAD, PickBook, PickingLayout, fit_view, hit_vertex, region_around
-from jawusd.viewer.take_plots import CoveragePlot, frame_words, frames_to_inspect
+from jawusd.viewer.plots import with_playhead
+from jawusd.viewer.take_plots import coverage_plot, frame_words, frames_to_inspect
 
 
 def filled():
@@ -156,9 +157,9 @@ def test_worst_frames_are_the_lost_and_the_badly_covered_ones():
 def test_the_plot_marks_the_frame_and_breaks_where_nothing_is_known():
     tracks = made_up_tracks()
     tracks.coverage_error[50:60] = np.nan
-    plot = CoveragePlot(tracks, (100, 199), [140])
-    assert plot.definition.count("M") >= 4 and "nan" not in plot.definition
-    left, right = plot.with_playhead(100), plot.with_playhead(199)
+    plot = coverage_plot(tracks, (100, 199), [140])
+    assert plot.static.count("M") >= 4 and "nan" not in plot.static
+    left, right = with_playhead(plot, 100), with_playhead(plot, 199)
     assert left != right and "nan" not in left + right
 
 
