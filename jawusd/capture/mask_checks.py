@@ -47,19 +47,19 @@ def swapped_cameras(
     return [(a, b) for a, b in combinations(wrong, 2) if fits(a, b) and fits(b, a)]
 
 
-def centre_findings(cameras: Mapping[str, Camera], middles: Sequence[Sequence[MaskCentres]]) -> Iterator[Finding]:
+def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[MaskCentres]]) -> Iterator[Finding]:
     """Yield findings about cameras whose mask centres contradict those of other cameras.
 
     Args:
         cameras: calibrated cameras by name.
-        middles: mask centres at some instants, one entry per candidate offset; the best candidate counts.
+        centres: mask centres at some instants, one entry per candidate offset; the best candidate counts.
 
     The camera that is part of most inconsistent pairs is reported.
     """
     apart: dict[tuple[str, str], float] = {}
     for pair in combinations(cameras, 2):
         distances = []
-        for guesses in middles:
+        for guesses in centres:
             seen = [found for found in guesses if all(name in found for name in pair)]
             distances += [min(_rays_mm(cameras, pair, found) for found in seen)] if seen else []
         if distances:

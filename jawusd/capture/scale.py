@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.capture.bundle import Bundle, camera_from
+from jawusd.capture.camera_checks import common_target
 from jawusd.formats.capture import Bootstrap
-from jawusd.geometry import Camera, se3_inverse, triangulate
+from jawusd.geometry import Camera, triangulate
 
 _FEWEST_PICKS = 3  # per jaw
 _TOLERANCE = 0.03  # picks determine the scale to about 0.5 %
@@ -116,12 +117,7 @@ def mouth_centre(cameras: list[Camera], bootstrap: Bootstrap | None, T_world_boa
         return np.concatenate([points for _, points in picks.values()]).mean(0), "the picked teeth"
     if len(cameras) == 1:
         return np.median(T_world_board[:, :3, 3], axis=0), "the centre of the boards"
-    # The point closest to all optical axes.
-    T = np.stack([se3_inverse(camera.T_cam_world) for camera in cameras])
-    across = np.eye(3) - T[:, :3, 2, None] * T[:, None, :3, 2]
-    return np.linalg.solve(across.sum(0), (across @ T[:, :3, 3, None]).sum(0))[
-        :, 0
-    ], "the intersection of the optical axes"
+    return common_target(cameras), "the intersection of the optical axes"
 
 
 def board_shape_error(cameras: list[Camera], bundle: Bundle, points_mm: Array, centre_mm: Array) -> ShapeError:

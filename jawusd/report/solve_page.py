@@ -216,7 +216,7 @@ def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
             solved.valid & ~is_inside(solved.margin_mm),
             "the pose lies outside the rig's bound, but within the tolerance of measured poses",
         ),
-        ("outside", ~solved.valid, "the rig does not allow the pose"),
+        ("outside", ~solved.valid, "the pose is invalid for the rig"),
     )
     total = max(len(solved.state), 1)
     return [(name, int(has.sum()), f"{100 * has.sum() / total:.1f} %", words) for name, has, words in rows]

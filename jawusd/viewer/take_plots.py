@@ -137,7 +137,7 @@ def solve_words(tracks: Tracks, solved: SolvedJaw, frame: int) -> str:
     for name, value, sigma in zip(_NAMES, solved.d[row], solved.sigma_mm[row], strict=True):
         parts.append(f"{name} {value:.2f} &plusmn; {sigma:.2f} mm (1 sigma)")
     margin = float(solved.margin_mm[row])
-    verdict = "" if solved.valid[row] else ": <b>the rig does not allow this pose</b>"
+    verdict = "" if solved.valid[row] else ": <b>invalid for the rig</b>"
     where = place_of(margin, float(tracks.meta.get("tolerance_mm", 0.0)))
     parts.append(f"bound: {where}, margin {margin:.2f} mm{verdict}")
     return "<br>".join(parts)

@@ -239,7 +239,7 @@ def test_a_solve_is_shown_with_its_states(viewed, copy, tmp_path):
     words = footage._words.content
     assert "upper: solved from the pictures" in words and "d1 opening 10.00 &plusmn; 0.05 mm" in words
     opened.press(footage.slider, FIRST + 20)
-    assert "bound: outside, margin -0.75 mm: <b>the rig does not allow this pose" in footage._words.content
+    assert "bound: outside, margin -0.75 mm: <b>invalid for the rig" in footage._words.content
     opened.press(footage.slider, FIRST + 7)
     assert "lower: out of sight" in footage._words.content and "1.25 mm" in footage._words.content
     poses = shown.tracked_poses(FIRST + 7)
