@@ -1,4 +1,4 @@
-"""Finding boards in drawn pictures whose corners are known."""
+"""Board detection in synthetic pictures with known corners."""
 
 from fractions import Fraction
 from functools import partial
@@ -50,7 +50,7 @@ def write_pictures(folder, images):
 
 
 def quiet(done, total):
-    """Swallow progress."""
+    """Ignore progress."""
 
 
 def test_chessboard_corners_in_video_are_those_projected(tmp_path):
@@ -69,7 +69,7 @@ def test_chessboard_corners_in_video_are_those_projected(tmp_path):
 
 @pytest.mark.parametrize("scale", [1.5, 0.3])
 def test_large_pictures_are_searched_at_half_their_size_unless_a_board_is_too_small_there(tmp_path, scale):
-    """The smaller board has squares of 7 px, of which half is too little."""
+    """The smaller board has squares of 7 px, too small at half resolution."""
     wide, images = (960, 1280), []
     for camera in pictures(board()):
         images.append([])
@@ -107,7 +107,7 @@ def test_charuco_in_numbered_pictures_keeps_the_numbers_of_its_corners(tmp_path)
 @pytest.mark.parametrize("legacy", [True, False])
 @pytest.mark.parametrize(("cols", "rows"), [(7, 5), (6, 5), (4, 7), (6, 4), (7, 6)])
 def test_charuco_boards_of_before_opencv_4_6_are_found(tmp_path, cols, rows, legacy):
-    """Boards of an even number of rows of squares, (7, 5), (6, 5) and (4, 7), were drawn otherwise."""
+    """Older OpenCV drew boards with an even number of rows, (7, 5), (6, 5) and (4, 7), differently."""
     about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 6.5, "square_mm": 9.0}
     about |= {"cols": cols, "rows": rows}
     images = pictures(board(**about), partial(charuco, legacy=legacy), T_world_board=POSES[:3])
@@ -131,7 +131,7 @@ def test_the_width_of_edges_is_that_of_the_blur(sigma):
     T[2, 3] = 200
     image = cv2.GaussianBlur(photograph(CAMERAS[0], T, texture, to_texture), (0, 0), sigma)
     corners = opencv_pixels(CAMERAS[0], corner_grid(boards) + [0, 0, 200])
-    # Drawing and differencing add half a pixel in squares; where edges cross, blur hides some of them.
+    # Rasterisation and differencing add half a pixel in quadrature; blur hides some edges at crossings.
     assert 0.95 < edge_width_px(image, corners, 9) / (2.563 * np.hypot(sigma, 0.5)) < 1.25
 
 
@@ -217,7 +217,7 @@ def test_a_clip_cut_short_is_used_and_said(tmp_path):
 
 
 def write_woven(folder, images, order):
-    """Write pictures whose odd rows show the next pose, marked as fields."""
+    """Write interlaced pictures, with the next pose in odd rows."""
     paths = []
     for c, camera in enumerate(images):
         path = folder / f"c{c}.mp4"

@@ -1,4 +1,4 @@
-"""Calibration from projected corners: against the cameras that projected them, and every way it must refuse."""
+"""Calibration from projected corners, compared with the true cameras, and all its errors."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_distances_survive_whatever_order_the_corners_come_in(tmp_path, cols, ro
         for v in range(24):
             grid = corners[c, v].reshape(rows, cols, 2)
             corners[c, v] = np.rot90(grid, turns[rng.integers(len(turns))]).reshape(-1, 2)
-    corners[1, 3, 5] += 30  # a corner mistaken for another thing
+    corners[1, 3, 5] += 30  # an outlier corner
     corners[2, 4:7] = np.nan  # views one camera missed
     capture = capture_of(CAMERAS, boards, tmp_path)
     cameras, report = calibrate_detections(altered(found, corners_px=corners), capture, {})
@@ -82,7 +82,7 @@ def test_clips_that_are_not_simultaneous_are_refused(tmp_path):
     rng, boards = np.random.default_rng(2), board()
     found = detections(CAMERAS, boards, poses(20, rng), rng)
     corners = found.corners_px.copy()
-    corners[1] = np.roll(corners[1], 3, axis=0)  # as if cut at the beginning
+    corners[1] = np.roll(corners[1], 3, axis=0)  # as if trimmed at the start
     with pytest.raises(CalibrationError, match=r"c0 and c1 are inconsistent.*of 20 agree.*synchronous"):
         calibrate_detections(altered(found, corners_px=corners), capture_of(CAMERAS, boards, tmp_path), {})
 
@@ -102,7 +102,7 @@ def test_too_few_views_are_refused_per_camera_and_per_pair(tmp_path):
 
 
 def picked(rng, noise_px=1.0):
-    """Return scans and picks of four points per jaw, seen by two cameras each with a mouse's accuracy."""
+    """Return scans and picks of four points per jaw in two cameras, with mouse accuracy."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix(), CENTRE
     scans, picks = {}, {}

@@ -1,4 +1,4 @@
-"""A calibration that cannot be right is told from its numbers alone; one that can be is not."""
+"""Implausible calibrations are found from their numbers alone, without false alarms."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Cameras aligned by time code and by the numbers of their pictures."""
+"""Synchronisation by time code and by picture numbers."""
 
 from fractions import Fraction
 
@@ -85,7 +85,7 @@ def test_a_time_code_whose_numbers_hold_parts_of_pictures_is_refused(tmp_path):
 
 
 def test_headers_of_fast_pictures_count_pairs(tmp_path):
-    """They have no room for more than 39 frames of a second."""
+    """They cannot represent more than 39 frames per second."""
     clips = {}
     for name, frame in (("a", 0x10), ("b", 0x13)):
         pattern = write_sequence(tmp_path / name, IMAGES, "exr")

@@ -1,4 +1,4 @@
-"""Alignment by sound, by time in videos of variable rate, and clips that offer neither flash nor sound."""
+"""Synchronisation by sound, videos of variable rate, and clips with neither flashes nor sound."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -20,7 +20,7 @@ TICK = Fraction(1, 90000)
 
 
 def speech(seconds: float, rate: int, seed: int = 0) -> np.ndarray:
-    """Make something like a voice: filtered noise in bursts of irregular length."""
+    """Return a synthetic voice: filtered noise in bursts of irregular length."""
     rng = np.random.default_rng(seed)
     noise = fftconvolve(rng.normal(size=int(seconds * rate)), np.exp(-np.arange(40) / 6.0), mode="same")
     edges = np.cumsum(rng.uniform(0.05, 0.6, 400))
@@ -29,7 +29,7 @@ def speech(seconds: float, rate: int, seed: int = 0) -> np.ndarray:
 
 
 def heard(scene: np.ndarray, at: float, seconds: float, rate: int, seed: int, noise: float = 0.2) -> np.ndarray:
-    """Return what a microphone hears from a moment on: echoes, its own noise, another loudness."""
+    """Return a microphone's recording from a start time: echoes, noise and gain."""
     rng = np.random.default_rng(seed)
     first = round(at * rate)
     part = scene[first : first + round(seconds * rate)]
@@ -45,7 +45,7 @@ def test_the_delay_is_found_to_a_fraction_of_a_frame(late_s: float) -> None:
     a = resample_poly(heard(scene, 5.0, 20, rate, 1), 1, 4)
     b = resample_poly(heard(scene, 5.0 + late_s, 25, rate, 2), 1, 4)
     found = match_sounds(Sound(b, RATE_HZ, 0.5), Sound(a, RATE_HZ, 0.0))
-    # b begins later in the scene and its file counts from 0.5 s.
+    # b starts later in the scene, and its file starts at 0.5 s.
     assert found.delay_s == pytest.approx(late_s - 0.5, abs=0.001)
     assert 0.3 < found.confidence <= 1
 

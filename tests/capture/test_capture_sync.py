@@ -1,4 +1,4 @@
-"""Light-flash alignment on videos exposed by a simulated lamp, and every way it can fail."""
+"""Synchronisation by light flashes on videos with a simulated lamp, and all its errors."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ FLASHES = ((10.3, 16.0), (371.0, 378.4))  # dark, in frames of the reference cam
 def exposures(
     count: int, start: float, flashes: tuple[tuple[float, float], ...] = FLASHES, exposure: float = 1.0
 ) -> np.ndarray:
-    """Return the lit share of each frame's exposure for a camera that starts at a time [reference frames]."""
+    """Return the lit fraction of each frame's exposure for a camera that starts at a time [reference frames]."""
     opened = start + np.arange(count)
     lit = np.ones(count)
     for off, on in flashes:
@@ -135,7 +135,7 @@ def steps(*times: float) -> list[Step]:
 def test_alignments_that_fit_equally_well_are_refused() -> None:
     with pytest.raises(SyncError, match=r"equally well at offsets of \S+ and \S+ frames"):
         match_steps(steps(10, 15), steps(20, 25, 600, 605), FPS)
-    # One frame more of darkness tells them apart.
+    # One more dark frame resolves the ambiguity.
     assert match_steps(steps(10, 15), steps(20, 25, 600, 606), FPS).frames == 10
 
 

@@ -1,4 +1,4 @@
-"""The report in a real browser, opened from disk: light and dark, no request, no console error, the replay moves."""
+"""The report opened from disk in a browser: light and dark, no requests, no console errors, a moving replay."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ chromium = pytest.fixture(headless_chromium, scope="module")
 
 @pytest.fixture(params=["light", "dark"])
 def opened(request, chromium, tmp_path):
-    """Open the report of an example; what went wrong and what was asked for is checked afterwards."""
+    """Open the report of an example; errors and requests are checked afterwards."""
     data, path = report_data(lost=(20, 21)), tmp_path / "report.html"
     write_document(path, data)
     page, trouble, requests = open_page(chromium, 1200, 900, color_scheme=request.param), [], []
@@ -37,7 +37,7 @@ def part(page, name):
 
 
 def picture(page):
-    """Return the replay as drawn, (h, w, 3)."""
+    """Return the rendered replay, (h, w, 3)."""
     import io
 
     from PIL import Image
@@ -51,7 +51,7 @@ def move_to(page, row):
 
 
 def ball(name, kind, radius, place=(0.0, 0.0, 0.0)):
-    """Return a ball of the replay that stands still."""
+    """Return a fixed ball for the replay."""
     made = trimesh.creation.icosphere(subdivisions=4, radius=radius)
     return ReplayPart(name, kind, False, Mesh(np.asarray(made.vertices) + place, np.asarray(made.faces, np.int32)))
 
@@ -65,7 +65,7 @@ def test_bone_that_nearly_coincides_with_teeth_stays_behind_them(chromium, tmp_p
     drawn = picture(page)
     red, green, blue = drawn[drawn.shape[0] // 2, drawn.shape[1] // 2]
     page.context.close()
-    colour = {"tooth": 0.90 / 0.95, "bone": 0.72 / 0.84}[seen]  # as replay.js paints them
+    colour = {"tooth": 0.90 / 0.95, "bone": 0.72 / 0.84}[seen]  # as in replay.js
     assert blue / red == pytest.approx(colour, abs=0.02)
 
 
@@ -87,7 +87,7 @@ def test_no_width_scrolls_the_page_sideways(chromium, tmp_path, scheme, width):
     assert wide[0] <= wide[1] == width
     assert len(links) > 5 and max(links) <= width
     assert len(cells) > 20 and max(cells) <= width  # verdicts are read without scrolling
-    assert letters > 8  # drawings are legible, and scrolled by themselves
+    assert letters > 8  # drawings are legible and scroll separately
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -1,4 +1,4 @@
-"""The report is one file that needs nothing else, shows everything, and takes no orders from what it shows."""
+"""The report is a self-contained file, complete, and immune to injected markup."""
 
 import base64
 import re
@@ -27,7 +27,7 @@ HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"' {{ 
 
 
 class Page(HTMLParser):
-    """Collect what a page consists of."""
+    """Collect the elements of a page."""
 
     def __init__(self, text):
         super().__init__()
@@ -46,7 +46,7 @@ class Page(HTMLParser):
 
 
 def outside(text):
-    """Return what a page would fetch from elsewhere."""
+    """Return the external references of a page."""
     page = Page(text)
     names = ("src", "href", "xlink:href", "srcset", "action", "poster", "data", "ping")
     links = [value for name in names for value in page.values(name) if not value.startswith(("#", "data:"))]
@@ -61,7 +61,7 @@ def page():
 
 @pytest.fixture
 def words_alone(monkeypatch):
-    """Leave the figures out, which take most of the time of a page."""
+    """Skip the figures, which take most of the time of a page."""
     monkeypatch.setattr(report_document, "inline_svg", lambda *arguments: "")
 
 
@@ -174,7 +174,7 @@ def test_commands_are_set_as_code_and_no_backtick_is_seen():
     text = document(data)
     shown = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
     assert "`" not in shown
-    assert shown.count("<code>jawusd check &lt;it&gt;</code>") == 9  # the finding also stands in the verdict
+    assert shown.count("<code>jawusd check &lt;it&gt;</code>") == 9  # the verdict contains the finding too
     assert worded("one ` alone") == "one ` alone"
 
 
@@ -232,7 +232,7 @@ def test_the_replay_carries_the_poses_and_the_meshes():
     expected = moved((A @ data.tracks.T_upper_lower)[~lost], points)
     np.testing.assert_allclose(moved(motion[~lost], at_rest), expected, atol=1e-3)
     fitted = np.frombuffer(base64.b64decode(packed["fitted"]), "<f4").reshape(-1, 3, 4)
-    np.testing.assert_allclose(moved(fitted[~lost], at_rest), expected, atol=1e-3)  # the take is the model's own
+    np.testing.assert_allclose(moved(fitted[~lost], at_rest), expected, atol=1e-3)  # the take was made by the model
     for part, wanted in zip(packed["parts"], data.parts, strict=True):
         steps = np.frombuffer(base64.b64decode(part["vertices"]), "<u2").reshape(-1, 3)
         np.testing.assert_allclose(part["low"] + steps * part["step"], wanted.mesh.vertices, atol=0.002)

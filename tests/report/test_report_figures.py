@@ -1,4 +1,4 @@
-"""The figures are drawn from results alone: every file, readable, the same each time, without any text cut away."""
+"""Figures are drawn from results alone: every file exists, is reproducible, and has no clipped text."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -29,7 +29,7 @@ def test_every_figure_is_a_picture_and_a_drawing(tmp_path, bones, gaps):
                 shown = np.asarray(picture.convert("RGB"))
             assert min(shown.shape[:2]) > 300 and shown.std() > 5
             edge = np.concatenate([shown[0], shown[-1], shown[:, 0], shown[:, -1]])
-            assert (edge == 255).all()  # nothing runs off the page
+            assert (edge == 255).all()  # nothing is clipped
         else:
             assert ElementTree.parse(path).getroot().tag.endswith("svg")
 

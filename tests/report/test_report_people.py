@@ -1,4 +1,4 @@
-"""The bars of many actors end where the ranges end, each in the row of its name."""
+"""The bars of several actors match their ranges, each in the row of its name."""
 
 import pytest
 

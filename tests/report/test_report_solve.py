@@ -1,4 +1,4 @@
-"""The page of a solved performance: what it counts, names and draws, from a performance made up here."""
+"""The page of a made-up solved performance: counts, names and drawings."""
 
 import re
 from dataclasses import replace
@@ -13,7 +13,7 @@ from jawusd.report.solve_page import jaw_figure, seen_figure, solve_page, unseen
 
 
 def text_of(page):
-    """Return what a reader sees, without tags."""
+    """Return the visible text, without tags."""
     parts = []
     reader = HTMLParser()
     reader.handle_data = parts.append

@@ -1,4 +1,4 @@
-"""Reports of takes that show little or nothing: drawn without a fault, and not called good for what is not known."""
+"""Reports of takes with little or no data: no errors, and no good grades for unknown values."""
 
 from dataclasses import replace
 
@@ -10,11 +10,11 @@ from jawusd.paper.figures import condyle_figure, parameter_figure, reconstructio
 from jawusd.report.solve_page import solve_page
 from jawusd.report.verdicts import GOOD, OPEN, judge
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")  # a division by zero, the mean of nothing
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")  # division by zero, mean of an empty array
 
 
 def rows_of(tracks, rows):
-    """Return the tracks of some frames alone."""
+    """Return the tracks restricted to some frames."""
     count = len(tracks.frames)
     values = {name: getattr(tracks, name) for name in tracks.__dataclass_fields__}
     cut = {n: v[rows] for n, v in values.items() if isinstance(v, np.ndarray) and len(v) == count}
@@ -22,7 +22,7 @@ def rows_of(tracks, rows):
 
 
 def cut_data(rows):
-    """Return the data of a report on a build of some of its frames."""
+    """Return report data restricted to some frames."""
     data = report_data(experiments=None)
     model = data.model
     cut = {name: getattr(model, name)[rows] for name in ("frames", "d", "residual_mm", "trained")}

@@ -1,4 +1,4 @@
-"""The verdicts: a good build is called good, and each planted fault is found at its stage."""
+"""Verdicts: a good build is good, and each planted fault is found at its stage."""
 
 from dataclasses import replace
 

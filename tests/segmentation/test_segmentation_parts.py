@@ -1,4 +1,4 @@
-"""The parts of the segmentation against what is known otherwise: exact cuts, painted colours, drawn masks."""
+"""Parts of the segmentation against independent references: exact cuts, known colours, known masks."""
 
 import cv2
 import numpy as np
@@ -91,7 +91,7 @@ def test_dark_lips_under_crowns_do_not_make_darkness_teeth():
     rng = np.random.default_rng(4)
     rgb = painted(rng, (100, 100), (170, 104, 96))  # lips
     rgb[40:60] = painted(rng, (20, 100), (205, 196, 176))  # teeth
-    rgb[30:40] = painted(rng, (10, 100), (64, 42, 38), 3)  # lips in shadow, nowhere but under crowns
+    rgb[30:40] = painted(rng, (10, 100), (64, 42, 38), 3)  # lips in shadow, only under crowns
     under = np.zeros((100, 100), bool)
     under[30:60] = True
     model = ColourModel(10.0)
@@ -114,7 +114,7 @@ def test_borders_settle_where_the_picture_changes():
     assert shares[1].max() == 0
     assert not (shares[0][:16, 98:] > 0.5).any()
     found = np.abs(shares[0].sum() - tooth.sum()) / tooth.sum()
-    assert found < 0.05  # began 16 % too small
+    assert found < 0.05  # initially 16 % too small
     assert clear[np.abs(away) < 1].mean() > 0.95
     assert (np.abs(away)[(shares[0] > 0.5) != (tooth[..., 0] > 0.5)] < 1.5).all()
 
@@ -178,7 +178,7 @@ def test_strokes_say_something_only_where_they_are(tmp_path):
 
 
 def expect_disks():
-    """Return what is expected of two disks of teeth, and their true places, in a picture of 90 x 120 px."""
+    """Return the expected and true position of two disks of teeth in a picture of 90 x 120 px."""
     y, x = np.mgrid[:90, :120]
     inside = np.stack([22.0 - np.hypot(x - cx, y - 45) for cx in (32, 88)]).astype(np.float32)
     labels = np.select([inside[0] > 0, inside[1] > 0], [UPPER, LOWER]).astype(np.uint8)
@@ -197,8 +197,8 @@ def test_strokes_overcome_every_colour():
     rgb = painted(rng, (90, 120), (170, 104, 96))
     rgb[true.any(0)] = painted(rng, (int(true.sum()),), (205, 196, 176))
     known, share = np.zeros((2, 90, 120), bool), np.zeros((2, 90, 120), np.float32)
-    known[0, 40:50, 25:40] = True  # not the upper row, though all else says so
-    known[1, 2:6, 2:6], share[1, 2:6, 2:6] = True, 1.0  # the lower row, though all else speaks against it
+    known[0, 40:50, 25:40] = True  # annotated against the upper row, contrary to all other evidence
+    known[1, 2:6, 2:6], share[1, 2:6, 2:6] = True, 1.0  # annotated as the lower row, contrary to all other evidence
     seeds = Seeds(known, share)
     model = taught(rgb, true.any(0))
     free = cut_arches(rgb, expected, model, SegmentationConfig(), 7.2, 1.0)
@@ -213,7 +213,7 @@ def test_rows_part_where_teeth_meet_and_not_where_they_were_expected():
     rng = np.random.default_rng(8)
     y = np.arange(90)[:, None] * np.ones((1, 120))
     teeth = (y > 15) & (y < 75)
-    clean = np.where(teeth[..., None], np.array((205, 196, 176)), (140, 70, 66))  # lips: a far stronger edge
+    clean = np.where(teeth[..., None], np.array((205, 196, 176)), (140, 70, 66))  # lips have a much stronger edge
     clean = np.where((teeth & (np.abs(y - 43) < 1.5))[..., None], (165, 158, 142), clean)  # where the rows meet
     rgb = np.clip(clean + rng.normal(0, 3, clean.shape), 0, 255).astype(np.uint8)
     expected_y = 47.0  # half a millimetre off
@@ -223,7 +223,7 @@ def test_rows_part_where_teeth_meet_and_not_where_they_were_expected():
     found = separate_arches(shares, rgb, Expectation(labels, inside), SegmentationConfig(), 7.2)
     assert np.allclose(found.sum(0), shares.sum(0), atol=1e-5)
     edge = (found[0] > 0.5).sum(0) + 16
-    assert edge.min() >= 42 and edge.max() <= 46  # expected it would be 48
+    assert edge.min() >= 42 and edge.max() <= 46  # it would be 48 at the prediction
 
 
 def test_numbers_are_learned_from_wider_drawn_masks():
@@ -255,7 +255,7 @@ def test_colours_go_on_where_they_stopped(tmp_path):
     assert states.restore(9, 1) is None
     assert states.restore(5, -1) is None
     assert not fresh.is_trained()
-    assert states.restore(7, 1) == 6  # frame 7 is on record, its colours are not
+    assert states.restore(7, 1) == 6  # frame 7 is recorded, but its colours are not saved
     assert states.restore(5, 1) == 5
     assert np.array_equal(fresh.log_odds(rgb), model.log_odds(rgb))
 
@@ -266,7 +266,7 @@ def test_damaged_colours_are_done_again(tmp_path):
     for frame in (5, 6):
         states.save(frame, 1)
     assert states.restore(6, 1) == 6
-    for path in state_files(tmp_path):  # only that of frame 6, then both
+    for path in state_files(tmp_path):  # first only that of frame 6, then both
         path.write_bytes(path.read_bytes()[:-40])
         assert states.restore(6, 1) == (5 if path == state_files(tmp_path)[0] else None)
 

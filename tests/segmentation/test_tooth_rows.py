@@ -1,4 +1,4 @@
-"""Rows of teeth in drawn pictures of mouths, against the masks they were drawn from."""
+"""Rows of teeth in synthetic pictures of mouths, compared with their true masks."""
 
 import cv2
 import numpy as np
@@ -47,7 +47,7 @@ def test_closed_rows_are_said_to_be_bridged():
 
 
 def test_a_face_without_teeth_has_no_rows():
-    """Grey walls and bright skin are no teeth."""
+    """Grey walls and bright skin are not teeth."""
     picture = mouth(20)[0]
     picture[(picture > 180).all(2)] = DARK
     assert tooth_rows(picture) is None

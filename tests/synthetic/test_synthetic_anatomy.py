@@ -1,4 +1,4 @@
-"""The modelled teeth and bones: sizes, closed outward surfaces, occlusion, agreement with the kinematics."""
+"""Teeth and bones: sizes, closed outward surfaces, occlusion, consistency with the kinematics."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_teeth_meet_in_occlusion_without_cutting(people: list[tuple[Person, Pers
     for _, anatomy in people:
         gaps = anatomy.occlusion.gaps(np.eye(4))
         assert gaps.min() > 0.0
-        assert (gaps[:, 3:] < 0.25).all()  # every back tooth has its contact
+        assert (gaps[:, 3:] < 0.25).all()  # every back tooth has a contact
 
 
 def test_gum_hides_the_crown_bases(people: list[tuple[Person, PersonAnatomy]]) -> None:

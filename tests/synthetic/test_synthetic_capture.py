@@ -1,4 +1,4 @@
-"""A whole small capture, read back with the package's own readers and with PyAV and trimesh."""
+"""A complete small capture, read back with the package's readers and with PyAV and trimesh."""
 
 from pathlib import Path
 
@@ -111,7 +111,7 @@ def test_true_poses_put_the_teeth_into_their_masks(capture: Capture, truth: dict
                 outline = np.zeros(CONFIG.size_px[::-1], bool)
                 inside = ((pixels >= 0) & (pixels < CONFIG.size_px)).all(1)
                 outline[tuple(pixels[inside].T[::-1])] = True
-                # the mask holds nothing that is not projected tooth, except for the pixels between vertices
+                # the mask contains only projected teeth, except for the pixels between vertices
                 grown = np.zeros_like(outline)
                 for dy in range(-3, 4):
                     for dx in range(-3, 4):

@@ -1,4 +1,4 @@
-"""The committed example capture: complete, small, and true to itself."""
+"""The committed example capture: complete, small and consistent."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The synthetic person moves like people do: ranges from published measurements, exact joint mechanics."""
+"""Synthetic persons have published ranges of motion and exact joint mechanics."""
 
 import numpy as np
 import pytest
@@ -100,9 +100,9 @@ def test_closed_glides_drop_the_incisors(people: list[Person]) -> None:
 
 def test_left_and_right_are_not_swapped(people: list[Person]) -> None:
     T = people[0].pose(0.0, 1.0, 0.0)
-    assert people[0].incisor(T)[0] > 5  # the chin goes to the subject's left
+    assert people[0].incisor(T)[0] > 5  # the chin moves to the subject's left
     moved = transform_points(T, people[0].joint.condyles) - people[0].joint.condyles
-    assert moved[1, 2] > 3 * abs(moved[0, 2])  # the right condyle goes forward, the left one turns on the spot
+    assert moved[1, 2] > 3 * abs(moved[0, 2])  # the right condyle moves forward, the left one rotates
 
 
 @pytest.mark.parametrize("kind", ["training", "hidden"])

@@ -1,4 +1,4 @@
-"""Persons over the human range: their bites measured on the meshes, their masks against cv2's projection."""
+"""Random persons: bites measured on the meshes, and masks compared with cv2's projection."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def _solid(arch) -> trimesh.Trimesh:
 
 
 def _winding_number(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
-    """How often a closed mesh surrounds points, by solid angles (van Oosterom and Strackee 1983)."""
+    """Return the winding number of a closed mesh at points, by solid angles (van Oosterom and Strackee 1983)."""
     a, b, c = np.moveaxis(mesh.triangles[None] - points[:, None, None], 2, 0)
     la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
     triple = np.einsum("pfi,pfi->pf", a, np.cross(b, c))
@@ -48,7 +48,7 @@ def _winding_number(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def _edge(mesh: trimesh.Trimesh, up: float) -> np.ndarray:
-    """The incisal edge at the midline, cut with planes: where the front teeth end."""
+    """Return the incisal edge at the midline from sections with planes."""
     ends = []
     for x in np.linspace(-4.0, 4.0, 17):
         section = mesh.section(plane_origin=[x, 0, 0], plane_normal=[1, 0, 0])
@@ -66,7 +66,7 @@ def test_bites_cover_the_human_range(bites: list[Bite]) -> None:
     overbite, overjet = edges[:, 1, 1] - edges[:, 0, 1], edges[:, 0, 2] - edges[:, 1, 2]
     assert overbite.min() < -1.0 and overbite.max() > 5.0
     assert overjet.min() < -1.0 and overjet.max() > 7.0
-    usual = [i for i, b in enumerate(bites) if abs(b.overbite_mm) < 4]  # where both measure the same edges
+    usual = [i for i, b in enumerate(bites) if abs(b.overbite_mm) < 4]  # both measure the same edges
     np.testing.assert_allclose(np.median(np.abs(overbite[usual] - [bites[i].overbite_mm for i in usual])), 0, atol=0.5)
     assert {draw_traits(seed).bite for seed in SEEDS} >= {"normal", "deep", "open", "large overjet", "crossbite"}
     kinds = {draw_traits(seed).bite for seed in range(80)}
@@ -91,7 +91,7 @@ def test_teeth_touch_in_occlusion_and_do_not_run_into_one_another(bites: list[Bi
         gap = cKDTree(a).query(b)[0].min()
         assert gap < 0.35, (seed, gap)
         deepest = 0.0
-        for tooth in upper.split(only_watertight=True):  # closed crowns say what is inside them
+        for tooth in upper.split(only_watertight=True):  # closed crowns define their interior
             near = lower.vertices[((lower.vertices > tooth.bounds[0]) & (lower.vertices < tooth.bounds[1])).all(1)]
             if len(near):
                 inside = near[_winding_number(near, tooth) > 0.5]
@@ -182,7 +182,7 @@ def test_annotators_draw_gum_and_edges_where_they_see_them(gum_mm: float, edge_p
         camera_px=np.zeros(1), wobble_px=0.0, papilla=0.0, sliver_px=2.0, missing=0.0, gross=0.0,
     )  # fmt: skip
     first, last = [], []
-    for part in range(FINER):  # of a pixel: on average over all places of an edge, a third of a pixel counts too
+    for part in range(FINER):  # subpixel shifts: averaged over all edge positions, a third of a pixel has an effect too
         tooth = np.zeros((FINER * 300, FINER * 400), np.uint8)
         tooth[FINER * 100 + part : FINER * 200 + part, FINER * 100 : FINER * 300] = 1
         gum = np.zeros(tooth.shape, bool)
@@ -191,7 +191,7 @@ def test_annotators_draw_gum_and_edges_where_they_see_them(gum_mm: float, edge_p
         column = np.flatnonzero(hand.draw(tooth, gum, (0, 0), FINER * 10.0)[:300, 200])
         first.append(column[0])
         last.append(column[-1])
-    middle = (FINER - 1) / (2 * FINER)  # of the parts
+    middle = (FINER - 1) / (2 * FINER)  # centre of the subpixels
     assert np.mean(first) == pytest.approx(100 + middle - 10 * gum_mm, abs=0.35)
     assert np.mean(last) == pytest.approx(199 + middle + edge_px, abs=0.35)
     if gum_mm == 0.0:

@@ -1,4 +1,4 @@
-"""Rendered pictures against another rasteriser, OpenCV's lens model and plain optics."""
+"""Rendered pictures compared with another rasteriser, OpenCV's lens model and geometric optics."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ Studio = Callable[..., tuple[render.Renderer, list[Camera]]]
 
 @pytest.fixture
 def studio() -> Iterator[Studio]:
-    """Open a renderer with the three cameras; skip where there is no EGL."""
+    """Open a renderer with the three cameras; skip without EGL."""
     with contextlib.ExitStack() as stack:
 
         def open_studio(size: tuple[int, int] = SIZE) -> tuple[render.Renderer, list[Camera]]:
@@ -90,7 +90,7 @@ def test_a_square_lands_where_opencv_projects_it(studio: Studio) -> None:
 
 
 def _miss(outline: np.ndarray, share: np.ndarray) -> list[float]:
-    """Compare coverage with the area inside an outline: shift right, shift down, growth outwards [px]."""
+    """Compare coverage with the area of an outline: shift right, shift down, outward offset [px]."""
     x, y = outline.T
     cross = x * np.roll(y, -1) - np.roll(x, -1) * y  # shoelace formulas
     area = cross.sum() / 2
@@ -155,13 +155,13 @@ def test_masks_of_the_mouth_agree_with_the_cpu_rasteriser(studio: Studio) -> Non
                 drawn, expected = coverage > 127, visible == label
                 assert expected.sum() > 3000
                 outline = cv2.morphologyEx(expected.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
-                # a tenth of a pixel along the outline, which is about half as long as its morphological gradient
+                # a tenth of a pixel along the outline, whose length is about half of its morphological gradient
                 assert abs(int(drawn.sum()) - int(expected.sum())) < 0.1 * outline.sum() / 2
                 assert (drawn != expected).sum() < 0.15 * outline.sum()
 
 
 def _visible(camera: Camera, meshes: list[Mesh], teeth: list[np.ndarray]) -> np.ndarray:
-    """Labels seen by each pixel: nearest-surface rasterisation of a finer pinhole picture, then OpenCV's lens."""
+    """Return the visible label per pixel: rasterise a finer pinhole picture, then apply OpenCV's lens."""
     fine = 3
     scaled = camera.scaled((fine * camera.size_px[0], fine * camera.size_px[1]))
     width, height = scaled.size_px

@@ -1,4 +1,4 @@
-"""The performance in front of the cameras, the jitter of the masks and the choice of picks."""
+"""Takes, mask jitter and picks."""
 
 import numpy as np
 import pytest
@@ -97,7 +97,7 @@ def test_outline_jitter_has_the_stated_size_and_constant_share() -> None:
     fields = np.stack([outline.next() for _ in range(60)])
     assert fields.std() == pytest.approx(0.7, rel=0.06)
     now, later = fields[:-10].ravel(), fields[10:].ravel()
-    assert 0.35 < np.corrcoef(now, later)[0, 1] < 0.65  # half of it is habit and stays
+    assert 0.35 < np.corrcoef(now, later)[0, 1] < 0.65  # half of the variance is constant
     cell = fields[0, :, :, 0]
     assert np.corrcoef(cell[:, :-1].ravel(), cell[:, 1:].ravel())[0, 1] > 0.9  # smooth within a cell
     assert abs(np.corrcoef(cell[:, :-12].ravel(), cell[:, 12:].ravel())[0, 1]) < 0.2

@@ -1,4 +1,4 @@
-"""A served example actor, and a browser that looks at it."""
+"""An example actor served by the viewer, and a browser."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""The real page in headless Chromium: sliders, drag, keys, files; page errors and requests elsewhere fail a test."""
+"""The page in headless Chromium: sliders, drag, keys, files. Page errors and external requests fail a test."""
 
 import time
 
@@ -55,7 +55,7 @@ def test_no_tab_scrolls_sideways_and_the_page_is_named_after_the_actor(chromium,
         assert box["width"] == kind.SIZE_PX[0] and box["y"] >= 0.49 * height
         incisor = tab.pixel(rest_places(tab.session.rig)[INCISOR])
         assert 0 < incisor[0] < kind.SIZE_PX[0] and 0 < incisor[1] < box["y"]
-        tab.web.get_by_text("someone", exact=True).click()  # the head of the panel folds it
+        tab.web.get_by_text("someone", exact=True).click()  # the panel's header collapses it
         until(lambda: tab.resting_place(panel)["height"] < 80)
     tab.web.close()
     assert tab.complaints == [] and tab.elsewhere == []
@@ -111,7 +111,7 @@ def test_dragging_the_incisor_is_inverse_kinematics(tab):
     handle, pointer = held[-1]
     T = rig.pose(start)
     asked = rig.T_anatomical_skull[:3, :3] @ (pointer - T[:3, :3] @ handle - T[:3, 3])
-    np.testing.assert_allclose(asked, [5.0, 0.0, 0.0], atol=0.6)  # the surface lies nearer to the eye than the incisor
+    np.testing.assert_allclose(asked, [5.0, 0.0, 0.0], atol=0.6)  # the surface is closer to the camera than the incisor
     found, _ = rig.ik(handle, pointer, start=start)
     moved = [T[:3, :3] @ handle + T[:3, 3] for T in rig.pose(np.stack([found, tab.session.d]))]
     assert np.linalg.norm(moved[0] - moved[1]) < 0.1
@@ -154,7 +154,7 @@ def test_a_pinned_condyle_stays_and_undo_takes_the_drag_back(tab):
     held = landmark_places(tab.session.rig, tab.session.d)
     travel = [np.linalg.norm((places - before)[CONDYLES[1]]) for places in (free, held)]
     assert travel[1] < 0.5 < travel[0]
-    assert before[INCISOR, 1] - held[INCISOR, 1] > 0.2  # about the condyle that is held
+    assert before[INCISOR, 1] - held[INCISOR, 1] > 0.2  # about the pinned condyle
     tab.press("undo")
     tab.press("undo")
     until(lambda: not tab.session.work.pins and close_to(tab.session, [15, 0, 0]))
@@ -162,7 +162,7 @@ def test_a_pinned_condyle_stays_and_undo_takes_the_drag_back(tab):
 
 def test_every_view_is_drawn_in_light_and_dark(tab):
     camera, rest = tab.page.client.camera, rest_places(tab.session.rig)
-    # The ratio of the picture, which the view follows, changes in between: viser draws more coarsely when it is slow.
+    # The aspect ratio may change in between, since viser reduces the resolution when drawing is slow.
     ratios = set()
 
     def shows(name):
@@ -171,7 +171,7 @@ def test_every_view_is_drawn_in_light_and_dark(tab):
         return any(np.allclose([camera.look_at, camera.position], view, atol=0.1) for view in views)
 
     for name in PRESETS:
-        shows(name)  # notes the ratio before the press
+        shows(name)  # records the ratio before the press
         tab.press(name)
         until(lambda name=name: shows(name))
         assert (tab.page.scene.grips[0].opacity is None) == (not name.startswith("condyle"))

@@ -1,4 +1,4 @@
-"""A capture as the viewer is given it, and its page without a browser."""
+"""The viewer's input of a capture, and its page without a browser."""
 
 import asyncio
 import shutil
@@ -60,7 +60,7 @@ def test_the_capture_is_read_with_its_poses(viewed):
     changed = np.argwhere((plain != drawn).any(axis=2))
     low, high = changed.min(axis=0), changed.max(axis=0)
     x0, y0, x1, y1 = viewed.teeth_region("cam0", FIRST)
-    assert low[1] < x0 + 8 and high[1] > x1 - 8 and low[0] < y0 and high[0] > y1  # lips hide a part of what is drawn
+    assert low[1] < x0 + 8 and high[1] > x1 - 8 and low[0] < y0 and high[0] > y1  # lips hide part of the drawing
     assert viewed.picture("cam0", 10_000, None, "outlines").std() == 0  # not recording: gray
     assert viewed.tracked_poses(FIRST - 1) is None
 
@@ -84,7 +84,7 @@ def test_stepping_jumping_and_looking(page):
     page.press(footage.slider, FIRST + 9)
     assert f"frame {FIRST + 9}" in footage._words.content
     page.press(footage.jumps, "next worse")
-    assert footage.frame == FIRST + 7  # the lost one comes first
+    assert footage.frame == FIRST + 7  # lost frames come first
     assert "lower: lost, matched contour 31% of the usual" in footage._words.content
     page.press(footage.jumps, "next worse")
     assert footage.frame in footage.worst[1:2]
@@ -110,10 +110,10 @@ def test_all_cameras_stand_side_by_side(page):
     assert page.page.scene._picture.image.shape == (height, width, 3) and page.page.layout.size_px == (width, height)
     drawn, bare = (capture.wall(FIRST, capture.tracked_poses(FIRST), look) for look in ("outlines", "footage"))
     changed = (drawn != bare).any(axis=2)
-    for part in np.array_split(changed, 3, axis=1):  # the teeth are drawn into each camera's part, well inside it
+    for part in np.array_split(changed, 3, axis=1):  # teeth are drawn well inside each camera's part
         y, x = np.argwhere(part).min(axis=0), np.argwhere(part).max(axis=0)
         assert (y > 20).all() and (x < np.array(part.shape) - 20).all() and part.sum() > 500
-    page.press(page.page.picks.picking, True)  # no picks are made here
+    page.press(page.page.picks.picking, True)  # picking is disabled in this view
     before = len(page.page.picks.book.picks)
     page.click(page.page.layout.place((width / 2, height / 2)))
     assert len(page.page.picks.book.picks) == before and page.page.poses == {} and page.notices == []
@@ -128,7 +128,7 @@ def test_cameras_are_shown_as_they_are_decoded(viewed):
     late = backdrops["cam1"]
 
     class Late:
-        """A camera whose picture comes last."""
+        """A camera whose picture arrives last."""
 
         is_footage = True
 
@@ -207,11 +207,11 @@ def test_playing_leaves_out_pictures_instead_of_falling_behind(viewed):
     opened.enter(footage.loop, False)
     opened.enter(footage.play, True)
     assert footage.player.playing and footage.play.label == "pause"
-    until(lambda: not footage.player.playing)  # the end is reached, and stays
+    until(lambda: not footage.player.playing)  # playback stops at the end
     until(lambda: not opened.page.busy)
     assert footage.frame == footage.slider.value == drawn[-1] == viewed.frames[1] and footage.play.label == "play"
     assert sorted(drawn) == drawn and len(drawn) < 0.5 * (STOP - FIRST)
-    opened.enter(footage.play, True)  # begins anew, and a frame that is chosen stops it
+    opened.enter(footage.play, True)  # playback restarts; choosing a frame stops it
     until(lambda: drawn[-1] < FIRST + 20)
     opened.enter(footage.slider, FIRST + 3)
     until(lambda: not opened.page.busy)
@@ -235,7 +235,7 @@ def test_a_solve_is_shown_with_its_states(viewed, copy, tmp_path):
     opened = QuietCapturePage(viewer)
     opened.settle()
     footage = opened.page.footage
-    assert footage.worst[:2] == [FIRST + 20, FIRST + 7]  # what the rig does not allow, then what was not seen
+    assert footage.worst[:2] == [FIRST + 20, FIRST + 7]  # invalid poses first, then unobserved ones
     words = footage._words.content
     assert "upper: solved from the pictures" in words and "d1 opening 10.00 &plusmn; 0.05 mm" in words
     opened.press(footage.slider, FIRST + 20)
@@ -286,7 +286,7 @@ def test_picks_are_clicked_and_written(page, copy, viewed):
     written = load_capture(copy).bootstrap
     assert written == picks.book.bootstrap() and written != before
     page.press(picks.edit, "pick")
-    page.enter(picks.write, True)  # three of an arch are enough
+    page.enter(picks.write, True)  # three per arch are enough
     assert page.notices.pop()[0] == "Written"
     page.press(picks.edit, "all")
     page.enter(picks.write, True)

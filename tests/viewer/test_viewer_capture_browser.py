@@ -1,4 +1,4 @@
-"""The real page of a capture in headless Chromium: footage, frames, space, and picks by the mouse that build a rig."""
+"""The page of a capture in headless Chromium: footage, frames, 3-D view, and mouse picks that build a rig."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ TWO_PICTURES = "new Promise(drawn => requestAnimationFrame(() => requestAnimatio
 
 
 def quiet(stage, done, total):
-    """Swallow progress."""
+    """Ignore progress."""
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
     text = path.read_text()
     start, end = text.index("[bootstrap]"), text.index("[motion]")
     text = text[:start] + "# picks go here\n" + text[end:]
-    with np.load(EXAMPLE / "truth" / "truth.npz") as archive:  # found elsewhere; here it would only cost time
+    with np.load(EXAMPLE / "truth" / "truth.npz") as archive:  # searching takes time and is tested elsewhere
         known = zip(archive["camera_names"], archive["offsets"], strict=True)
         offsets = ", ".join(f"{name} = {offset}" for name, offset in known)
     text = text.replace('method = "flash"', f'method = "offsets"\noffsets = {{ {offsets} }}')
@@ -57,26 +57,26 @@ class CaptureTab(Tab):
     SIZE_PX = (1000, 600)
 
     def settle(self):
-        """Wait until the picture is there and the eye stands still."""
+        """Wait until the picture is shown and the camera is at rest."""
         until(lambda: not self.page.busy)
         before = None
         while before != (before := tuple(self.page.client.camera.position)):
-            self.web.evaluate(TWO_PICTURES)  # a busy machine may not have drawn what it was told
+            self.web.evaluate(TWO_PICTURES)  # a busy machine may not have drawn yet
             time.sleep(0.7)
 
     def click(self, place):
-        """Click where a place of the page is on the screen, and wait for what it does."""
+        """Click at the screen position of a point and wait for the effect."""
         wanted = self.page._wanted
         self.web.mouse.click(*self.pixel(place))
         until(lambda: self.page._wanted > wanted)
         self.settle()
 
     def view(self, name):
-        """Look at a camera, or at all of them."""
+        """Show one camera, or all of them."""
         self.tab("Footage")
         self.settle()
         wanted = self.page._wanted
-        self.press(name)  # also of the view shown, which moves the eye back
+        self.press(name)  # pressing the current view resets the camera
         until(lambda: self.page._wanted > wanted and self.page.footage.view == name)
         self.settle()
         self.tab("Picks")
@@ -93,7 +93,7 @@ def tab(chromium, viewer):
 
 
 def clickable(mesh, vertex, pose, eye):
-    """Return a place on the surface nearest to a vertex, on the face there that is turned most towards an eye."""
+    """Return a surface point next to a vertex, on the adjacent face that faces the camera most."""
     world = transform_points(pose, mesh.vertices)
     corners = world[mesh.faces[(mesh.faces == vertex).any(axis=1)]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -199,8 +199,8 @@ def test_picks_made_in_the_page_build_a_rig(tab, folder, tmp_path):
         np.linalg.norm(np.diff(capture.scans[pick.arch].vertices[[pick.vertex, given.vertex]], axis=0))
         for pick, given in zip(book.picks, (*original.upper, *original.lower), strict=True)
     ]
-    assert max(moved) < 0.5  # mm: the vertex meant, or one beside it
-    with np.load(EXAMPLE / "truth" / "truth.npz") as archive:  # the eyes of the person who clicks
+    assert max(moved) < 0.5  # mm: the intended vertex or a neighbour
+    with np.load(EXAMPLE / "truth" / "truth.npz") as archive:  # stands in for the person who clicks
         poses = {arch: archive[f"T_world_{arch}"][0] for arch in ("upper", "lower")}
         assert archive["frames"][0] == FIRST
     for camera in ("cam0", "cam2"):
@@ -235,7 +235,7 @@ def test_tracked_poses_are_drawn_and_the_plot_is_a_timeline(chromium, example_bu
     left, right = footage._plot.across
     x = plot["x"] + plot["width"] * (left + 0.5 * (right - left))
     tab.web.mouse.click(x, plot["y"] + 0.5 * plot["height"])
-    until(lambda: abs(footage.frame - 170) <= 2)  # half way from 20 to 319
+    until(lambda: abs(footage.frame - 170) <= 2)  # halfway from 20 to 319
     tab.settle()
     tab.picture("capture_tracked")
     tab.press("first")

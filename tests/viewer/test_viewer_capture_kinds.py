@@ -1,4 +1,4 @@
-"""Captures that the viewer opens: without a calibration, of masks alone, and those it cannot show."""
+"""Captures without a calibration, with masks only, and captures that the viewer cannot show."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""The contacts of the teeth on a page: drawn when they are wanted, explained where there are none."""
+"""Tooth contacts on a page: drawn on request, explained if missing."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def page_of(folder, rig):
 
 @pytest.fixture
 def marked(tmp_path, monkeypatch):
-    """Return a page whose pictures hold the pose they are of."""
+    """Return a page whose contact pictures encode their pose."""
     drawn = []
 
     def draw(self, d):

@@ -152,7 +152,7 @@ def test_meshes_for_the_screen_are_small_and_keep_their_shape():
     assert radius.min() > 29 and radius.max() < 30.01
     a, b, c = (small.vertices[small.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
-    assert (np.einsum("ij,ij->i", normal, a + b + c) > 0).mean() > 0.99  # still turned outwards
+    assert (np.einsum("ij,ij->i", normal, a + b + c) > 0).mean() > 0.99  # still oriented outwards
     assert len(np.unique(np.sort(small.faces, axis=1), axis=0)) == len(small.faces)
 
 

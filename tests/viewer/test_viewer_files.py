@@ -1,4 +1,4 @@
-"""What the viewer is given of an actor, and what it may write: read back by readers that know nothing of it."""
+"""The viewer's input of an actor, and the files it writes, read back by independent readers."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Clips, keys on a track, and the clock that plays them."""
+"""Clips, keys and playback."""
 
 import asyncio
 
@@ -25,7 +25,7 @@ def test_keys_are_added_replaced_deleted_and_moved():
     assert frames_of(motion.without_key(KEYS, 10)) == [0, 20]
     shifted = motion.at_frames(KEYS, (3, 11, 90))
     assert frames_of(shifted) == [3, 11, 90] and [key.d for key in shifted] == [key.d for key in KEYS]
-    assert frames_of(KEYS) == [0, 10, 20]  # nothing was changed in place
+    assert frames_of(KEYS) == [0, 10, 20]  # not modified in place
 
 
 @pytest.mark.parametrize(
@@ -60,11 +60,11 @@ def test_clips_without_motion_or_order_are_refused():
 def test_playing_keeps_time_stops_at_the_end_or_goes_round():
     assert frame_after(10, 0.5, 24, (0, 100), loop=False) == 22
     assert frame_after(90, 1.0, 24, (0, 100), loop=False) is None
-    assert frame_after(90, 1.0, 24, (0, 100), loop=True) == pytest.approx(13)  # 101 frames go round
-    assert frame_after(100, 0.0, 24, (0, 100), loop=False) == 0  # at the end it begins again
+    assert frame_after(90, 1.0, 24, (0, 100), loop=True) == pytest.approx(13)  # a cycle has 101 frames
+    assert frame_after(100, 0.0, 24, (0, 100), loop=False) == 0  # restarts from the end
     assert frame_after(-40, 0.25, 24, (0, 100), loop=False) == 6
     assert frame_after(0, 100.0, 24, (0, 0), loop=True) == 0
-    assert frame_after(90, 10.5 / 24, 24, (0, 100), loop=True) == 100  # the last frame for its own duration
+    assert frame_after(90, 10.5 / 24, 24, (0, 100), loop=True) == 100  # the last frame keeps its full duration
 
 
 def test_the_player_shows_rising_frames_ends_by_itself_and_can_be_stopped():
@@ -80,7 +80,7 @@ def test_the_player_shows_rising_frames_ends_by_itself_and_can_be_stopped():
         first, count = list(shown), len(ended)
         player.start(0, 10.0, (0.0, 100.0), lambda: True)
         await asyncio.sleep(0.05)
-        player.start(50, 10.0, (0.0, 100.0), lambda: True)  # a new start ends the old one
+        player.start(50, 10.0, (0.0, 100.0), lambda: True)  # a new start cancels the old one
         player.stop()
         player.stop()
         await asyncio.sleep(0.15)

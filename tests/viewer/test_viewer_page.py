@@ -1,4 +1,4 @@
-"""Widgets and session together, as events of a visitor reach them, without a browser."""
+"""Widgets and session, driven by events without a browser."""
 
 import time
 
@@ -56,7 +56,7 @@ def test_the_verdict_stands_above_the_tabs_and_sliders_name_their_unit(quiet):
     inside = {one._impl.parent_container_id for one in (page.pose.sliders[0], page.motion.play, page.files.load)}
     assert page.verdict._impl.parent_container_id == "root" and len(inside - {"root"}) == 3
     assert all(slider.label.endswith(" [mm]") for slider in page.pose.sliders)
-    assert not any("forward" in slider.label for slider in page.pose.sliders)  # of the incisor, which is read out
+    assert not any("forward" in slider.label for slider in page.pose.sliders)  # only the readout has it
 
 
 def test_what_was_undone_is_done_again_by_its_key(quiet):
@@ -84,7 +84,7 @@ def test_every_view_shows_the_joints_and_the_incisor_beside_the_panel_of_a_phone
     across, upwards = (p[:, k] / p[:, 2] / np.tan(0.3) for k in (0, 1))
     assert (np.abs(across) < aspect).all() and (np.abs(upwards) < 1).all()
     if aspect < 1:
-        assert (upwards > 0).all()  # the lower half is the panel's
+        assert (upwards > 0).all()  # the panel covers the lower half
     if name == "top":
         assert upwards[0] < upwards[1]  # front teeth below, joints above
 
@@ -117,7 +117,7 @@ def test_a_drag_of_the_mesh_is_inverse_kinematics_and_pins_are_shown(quiet):
     assert np.linalg.norm(moved[0] - moved[1]) < 0.1 and page.session.d[1] > 2
     quiet.enter(page.pose.pins["condyle_left"], True)
     assert page.scene._pins["condyle_left"].visible and not page.scene._pins["condyle_right"].visible
-    quiet.drag(grip, "update", incisor, incisor)  # nothing is held: nothing happens
+    quiet.drag(grip, "update", incisor, incisor)  # no effect without a grabbed point
     assert quiet.notices == []
 
 

@@ -60,7 +60,7 @@ def test_pixels_of_two_frames_do_not_mix():
     book.add("upper", 1)
     book.see("a", 20, (1.0, 2.0))
     book.selected = 0
-    book.see("b", 30, (3.0, 4.0))  # the only pick moves to the other frame, without the pixel of the first
+    book.see("b", 30, (3.0, 4.0))  # the only pick moves to the other frame and loses its old pixel
     assert book.frame == 30 and book.picks[0].views == {"b": (3.0, 4.0)}
     book.remove_pixel("b")
     book.remove()
@@ -98,7 +98,7 @@ def test_layout_pixels_and_rays_agree():
     for pixel in ((0.0, 0.0), (641.3, 278.9), (1279.4, 719.4)):
         assert table.pixel(eye, table.place(pixel) - eye) == pytest.approx(pixel, abs=1e-9)
     assert table.pixel(eye, table.place((1281.0, 20.0)) - eye) is None
-    assert table.pixel(eye, eye - table.place((20.0, 20.0))) is None  # behind the eye
+    assert table.pixel(eye, eye - table.place((20.0, 20.0))) is None  # behind the camera
     assert table.pixel(eye, (1.0, 0.0, 0.0)) is None
 
 
@@ -123,14 +123,14 @@ def test_a_region_has_room_and_stays_in_the_picture():
 
 
 def made_up_tracks(count=100):
-    """Return tracks with frame 140 lost and frame 120 badly covered by the lower arch."""
+    """Return tracks with frame 140 lost and a poor coverage of the lower arch at frame 120."""
     frames = np.arange(100, 100 + count)
     poses = np.tile(np.eye(4), (count, 1, 1))
     lost = poses.copy()
     lost[40] = np.nan
     coverage = np.full((count, 2, 2), 0.005)
     coverage[20, 1] = 0.08
-    coverage[60, 0, 1] = 0.9  # spoiled, and not used
+    coverage[60, 0, 1] = 0.9  # bad but unused
     used = np.ones((count, 2, 2), bool)
     used[60, 0, 1] = False
     status = np.full((count, 2), TRACKED, np.int8)

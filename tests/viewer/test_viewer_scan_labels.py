@@ -1,4 +1,4 @@
-"""Labels corrected with the brush: what a stroke reaches, undo, and a page that saves them for the tracker."""
+"""Editing scan labels with the brush: extent of strokes, undo, and saving from the page."""
 
 import shutil
 
@@ -20,7 +20,7 @@ from jawusd.viewer.server import CaptureViewer
 
 
 def balls(soup: bool) -> Mesh:
-    """Two balls that touch nearly; as a triangle soup, faces share no vertices."""
+    """Two balls that nearly touch; in a triangle soup, faces share no vertices."""
     one, two = (trimesh.creation.icosphere(subdivisions=3, radius=2.0) for _ in range(2))
     vertices = np.concatenate([one.vertices, two.vertices + [4.01, 0, 0]])
     faces = np.concatenate([one.faces, two.faces + len(one.vertices)])

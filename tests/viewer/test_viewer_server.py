@@ -1,4 +1,4 @@
-"""Who may look: addresses, foreign pages, and a warning when the world is let in."""
+"""Access to the server: addresses, foreign pages, and a warning for public addresses."""
 
 import contextlib
 import logging
@@ -31,7 +31,7 @@ def test_which_addresses_are_this_machine_alone(host, local):
         ("localhost:8080", "https://evil.example", True, False),
         ("localhost:8080", "http://localhost:9999", True, False),
         ("localhost:8080", "null", True, False),
-        ("evil.example:8080", "http://evil.example:8080", True, False),  # its name was made to point here
+        ("evil.example:8080", "http://evil.example:8080", True, False),  # DNS rebinding
         ("studio.local:8080", "http://studio.local:8080", False, True),
         ("studio.local:8080", "http://evil.example", False, False),
         ("", None, True, False),
@@ -49,12 +49,12 @@ def test_an_address_of_another_machine_is_refused(folder):
 
 
 def heed_interrupts():
-    """Undo what a shell does that starts the tests in the background: they, and their children, ignore interrupts."""
+    """Restore interrupts, which background jobs of a shell ignore."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def run_view(folder, *options):
-    """Run `jawusd view` until it says where to look; return stdout's first line and stderr."""
+    """Run `jawusd view` until it prints its address; return stdout's first line and stderr."""
     command = [sys.executable, "-m", "jawusd", "view", str(folder), "--no-browser", "--port", "0", *options]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
@@ -107,7 +107,7 @@ def test_messages_that_mean_nothing_are_one_line(message, viewer, caplog):
     assert all(record.exc_info is None for record in caplog.records if record.levelno > logging.DEBUG)
     assert all("\n" not in record.getMessage() for record in caplog.records)
     with connect(address, subprotocols=[protocol], origin=viewer.url, max_size=None) as page:
-        assert page.recv(timeout=20)  # others are served as before
+        assert page.recv(timeout=20)  # other clients are still served
 
 
 def test_tasks_that_fail_are_one_line(viewer, caplog):

@@ -1,4 +1,4 @@
-"""What a visitor does with a rig, without a page: sliders, dragging, pins, keys, undo."""
+"""Session without a page: sliders, dragging, pins, keys, undo."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_sliders_stop_at_the_bound_only_where_asked_to(session):
     session.set_parameter(1, 50.0)
     assert session.d[1] == 50.0 and not session.readout().inside
     session.undo()
-    assert session.d[1] == pytest.approx(high)  # what the switch allows is a step of its own
+    assert session.d[1] == pytest.approx(high)  # switching is a separate undo step
     session.redo()
     session.set_keep_valid(True)
     assert session.readout().inside
@@ -53,7 +53,7 @@ def test_sliders_stop_at_the_bound_only_where_asked_to(session):
 
 
 def test_the_opening_wins_and_takes_d2_and_d3_with_it(session):
-    """Opening wide with the jaw at its side keeps the opening and brings the jaw towards the middle, no farther."""
+    """Opening wide in laterotrusion keeps the opening and reduces the laterotrusion as little as possible."""
     session.set_parameter(0, 5.0)
     session.set_parameter(1, 50.0)
     side = session.d[1]
@@ -94,7 +94,7 @@ def test_a_drag_follows_the_pointer_as_inverse_kinematics_does(session):
     session.release()
     assert session.held_place() is None
     session.undo()
-    np.testing.assert_allclose(session.d, start)  # one drag is one step
+    np.testing.assert_allclose(session.d, start)  # a drag is a single undo step
 
 
 def test_dragging_nothing_is_refused(session):
@@ -140,7 +140,7 @@ def test_undo_and_redo_walk_through_every_kind_of_change(session):
     assert not session.redo()
     session.undo()
     session.set_parameter(0, 3.0)
-    assert not session.redo()  # a new change forgets what was taken back
+    assert not session.redo()  # a new change clears the redo history
 
 
 def test_a_run_of_slider_moves_is_one_step_and_playing_is_none(session):

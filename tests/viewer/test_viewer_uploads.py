@@ -1,4 +1,4 @@
-"""Files that pages send: hostile names, sizes and numbers; nothing is written but below a folder of its own."""
+"""Uploads: hostile names, sizes and numbers; files are written only to a temporary folder."""
 
 import asyncio
 
@@ -17,7 +17,7 @@ def quiet(viewer):
 
 
 def send(quiet, *messages):
-    """Do what the server does with messages of a page."""
+    """Dispatch messages of a page as the server does."""
 
     async def run():
         for message in messages:
