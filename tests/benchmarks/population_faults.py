@@ -111,9 +111,8 @@ def _without_picks(text: str) -> str:
 
 def _other_lower(folder: Path, rng: np.random.Generator) -> None:
     """The lower scan of somebody else, in occlusion as far as that goes: same frame, same lower incisal point."""
+    from subjects.bite import build_bite
     from subjects.traits import draw_traits
-
-    from jawusd.synthetic.bite import build_bite
 
     other = build_bite(draw_traits(int(rng.integers(10_000, 20_000))))
     with np.load(folder / "truth" / "truth.npz", allow_pickle=False) as truth:

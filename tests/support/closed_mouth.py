@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from subjects.bite import build_bite
+from subjects.dentition import without_gum
 from subjects.traits import draw_traits
 
 from jawusd.geometry import make_transform, random_rotation, se3_inverse, so3_exp, transform_point
 from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.photographs import align, search
-from jawusd.synthetic.bite import build_bite
-from jawusd.synthetic.dentition import without_gum
 
 SIZE, FOCAL = (720, 540), 1500.0
 VIEWS = {"front": 0.0, "left": 0.9, "right": -0.9}  # yaw

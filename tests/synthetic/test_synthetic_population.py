@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 from subjects.annotator import FINER, MaskDrawer, draw_annotator
+from subjects.bite import Bite, build_bite
 from subjects.scanner import FORMATS, Scanner, encoded, scanned
 from subjects.short_capture import ShortConfig, write_short_capture
 from subjects.traits import draw_traits
@@ -16,7 +17,6 @@ from jawusd.cameras.calibration import load_calibration
 from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import tooth_labels
 from jawusd.meshes.meshio import load_mesh
-from jawusd.synthetic.bite import Bite, build_bite
 
 SEEDS = (0, 1, 3, 7, 8, 11, 16, 18, 20, 22)  # every kind of bite and gum, brackets, gaps of up to four teeth
 

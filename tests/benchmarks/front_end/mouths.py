@@ -1,6 +1,6 @@
 """Mouths to learn from: label maps of synthetic persons, painted at random each time they are taken.
 
-Nothing of any renderer, camera or person that results are told on: shapes come from `jawusd.synthetic.dentition`, and
+Nothing of any renderer, camera or person that results are told on: shapes come from `subjects.dentition`, and
 colours, light, lenses, noise and compression are drawn far wider than footage has them, so that a network must go by
 what stays (Billot et al. 2023, SynthSeg, do so with scans of heads).
 """

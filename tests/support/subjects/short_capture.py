@@ -21,15 +21,15 @@ from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_te
 from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
 from jawusd.meshes.raster import draw_depth_labels
-from jawusd.synthetic.bite import Bite, build_bite
 from jawusd.synthetic.dental_arch import DentalArch
-from jawusd.synthetic.dentition import Traits, without_gum
 from jawusd.synthetic.person import draw_joint
 from jawusd.synthetic.soft_tissue import Face, palate, tongue
 from subjects.annotator import FINER, Annotator, MaskDrawer, draw_annotator, write_mask
+from subjects.bite import Bite, build_bite
+from subjects.dentition import without_gum
 from subjects.scanner import Scanner, draw_scanner, encoded, scanned
 from subjects.short_take import TEETH_FROM, Drawn, Motion, ShortPick, draw_cameras, draw_motion, pick_ends, pick_lines
-from subjects.traits import draw_traits
+from subjects.traits import Traits, draw_traits
 
 FPS = 24.0
 FIRST_FRAME = 12

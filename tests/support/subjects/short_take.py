@@ -15,9 +15,9 @@ from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
 from jawusd.synthetic.annotations import spread_out
-from jawusd.synthetic.bite import Bite
 from jawusd.synthetic.kinematics import Joint, controlled_pose, smoothstep
 from jawusd.synthetic.soft_tissue import LipState
+from subjects.bite import Bite
 
 #: Labels (rows, columns), first column and row of that part of the picture, inverse depth (rows, columns) [1/mm].
 Drawn = tuple[NDArray[np.uint8], tuple[int, int], NDArray[np.float32]]

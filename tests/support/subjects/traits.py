@@ -1,4 +1,4 @@
-"""Draw random mouths over the human range from a seed.
+"""Traits of a mouth, and random mouths over the human range from a seed.
 
 Ranges: overbite, overjet and crossbite after the NHANES III survey (Proffit, Fields and Moray 1998), tooth size
 after Ash and Nelson with a coefficient of variation of 6 % between and 3 % within persons.
@@ -6,16 +6,70 @@ after Ash and Nelson with a coefficient of variation of 6 % between and 3 % with
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.geometry import so3_exp
-from jawusd.synthetic.dentition import ArchTraits, Gums, Traits
 
+Gums = Literal["dipping", "continuous", "crowns"]
+BITES = ("normal", "deep", "open", "edge to edge", "underbite", "large overjet", "crossbite")
 #: Intended vertical and horizontal distance of the incisal edges [mm]; the settled bite may end elsewhere.
 OVERBITE_MM, OVERJET_MM = (-3.0, 8.0), (-3.0, 10.0)
 _USUAL_SHARE = 0.4  # fraction of persons with a usual bite; the others cover the whole range
 _BUCCAL_MM = 2.8  # distance of the lower buccal cusps inside the upper ones
 _FRONT = (1, 2, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class ArchTraits:
+    """Individual traits of one arch; arrays run from first incisor to second molar, left then right, shape (2, 7)."""
+
+    width_scale: Array  # tooth width relative to the mean
+    height_scale: Array  # crown height relative to the mean: worn, short or long crowns
+    shift_mm: Array  # facial offset from the arch line
+    turn_rad: Array  # rotation about the tooth's axis
+    rise_mm: Array  # height of edges and cusps over the occlusal curve
+    overlap_mm: Array  # overlap with the mesial neighbour; negative for a gap
+    present: Array  # 1, or 0 for a missing tooth
+    brackets: bool  # on the facial faces of all teeth but the molars
+
+
+@dataclass(frozen=True, eq=False)
+class Traits:
+    """Individual traits of a mouth; lengths mm, angles rad, frame x left, y up, z anterior."""
+
+    seed: int
+    overbite_mm: float  # intended height of the lower incisal edges over the upper ones
+    overjet_mm: float  # intended distance of the lower incisal edges behind the upper ones
+    buccal_mm: tuple[float, float]  # distance of the left and right lower back teeth inside the upper ones
+    quadratic_per_mm: float
+    quartic_per_mm3: float
+    cusp_slope: float  # drop of the cusps per mm
+    spee_mm: float  # depth of the occlusal curve
+    midline_mm: float  # shift of the lower arch to the left
+    skew: tuple[float, float]  # widening to the left, and forward shift of the left side, per mm
+    tilt: Array  # rotation of the occlusal plane relative to the joint, shape (3, 3)
+    upper: ArchTraits
+    lower: ArchTraits
+    gums: Gums
+
+    @property
+    def bite(self) -> str:
+        """Return the intended kind of bite, one of `BITES`."""
+        if min(self.buccal_mm) < 0.5:
+            return "crossbite"
+        if self.overjet_mm < -0.8:
+            return "underbite"
+        if self.overbite_mm < -0.5:
+            return "open"
+        if self.overjet_mm < 1.0 and self.overbite_mm < 1.0:
+            return "edge to edge"
+        if self.overjet_mm > 6.0:
+            return "large overjet"
+        return "deep" if self.overbite_mm > 4.5 else "normal"
 
 
 def draw_traits(seed: int) -> Traits:

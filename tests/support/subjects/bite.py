@@ -9,8 +9,9 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.synthetic.anatomy import Occlusion
 from jawusd.synthetic.dental_arch import ArchLine, ArchShape, DentalArch
-from jawusd.synthetic.dentition import PlacedTooth, Traits, build, placed_teeth
 from jawusd.synthetic.teeth import LOWER, UPPER
+from subjects.dentition import PlacedTooth, build, placed_teeth
+from subjects.traits import Traits
 
 # Heights of the upper edges and cusps over the plane of the first incisors [mm].
 _UPPER_TIPS_MM = -np.array([0.0, 0.5, 0.2, 0.3, 0.4, 0.6, 1.0])

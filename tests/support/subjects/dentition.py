@@ -1,4 +1,4 @@
-"""Arches of arbitrary persons: traits, and teeth with individual size, position and gum line.
+"""Arches of arbitrary persons, with individual size, position and gum line of every tooth.
 
 The gum is a separate ridge around the crowns ("dipping"), a surface that continues each crown at its cervical line
 ("continuous"), or missing from the scan ("crowns"). Built with the occlusal side up, like `dental_arch`.
@@ -7,7 +7,6 @@ The gum is a separate ridge around the crowns ("dipping"), a surface that contin
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -27,62 +26,12 @@ from jawusd.synthetic.dental_arch import (
 )
 from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
+from subjects.traits import ArchTraits, Gums, Traits
 
-Gums = Literal["dipping", "continuous", "crowns"]
-BITES = ("normal", "deep", "open", "edge to edge", "underbite", "large overjet", "crossbite")
 _AROUND = 36
 # Profile of the gum below a crown's cervical line: distance outwards and height [mm].
 _COLLAR = np.array([[0.05, -0.03], [0.22, -0.2], [0.5, -0.8], [0.8, -2.2], [1.1, -4.5], [0.9, -7.0]])
 _BRACKET_MM = np.array([3.0, 3.0, 1.8])
-
-
-@dataclass(frozen=True, eq=False)
-class ArchTraits:
-    """Individual traits of one arch; arrays run from first incisor to second molar, left then right, shape (2, 7)."""
-
-    width_scale: Array  # tooth width relative to the mean
-    height_scale: Array  # crown height relative to the mean: worn, short or long crowns
-    shift_mm: Array  # facial offset from the arch line
-    turn_rad: Array  # rotation about the tooth's axis
-    rise_mm: Array  # height of edges and cusps over the occlusal curve
-    overlap_mm: Array  # overlap with the mesial neighbour; negative for a gap
-    present: Array  # 1, or 0 for a missing tooth
-    brackets: bool  # on the facial faces of all teeth but the molars
-
-
-@dataclass(frozen=True, eq=False)
-class Traits:
-    """Individual traits of a mouth; lengths mm, angles rad, frame x left, y up, z anterior."""
-
-    seed: int
-    overbite_mm: float  # intended height of the lower incisal edges over the upper ones
-    overjet_mm: float  # intended distance of the lower incisal edges behind the upper ones
-    buccal_mm: tuple[float, float]  # distance of the left and right lower back teeth inside the upper ones
-    quadratic_per_mm: float
-    quartic_per_mm3: float
-    cusp_slope: float  # drop of the cusps per mm
-    spee_mm: float  # depth of the occlusal curve
-    midline_mm: float  # shift of the lower arch to the left
-    skew: tuple[float, float]  # widening to the left, and forward shift of the left side, per mm
-    tilt: Array  # rotation of the occlusal plane relative to the joint, shape (3, 3)
-    upper: ArchTraits
-    lower: ArchTraits
-    gums: Gums
-
-    @property
-    def bite(self) -> str:
-        """Return the intended kind of bite, one of `BITES`."""
-        if min(self.buccal_mm) < 0.5:
-            return "crossbite"
-        if self.overjet_mm < -0.8:
-            return "underbite"
-        if self.overbite_mm < -0.5:
-            return "open"
-        if self.overjet_mm < 1.0 and self.overbite_mm < 1.0:
-            return "edge to edge"
-        if self.overjet_mm > 6.0:
-            return "large overjet"
-        return "deep" if self.overbite_mm > 4.5 else "normal"
 
 
 @dataclass(frozen=True, eq=False)
