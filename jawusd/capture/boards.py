@@ -81,9 +81,9 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
     widths = np.array([[width for _, width in camera] for camera in found])
     seen = np.isfinite(widths)
     for name, clip, mask in zip(names, clips, seen):
-        _refuse_other_board(name, clip, chosen, boards, int(mask.sum()))
+        _check_board(name, clip, chosen, boards, int(mask.sum()))
     blurred = seen & (widths > _limits_px(widths)[:, None])
-    _refuse_blur(names, clips, widths, blurred)
+    _check_blur(names, clips, widths, blurred)
     notes += [f"camera {name}: {INTERLACED}. {INTERLACED_HINT}" for name, c in zip(names, clips) if c.is_interlaced]
     corners[blurred] = np.nan
     used = (seen & ~blurred).any(0)
@@ -130,7 +130,7 @@ def _limits_px(widths: Array) -> Array:
     return np.clip(_BLUR_RATIO * median, *_BLUR_LIMITS_PX)
 
 
-def _refuse_other_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, found: int) -> None:
+def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, found: int) -> None:
     """Raise an error if the pictures show no board or a different one."""
     missed = found < len(chosen) / 2
     if missed and clip.is_interlaced:
@@ -162,7 +162,7 @@ def _refuse_other_board(name: str, clip: BoardClip, chosen: list[int], boards: B
         )
 
 
-def _refuse_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, blurred: Mask) -> None:
+def _check_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, blurred: Mask) -> None:
     """Raise an error if all pictures of the board by a camera are blurred."""
     for name, clip, row, out, limit in zip(names, clips, widths, blurred, _limits_px(widths)):
         seen = np.isfinite(row)

@@ -75,7 +75,7 @@ def initial_cameras(
                 (c, s)
                 for c in seen
                 for s, turn in enumerate(turns)
-                if _alike(T_cam_world[c] @ T, T_cam_board[c, v] @ turn)
+                if _equal(T_cam_world[c] @ T, T_cam_board[c, v] @ turn)
             ]
             if len(found) > len(agreed):
                 agreed, T_world_board[v] = found, T
@@ -125,7 +125,7 @@ def _turn(points_mm: Array, order: NDArray[np.int64]) -> Array:
     return make_transform(R, np.zeros(3))
 
 
-def _alike(a: Array, b: Array) -> Mask:
+def _equal(a: Array, b: Array) -> Mask:
     """Return whether poses are equal within the tolerance, shape (...)."""
     angle = np.linalg.norm(so3_log(a[..., :3, :3] @ np.swapaxes(b[..., :3, :3], -1, -2)), axis=-1)
     apart = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
@@ -160,7 +160,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
     # (orders, views, 4, 4): T_b_a if b lists the corners in that order.
     candidates = np.stack([T_b @ turn @ se3_inverse(T_a) for turn in turns])
     flat = candidates.reshape(-1, 4, 4)
-    votes = _alike(flat[:, None, None], candidates[None]).any(1)  # (candidates, views)
+    votes = _equal(flat[:, None, None], candidates[None]).any(1)  # (candidates, views)
     support = votes.sum(1)
     best = int(np.argmax(support))
     if support[best] < _LEAST_AGREEMENT * both.sum():
@@ -171,7 +171,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
         )
     # The most central one of the well supported poses.
     strong = flat[support >= 0.8 * support[best]]
-    near = strong[_alike(strong, flat[best])]
+    near = strong[_equal(strong, flat[best])]
     gap = np.linalg.norm(near[:, None, :3] - near[None, :, :3], axis=(-1, -2)).sum(1)
     return near[int(np.argmin(gap))]
 
@@ -192,7 +192,7 @@ def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
     markers: Counter[str] = Counter()
     highest: dict[str, int] = {}
     for picture in pictures:
-        small = _shrunk(picture)
+        small = _reduced(picture)
         for family, largest in _markers(small):
             markers[family] += 1
             highest[family] = max(largest, highest.get(family, 0))
@@ -208,7 +208,7 @@ def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
     return DetectedBoard("chessboard", cols, rows) if times >= _FEWEST_PICTURES else None
 
 
-def _shrunk(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     height, width = picture.shape
     if width <= _WIDTH_PX:
         return np.ascontiguousarray(picture)

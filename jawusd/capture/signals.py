@@ -105,7 +105,7 @@ def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
             f"the light steps at {_listed(steps)} do not match those at {_listed(reference)} of the reference."
         )
     pairs, spread, exact = ranked[0]
-    _refuse_lost_frames(steps, reference, pairs, exact, _DROPPED_S * fps)
+    _check_dropped_frames(steps, reference, pairs, exact, _DROPPED_S * fps)
     for other_pairs, other_spread, other in ranked[1:]:
         if len(other_pairs) == len(pairs) and other_spread < spread + 0.5 and abs(other - exact) > _TOLERANCE_FRAMES:
             raise SyncError(f"the light flashes match equally well at offsets of {exact:.0f} and {other:.0f} frames.")
@@ -113,7 +113,7 @@ def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
     return Offset(round(exact), exact, spread, len(pairs), confidence)
 
 
-def _refuse_lost_frames(
+def _check_dropped_frames(
     steps: list[Step], reference: list[Step], pairs: list[tuple[int, int]], exact: float, reach_frames: float
 ) -> None:
     """Raise an error if unmatched steps would match at a slightly different offset."""

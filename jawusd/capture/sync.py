@@ -108,7 +108,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
         if by_light and dark is None:
             steps = {name: to_frames(found[name].steps, video.timeline.numbers) for name, video in opened.items()}
             offsets = {
-                name: _against(name, reference, video, hint, partial(match_steps, steps[name], steps[reference], rate))
+                name: _compared(name, reference, video, hint, partial(match_steps, steps[name], steps[reference], rate))
                 for name, video in opened.items()
             }
             return Alignment(reference, offsets, "light flash", (*notes, *_stopped_early(opened, offsets, rate)))
@@ -122,7 +122,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
         whose = "no clip has" if len(silent) == len(opened) else f"camera {silent[0]} has no"
         raise SyncError(f"{why}{whose} sound to use instead.", path=opened[dark or silent[0]].path, hint=hint)
     offsets = {
-        name: _against(name, reference, video, hint, partial(_by_sound, name, reference, sounds, opened, rate), why)
+        name: _compared(name, reference, video, hint, partial(_by_sound, name, reference, sounds, opened, rate), why)
         for name, video in opened.items()
     }
     by_sound = (f"{why}the cameras are synchronised by sound",) if why else ()
@@ -172,7 +172,9 @@ def _by_sound(name: str, reference: str, sounds: Mapping[str, Sound], videos: Ma
     return Offset(round(exact), exact, 0.0, 0, match.confidence)
 
 
-def _against(name: str, reference: str, video: Clip, hint: str, work: Callable[[], Offset], before: str = "") -> Offset:
+def _compared(
+    name: str, reference: str, video: Clip, hint: str, work: Callable[[], Offset], before: str = ""
+) -> Offset:
     """Run a comparison of two cameras, naming both in its errors."""
     try:
         return work()

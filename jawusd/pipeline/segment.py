@@ -279,7 +279,7 @@ class _Segmentation:
         config, learned = learn_numbers(finished, self._config)
         write_text_atomic(self._folder / LEARNED, json.dumps(learned) + "\n")
         for segmenter in self._segmenters.values():
-            segmenter.adopt(config)
+            segmenter.configure(config)
         again = [frame for frame in range(self._first, self._stop) if "again" not in self._journal.entries[frame]]
         for frame, pictures in self._footage.walk(range(again[0], self._stop)) if again else ():
             with self._opened(frame, pictures) as shown:

@@ -32,7 +32,7 @@ _NAMES = ("d1 opening", "d2 laterotrusion,\nleft is positive", "d3 protrusion,\n
 _INKS = (BLACK, BLUE, VERMILION)
 _STYLES = ("-", "--", ":")
 _BAND = 2.0  # sigmas: 95 % of normal errors
-_UNSEEN = (SolveState.CARRIED, SolveState.LOST)
+_UNOBSERVED = (SolveState.CARRIED, SolveState.LOST)
 _LISTED = 60  # most runs listed
 
 
@@ -56,12 +56,12 @@ def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
         _shade(axis, frames, solved)
         legend_beside(axis)
     _label_frames(axes[0], axes[-1], fps)
-    shades = [Patch(color=STATE_INKS[state], alpha=0.3, label=STATE_WORDS[state]) for state in _UNSEEN]
+    shades = [Patch(color=STATE_INKS[state], alpha=0.3, label=STATE_WORDS[state]) for state in _UNOBSERVED]
     figure.legend(handles=shades, loc="outside upper right", ncols=2, frameon=False)
     return figure
 
 
-def seen_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
+def observation_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
     """Plot the state and verdict of every frame, and the masks used of each camera and arch."""
     frames, names = tracks.frames, tracks.camera_names
     lanes = [(str(state), solved.state == state, ink) for state, ink in STATE_INKS.items()]
@@ -96,7 +96,7 @@ def _draw_margin(axis: Axes, tracks: Tracks, solved: SolvedJaw) -> None:
 
 
 def _shade(axis: Axes, frames: NDArray[np.int64], solved: SolvedJaw) -> None:
-    for state in _UNSEEN:
+    for state in _UNOBSERVED:
         spans = runs(frames, solved.state == state)
         over = axis.get_xaxis_transform()
         axis.broken_barh(spans, (0, 1), transform=over, facecolors=STATE_INKS[state], alpha=0.22, linewidth=0, zorder=0)
@@ -120,7 +120,7 @@ def _scaled(value: ArrayLike, factor: float) -> Array:
     return np.asarray(value, np.float64) * factor
 
 
-class Unseen(NamedTuple):
+class UnobservedRun(NamedTuple):
     """A run of frames in which an arch was not found."""
 
     first: int
@@ -151,7 +151,7 @@ def solve_page(data: SolveReportData) -> str:
     if solved is None:
         raise FormatError("holds no solved performance.", hint="Pass the .npz written by `jawusd solve`.")
     findings = list(dict.fromkeys(Finding.from_json(one).line() for one in data.tracks.meta.get("findings", [])))
-    unseen = unseen_runs(data, solved)
+    unobserved = unobserved_runs(data, solved)
     return (
         page_environment()
         .get_template("solve.html.j2")
@@ -163,15 +163,15 @@ def solve_page(data: SolveReportData) -> str:
             jaw=_jaw_rows(solved),
             figures=_figures(data, solved),
             pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
-            unseen=unseen[:_LISTED],
-            more=max(len(unseen) - _LISTED, 0),
+            unobserved=unobserved[:_LISTED],
+            more=max(len(unobserved) - _LISTED, 0),
             cameras=_cameras(data),
             findings=findings,
         )
     )
 
 
-def unseen_runs(data: SolveReportData, solved: SolvedJaw) -> list[Unseen]:
+def unobserved_runs(data: SolveReportData, solved: SolvedJaw) -> list[UnobservedRun]:
     """Return the runs of frames in which an arch was not found, each with a single state."""
     frames, found = data.tracks.frames, []
     breaks = np.flatnonzero((np.diff(solved.state) != 0) | (np.diff(frames) != 1)) + 1
@@ -184,7 +184,7 @@ def unseen_runs(data: SolveReportData, solved: SolvedJaw) -> list[Unseen]:
         first, last = int(frames[rows[0]]), int(frames[rows[-1]])
         worst = ", ".join(f"{value:.2f}" for value in solved.sigma_mm[rows].max(axis=0))
         seconds = f"{first / data.fps:.2f} to {(last + 1) / data.fps:.2f}"
-        found.append(Unseen(first, last, seconds, STATE_WORDS[state], " and ".join(arches), worst))
+        found.append(UnobservedRun(first, last, seconds, STATE_WORDS[state], " and ".join(arches), worst))
     return found
 
 
@@ -193,7 +193,9 @@ def _figures(data: SolveReportData, solved: SolvedJaw) -> dict[str, Markup]:
         return {}
     return {
         "jaw": inline_svg(jaw_figure(data.tracks, solved, data.fps), "jaw", "d, sigma and margin of every frame."),
-        "seen": inline_svg(seen_figure(data.tracks, solved, data.fps), "seen", "State of every frame and masks used."),
+        "seen": inline_svg(
+            observation_figure(data.tracks, solved, data.fps), "seen", "State of every frame and masks used."
+        ),
     }
 
 

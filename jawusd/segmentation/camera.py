@@ -72,7 +72,7 @@ class CameraSegmenter:
         self._frame = PictureFrame(source, self._around(poses).mean(0), config.working_px_per_mm)
         self.colours = ColourModel(config.memory_frames)
 
-    def adopt(self, config: SegmentationConfig) -> None:
+    def configure(self, config: SegmentationConfig) -> None:
         """Replace the configuration."""
         self._config = config
 

@@ -77,7 +77,7 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
         fair[[0, *_at_border(groups)]] = False
         boxes = ndimage.find_objects(groups)
         for number in np.flatnonzero(fair).tolist():
-            inside, outside = _standing_out(groups, number, boxes[number - 1], above, toothlike, redness)
+            inside, outside = _group_contrast(groups, number, boxes[number - 1], above, toothlike, redness)
             worth = (inside - outside) ** 2 * np.sqrt(areas[number])
             if worth > (0.0 if best is None else best[0]):
                 best = worth, inside, outside, groups == number
@@ -91,7 +91,7 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
     boxes = ndimage.find_objects(parts)
 
     def stands_out(number: int) -> float:
-        inside, outside = _standing_out(parts, number, boxes[number - 1], parts > 0, toothlike, redness)
+        inside, outside = _group_contrast(parts, number, boxes[number - 1], parts > 0, toothlike, redness)
         return inside - outside
 
     kept = [
@@ -117,7 +117,7 @@ def _at_border(groups: NDArray[np.int32]) -> list[int]:
     return np.unique(np.concatenate([groups[0], groups[-1], groups[:, 0], groups[:, -1]])).tolist()
 
 
-def _standing_out(
+def _group_contrast(
     groups: NDArray[np.int32],
     number: int,
     box: tuple[slice[int, int, None], slice[int, int, None]],

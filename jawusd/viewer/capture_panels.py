@@ -11,7 +11,7 @@ from jawusd.formats.tracks import Tracks
 from jawusd.viewer.motion import Player
 from jawusd.viewer.picking import SIDES, PickBook
 from jawusd.viewer.plots import Plot, plot_seek, with_playhead
-from jawusd.viewer.take_plots import coverage_plot, frame_words, frames_to_inspect, solve_plot
+from jawusd.viewer.take_plots import coverage_plot, frame_html, frames_to_inspect, solve_plot
 from jawusd.viewer.viewed import Look, ViewedCapture
 from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, enable, guarded, notify, small_text
 
@@ -132,7 +132,7 @@ class FootagePanel:
         if capture.tracks is not None:
             drawn = with_playhead(self._plot, frame)
             self._playhead.content = plot_seek(drawn, capture.frames, self._plot.across, self.slider._impl.uuid)
-            lines.append(frame_words(capture.tracks, frame))
+            lines.append(frame_html(capture.tracks, frame))
         else:
             lines.append("no poses: pass the folder of a build, or the file of a solve, with --tracks")
         if self._loading:

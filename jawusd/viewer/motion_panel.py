@@ -18,7 +18,7 @@ from jawusd.viewer.motion import Clip, KeyTrack, Player, with_key, without_key
 from jawusd.viewer.plots import Plot, curve_plot, plot_seek, with_playhead
 from jawusd.viewer.session import Interpolation, Session
 from jawusd.viewer.viewed import ViewedActor
-from jawusd.viewer.widgets import Choice, assign, guarded, limit_uploads, named, notify
+from jawusd.viewer.widgets import Choice, assign, guarded, limit_uploads, notify, upload_name
 
 KEYS = "keys"
 _LENGTH = 100
@@ -230,7 +230,7 @@ class FilePanel:
 
     async def _load(self, _: object) -> None:
         upload = self.load.value
-        name, suffix = named(upload, (".json", ".csv"))
+        name, suffix = upload_name(upload, (".json", ".csv"))
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"upload{suffix}"
             path.write_bytes(upload.content)

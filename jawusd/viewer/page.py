@@ -114,11 +114,11 @@ class Page:
             return
         pointer = scene.skull_from_page(event.end_position)
         session.drag_to(pointer)
-        held = session.held_place()
+        held = session.grabbed_point()
         if event.phase == "end":
             session.release()
             held = None
-        scene.show_hold(held, pointer)
+        scene.show_grab(held, pointer)
         self.refresh()
 
     def refresh(self) -> None:

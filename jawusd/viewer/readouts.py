@@ -46,7 +46,7 @@ def rest_places(rig: JawRig) -> Array:
     return transform_points(T, rig.landmarks)
 
 
-def read_out(rig: JawRig, d: Array) -> Readout:
+def measure_pose(rig: JawRig, d: Array) -> Readout:
     """Return the measures of the pose of parameters d (3,) [mm]."""
     moved = landmark_places(rig, d) - rest_places(rig)
     margin = float(rig.margin(d))

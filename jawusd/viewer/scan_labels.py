@@ -125,15 +125,15 @@ class ScanLabelsPanel:
         self._state = gui.add_html("")
         self.write = gui.add_button("save the labels", icon=viser.Icon.DEVICE_FLOPPY)
         self.write.on_click(guarded(client, self._write))
-        self._say_state()
+        self._show_state()
 
     def click(self, arch: str, vertex: int) -> None:
         """Paint around a vertex."""
         if self.brush.paint(arch, vertex, self.radius.value, self.label):
             self._painted(arch)
-        self._say_state()
+        self._show_state()
 
-    def _say_state(self) -> None:
+    def _show_state(self) -> None:
         enable(self.kinds, self.painting.value)
         enable(self.radius, self.painting.value)
         enable(self.undo, self.brush.strokes > 0)
@@ -143,18 +143,18 @@ class ScanLabelsPanel:
         self._state.content = small_text(state + (f"not saved: {unsaved}" if unsaved else "all saved"))
 
     async def _turn(self, _: object) -> None:
-        self._say_state()
+        self._show_state()
         self._turned()
 
     async def _choose(self, event: Choice) -> None:
         self.label = BRUSHES[event.target.value]
-        self._say_state()
+        self._show_state()
 
     async def _undo(self, _: object) -> None:
         arch = self.brush.undo()
         if arch is not None:
             self._painted(arch)
-        self._say_state()
+        self._show_state()
 
     async def _write(self, _: object) -> None:
         """Save both arches: an arch left unchanged counts as accepted."""
@@ -162,7 +162,7 @@ class ScanLabelsPanel:
         for arch, labels in self.brush.labels.items():
             paths.append(await asyncio.to_thread(self._capture.save_labels, arch, labels.copy()))
             self.brush.saved(arch)
-        self._say_state()
+        self._show_state()
         notify(
             self._client,
             "Written",

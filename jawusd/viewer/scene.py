@@ -83,7 +83,7 @@ class JawScene:
         self._pins = {name: self._ball(f"/pin/{name}", _PIN_MM, _PIN, opacity=0.6) for name in LANDMARKS}
         self._held = self._ball("/held", _MARKER_MM, _HELD)
         self._line = self._lines("/pull", np.zeros((1, 2, 3)), _HELD)
-        self.show_hold(None, None)
+        self.show_grab(None, None)
         self.show_pins({})
 
     def _add_mesh(self, name: str, mesh: Mesh, color: Color, opacity: float | None) -> viser.MeshHandle:
@@ -146,7 +146,7 @@ class JawScene:
             self._mandible.color = self._bone if inside else _OUTSIDE
         self._inside = inside
 
-    def show_hold(self, held_skull: Array | None, pointer_skull: Array | None) -> None:
+    def show_grab(self, held_skull: Array | None, pointer_skull: Array | None) -> None:
         """Mark the grabbed point and draw a line to the pointer, both (3,) [mm] in the skull frame; None hides them."""
         visible = held_skull is not None and pointer_skull is not None
         if held_skull is not None and pointer_skull is not None:

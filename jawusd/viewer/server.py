@@ -32,7 +32,7 @@ _HEAD_START_S = 0.5
 _SHOW_EVERY_S = 0.1  # shortest interval between live poses
 
 
-class _OneLine(logging.Filter):
+class _WithoutTraceback(logging.Filter):
     """Log failed connections in one line without traceback, since any program may send invalid bytes."""
 
     def filter(self, record: logging.LogRecord) -> bool:
@@ -47,7 +47,7 @@ class _OneLine(logging.Filter):
         return True
 
 
-_ONE_LINE = _OneLine()
+_WITHOUT_TRACEBACK = _WithoutTraceback()
 
 
 def _report_task(loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
@@ -91,14 +91,14 @@ class PageServer(ABC):
         _check_address(host)
         with contextlib.redirect_stdout(sys.stderr):  # viser prints a greeting; stdout is for results
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
-        logging.getLogger("websockets.server").addFilter(_ONE_LINE)  # repeated calls have no effect
+        logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # repeated calls have no effect
         self._server.get_event_loop().set_exception_handler(_report_task)
         set_theme(self._server.gui)
-        self._server.on_client_connect(self._welcome)
-        self._server.on_client_disconnect(self._farewell)
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._disconnected)
         self.url = f"http://{'localhost' if is_loopback(host) else host}:{self._server.get_port()}"
 
-    async def _welcome(self, client: viser.ClientHandle) -> None:
+    async def _connected(self, client: viser.ClientHandle) -> None:
         if not self._trusted(client):
             log.warning("refused a page of another site")
             return
@@ -112,7 +112,7 @@ class PageServer(ABC):
     async def _page(self, client: viser.ClientHandle) -> _Closable:
         """Build the page of a visitor."""
 
-    async def _farewell(self, client: viser.ClientHandle) -> None:
+    async def _disconnected(self, client: viser.ClientHandle) -> None:
         page = self.pages.pop(client.client_id, None)
         if page is not None:
             page.close()

@@ -15,7 +15,7 @@ from jawusd.formats.keys import Keys
 from jawusd.geometry import LANDMARKS
 from jawusd.geometry.se3 import se3_inverse, transform_point
 from jawusd.viewer.motion import Clip, KeyTrack, at_frames, with_key
-from jawusd.viewer.readouts import Readout, read_out, triple
+from jawusd.viewer.readouts import Readout, measure_pose, triple
 
 Interpolation = Literal["linear", "smooth"]
 
@@ -76,7 +76,7 @@ class Session:
 
     def readout(self) -> Readout:
         """Return the measures of the current pose."""
-        return read_out(self.rig, self.d)
+        return measure_pose(self.rig, self.d)
 
     def limits(self) -> Array:
         """Return the lower and upper limit of each parameter [mm], shape (3, 2).
@@ -171,7 +171,7 @@ class Session:
         self._handle = None
         self._gesture = None
 
-    def held_place(self) -> Array | None:
+    def grabbed_point(self) -> Array | None:
         """Return the position of the grabbed point [mm], skull frame, shape (3,); None if nothing is grabbed."""
         return None if self._handle is None else transform_point(self.pose(), self._handle)
 

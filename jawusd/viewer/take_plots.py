@@ -46,10 +46,10 @@ def frames_to_inspect(tracks: Tracks, fps: float) -> list[int]:
     return [int(tracks.frames[index]) for index in worst_frames(badness, tracks.frames, fps, _MOST_WORST)]
 
 
-def frame_words(tracks: Tracks, frame: int) -> str:
+def frame_html(tracks: Tracks, frame: int) -> str:
     """Return HTML that describes the tracking or the solve of a frame."""
     if tracks.solved is not None:
-        return solve_words(tracks, tracks.solved, frame)
+        return solve_html(tracks, tracks.solved, frame)
     index = tracks.row_of(frame)
     if index is None:
         return "not tracked"
@@ -124,7 +124,7 @@ def _strip(plot: Plot, tracks: Tracks, solved: SolvedJaw, state: SolveState) -> 
     return f'<path d="{steps}" stroke="{_css(state)}" stroke-width="{_STRIP_PX}"/>'
 
 
-def solve_words(tracks: Tracks, solved: SolvedJaw, frame: int) -> str:
+def solve_html(tracks: Tracks, solved: SolvedJaw, frame: int) -> str:
     """Return HTML that describes the solve of a frame, in the colours of its outlines."""
     row = tracks.row_of(frame)
     if row is None:

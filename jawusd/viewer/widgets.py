@@ -116,7 +116,7 @@ def guarded(
     return callback
 
 
-def named(upload: viser.UploadedFile, suffixes: tuple[str, ...]) -> tuple[str, str]:
+def upload_name(upload: viser.UploadedFile, suffixes: tuple[str, ...]) -> tuple[str, str]:
     """Return the name of an upload for messages, and its suffix.
 
     Raises:

@@ -47,7 +47,7 @@ def drags(page, rng):
 
     def one(pointer):
         session.drag_to(pointer)
-        page.scene.show_hold(session.held_place(), pointer)
+        page.scene.show_grab(session.grabbed_point(), pointer)
         page.refresh()
 
     return [lambda pointer=pointer: session.drag_to(pointer) for pointer in path], [

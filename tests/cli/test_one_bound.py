@@ -34,7 +34,7 @@ from jawusd.formats.poses import write_parameters, write_poses
 from jawusd.media.side_by_side import StatusBar
 from jawusd.pipeline.library import retarget
 from jawusd.plugins import extension
-from jawusd.report.solve_page import seen_figure
+from jawusd.report.solve_page import observation_figure
 from jawusd.report.verdicts import judge
 from jawusd.rig import load_rig
 from jawusd.rig.animation import write_animation
@@ -43,9 +43,9 @@ from jawusd.rig.onnx_sidecar import decode_model
 from jawusd.rig.rules import check_bounds
 from jawusd.solvers import JawLayer
 from jawusd.viewer.pose_panel import verdict_html
-from jawusd.viewer.readouts import read_out
+from jawusd.viewer.readouts import measure_pose
 from jawusd.viewer.session import Session
-from jawusd.viewer.take_plots import solve_words
+from jawusd.viewer.take_plots import solve_html
 
 COUNT, TOLERANCE_MM, UNDECIDED_MM = 5000, 1.0, 1e-6
 ARRAYS = example_arrays() | {"tolerance_mm": np.array(TOLERANCE_MM)}
@@ -206,7 +206,7 @@ def test_command_with_numpy_alone(tmp_path, capsys):
 
 
 def test_viewer():
-    readouts = [read_out(RIG, d) for d in D]
+    readouts = [measure_pose(RIG, d) for d in D]
     assert disagreements([readout.inside for readout in readouts]) == 0
     pages = [verdict_html(readout) for readout in readouts]
     assert disagreements(["inside the bound" in page and "OUTSIDE" not in page for page in pages]) == 0
@@ -230,14 +230,14 @@ def test_solved_takes_in_viewer_and_report():
     tracks.solved = SolvedJaw(D[:count], np.ones((count, 3)), margin, state, valid)
     tracks.meta["tolerance_mm"] = TOLERANCE_MM
     for row, frame in enumerate(tracks.frames):
-        text = solve_words(tracks, tracks.solved, int(frame))
+        text = solve_html(tracks, tracks.solved, int(frame))
         assert f"bound: {words_of_measured(margin[row])}, margin {margin[row]:.2f} mm" in text
         assert ("does not allow" in text) == (margin[row] < -TOLERANCE_MM)
 
     bar = StatusBar(tracks, FPS, 1600)
     said = [" ".join(text for text, *_ in bar._said(row)) for row in range(count)]
     assert all(f"bound: {words_of_measured(m)}, margin" in text for m, text in zip(margin, said))
-    names = [label.get_text() for label in seen_figure(tracks, tracks.solved, FPS).axes[0].get_yticklabels()]
+    names = [label.get_text() for label in observation_figure(tracks, tracks.solved, FPS).axes[0].get_yticklabels()]
     outside = int((margin < -TOLERANCE_MM).sum())
     assert names[-2:] == [f"within tolerance  {(margin < 0).sum() - outside}", f"outside  {outside}"]
 

@@ -9,7 +9,7 @@ import pytest
 from report_data import FPS, report_data, solve_data
 
 from jawusd.base.errors import FormatError
-from jawusd.report.solve_page import jaw_figure, seen_figure, solve_page, unseen_runs
+from jawusd.report.solve_page import jaw_figure, observation_figure, solve_page, unobserved_runs
 
 
 def text_of(page):
@@ -32,7 +32,7 @@ def test_the_page_counts_and_names_what_was_not_seen():
     assert "outside 2 frames (3.3 %)" in text
     assert f"{first + 10}–{first + 14}" in text and "masks <are> wide" in text and "lost <here>" in text
     assert "1.0200 ± 0.0030" in text and "not used" in text and "Limited by having one camera" in text
-    runs = unseen_runs(data, data.tracks.solved)
+    runs = unobserved_runs(data, data.tracks.solved)
     assert [(run.first - first, run.last - first, run.arches, run.sigma) for run in runs] == [
         (10, 14, "lower", "1.00, 0.50, 0.25"),
         (30, 30, "upper and lower", "3.00, 3.00, 3.00"),
@@ -43,7 +43,7 @@ def test_the_page_counts_and_names_what_was_not_seen():
 def test_runs_end_where_frames_are_missing():
     data = solve_data()
     data.tracks.frames[12:] += 5
-    runs = unseen_runs(data, data.tracks.solved)
+    runs = unobserved_runs(data, data.tracks.solved)
     assert [run.last - run.first for run in runs] == [1, 2, 0]
 
 
@@ -68,7 +68,8 @@ def test_the_page_asks_for_nothing_and_draws_the_values():
         at = band[np.abs(band[:, 0] - data.tracks.frames[30]) < 1e-9, 1]
         assert np.ptp(at) == pytest.approx(widest)
         assert "[mm]" in axis.get_ylabel()
-    names = [label.get_text() for label in seen_figure(data.tracks, data.tracks.solved, FPS).axes[0].get_yticklabels()]
+    figure = observation_figure(data.tracks, data.tracks.solved, FPS)
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert names == ["solved  54", "carried  5", "lost  1", "within tolerance  1", "outside  2"]
 
 

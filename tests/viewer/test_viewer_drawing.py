@@ -13,7 +13,7 @@ from jawusd.geometry import LANDMARKS
 from jawusd.viewer.motion import Clip
 from jawusd.viewer.plots import bound_plot, curve_plot, posselt_plot, posselt_point, with_playhead
 from jawusd.viewer.pose_panel import reading_html, slider_ends, verdict_html
-from jawusd.viewer.readouts import border_path, habitual_path, landmark_places, read_out, rest_places
+from jawusd.viewer.readouts import border_path, habitual_path, landmark_places, measure_pose, rest_places
 from jawusd.viewer.viewed import for_view, is_solid
 
 RIG = example_rig()
@@ -25,14 +25,14 @@ def test_the_numbers_of_a_pose_are_displacements_in_anatomical_axes():
     T, rest = RIG.pose(d), RIG.T_rest
     moved = [A @ ((T - rest) @ [*RIG.landmarks[LANDMARKS.index(name)], 1])[:3] for name in
              ("incisor", "condyle_left", "condyle_right")]  # fmt: skip
-    found = read_out(RIG, d)
+    found = measure_pose(RIG, d)
     np.testing.assert_allclose(found.incisor_mm, moved[0], atol=1e-9)
     np.testing.assert_allclose([found.condyle_left_mm, found.condyle_right_mm], moved[1:], atol=1e-9)
     assert found.inside and found.margin_mm == float(RIG.margin(d)) and found.incisor_mm[1] < -10
     codes = RIG.captured_d
     nearest = np.linalg.norm(codes - d, axis=1).min() if len(codes) else np.inf
     assert found.captured_mm == pytest.approx(nearest)
-    assert not read_out(RIG, [14.0, 40.0, 0.0]).inside
+    assert not measure_pose(RIG, [14.0, 40.0, 0.0]).inside
 
 
 def test_the_places_of_five_poses_are_those_of_each():
@@ -80,7 +80,7 @@ def test_posselt_figures_hold_the_border_and_mark_the_incisal_point():
     for axis, column in ((1, 0), (2, 2)):
         plot = posselt_plot(RIG, axis)
         ElementTree.fromstring(plot.definition())
-        found = read_out(RIG, [10.0, 1.0, 0.0])
+        found = measure_pose(RIG, [10.0, 1.0, 0.0])
         x, y = posselt_point(landmark_places(RIG, [10.0, 1.0, 0.0]), rest, axis)
         assert (x, y) == pytest.approx((found.incisor_mm[column], found.incisor_mm[1]))
         assert plot.low[0] < x < plot.high[0] and plot.low[1] < y < plot.high[1]
@@ -113,23 +113,23 @@ def test_slider_ends_are_rounded_inwards_and_reach_beyond_only_when_allowed():
 
 def test_the_reading_says_in_words_and_colour_when_a_pose_is_outside():
     limits = np.array([[0.0, 40.0], [-2, 2], [-1, 1]])
-    good = reading_html(read_out(RIG, [5.0, 0, 0]), (5.0, 0, 0), limits)
-    bad = reading_html(read_out(RIG, [5.0, 30.0, 0]), (5.0, 30.0, 0), limits)
+    good = reading_html(measure_pose(RIG, [5.0, 0, 0]), (5.0, 0, 0), limits)
+    bad = reading_html(measure_pose(RIG, [5.0, 30.0, 0]), (5.0, 30.0, 0), limits)
     assert "<b style" in bad and "<b style" not in good
-    inside, outside = (verdict_html(read_out(RIG, [5.0, side, 0])) for side in (0.0, 30.0))
+    inside, outside = (verdict_html(measure_pose(RIG, [5.0, side, 0])) for side in (0.0, 30.0))
     assert "OUTSIDE" not in inside and "OUTSIDE" in outside and "margin -" in outside
 
 
 def test_measures_are_explained_where_the_pointer_rests():
-    reading = reading_html(read_out(RIG, [5.0, 0, 0]), (5.0, 0, 0), np.array([[0.0, 40.0], [-2, 2], [-1, 1]]))
+    reading = reading_html(measure_pose(RIG, [5.0, 0, 0]), (5.0, 0, 0), np.array([[0.0, 40.0], [-2, 2], [-1, 1]]))
     rows = {row.find("td").text: row.get("title") for row in ElementTree.fromstring(reading).iter("tr")}
     assert "pose" in rows["nearest captured"] and "forward" in rows["incisal point moved"] and all(rows.values())
-    assert "forward" not in rows and 'title="Distance' in verdict_html(read_out(RIG, [5.0, 0, 0]))
+    assert "forward" not in rows and 'title="Distance' in verdict_html(measure_pose(RIG, [5.0, 0, 0]))
 
 
 def test_no_value_is_minus_zero():
     limits = np.array([[0.0, 40.0], [-2, 2], [-1, 1]])
-    assert "-0.00" not in reading_html(read_out(RIG, [0.0, 0, 0]), (0.0, 0, 0), limits)
+    assert "-0.00" not in reading_html(measure_pose(RIG, [0.0, 0, 0]), (0.0, 0, 0), limits)
 
 
 def sphere(count):

@@ -10,7 +10,7 @@ from jawusd.formats.tracks import LOST, TRACKED, Tracks, uncovered_percent
 from jawusd.geometry import make_transform, random_rotation, transform_points
 from jawusd.viewer.picking import FOV_RAD, PickBook, PickingLayout, fit_view, hit_vertex, region_around
 from jawusd.viewer.plots import with_playhead
-from jawusd.viewer.take_plots import coverage_plot, frame_words, frames_to_inspect
+from jawusd.viewer.take_plots import coverage_plot, frame_html, frames_to_inspect
 
 
 def filled():
@@ -150,8 +150,8 @@ def test_worst_frames_are_the_lost_and_the_badly_covered_ones():
     assert apart.min() >= 12
     percent = uncovered_percent(tracks)
     assert percent[20, 1] == pytest.approx(8.0) and percent[60, 0] == pytest.approx(0.5)
-    assert "8.00 %" in frame_words(tracks, 120) and "lost" in frame_words(tracks, 140)
-    assert frame_words(tracks, 99) == frame_words(tracks, 200) == "not tracked"
+    assert "8.00 %" in frame_html(tracks, 120) and "lost" in frame_html(tracks, 140)
+    assert frame_html(tracks, 99) == frame_html(tracks, 200) == "not tracked"
 
 
 def test_the_plot_marks_the_frame_and_breaks_where_nothing_is_known():

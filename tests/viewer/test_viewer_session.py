@@ -90,9 +90,9 @@ def test_a_drag_follows_the_pointer_as_inverse_kinematics_does(session):
     found, distance = RIG.ik(RIG.landmarks[0], target, start=start)
     assert np.linalg.norm(place(session.d, 0) - place(found, 0)) < 0.1
     assert left == pytest.approx(float(distance), abs=0.01) and session.readout().inside
-    np.testing.assert_allclose(session.held_place(), place(session.d, 0), atol=1e-9)
+    np.testing.assert_allclose(session.grabbed_point(), place(session.d, 0), atol=1e-9)
     session.release()
-    assert session.held_place() is None
+    assert session.grabbed_point() is None
     session.undo()
     np.testing.assert_allclose(session.d, start)  # a drag is a single undo step
 

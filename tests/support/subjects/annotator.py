@@ -99,7 +99,7 @@ class MaskDrawer:
             return None
         part = self._outline(tooth, gum, window, px_per_mm)
         if wrong:
-            part = _spoilt(part, rng)
+            part = _grossly_wrong(part, rng)
         part = part[FINER // 2 :: FINER, FINER // 2 :: FINER]  # centres of mask pixels
         mask = np.zeros(self._size[::-1], np.uint8)
         row, column = window[1] // FINER, window[0] // FINER
@@ -121,7 +121,7 @@ class MaskDrawer:
         if gum.any():
             to_gum_mm = np.maximum(outside_px(gum), 0.0) / px_per_mm
             near = np.clip((_AWAY_FROM_GUM_MM - to_gum_mm) / (_AWAY_FROM_GUM_MM - _NEAR_GUM_MM), 0.0, 1.0)
-        gum_px = px_per_mm * (who.gum_mm[self._arch] + self._by_tooth(tooth, scale))
+        gum_px = px_per_mm * (who.gum_mm[self._arch] + self._tooth_offsets(tooth, scale))
         edge_px = scale * who.edge_px
         shift = near * gum_px + (1.0 - near) * edge_px + scale * who.camera_px[self._camera]
         shift = blurred(shift.astype(np.float32), 3.0 * scale) + scale * who.wobble_px * wobble
@@ -141,7 +141,7 @@ class MaskDrawer:
             out.append(enlarged(1.35 * field, FINER))
         return out[0], out[1]
 
-    def _by_tooth(self, tooth: NDArray[np.uint8], scale: float) -> NDArray[np.float32]:
+    def _tooth_offsets(self, tooth: NDArray[np.uint8], scale: float) -> NDArray[np.float32]:
         """Extend the gum offsets of the teeth [mm] to their surroundings."""
         offsets = np.concatenate([[0.0], self._who.gum_tooth_mm[self._arch]]).astype(np.float32)
         if not offsets.any():
@@ -151,7 +151,7 @@ class MaskDrawer:
         return np.asarray(blurred(offsets[tooth], sigma) / np.maximum(weight, np.float32(1e-3)), np.float32)
 
 
-def _spoilt(mask: Mask, rng: np.random.Generator) -> Mask:
+def _grossly_wrong(mask: Mask, rng: np.random.Generator) -> Mask:
     """Return a grossly wrong mask: half of it missing, or a large extra patch."""
     rows, columns = np.nonzero(mask)
     if not len(rows):
@@ -185,15 +185,15 @@ def blurred(values: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]
 
 def closed(mask: Mask, width_px: float) -> Mask:
     """Return the morphological closing of a mask by a disc: gaps up to a width are filled."""
-    return _less(~_less(~mask, 0.5 * width_px), 0.5 * width_px)
+    return _eroded(~_eroded(~mask, 0.5 * width_px), 0.5 * width_px)
 
 
 def opened(mask: Mask, width_px: float) -> Mask:
     """Return the morphological opening of a mask by a disc: parts narrower than a width are removed."""
-    return ~_less(~_less(mask, 0.5 * width_px), 0.5 * width_px)
+    return ~_eroded(~_eroded(mask, 0.5 * width_px), 0.5 * width_px)
 
 
-def _less(mask: Mask, radius_px: float) -> Mask:
+def _eroded(mask: Mask, radius_px: float) -> Mask:
     """Erode a mask by a radius, except at the picture's border."""
     inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
     return np.asarray(inside - 0.5 > radius_px)

@@ -175,9 +175,9 @@ def draw_motion(joint: Joint, bite: Bite, T_world_head: Array, frames: int, rng:
     controls = _exercise(frames, rng)
     lift = np.zeros(frames)
     for i in range(CLOSED_FRAMES, frames):
-        while lift[i] < _MOST_LIFT and _cuts(joint, bite, controls[i] + [lift[i], 0.0, 0.0]):
+        while lift[i] < _MOST_LIFT and _penetrates(joint, bite, controls[i] + [lift[i], 0.0, 0.0]):
             lift[i] += _LIFT_STEP
-    controls[CLOSED_FRAMES:, 0] += _evenly(lift)[CLOSED_FRAMES:]
+    controls[CLOSED_FRAMES:, 0] += _upper_envelope(lift)[CLOSED_FRAMES:]
     turn = so3_exp(np.deg2rad(rng.normal(0.0, [4.0, 5.0, 4.0])))
     centre = _TARGET_MM
     T_head = T_world_head @ make_transform(turn, centre - turn @ centre)
@@ -205,7 +205,7 @@ def _exercise(frames: int, rng: np.random.Generator) -> Array:
     return np.stack([_through(keys, values, t) for t in range(frames)])
 
 
-def _evenly(lift: Array) -> Array:
+def _upper_envelope(lift: Array) -> Array:
     """Return a smooth upper envelope of a lift per frame, shape (F,)."""
     apart = np.abs(np.subtract.outer(np.arange(len(lift)), np.arange(len(lift))))
     share = np.where(apart < _LIFT_FRAMES, np.cos(0.5 * np.pi * apart / _LIFT_FRAMES) ** 2, 0.0)
@@ -231,7 +231,7 @@ def _through(keys: Array, values: Array, t: float) -> Array:
     return np.asarray((1.0 - share) * values[k] + share * values[k + 1])
 
 
-def _cuts(joint: Joint, bite: Bite, controls: Array) -> bool:
+def _penetrates(joint: Joint, bite: Bite, controls: Array) -> bool:
     pose = controlled_pose(joint, *controls) @ se3_inverse(controlled_pose(joint, 0.0, 0.0, 0.0))
     return bite.occlusion.gap(pose) < _TOUCH_MM
 
