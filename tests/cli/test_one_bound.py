@@ -232,7 +232,7 @@ def test_solved_takes_in_viewer_and_report():
     for row, frame in enumerate(tracks.frames):
         text = solve_html(tracks, tracks.solved, int(frame))
         assert f"bound: {words_of_measured(margin[row])}, margin {margin[row]:.2f} mm" in text
-        assert ("does not allow" in text) == (margin[row] < -TOLERANCE_MM)
+        assert ("invalid for the rig" in text) == (margin[row] < -TOLERANCE_MM)
 
     bar = StatusBar(tracks, FPS, 1600)
     said = [" ".join(text for text, *_ in bar._said(row)) for row in range(count)]
