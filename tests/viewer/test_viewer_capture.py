@@ -241,7 +241,7 @@ def test_a_solve_is_shown_with_its_states(viewed, copy, tmp_path):
     opened.press(footage.slider, FIRST + 20)
     assert "bound: outside, margin -0.75 mm: <b>invalid for the rig" in footage._words.content
     opened.press(footage.slider, FIRST + 7)
-    assert "lower: out of sight" in footage._words.content and "1.25 mm" in footage._words.content
+    assert "lower: hidden" in footage._words.content and "1.25 mm" in footage._words.content
     poses = shown.tracked_poses(FIRST + 7)
     picture = shown.picture("cam0", FIRST + 7, poses, "outlines").reshape(-1, 3).astype(int)
     counts = {s: np.count_nonzero((picture == colour).all(axis=1)) for s, colour in STATE_COLOURS.items()}
