@@ -190,7 +190,7 @@ def contact_words(contact: object) -> str:
     found = contact if isinstance(contact, dict) else {}
     closed, error = found.get("closed_mm"), found.get("error_mm")
     if not isinstance(closed, float) or not isinstance(error, float):
-        return f"not protected from interpenetration: {found.get('missing', 'contact was not measured')}"
+        return f"clearance of the teeth is unknown: {found.get('missing', 'contact was not measured')}"
     meet = f"scans penetrate by {closed:.2f} mm" if closed > 0 else f"scans are {-closed:.2f} mm apart"
     return f"{meet} in the closed bite; clearances to {error:.2f} mm"
 

@@ -121,5 +121,5 @@ def test_links_to_files_elsewhere_are_not_copied(name, anchored_folder, tmp_path
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes of POSIX")
 def test_pipes_are_not_copied(anchored_folder, tmp_path):
     os.mkfifo(anchored_folder / "more.onnx")
-    with pytest.raises(RigError, match="not a file"):
+    with pytest.raises(RigError, match="is not a regular file"):
         publish_rig(anchored_folder, tmp_path / "out", "hero")
