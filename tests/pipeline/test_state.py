@@ -109,7 +109,7 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path, name):
     folder, outside = tmp_path / "out", tmp_path / "outside"
     folder.mkdir()
     (folder / name).symlink_to(outside)
-    with pytest.raises(OutputError, match="is a symbolic link"), locked(folder):
+    with pytest.raises(OutputError, match="is a (symbolic )?link"), locked(folder):
         pass
     assert not outside.exists()
 
