@@ -156,7 +156,7 @@ def pick_on_another_vertex(folder):
 #: Per fault: severity, kind and words of its line.
 SAID = {
     frames_beyond: ("error", "frames_missing", "frames end at 3199"),
-    rest_frame_outside: ("warning", "rest_frame", "motion.rest_frame is 12, frames run from 20 to 319"),
+    rest_frame_outside: ("warning", "rest_frame", "motion.rest_frame is 12; frames run from 20 to 319"),
     pick_frame_outside: ("error", "bootstrap_frame", "bootstrap.frame is 12"),
     rate_of_another_take: ("warning", "fps_differs", "30 in the capture, but the clip has 24"),
     offset_beyond: ("error", "offset_wrong", "offset of +4000"),
@@ -166,11 +166,11 @@ SAID = {
     damaged_scan: ("error", "mesh", "is truncated"),
     scan_in_metres: ("error", "mesh", "metres"),
     scan_apart: ("error", "scans_apart", "mm apart"),
-    mandible_elsewhere: ("warning", "bone_elsewhere", "mandible lies"),
+    mandible_elsewhere: ("warning", "bone_elsewhere", "mandible is"),
     black_masks: ("warning", "masks_black", "all black"),
     masks_of_another_size: ("error", "masks", "320 x 180"),
     arches_exchanged: ("error", "masks_arches_exchanged", "exchanged"),
-    cameras_exchanged: ("error", "masks_cameras_exchanged", "cameras cam1 and cam2 are exchanged"),
+    cameras_exchanged: ("error", "masks_cameras_exchanged", "cameras cam1 and cam2 are"),
     pick_on_another_vertex: ("warning", "pick_wrong", "pick 1 on the upper teeth"),
 }
 
