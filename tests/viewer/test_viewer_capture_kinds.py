@@ -37,7 +37,7 @@ def test_bad_captures_and_foreign_tracks_are_clear_errors(copy, tmp_path):
     with pytest.raises(FormatError, match="no such file"):
         viewed_capture(tmp_path / "capture.toml", None, quiet)
     tracks = write_true_tracks(tmp_path / "tracks.npz", ("cam0", "cam1", "left"))
-    with pytest.raises(FormatError, match="of the cameras cam0, cam1, left; the capture has cam0, cam1, cam2"):
+    with pytest.raises(FormatError, match="use the cameras cam0, cam1, left; the capture has cam0, cam1, cam2"):
         viewed_capture(copy, tracks, quiet)
     folder = shutil.copytree(copy, tmp_path / "capture")
     path = folder / "capture.toml"
