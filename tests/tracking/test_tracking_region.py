@@ -20,6 +20,7 @@ from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, 
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.region import performance, rig_tracker
+from jawusd.tracking.region import tracker as region_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import _light, search_borders, sharpen
@@ -281,6 +282,30 @@ def test_what_a_search_finds_is_kept_only_if_enough_of_it_fits(monkeypatch, fits
     tracker._wide_look, tracker._searched = (lambda *_: look), (lambda *_: far)
     found, _ = tracker._best(SimpleNamespace(pose=None), look, None, 1.0, np.array([0.15, 0.15]))
     assert found.pose == kept
+
+
+def test_a_jaw_out_of_sight_is_searched_although_the_head_fits_less_than_usual(monkeypatch):
+    """In dim light less of both contours matches; the head may still be right."""
+    monkeypatch.setattr(region_tracker, "fitting_share", np.asarray)
+    fits, tried = [0.18, 0.02], []
+    search = SimpleNamespace(
+        best=lambda *_: fits,
+        from_farther=lambda *_: fits,
+        near=lambda *_, **__: fits,
+        with_head_alone=lambda *_: tried.append("head alone") or fits,
+        with_head_searched=lambda *_: tried.append("head") or fits,
+        with_jaw_searched=lambda *_: tried.append("jaw") or fits,
+    )
+    one_way = region_tracker._DirectionTracker.__new__(region_tracker._DirectionTracker)
+    one_way._search, one_way._poses, one_way._motion, one_way._found = search, None, None, np.ones(2, bool)
+    one_way._rest = one_way._absent = one_way._missed = 0
+    one_way._located([None], None, np.array([0.33, 0.3]))
+    assert tried == ["head alone", "head", "jaw"]
+
+
+@pytest.mark.parametrize(("found", "due"), [(True, [1, 2, 4, 8]), (False, [1, 2, 3, 4, 5, 6, 8])])
+def test_arches_that_fit_badly_are_searched_less_and_less_often(found, due):
+    assert [count for count in range(10) if region_tracker._is_due(count, found)] == due
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import Scan, thinned
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import View
+from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.region.appearance import CORRELATION_PX
 from jawusd.tracking.region.jaw_priors import BiteTerm, CondyleMotion, CondyleTerm
 from jawusd.tracking.region.view import RegionView
@@ -56,7 +56,9 @@ _BORDER_PX3 = 0.7**2 * CORRELATION_PX  # the same, as estimated from residuals
 # Tukey's loss of 4.685^2 / 6, and samples are correlated over the length above.
 _STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
 _FAST_MM = 1.0  # predicted motion above which other starts are tried
-_HOPEFUL, _FINALISTS = 24, 3  # starts that a search tries, and those it aligns fully
+# Starts that a search tries, near the last poses and anywhere in the human range, and those it aligns fully. Colours
+# rank the right start among the first 22 of 57.
+_HOPEFUL_NEAR, _HOPEFUL, _FINALISTS = 12, 24, 3
 
 
 def head_shifts(T_world_head: Array, axes: Array) -> Array:
@@ -170,28 +172,34 @@ class PoseSearch:
         everywhere: bool,
     ) -> Solution:
         """Try earlier jaw poses, rotated ones and, on request, the whole human range, with the head as found."""
-        jaws = [se3_inverse(poses[0]) @ poses[1] for poses in (last, *motion.pose_history())]
-        bases = (se3_inverse(predicted[0]) @ predicted[1], jaws[0])
-        jaws += turned_starts(self.condyles, bases)
-        if everywhere:
-            jaws += starts_everywhere(self.condyles)
-        head = solution.poses[0]
-        order = rank_by_colour([head @ jaw for jaw in jaws], look.views, self._thin.scans, 1)[:_HOPEFUL]
-        pairs = (np.stack([head, head @ jaws[k]]) for k in order)
+        near = [se3_inverse(poses[0]) @ poses[1] for poses in (last, *motion.pose_history())]
+        near += turned_starts(self.condyles, (se3_inverse(predicted[0]) @ predicted[1], near[0]))
+        anywhere = starts_everywhere(self.condyles) if everywhere else []
+        head, pairs = solution.poses[0], []
+        for jaws, count in ((near, _HOPEFUL_NEAR if everywhere else _HOPEFUL), (anywhere, _HOPEFUL)):
+            order = rank_by_colour([head @ jaw for jaw in jaws], look.views, self._thin.scans, 1)[:count]
+            pairs += [np.stack([head, head @ jaws[k]]) for k in order]
         brief = [self._align(pair, look, _TRIAL_GATES_PX, True) for pair in pairs]
         brief.sort(key=lambda trial: -self.objective_px(trial))
         for trial in brief[:_FINALISTS]:
             solution = self._better(solution, self.near(trial.poses, look, firm=True))
         return solution
 
-    def with_head_searched(self, solution: Solution, predicted: Array, look: InstantViews) -> Solution:
-        """Try shifted head poses with an unchanged jaw."""
-        shifts = head_shifts(predicted[0], self._axes)
+    def with_head_alone(self, solution: Solution, start: Array, look: InstantViews) -> Solution:
+        """Align the head alone if its contour then fits better: a wrong jaw pulls it along by the condyles."""
+        alone = self._align(start, look, _FAR_GATES_PX, use=_upper_alone(look.views))
+        return max((solution, alone), key=lambda trial: float(fitting_share(trial)[0]))
+
+    def with_head_searched(self, solution: Solution, predicted: Array, look: InstantViews, alone: bool) -> Solution:
+        """Try shifted head poses with an unchanged jaw; `alone` ignores the contour of the jaw."""
+        shifts, use = head_shifts(predicted[0], self._axes), _upper_alone(look.views) if alone else None
         order = rank_by_colour(list(shifts @ predicted[0]), look.views, self._thin.scans, 0)[: _HOPEFUL // 2]
-        brief = [self._align(shifts[k] @ predicted, look, _TRIAL_GATES_PX, True) for k in order]
+        brief = [self._align(shifts[k] @ predicted, look, _TRIAL_GATES_PX, True, use) for k in order]
         brief.sort(key=lambda trial: -float(score_px(trial)[0].sum()))
-        best = [self.near(trial.poses, look, firm=True) for trial in brief[:_FINALISTS]]
-        return max((solution, *best), key=lambda trial: float(score_px(trial)[0].sum()))
+        best = [self._align(trial.poses, look, _FAR_GATES_PX, True, use) for trial in brief[:_FINALISTS]]
+        if alone:
+            return max((solution, *best), key=lambda trial: float(score_px(trial)[0].sum()))
+        return max((solution, *best), key=self.objective_px)
 
     def look(self, views: Sequence[View]) -> InstantViews:
         """Return the views of an instant with a shared rendering."""
@@ -210,9 +218,22 @@ class PoseSearch:
         """Return the solution with the higher objective."""
         return other if self.objective_px(other) > self.objective_px(one) else one
 
-    def _align(self, start: Array, look: InstantViews, gates_px: Sequence[float], firm: bool = False) -> Solution:
+    def _align(
+        self,
+        start: Array,
+        look: InstantViews,
+        gates_px: Sequence[float],
+        firm: bool = False,
+        use: Mask | None = None,
+    ) -> Solution:
         terms = (self._firm if firm else self._loose, self._bite)
-        return self._thin.solve(start, look.views, gates_px, None, terms, rendering=look.rendering)
+        return self._thin.solve(start, look.views, gates_px, use, terms, rendering=look.rendering)
+
+
+def _upper_alone(views: Sequence[View]) -> Mask:
+    use = present_masks(views)
+    use[1] = False
+    return use
 
 
 def fitting_share(solution: Solution) -> Array:

@@ -26,7 +26,6 @@ _FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of
 # that of the first frame, so that slowly closing lips do not become usual.
 _DOUBTED, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = 0.8, 0.6, 0.5, 0.25, 0.7
 _USUAL_FRAMES = 15  # window of the usual matched share
-# A lost jaw is searched in the first `_EAGER` frames, then in every `_OFTEN`-th one, like a lost head.
 _EAGER, _OFTEN = 6, 4
 _RESTING = 4  # frames without wide gates after these have failed, since lips stay closed for a while
 _WIDE_MM = 40.0  # largest expected opening of a jaw that was out of sight
@@ -158,26 +157,29 @@ class _DirectionTracker:
         if (share < _DOUBTED * usual).any() and not self._rest:
             near, solution = solution, search.from_farther(solution, starts[0], self._poses, look)
             share, self._rest = fitting_share(solution), _RESTING if solution is near else 0
-        self._absent = self._absent + 1 if share[0] < _SUSPECT * usual[0] and not self._found[0] else 0
-        if self._absent % _OFTEN == 1:
-            solution, searched = search.with_head_searched(solution, starts[0], look), True
-            share = fitting_share(solution)
-        elif share[1] < _SUSPECT * usual[1]:
+        if share[1] < _SUSPECT * usual[1]:
             solution, searched = search.near(starts[0], look, firm=True), True
+            solution = search.with_head_alone(solution, starts[0], look)
             share = fitting_share(solution)
-        missed = share[0] >= _SUSPECT * usual[0] and share[1] < _SUSPECT * usual[1]
+        self._absent = self._absent + 1 if share[0] < _SUSPECT * usual[0] else 0
+        if _is_due(self._absent, self._found[0]):
+            solution = search.with_head_searched(solution, starts[0], look, bool(share[1] < _SUSPECT * usual[1]))
+            share, searched = fitting_share(solution), True
+        missed = share[0] >= self._least()[0] * usual[0] and share[1] < _SUSPECT * usual[1]
         self._missed = self._missed + 1 if missed else 0
-        # A jaw that disappears is searched at doubling intervals, a lost one in every frame at first.
-        late = self._missed & (self._missed - 1) == 0
-        if missed and (late if self._found[1] else self._missed <= _EAGER or self._missed % _OFTEN == 0):
+        if _is_due(self._missed, self._found[1]):
             lost = not self._found[1]
             solution = search.with_jaw_searched(solution, starts[0], self._poses, look, self._motion, lost)
         return solution, searched
 
+    def _least(self) -> Array:
+        """Return the share of the usual matched contour below which an arch is not found, shape (2,)."""
+        return np.where(self._found, _LOST, _AGAIN)
+
     def _taken(self, instant: _Instant, rough: Solution, searched: bool, usual: Array, seen: bool) -> RegionPose:
         """Refine a rough alignment, decide which arches are found, and learn if both are."""
         solution = instant.polished(rough, firm=searched)
-        share, least = fitting_share(rough), np.where(self._found, _LOST, _AGAIN)
+        share, least = fitting_share(rough), self._least()
         found = (share >= least * usual) & (matched_px(solution) >= self._search.config.least_matched_px)
         poses = np.where(found[:, None, None], solution.poses, self._motion.predict())
         covariance = np.where(found[:, None, None], _covariance(solution), np.nan)
@@ -189,6 +191,15 @@ class _DirectionTracker:
         self._poses, self._found = poses, found
         objective_px = self._search.objective_px(solution)
         return RegionPose(poses, found, covariance, objective_px, solution, share / usual, least)
+
+
+def _is_due(count: int, found: bool) -> bool:
+    """Return whether to search an arch that fits badly for the `count`-th frame in a row.
+
+    One that disappears is searched at doubling intervals, a lost one in the first `_EAGER` frames, then in every
+    `_OFTEN`-th one.
+    """
+    return count > 0 and (count & (count - 1) == 0 if found else count <= _EAGER or count % _OFTEN == 0)
 
 
 def _covariance(solution: Solution) -> Array:
