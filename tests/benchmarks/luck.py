@@ -1,0 +1,200 @@
+"""Track a capture many times with inputs changed by nothing that matters, and compare the runs with the truth.
+
+    python tests/benchmarks/luck.py CAPTURE [--runs 10] [--seed 0] [--footage]
+
+CAPTURE has truth/truth.npz; with --footage its masks are ignored. Every run is a process of its own. The first is the
+capture as it is; the others change one thing each, in turn:
+
+    1e-9, 1e-3, 0.1, 0.3 px   picks moved by normal noise of that size
+    grey                      a grey level of noise, -1, 0 or 1, in the videos (masks stay)
+    order                     cameras in reverse order
+    reversed                  videos and masks played backwards (masks must be videos)
+    first                     the first frame left out
+    thread                    one thread instead of three
+    generic                   compiled for a processor without vector units
+
+Per run: frames lost; distance of the incisal point from the truth over the others, mean and worst [mm]; frames off by
+more than 1 mm whose stated standard deviation is under 0.5 mm; findings. Then mean, worst and spread of the runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+
+from jawusd.formats.capture import Bootstrap, Capture, load_capture
+from jawusd.formats.tracks import LOST, Tracks
+from jawusd.geometry import transform_point
+from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
+from jawusd.pipeline.track import track
+
+KINDS = ("1e-9 px", "1e-3 px", "0.1 px", "0.3 px", "grey", "order", "reversed", "first", "thread", "generic")
+WRONG_MM, SURE_MM = 1.0, 0.5
+
+
+def moved_picks(picks: Bootstrap, sigma_px: float, rng: np.random.Generator) -> Bootstrap:
+    """Return picks with noise."""
+
+    def moved(view):
+        x, y = rng.normal((view.x, view.y), sigma_px)
+        return view.model_copy(update={"x": float(x), "y": float(y)})
+
+    def row(given):
+        return tuple(pick.model_copy(update={"views": tuple(map(moved, pick.views))}) for pick in given)
+
+    return picks.model_copy(update={"upper": row(picks.upper), "lower": row(picks.lower)})
+
+
+def rewritten(source: Path, target: Path, reverse: bool, rng: np.random.Generator | None) -> int:
+    """Write a video without loss, backwards or with a grey level of noise; return its number of frames."""
+    with av.open(str(source)) as opened:
+        stream = opened.streams.video[0]
+        pictures = list(opened.decode(stream))
+        rate = Fraction(stream.average_rate)
+    layout = "gray" if pictures[0].format.name.startswith("gray") else "yuv420p"
+    with av.open(str(target), "w") as made:
+        out = made.add_stream("ffv1", rate=rate)
+        out.width, out.height, out.pix_fmt = pictures[0].width, pictures[0].height, layout
+        for picture in reversed(pictures) if reverse else pictures:
+            values = picture.to_ndarray(format=layout)
+            if rng is not None:
+                luma = values[: picture.height].astype(np.int16)
+                luma += rng.integers(-1, 2, luma.shape, dtype=np.int16)
+                values[: picture.height] = np.clip(luma, 0, 255)
+            frame = av.VideoFrame.from_ndarray(values, layout)
+            frame.colorspace, frame.color_range = picture.colorspace, picture.color_range
+            made.mux(out.encode(frame))
+        made.mux(out.encode(None))
+    return len(pictures)
+
+
+def backwards(capture: Capture, folder: Path) -> Capture:
+    """Return a capture played backwards: frame k of a clip of n frames becomes frame n - 1 - k."""
+    offsets, cameras, counts = sync_cameras(capture, lambda *_: None)["offsets"], [], {}
+    for camera in capture.cameras:
+        clips = {"video": camera.video} if camera.video else {}
+        clips |= {"upper": camera.masks.upper, "lower": camera.masks.lower} if camera.masks else {}
+        files = {name: folder / f"{camera.name}_{name}.mkv" for name in clips}
+        for name, path in clips.items():
+            counts[camera.name] = rewritten(path, files[name], True, None)
+        masks = camera.masks and camera.masks.model_copy(update={k: files[k] for k in ("upper", "lower")})
+        cameras.append(camera.model_copy(update={"video": files.get("video"), "masks": masks}))
+    reference = capture.sync.reference or capture.cameras[0].name
+    last = counts[reference] - 1
+    turned = {name: last + 1 - counts[name] - offset for name, offset in offsets.items()}
+    sync = capture.sync.model_copy(update={"method": "offsets", "offsets": turned, "reference": reference})
+    frames = capture.frames and (last + 1 - capture.frames[1], last + 1 - capture.frames[0])
+    rest = capture.motion.rest_frame
+    motion = capture.motion.model_copy(update={"rest_frame": None if rest is None else last - rest})
+    picks = capture.bootstrap and capture.bootstrap.model_copy(update={"frame": last - capture.bootstrap.frame})
+    changed = {"cameras": tuple(cameras), "sync": sync, "frames": frames, "motion": motion, "bootstrap": picks}
+    return capture.model_copy(update=changed)
+
+
+def changed(capture: Capture, kind: str, folder: Path, rng: np.random.Generator) -> Capture:
+    """Return a capture with one thing changed."""
+    if kind.endswith("px") and capture.bootstrap:
+        picks = moved_picks(capture.bootstrap, float(kind[:-2]), rng)
+        return capture.model_copy(update={"bootstrap": picks})
+    if kind == "grey":
+        cameras = []
+        for camera in capture.cameras:
+            if camera.video is not None:
+                rewritten(camera.video, folder / f"{camera.name}.mkv", False, rng)
+                camera = camera.model_copy(update={"video": folder / f"{camera.name}.mkv"})
+            cameras.append(camera)
+        return capture.model_copy(update={"cameras": tuple(cameras)})
+    if kind == "order":
+        reference = capture.sync.reference or capture.cameras[0].name
+        sync = capture.sync.model_copy(update={"reference": reference})
+        return capture.model_copy(update={"cameras": capture.cameras[::-1], "sync": sync})
+    if kind == "first" and capture.frames:
+        return capture.model_copy(update={"frames": (capture.frames[0] + 1, capture.frames[1])})
+    return backwards(capture, folder) if kind == "reversed" else capture
+
+
+def scores(capture: Capture, tracks: Tracks, frames: np.ndarray) -> dict[str, object]:
+    """Return what a run gives, against the truth at these frames of the capture."""
+    with np.load(capture.folder / "truth" / "truth.npz") as truth:
+        exact = truth["T_upper_lower"][np.searchsorted(truth["frames"], frames)]
+    incisor = subject_of_capture(capture, load_meshes(capture)).landmarks[0]
+    gap = transform_point(tracks.raw_T_upper_lower, incisor) - transform_point(exact, incisor)
+    known = (tracks.status != LOST).all(axis=1)
+    off_mm = np.linalg.norm(gap, axis=-1)[known]
+    sure = tracks.sigma_mm[known, 0] < SURE_MM
+    return {
+        "frames": len(frames),
+        "lost": frames[~known].tolist(),
+        "mean_mm": float(off_mm.mean()),
+        "worst_mm": float(off_mm.max()),
+        "silent": int(((off_mm > WRONG_MM) & sure).sum()),
+        "findings": sorted({str(found["kind"]) for found in tracks.meta.get("findings", [])}),
+    }
+
+
+def one_run(path: Path, kind: str, seed: int, footage: bool) -> dict[str, object]:
+    """Track a capture with one thing changed."""
+    capture = load_capture(path)
+    if footage:
+        bare = tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras)
+        capture = capture.model_copy(update={"cameras": bare})
+    with tempfile.TemporaryDirectory() as folder:
+        given = changed(capture, kind, Path(folder), np.random.default_rng(seed))
+        tracks = track(given, jobs=1 if kind == "thread" else 3)
+    frames = tracks.frames
+    if kind == "reversed":
+        first, stop = given.frames or (int(frames[0]), int(frames[-1]) + 1)
+        original = capture.frames or (first, stop)
+        frames = original[0] + stop - 1 - frames
+    return scores(capture, tracks, frames)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--footage", action="store_true", help="ignore masks")
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # of the processes that this starts
+    options = parser.parse_args()
+    if options.one is not None:
+        print(json.dumps(one_run(options.capture, options.one, options.seed, options.footage)))
+        return
+    print(f"{'run':<10}{'lost':>6}{'mean':>9}{'worst':>9}{'silent':>8}  findings")
+    found = []
+    for run in range(options.runs):
+        kind = "as it is" if run == 0 else KINDS[(run - 1) % len(KINDS)]
+        line = [sys.executable, __file__, str(options.capture), "--one", kind, "--seed", str(options.seed + run)]
+        generic = {"NUMBA_CPU_NAME": "generic"} if kind == "generic" else {}
+        line += ["--footage"] if options.footage else []
+        done = subprocess.run(line, capture_output=True, text=True, check=False, env={**os.environ, **generic})
+        if done.returncode:
+            print(f"{kind:<10} {done.stderr.strip().splitlines()[-1][:140]}", flush=True)
+            continue
+        row = json.loads(done.stdout.splitlines()[-1])
+        found.append(row)
+        numbers = f"{len(row['lost']):>6}{row['mean_mm']:>9.3f}{row['worst_mm']:>9.3f}{row['silent']:>8}"
+        print(f"{kind:<10}{numbers}  {', '.join(row['findings'])}", flush=True)
+    if found:
+        lost, mean = (
+            np.array(each) for each in zip(*((len(row["lost"]), row["mean_mm"]) for row in found), strict=True)
+        )
+        worst, silent = max(row["worst_mm"] for row in found), max(row["silent"] for row in found)
+        print(f"mean      {lost.mean():>6.1f}{mean.mean():>9.3f}")
+        print(f"worst     {lost.max():>6}{mean.max():>9.3f}{worst:>9.3f}{silent:>8}  of {len(found)} runs")
+        print(f"spread          {np.ptp(mean):>9.3f}")
+
+
+if __name__ == "__main__":
+    main()
