@@ -23,6 +23,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
+from hostile_rigs import doubling, enlarge, nested  # noqa: E402  # from the folder above
+
 GOLDEN, CAPTURE = ROOT / "tests" / "golden" / "rig_v2_anchored", ROOT / "examples" / "capture"
 PROGRAM = [sys.executable, "-m", "jawusd"]
 YES, NO, FORMAT, CAPTURE_NO, RIG, OUTPUT, ENDED = 0, 1, 3, 5, 8, 10, 12  # exit codes
@@ -63,28 +65,15 @@ def rig(folder: Path) -> Path:
 
 def many_faces(folder: Path) -> list[str]:
     """View a rig of some MB that declares 300 million corners of faces."""
-    from pxr import Sdf, Vt
-
     there = rig(folder)
-    layer = Sdf.Layer.FindOrOpen(str(there / "geo.usdc"))
-    corners = layer.GetAttributeAtPath("/Actor/geo/Mandible/LowerTeethMesh.faceVertexIndices")
-    corners.default = Vt.IntArray(300_000_000)
-    layer.Export(str(there / "large.usdc"))
-    (there / "large.usdc").replace(there / "geo.usdc")
+    enlarge(there / "geo.usdc", "/Actor/geo/Mandible/LowerTeethMesh.faceVertexIndices", 300_000_000)
     return ["view", str(there / "actor.usda"), "--port", "0"]
 
 
 def layer(command: str, body: str, folder: Path) -> list[str]:
     """Run a command over a layer."""
-    (folder / "a.usda").write_text("#usda 1.0\n" + body)
+    (folder / "a.usda").write_text(body)
     return [command, str(folder / "a.usda")]
-
-
-def doubling(levels: int) -> str:
-    """Return a layer of 2 ** levels prims."""
-    half = 'def "{}" ( references = </P{}> ) {{}}\n'
-    lines = [f'def "P{i}" {{\n{half.format("a", i + 1)}{half.format("b", i + 1)}}}\n' for i in range(levels)]
-    return "".join(lines) + f'def "P{levels}" {{}}\n'
 
 
 def linked(folder: Path) -> list[str]:
@@ -194,13 +183,12 @@ def without_proc() -> None:
     libc.umount2(b"/proc", detach)
 
 
-DEEP = 'def "a" {\n' * 40_000 + "}\n" * 40_000
 ASCII = (("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0"))
 ATTACKS = {
     "300 million corners": Attack(many_faces, FORMAT, "values, more than the limit", 1800),
-    "40,000 prims deep, info": Attack(partial(layer, "info", DEEP), ENDED, "a library crashed"),
-    "40,000 prims deep, validate": Attack(partial(layer, "validate", DEEP), ENDED, "a library crashed"),
-    "40,000 prims deep, view": Attack(partial(layer, "view", DEEP), ENDED, "a library crashed"),
+    "40,000 prims deep, info": Attack(partial(layer, "info", nested(40_000)), ENDED, "a library crashed"),
+    "40,000 prims deep, validate": Attack(partial(layer, "validate", nested(40_000)), ENDED, "a library crashed"),
+    "40,000 prims deep, view": Attack(partial(layer, "view", nested(40_000)), ENDED, "a library crashed"),
     "2 ** 28 prims": Attack(partial(layer, "info", doubling(28)), ENDED, "processor time", 18_000),
     "2 ** 28 prims in 1 GB": Attack(
         partial(layer, "info", doubling(28)), ENDED, "", 1100, env=(("JAWUSD_MEMORY_GB", "1"),)

@@ -11,7 +11,9 @@ import threading
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom, Vt
+from example_rig import forget_checksums
+from hostile_rigs import HEADER, doubling, enlarge, nested
+from pxr import Usd, UsdGeom
 
 import jawusd
 from jawusd.base.errors import FormatError, ResourceError, RigError
@@ -20,38 +22,7 @@ from jawusd.rig import attributes, separate, untrusted
 from jawusd.rig.geo import read_geometry, read_gum
 from jawusd.rig.read import describe, load_rig, open_stage
 
-HEADER = "#usda 1.0\n"
 limits = pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
-
-
-def doubling(levels):
-    """Return a layer of 2 ** levels prims."""
-    refers = "".join(
-        f'def "P{i}" {{\ndef "a" ( references = </P{i + 1}> ) {{}}\ndef "b" ( references = </P{i + 1}> ) {{}}\n}}\n'
-        for i in range(levels)
-    )
-    return f'{HEADER}{refers}def "P{levels}" {{}}\n'
-
-
-def nested(levels):
-    """Return a layer that makes OpenUSD overflow its stack."""
-    return HEADER + 'def "a" {\n' * levels + "}\n" * levels
-
-
-def enlarged(folder, path, count):
-    """Fill an array of a rig with many zeros; the binary layer stays small."""
-    for name in ("geo.usdc", "rig.usdc"):
-        layer = Sdf.Layer.FindOrOpen(str(folder / name))
-        spec = layer.GetAttributeAtPath(path)
-        if spec:
-            kind = Vt.IntArray if spec.typeName == Sdf.ValueTypeNames.IntArray else Vt.DoubleArray
-            spec.default = kind(count)
-            layer.Export(str(folder / "large.usdc"))
-            os.replace(folder / "large.usdc", folder / name)
-    actor = Sdf.Layer.FindOrOpen(str(folder / "actor.usda"))
-    actor.customLayerData = {k: v for k, v in actor.customLayerData.items() if k != "sha256"}
-    actor.Save()
-    return folder / "actor.usda"
 
 
 def test_a_separate_process_gives_the_same_rig(folder):
@@ -80,10 +51,11 @@ def test_what_takes_too_long_is_an_error(tmp_path, monkeypatch):
 
 @limits
 def test_what_needs_too_much_memory_is_an_error(anchored_folder, monkeypatch):
-    actor = enlarged(anchored_folder, "/Actor.jaw:model:tRest", 150_000_000)
+    enlarge(anchored_folder / "rig.usdc", "/Actor.jaw:model:tRest", 150_000_000)
+    forget_checksums(anchored_folder)
     monkeypatch.setattr(separate, "MAX_MEMORY_GB", 0.8)
     with pytest.raises((FormatError, ResourceError), match="Corrupt asset|needs more memory"):
-        jawusd.load(actor, untrusted=True)
+        jawusd.load(anchored_folder, untrusted=True)
 
 
 def test_errors_come_back_as_they_are(anchored_folder, tmp_path, monkeypatch):
