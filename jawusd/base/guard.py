@@ -28,7 +28,7 @@ except ImportError:  # on Windows, which has no such limits
 #: Environment variable: how much memory [GB] a command may use; 0 for no limit.
 SETTING = "JAWUSD_MEMORY_GB"
 
-_FRACTION, _MIN_GB = 0.75, 4.0  # share of the machine's memory; lower bound, which ordinary builds stay below
+_FRACTION, _MIN_GB = 0.75, 4.0  # fraction of the machine's memory; lower bound, which ordinary builds stay below
 _MIN_SPACE_GB = 1.5  # OpenUSD's libraries take 1.3 GB of address space
 _CHILD = "_JAWUSD_CHILD"  # environment variable that marks the child where processes cannot fork
 _SI_KERNEL = 0x80  # from Linux's siginfo.h: sent by a terminal, to the child as well

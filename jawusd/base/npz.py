@@ -126,7 +126,7 @@ def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: ob
 
     Args:
         shape: Required shape, None for any length.
-        finite: Refuse NaN and infinity.
+        finite: Reject NaN and infinity.
 
     Raises:
         FormatError: missing, of another shape, or not finite.

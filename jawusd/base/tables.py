@@ -7,7 +7,7 @@ All readers share these rules:
 * separator: tab, semicolon or comma, the first that splits header and first row into equally many cells, or that splits
   the header; a line `sep=;` overrides this;
 * decimal sign: a point, or a comma if no number of the table has a point. Thousands separators are not supported, and
-  the ambiguous `1,234` is refused.
+  the ambiguous `1,234` is rejected.
 
 Blank lines, comments and blank columns at the end are skipped.
 """

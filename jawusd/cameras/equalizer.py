@@ -34,7 +34,7 @@ def load_3de(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
 
     Args:
         path: the script or its folder.
-        sizes: (width, height) [px] of the pictures by camera.
+        sizes: (width, height) [px] of the images by camera.
 
     Raises:
         CalibrationError: no camera, a camera that moves or zooms, an unknown size or distortion model, or a lens that

@@ -7,8 +7,8 @@ as knobs.
 
 The models (Science-D-Visions, "The Standard Models for Lens Distortion in 3DE4", and its Lens Distortion Plugin Kit)
 map recorded to undistorted points, in coordinates from the lens centre, y up, over half the film back diagonal. OpenCV
-maps in the other direction: its coefficients are fitted to the model over the picture, and residuals above 0.05 px are
-refused. Only "OpenCV Radial Degree 6, Decentered Degree 2" uses OpenCV's own coefficients.
+maps in the other direction: its coefficients are fitted to the model over the image, and residuals above 0.05 px are
+rejected. Only "OpenCV Radial Degree 6, Decentered Degree 2" uses OpenCV's own coefficients.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _STATIC = ("0", "DISTORTION_STATIC")
 _FOV = {"xa": 0.0, "xb": 1.0, "ya": 0.0, "yb": 1.0}
 _LARGEST_ERROR_PX = 0.05
 _MM_PER_CM = 10.0
-_GRID, _BEYOND = 33, 0.03  # fitting points per side of the picture, and margin around it [share of the side]
+_GRID, _BEYOND = 33, 0.03  # fitting points per side of the image, and margin around it [fraction of the side]
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def opencv_of(
     Args:
         lens: the lens.
         K: the camera's pinhole matrix [px].
-        size: width and height of its picture [px].
+        size: width and height of its image [px].
         back_mm: width and height of its film back.
         focal_mm: its focal length.
 

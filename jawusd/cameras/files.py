@@ -67,7 +67,7 @@ def load_cameras_file(
             nerfstudio's transforms.json, Metashape XML, RealityScan CSV or (a folder of) XMP, OpenCV YAML, XML or JSON,
             or 3DEqualizer's Nuke script (or its folder).
         unit_mm: length of the file's unit.
-        sizes: (width, height) [px] of the pictures by camera, for formats without them; see `lacks_sizes`.
+        sizes: (width, height) [px] of the images by camera, for formats without them; see `lacks_sizes`.
 
     Raises:
         CalibrationError: a value is missing or wrong, or the camera model is not supported.

@@ -48,7 +48,7 @@ def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
     Args:
         paths: the files; values of a camera are merged over all files. If any camera has a pose, those without one are
             ignored.
-        sizes: (width, height) [px] of the pictures by camera, if not in the files.
+        sizes: (width, height) [px] of the images by camera, if not in the files.
 
     Raises:
         CalibrationError: a camera lacks intrinsics, pose or size, or a value is wrong.

@@ -41,7 +41,7 @@ class CameraFormat:
 
     # whether a path has this format: 0 no, 1 by its name, 2 by its content
     reads: Callable[[Path], int]
-    # returns the cameras in the file's order and unit, given (width, height) [px] of the pictures by camera
+    # returns the cameras in the file's order and unit, given (width, height) [px] of the images by camera
     load: Callable[[Path, Mapping[str, Size]], list[Camera]]
     files: Callable[[Path], list[Path]] = lambda path: [path]  # all files of a calibration
     lacks_sizes: bool = False  # image sizes are not, or not always, in the file
@@ -58,7 +58,7 @@ def plain_name(name: str) -> str:
 
 
 def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
-    """Return a unique name for each picture label; folder and suffix are dropped unless needed.
+    """Return a unique name for each image label; folder and suffix are dropped unless needed.
 
     Raises:
         CalibrationError: two labels are equal.
@@ -83,7 +83,7 @@ def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
 
 
 def known_size(path: Path, name: str, sizes: Mapping[str, Size]) -> Size:
-    """Return the size of a camera's pictures.
+    """Return the size of a camera's images.
 
     Raises:
         CalibrationError: the size is unknown.

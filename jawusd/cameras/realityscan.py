@@ -1,4 +1,4 @@
-"""Cameras of RealityScan (RealityCapture): XMP beside the pictures, and CSV.
+"""Cameras of RealityScan (RealityCapture): XMP beside the images, and CSV.
 
 XMP, `IMAGE.xmp` ("Camera Geometry in RealityScan", dev.epicgames.com, and "RealityCapture XMP Camera Math",
 support.capturingreality.com): Rotation (row-major) maps world to camera axes, x right, y down, z forward; Position is
@@ -52,7 +52,7 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
 
     Args:
         folder: the folder of the files.
-        sizes: (width, height) [px] of the pictures by camera.
+        sizes: (width, height) [px] of the images by camera.
 
     Raises:
         CalibrationError: a size is unknown, or a value is missing or wrong.
@@ -90,11 +90,11 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
 
 
 def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read cameras from RealityScan's camera parameters, named after the pictures, in the file's unit.
+    """Read cameras from RealityScan's camera parameters, named after the images, in the file's unit.
 
     Args:
         path: the CSV.
-        sizes: (width, height) [px] of the pictures by camera.
+        sizes: (width, height) [px] of the images by camera.
 
     Raises:
         CalibrationError: a column or a size is missing, or a value is not finite.

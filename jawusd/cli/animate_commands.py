@@ -283,9 +283,9 @@ def _rate_of(rig: Path, prim: str | None) -> float:
 
 
 def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None) -> AuthoredMotion:
-    """Read the jaw of an ARKit face capture, by the person's mapping or as shares of the person's ranges.
+    """Read the jaw of an ARKit face capture, by the person's mapping or as fractions of the person's ranges.
 
-    As shares, JawOpen 1 is the full opening; JawLeft minus JawRight, and JawForward, are shares of the range at that
+    As shares, JawOpen 1 is the full opening; JawLeft minus JawRight, and JawForward, are fractions of the range at that
     opening. Left is the subject's left.
 
     Args:

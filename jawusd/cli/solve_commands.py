@@ -145,7 +145,7 @@ def live(
 ) -> None:
     """Track the jaw of a person with a rig in live video: a line of JSON per instant, OSC, a page.
 
-    Frames are dropped if pictures arrive too fast; every line contains the latency.
+    Frames are dropped if images arrive too fast; every line contains the latency.
     """
     from jawusd.pipeline.live import OscSender
     from jawusd.pipeline.live import live as follow

@@ -28,7 +28,7 @@ def check_lines(findings: Sequence[Finding]) -> list[str]:
     return [*(finding.line() for finding in findings), counted]
 
 
-_LISTED = 10  # pictures per camera
+_LISTED = 10  # images per camera
 _LISTED_MASKS = 12
 
 
@@ -121,7 +121,7 @@ def start_lines(start: CaptureStart) -> list[str]:
     return [*lines, f"next: jawusd check {folder}"]
 
 
-_LEAST_APART_MM = 10.0  # the same as in `capture.camera_checks`, which refuses such a capture
+_LEAST_APART_MM = 10.0  # the same as in `capture.camera_checks`, which rejects such a capture
 
 
 def camera_lines(cameras: list[Camera], files: list[Path]) -> list[str]:

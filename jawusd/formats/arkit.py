@@ -65,7 +65,7 @@ class FaceCapture:
 
 
 def shares_of(weights: Array) -> Array:
-    """Return weights (F, 4) as shares of opening, reach to the left and reach forward, shape (F, 3)."""
+    """Return weights (F, 4) as fractions of opening, reach to the left and reach forward, shape (F, 3)."""
     opening, left, right, forward = weights.T
     return np.stack([opening, left - right, forward], axis=1)
 

@@ -50,7 +50,7 @@ class Sync(Strict):
 
 
 class PickView(Strict):
-    """The pixel of a picked vertex in one camera (OpenCV pixels of the recorded picture)."""
+    """The pixel of a picked vertex in one camera (OpenCV pixels of the recorded image)."""
 
     camera: Annotated[str, Key("Name of the camera.", '"left"')]
     x: Annotated[float, Key("Pixel column; the centre of the first pixel is 0.", "651.5", "px")]

@@ -41,7 +41,7 @@ class Scans(Strict):
 class Masks(Strict):
     """The teeth masks of one camera: a PNG pattern with %06d, or a video.
 
-    A mask is white on black, or the alpha channel of a picture. Instead of `upper` and `lower`, `labels` may name one
+    A mask is white on black, or the alpha channel of an image. Instead of `upper` and `lower`, `labels` may name one
     pattern or lossless video in which gray value `upper_value` is upper teeth, `lower_value` lower teeth, 0 neither.
     """
 
@@ -167,7 +167,7 @@ class CameraSource(Strict):
 class Boards(Strict):
     """The calibration board and its clips; counts are inner corners.
 
-    `videos` lists one video or image sequence (`%04d`) per camera, in camera order; pictures with the same number count
+    `videos` lists one video or image sequence (`%04d`) per camera, in camera order; images with the same number count
     as simultaneous. A ChArUco board also needs OpenCV's name of its dictionary, and its marker size.
     """
 

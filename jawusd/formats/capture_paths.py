@@ -119,7 +119,7 @@ def _named_twice(
 
 
 def _link_out(place: Path, folder: Path) -> str | None:
-    """Return a link in a folder of pictures or labels that leads outside the capture's folder, or None."""
+    """Return a link in a folder of images or labels that leads outside the capture's folder, or None."""
     if not place.is_dir():
         return None
     with os.scandir(place) as entries:

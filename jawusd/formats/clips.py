@@ -44,7 +44,7 @@ class ClipSource:
         colour_space: "display", "linear", "cineon" or a name in the OpenColorIO config; None: by file type.
         colour_config: OpenColorIO config.
         pixel_aspect: width of a pixel over its height; None: from the file.
-        timecode: of the first picture; "": from the file.
+        timecode: of the first image; "": from the file.
     """
 
     path: Path
@@ -56,7 +56,7 @@ class ClipSource:
 
     @property
     def is_light(self) -> bool:
-        """Whether the pictures are floating-point light (EXR)."""
+        """Whether the images are floating-point light (EXR)."""
         return self.path.suffix.lower() == ".exr"
 
 
@@ -64,7 +64,7 @@ class ClipSource:
 class LightCurve:
     """Brightness of one clip over time."""
 
-    times_s: Array  # presentation time of every picture after the first one [s], shape (n,)
+    times_s: Array  # presentation time of every image after the first one [s], shape (n,)
     frames: NDArray[np.int64]  # its frame on the clip's even grid, shape (n,)
     brightness: Array  # its mean brightness, 0 .. 255, shape (n,)
     # times at which the light suddenly went off, and on [frames], shapes (a,), (b,)

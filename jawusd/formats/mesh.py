@@ -15,7 +15,7 @@ GUM, TOOTH, BOUNDARY, BASE = 0, 1, 2, 3
 # Excess of red or green over the other channels (of 255) that marks a label: painted labels have more (pure red 255),
 # gum in photographic textures, such as (200, 110, 110), less.
 _PAINT_CONTRAST = 100
-_FEWEST_PAINTED = 0.01  # share of vertices; fewer are not a labelling
+_FEWEST_PAINTED = 0.01  # fraction of vertices; fewer are not a labelling
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ def crown_face_mask(mesh: Mesh) -> Mask:
 
 
 class Mark(NamedTuple):
-    """A colour in contact pictures."""
+    """A colour in contact images."""
 
     color: tuple[int, int, int]  # red, green, blue, 0 to 255
     meaning: str

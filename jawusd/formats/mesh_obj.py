@@ -28,7 +28,7 @@ from jawusd.formats.mesh_data import (
 _MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
 _COUNTED = re.compile(r"^#\s*Faces:\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE)  # written by MeshLab above the faces
-# OBJ has no counts. A file without a final line end, and with this share of unused vertices, counts as truncated.
+# OBJ has no counts. A file without a final line end, and with this fraction of unused vertices, counts as truncated.
 _LEAST_LOOSE = 0.1
 
 

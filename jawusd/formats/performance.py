@@ -21,9 +21,9 @@ _PREFIX = "solved_"
 class SolveState(IntEnum):
     """Values of `Performance.state`."""
 
-    LOST = 0  # no pose fits the pictures; interpolated
+    LOST = 0  # no pose fits the images; interpolated
     SOLVED = 1  # both arches found
-    CARRIED = 2  # an arch is hidden (lips closed, no picture); interpolated
+    CARRIED = 2  # an arch is hidden (lips closed, no image); interpolated
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -35,7 +35,7 @@ STATE_WORDS: dict[SolveState, str] = {
     SolveState.CARRIED: "hidden: interpolated from neighbouring frames",
     SolveState.LOST: "lost: no pose fits the pictures",
 }
-#: RGB of an arch in pictures, by state; the colours also differ in brightness.
+#: RGB of an arch in images, by state; the colours also differ in brightness.
 STATE_COLOURS: dict[SolveState, tuple[int, int, int]] = {
     SolveState.SOLVED: (0, 190, 120),
     SolveState.CARRIED: (255, 225, 0),

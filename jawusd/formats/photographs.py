@@ -15,16 +15,16 @@ FORMAT = "jawusd-photos/1"
 
 @dataclass(frozen=True, eq=False)
 class AlignedPhoto:
-    """Pose and lens of one photograph, in pixels of the picture as stored (mirrored if it is)."""
+    """Pose and lens of one photograph, in pixels of the image as stored (mirrored if it is)."""
 
     name: str
     size_px: tuple[int, int]
-    mirrored: bool  # taken in a mirror: poses refer to the horizontally flipped picture
+    mirrored: bool  # taken in a mirror: poses refer to the horizontally flipped image
     focal_px: float
     distortion: float  # OpenCV's k1
     middle_px: Array  # principal point, shape (2,)
     T_cam_upper: Array  # upper scan to camera, shape (4, 4)
-    outline_rms_px: float  # rms distance of drawn points from the outlines, in px of a picture 1440 px wide
+    outline_rms_px: float  # rms distance of drawn points from the outlines, in px of an image 1440 px wide
     outline_median_px: float
     free_rms_px: float  # the same without gum lines
     # mean squared distance in position and direction, relative to half a millimetre, at most 1, of the worse arch

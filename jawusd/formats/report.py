@@ -29,7 +29,7 @@ class CameraFacts:
     name: str
     video: str  # file name of the footage, "" without any
     masks: str  # file names of the masks, "" without any
-    size_px: tuple[int, int]  # (width, height) of the recorded pictures
+    size_px: tuple[int, int]  # (width, height) of the recorded images
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Overlay:
 
     frame: int  # of the reference camera
     reason: str  # why this frame is shown
-    jpeg: bytes  # the picture, a JPEG file
+    jpeg: bytes  # the image, a JPEG file
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class ContactPicture:
 
     title: str
     clearance_mm: float
-    jpeg: bytes  # the picture, a JPEG file
+    jpeg: bytes  # the image, a JPEG file
 
 
 @dataclass(frozen=True, eq=False)

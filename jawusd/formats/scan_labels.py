@@ -3,7 +3,7 @@
     labels (V,) uint8    0 gum, 1 crown, 2 crown at a border of interest, 3 base plate; in the order of the scan file
     meta                 JSON: scan_sha256 of the scan's vertices, source, weak_share
 
-The hash ties labels to one version of the scan; they are refused for any other.
+The hash ties labels to one version of the scan; they are rejected for any other.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class ScanLabels:
 
     labels: NDArray[np.uint8]  # GUM, TOOTH, BOUNDARY or BASE of `formats.mesh` per vertex of the scan file, shape (V,)
     source: LabelSource  # "automatic": from the shape; "reviewed": accepted by a user
-    weak_share: float = 0.0  # share of the crown-gum border with weak geometric evidence, 0 .. 1
+    weak_share: float = 0.0  # fraction of the crown-gum border with weak geometric evidence, 0 .. 1
 
 
 def labels_path(scan: Path, folder: Path | None = None) -> Path:

@@ -17,12 +17,12 @@ _UPPER, _LOWER, _NEITHER = 150, 105, 25
 
 
 class Backdrop:
-    """Pictures of one camera by frames of the reference camera; thread-safe.
+    """Images of one camera by frames of the reference camera; thread-safe.
 
     Attributes:
-        size_px: (width, height) of the pictures.
+        size_px: (width, height) of the images.
         count: one past the camera's own last frame.
-        is_footage: whether the pictures are footage, not masks.
+        is_footage: whether the images are footage, not masks.
     """
 
     def __init__(self, source: CameraSource, offset: int) -> None:
@@ -49,7 +49,7 @@ class Backdrop:
             )
 
     def picture(self, frame: int) -> NDArray[np.uint8] | None:
-        """Return the picture at a frame of the reference camera, (h, w, 3) RGB, read-only, or None.
+        """Return the image at a frame of the reference camera, (h, w, 3) RGB, read-only, or None.
 
         Raises:
             CaptureError: it cannot be decoded.

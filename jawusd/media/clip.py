@@ -25,10 +25,10 @@ INTERLACED_HINT = (
 
 @dataclass(frozen=True, eq=False)
 class VideoFrame:
-    """One decoded picture."""
+    """One decoded image."""
 
     index: int  # number in order of presentation, the first is 0
-    time_s: float  # presentation time after the first picture [s]
+    time_s: float  # presentation time after the first image [s]
     image: NDArray[np.uint8]  # (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, 0..255, read-only
 
 
@@ -37,19 +37,19 @@ class Clip(ABC):
 
     Attributes:
         path: the file, or the pattern of the files.
-        count: number of pictures.
-        times_s: presentation times after the first picture [s], shape (count,), increasing.
-        timeline: maps frames to pictures.
+        count: number of images.
+        times_s: presentation times after the first image [s], shape (count,), increasing.
+        timeline: maps frames to images.
         keys: indices of key frames, shape (n,).
-        start_s: presentation time of the first picture in the file, on the same clock as its sound [s].
-        fps: average pictures per second.
-        rotation_deg: counter-clockwise rotation stored in the file: 0, 90, 180 or 270. It is applied to every picture.
+        start_s: presentation time of the first image in the file, on the same clock as its sound [s].
+        fps: average images per second.
+        rotation_deg: counter-clockwise rotation stored in the file: 0, 90, 180 or 270. It is applied to every image.
         size_px: (width, height) after rotation.
-        pixel_aspect: width of a pixel over its height, after rotation, from the file; pictures are not resampled.
-        timecode: time code of the first picture, as HH:MM:SS:FF; "" if there is none.
+        pixel_aspect: width of a pixel over its height, after rotation, from the file; images are not resampled.
+        timecode: time code of the first image, as HH:MM:SS:FF; "" if there is none.
         timecode_fps: frames per second of the time code; None if unknown.
-        is_interlaced: whether a decoded picture was marked as interlaced.
-        has_alpha: whether the pictures have an alpha channel.
+        is_interlaced: whether a decoded image was marked as interlaced.
+        has_alpha: whether the images have an alpha channel.
         is_gray: whether they are stored as one channel.
         is_rgb: whether they are stored as RGB.
     """
@@ -80,21 +80,21 @@ class Clip(ABC):
         region: tuple[int, int, int, int] | None = None,
         threads: int = 0,
     ) -> Iterator[VideoFrame]:
-        """Return an iterator over the pictures first, first + 1, .. last - 1.
+        """Return an iterator over the images first, first + 1, .. last - 1.
 
         Gray is the luma at full range (black 0, white 255); for gray and full-range files it is the decoder's own
         buffer, without a copy.
 
         Args:
-            first: number of the first picture.
-            last: one after the last picture; None = to the end.
-            colour: format of the pictures.
-            region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the rotated picture; None = all of it.
+            first: number of the first image.
+            last: one after the last image; None = to the end.
+            colour: format of the images.
+            region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the rotated image; None = all of it.
             threads: decoder threads; 0 lets the codec choose.
 
         Raises:
-            CaptureError: a picture lies outside the file or cannot be decoded.
-            ValueError: the region is empty or outside the picture.
+            CaptureError: an image lies outside the file or cannot be decoded.
+            ValueError: the region is empty or outside the image.
         """
         last = self.count if last is None else last
         self._check_range(first, last)
@@ -108,15 +108,15 @@ class Clip(ABC):
     def pictures(
         self, wanted: Sequence[int | None], *, colour: Colour = "gray", threads: int = 0
     ) -> Iterator[NDArray[np.uint8] | None]:
-        """Yield a picture for each of increasing indices and None for None, decoding every picture at most once.
+        """Yield an image for each of increasing indices and None for None, decoding every image at most once.
 
         Args:
-            wanted: indices of pictures, increasing, or None.
-            colour: format of the pictures.
+            wanted: indices of images, increasing, or None.
+            colour: format of the images.
             threads: decoder threads; 0 lets the codec choose.
 
         Raises:
-            CaptureError: a picture lies outside the file or cannot be decoded.
+            CaptureError: an image lies outside the file or cannot be decoded.
         """
         known = [number for number in wanted if number is not None]
         decoded = self.frames(known[0], known[-1] + 1, colour=colour, threads=threads) if known else iter(())
@@ -124,10 +124,10 @@ class Clip(ABC):
             yield None if number is None else next(frame.image for frame in decoded if frame.index == number)
 
     def colour_pictures(self, wanted: Sequence[int | None], *, threads: int = 0) -> Iterator[ColourPicture | None]:
-        """Yield RGB pictures like `pictures`; videos convert only the parts that are accessed.
+        """Yield RGB images like `pictures`; videos convert only the parts that are accessed.
 
         Raises:
-            CaptureError: a picture lies outside the file or cannot be decoded.
+            CaptureError: an image lies outside the file or cannot be decoded.
         """
         yield from self.pictures(wanted, colour="rgb", threads=threads)
 
@@ -141,4 +141,4 @@ class Clip(ABC):
 
     @abstractmethod
     def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
-        """Yield the pictures first to last - 1."""
+        """Yield the images first to last - 1."""

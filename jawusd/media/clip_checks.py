@@ -1,4 +1,4 @@
-"""Quick checks of clips: decoding errors, frozen pictures, and frame rates."""
+"""Quick checks of clips: decoding errors, frozen images, and frame rates."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from jawusd.media.picture_sequence import PictureSequence
 _DRIFT_FRAMES = 0.5
 # Relative tolerance of frame rates: accepts rounding to three digits and 23.976 for 24, but not 25 [1].
 _RATE_TOLERANCE = 0.005
-_DECODED_PX = 1.5e9  # pixels decoded per clip: 700 pictures of full HD, a few seconds
+_DECODED_PX = 1.5e9  # pixels decoded per clip: 700 images of full HD, a few seconds
 _ENDS_S = 4.0  # duration that `sync` reads first
-_PART = 48  # pictures
+_PART = 48  # images
 _SPARSE = 4  # every 4th pixel in both directions
 _LISTED = 5
-# Thresholds for repeated pictures, relative to the usual change: a percentile over a window of pictures.
+# Thresholds for repeated images, relative to the usual change: a percentile over a window of images.
 # Chosen on `tests/benchmarks/frozen.py`, which measures false alarms in still and noisy scenes.
 _MOST, _AROUND = 75, 48
-_FEWEST = 12  # pictures needed to estimate the usual change
+_FEWEST = 12  # images needed to estimate the usual change
 _LEAST_CHANGE = 0.1  # of 255 levels
-_SAME, _ALIKE = 0.05, 0.03  # for long runs, and for one or two pictures, which resemble a reversal of motion
-_SHORT, _SOME, _LONG = 2, 5, 12  # pictures
+_SAME, _ALIKE = 0.05, 0.03  # for long runs, and for one or two images, which resemble a reversal of motion
+_SHORT, _SOME, _LONG = 2, 5, 12  # images
 _STOPS, _FARTHER = (0.5, 4.0), 1.25
 _FAR_BELOW = 0.2  # of the 25th percentile
-_REGULAR = 0.15  # of the pictures
-_MISSING_SHARE = 0.01  # share of frames without a picture that is accepted at a constant rate
+_REGULAR = 0.15  # of the images
+_MISSING_SHARE = 0.01  # fraction of frames without an image that is accepted at a constant rate
 
 
 def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
-    """Decode a clip, or parts of a long one; yield errors for undecodable pictures, and warnings about the content.
+    """Decode a clip, or parts of a long one; yield errors for undecodable images, and warnings about the content.
 
     Kinds: "clip_damaged", "interlaced", "pictures_repeated".
     """
@@ -77,7 +77,7 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
 
 
 def _parts(video: Clip) -> list[tuple[int, int]]:
-    """Return the ranges of pictures to decode: all, or both ends, used for synchronisation, and parts between."""
+    """Return the ranges of images to decode: all, or both ends, used for synchronisation, and parts between."""
     most = int(_DECODED_PX / (video.size_px[0] * video.size_px[1]))
     if video.count <= most:
         return [(0, video.count)]
@@ -87,7 +87,7 @@ def _parts(video: Clip) -> list[tuple[int, int]]:
 
 
 def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
-    """Return the mean difference of each gray picture (h, w) from the one before, NaN for the first [of 255 levels]."""
+    """Return the mean difference of each gray image (h, w) from the one before, NaN for the first [of 255 levels]."""
     before, changes = None, []
     for picture in pictures:
         shown = picture[::_SPARSE, ::_SPARSE].astype(np.int16)
@@ -97,10 +97,10 @@ def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
 
 
 def repeated_runs(changes: Array) -> list[tuple[int, int]]:
-    """Return the first and last picture of runs that repeat the picture before them.
+    """Return the first and last image of runs that repeat the image before them.
 
-    Encoders also repeat pictures of static scenes, but there changes fade out and in. In a freeze they stop and resume
-    abruptly, and after one or two repeated pictures the change is larger than usual. A light switched off causes a
+    Encoders also repeat images of static scenes, but there changes fade out and in. In a freeze they stop and resume
+    abruptly, and after one or two repeated images the change is larger than usual. A light switched off causes a
     larger change before the run. Scenes without a usual change are not judged.
 
     Args:
@@ -129,7 +129,7 @@ def _stands_out(changes: Array, first: int, last: int) -> bool:
     little, usual = np.percentile(outside, (100 - _MOST, _MOST))
     before = changes[max(0, first - 2) : first].max()
     length, most = last - first + 1, changes[first : last + 1].max()
-    # If even the quietest pictures change, by noise or motion, encoders do not repeat pictures.
+    # If even the quietest images change, by noise or motion, encoders do not repeat images.
     restless = length >= _SOME and little > _LEAST_CHANGE and most <= _FAR_BELOW * little
     least = _STOPS[0] * (little if restless else usual)
     if usual <= _LEAST_CHANGE or not least <= before <= _STOPS[1] * usual:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jawusd.base.errors import CaptureError
 from jawusd.base.inputs import check_input
 
-#: Most pixels of a picture, four times 8K: a few bytes can declare one that fills the memory.
+#: Most pixels of an image, four times 8K: a few bytes can declare one that fills the memory.
 MOST_PX = 1 << 27
 #: Self-contained formats. FFmpeg also follows playlists (HLS, DASH, concat, SDP), which refer to other files and URLs.
 FORMATS = (
@@ -23,14 +23,14 @@ FORMATS = (
 )  # fmt: skip
 
 
-#: Formats of single pictures.
+#: Formats of single images.
 PICTURES = (
     "image2", "png_pipe", "exr_pipe", "dpx_pipe", "tiff_pipe", "bmp_pipe", "jpeg_pipe", "j2k_pipe", "webp_pipe",
     "pam_pipe", "pgm_pipe", "ppm_pipe", "sgi_pipe", "cin_pipe", "hdr_pipe",
 )  # fmt: skip
 
 
-# Decoders for which strict error detection, including checksums, is enabled. Not all: the TIFF decoder then refuses
+# Decoders for which strict error detection, including checksums, is enabled. Not all: the TIFF decoder then rejects
 # valid files, and others gain nothing.
 _STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
 _STRICT_CODECS = ("hevc", "mjpeg", "png")
@@ -43,7 +43,7 @@ def open_container(
 ) -> av.container.InputContainer:
     """Open a video or sound file, or a file of the given formats.
 
-    Decoders raise errors for damage or mark pictures as corrupt, and refuse pictures of more than `most_px` pixels.
+    Decoders raise errors for damage or mark images as corrupt, and reject images of more than `most_px` pixels.
 
     Raises:
         av.FFmpegError: it has another format, or refers to other files.
@@ -53,7 +53,7 @@ def open_container(
     options = {"format_whitelist": ",".join(formats), "protocol_whitelist": "file"}
     container = av.open(
         os.fspath(path), metadata_errors="replace", options=options | limit
-    )  # this also decodes some pictures
+    )  # this also decodes some images
     for stream in container.streams.video:
         if stream.codec_context is not None:  # None for unknown codecs
             strict = _STRICT if stream.codec_context.name in _STRICT_CODECS else {}
@@ -62,9 +62,9 @@ def open_container(
 
 
 def slices_are_whole(packet: bytes) -> bool:
-    """Verify the slice checksums of an FFV1 picture; false also if there are none.
+    """Verify the slice checksums of an FFV1 image; false also if there are none.
 
-    FFmpeg silently replaces damaged slices by those of the previous picture. RFC 9043, 4.9: a slice ends with its size
+    FFmpeg silently replaces damaged slices by those of the previous image. RFC 9043, 4.9: a slice ends with its size
     (3 bytes), a status (1) and a CRC (4; polynomial 0x04C11DB7, highest bit first, initial value 0).
     """
     end = len(packet)

@@ -1,4 +1,4 @@
-"""Convert pictures of any bit depth to 8-bit display values, which the trackers use.
+"""Convert images of any bit depth to 8-bit display values, which the trackers use.
 
 Colour spaces, by name:
 
@@ -28,7 +28,7 @@ _WHITE, _BLACK, _DENSITY, _GAMMA, _STEPS = 685.0, 95.0, 0.002, 0.6, 1023.0
 
 
 def to_display(stored: Stored, largest: int, space: str | None, config: Path | None) -> NDArray[np.uint8]:
-    """Return a display-referred picture, (h, w) or (h, w, 3) uint8, 0 .. 255.
+    """Return a display-referred image, (h, w) or (h, w, 3) uint8, 0 .. 255.
 
     Args:
         stored: pixels as stored: integers 0 .. largest, or floating point.

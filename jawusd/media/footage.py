@@ -17,8 +17,8 @@ from jawusd.media.clip import Clip, VideoFrame
 from jawusd.media.picture_sequence import PictureSequence
 from jawusd.media.video import Video
 
-_AHEAD = 24  # pictures up to which decoding forward is faster than seeking
-_BACK = 8  # pictures decoded at once when stepping backwards
+_AHEAD = 24  # images up to which decoding forward is faster than seeking
+_BACK = 8  # images decoded at once when stepping backwards
 _KEPT_BYTES = 128 << 20
 
 
@@ -45,9 +45,9 @@ def open_clip(source: ClipSource | Path) -> Clip:
 
 
 class FrameReader:
-    """Random access to pictures of one video; thread-safe.
+    """Random access to images of one video; thread-safe.
 
-    The decoder stays at the last picture, so that the next one is cheap; recent pictures are cached. Jumps seek to the
+    The decoder stays at the last image, so that the next one is cheap; recent images are cached. Jumps seek to the
     previous key frame.
     """
 
@@ -62,7 +62,7 @@ class FrameReader:
         self._lock = threading.Lock()
 
     def picture(self, index: int) -> NDArray[np.uint8]:
-        """Return picture number `index`, (h, w, 3) RGB uint8, read-only.
+        """Return image number `index`, (h, w, 3) RGB uint8, read-only.
 
         Raises:
             CaptureError: it lies outside the video or cannot be decoded.
@@ -81,7 +81,7 @@ class FrameReader:
 
     def _read_to(self, index: int) -> None:
         running = self._running
-        self._running = None  # if decoding fails, the next picture opens the file again
+        self._running = None  # if decoding fails, the next image opens the file again
         if running is None or not self._next <= index < self._next + _AHEAD:
             walks_back = self._last - _BACK <= index < self._last
             first = max(0, index - min(_BACK, self._most - 1)) if walks_back else index

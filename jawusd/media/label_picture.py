@@ -16,7 +16,7 @@ from jawusd.meshes.raster import draw_depth_labels
 COLOURS = np.array([(214, 108, 112), (240, 234, 214), (150, 205, 130), (120, 135, 165)], np.uint8)
 _BACKGROUND = (40, 42, 46)
 _TILE_PX = (520, 400)
-_MARGIN = 0.92  # share of a tile that the scan fills
+_MARGIN = 0.92  # fraction of a tile that the scan fills
 _FAR_MM = 1000.0  # camera distance, far enough for near-orthographic views
 _LEAST_LIGHT = 0.35
 # Rows: right, up and towards the camera in (left, up, front) axes of the subject. The biting side of the upper arch is
@@ -34,7 +34,7 @@ def label_sheet(
     T_anatomical_scan: Array,
     captions: Sequence[str],
 ) -> NDArray[np.uint8]:
-    """Return one RGB picture with a row of four views per scan.
+    """Return one RGB image with a row of four views per scan.
 
     Args:
         scans: "upper" or "lower", the scan, and its labels of `formats.mesh` per vertex.

@@ -1,4 +1,4 @@
-"""The clock of live pictures; tests replace it."""
+"""The clock of live images; tests replace it."""
 
 from __future__ import annotations
 

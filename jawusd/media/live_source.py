@@ -1,4 +1,4 @@
-"""Live pictures of a camera: from a device, a network stream, or a file played at its own rate."""
+"""Live images of a camera: from a device, a network stream, or a file played at its own rate."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from jawusd.media.pixels import ColourPicture, DecodedPicture
 from jawusd.media.video import Video
 
 _WAIT_S = 0.1
-_KEPT = 8  # buffered pictures, more than can be waiting for processing
+_KEPT = 8  # buffered images, more than can be waiting for processing
 # PyAV's input format for local devices, by address prefix.
 _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
 
 
 @dataclass(frozen=True, eq=False)
 class LivePicture:
-    """A picture: its time on the common clock [s], and its pixels, RGB uint8 (H, W, 3), converted on first access."""
+    """An image: its time on the common clock [s], and its pixels, RGB uint8 (H, W, 3), converted on first access."""
 
     time_s: float
     rgb: ColourPicture
 
 
 class LiveSource:
-    """Reader of one camera in its own thread, with a buffer of the last pictures."""
+    """Reader of one camera in its own thread, with a buffer of the last images."""
 
     def __init__(self, where: str, size_px: tuple[int, int], early_s: float = 0.0) -> None:
         """Prepare to read from an address.
@@ -65,7 +65,7 @@ class LiveSource:
             self.refuse_silence(silence_s)
 
     def refuse_silence(self, silence_s: float) -> None:
-        """Check that a device or stream has sent a picture within a time [s].
+        """Check that a device or stream has sent an image within a time [s].
 
         Raises:
             CaptureError: it has not.
@@ -78,7 +78,7 @@ class LiveSource:
             )
 
     def play(self, begin_s: float) -> None:
-        """Start delivering pictures; the recordings of files begin at `begin_s` on `live_clock`."""
+        """Start delivering images; the recordings of files begin at `begin_s` on `live_clock`."""
         self._begin_s = begin_s
         self._playing.set()
 
@@ -88,7 +88,7 @@ class LiveSource:
         self._playing.set()
 
     def times_s(self) -> list[float]:
-        """Return the times of the buffered pictures, newest last.
+        """Return the times of the buffered images, newest last.
 
         Raises:
             CaptureError: the source cannot be read.
@@ -99,12 +99,12 @@ class LiveSource:
             return [picture.time_s for picture in self._kept]
 
     def at(self, time_s: float) -> LivePicture | None:
-        """Return the buffered picture nearest to a time, None before the first one."""
+        """Return the buffered image nearest to a time, None before the first one."""
         with self._changed:
             return min(self._kept, key=lambda picture: abs(picture.time_s - time_s), default=None)
 
     def wait(self, after_s: float, timeout_s: float) -> bool:
-        """Wait for a picture newer than a time; return whether there is one."""
+        """Wait for an image newer than a time; return whether there is one."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: self.ended or self._error is not None or (bool(self._kept) and self._kept[-1].time_s > after_s),
@@ -134,7 +134,7 @@ class LiveSource:
                 self._changed.notify_all()
 
     def _file(self, from_s: float) -> Iterator[LivePicture]:
-        """Yield the pictures of a file at their recorded times."""
+        """Yield the images of a file at their recorded times."""
         video = Video(self.where)
         first = int(np.searchsorted(video.times_s, from_s + self._early_s))
         numbers = range(first, video.count)

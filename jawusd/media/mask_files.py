@@ -29,7 +29,7 @@ class PngMasks:
 
     Attributes:
         count: one past the highest number.
-        odd: rejected pictures read so far, by number, with the reason; they count as not segmented.
+        odd: rejected images read so far, by number, with the reason; they count as not segmented.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class PngMasks:
             pattern: pattern of the files.
             size_px: (width, height) of all of them, if known.
             labels: see `LabelValues`.
-            is_other: detects pictures that are not masks, which are excluded from finding the levels.
+            is_other: detects images that are not masks, which are excluded from finding the levels.
 
         Raises:
             CaptureError: the folder is missing or has no such file.
@@ -88,7 +88,7 @@ class PngMasks:
         """Find the meaning of the values from samples of the whole take.
 
         Raises:
-            CaptureError: the pictures have the wrong size or are not masks.
+            CaptureError: the images have the wrong size or are not masks.
         """
         found = png_levels([self._path(k) for k in sorted(self._names)], self._is_other)
         if self._size_px is not None:
@@ -100,7 +100,7 @@ class PngMasks:
         """Yield the masks from a number on, (h, w) uint8, None without a file or segmentation.
 
         Raises:
-            CaptureError: a file cannot be decoded or has the wrong size, or the pictures are not masks.
+            CaptureError: a file cannot be decoded or has the wrong size, or the images are not masks.
         """
         for number in range(first, self.count):
             if number not in self._names:
@@ -144,9 +144,9 @@ class VideoMasks:
     """Masks as a video: black and white, or its alpha channel.
 
     Attributes:
-        count: number of pictures.
-        timeline: maps frames to pictures.
-        odd: rejected pictures read so far, by number, with the reason; they count as not segmented.
+        count: number of images.
+        timeline: maps frames to images.
+        odd: rejected images read so far, by number, with the reason; they count as not segmented.
     """
 
     def __init__(self, path: Path, size_px: tuple[int, int], labels: LabelValues | None = None) -> None:
@@ -166,10 +166,10 @@ class VideoMasks:
         return video_levels(self._video.path)[0]
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
-        """Yield the masks from a picture on, (h, w) uint8, None where nothing is segmented.
+        """Yield the masks from an image on, (h, w) uint8, None where nothing is segmented.
 
         Raises:
-            CaptureError: a picture cannot be decoded, or the pictures are not masks.
+            CaptureError: an image cannot be decoded, or the images are not masks.
         """
         if self._labels is not None:  # use luma where possible: conversions change values
             colour: Colour = "rgb" if self._video.is_rgb else "gray"
@@ -201,7 +201,7 @@ def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) ->
 
 
 def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> MaskImage:
-    """Return 255 where a label image shows the requested arch; refuse unknown values."""
+    """Return 255 where a label image shows the requested arch; reject unknown values."""
     plane = image if image.ndim == 2 else image[..., 0]
     if image.ndim == 3 and not all((image[..., c] == plane).all() for c in (1, 2)):
         raise CaptureError(

@@ -1,4 +1,4 @@
-"""How pictures become masks: which channel and values mean background and teeth, found once per take from content."""
+"""How images become masks: which channel and values mean background and teeth, found once per take from content."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from jawusd.media.pixels import Slices
 MaskImage = NDArray[np.uint8]
 RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as stored in files
 
-# Largest share of intermediate values in a mask. Blurred edges reach 0.2 in small masks; photographs have 0.39 or more.
+# Largest fraction of intermediate values in a mask. Blurred edges reach 0.2 in small masks; photographs have 0.39 or
+# more.
 MOST_GRAY = 0.2
-MOST_SOFT = 0.35  # largest usual share of intermediate values outside the background, as after a blur of 8 px
-_FAINT = 0.25  # of the contrast: smaller values are noise; a picture with nothing above it shows no teeth
+MOST_SOFT = 0.35  # largest usual fraction of intermediate values outside the background, as after a blur of 8 px
+_FAINT = 0.25  # of the contrast: smaller values are noise; an image with nothing above it shows no teeth
 _DEAD_ZONE = 0.06  # of the contrast: deviation from the levels by lossy coding
 _NEAR = 24  # of 255: closer values belong to one level, after blur or lossy coding
 _FLAT = 10  # of 255: pixels that differ less from their neighbours are inside a region, not on its edge
-_ALIKE = 0.15  # of the contrast: largest difference of levels between pictures of one source
+_ALIKE = 0.15  # of the contrast: largest difference of levels between images of one source
 _MOST_THIRD = 0.25  # area of a third level over the smaller of the other two; soft edges are not flat
 _SHARP = (
-    0.8  # share of a level's area within one step of its value; labels reach it, smooth parts of photographs do not
+    0.8  # fraction of a level's area within one step of its value; labels reach it, smooth parts of photographs do not
 )
 
 
 @dataclass(frozen=True)
 class MaskLevels:
-    """How pictures of one source are converted to coverage.
+    """How images of one source are converted to coverage.
 
     `plane` is the channel that separates teeth from background: "alpha", the "brightest" or "darkest" colour, or the
     index of a colour.
@@ -45,7 +46,7 @@ class MaskLevels:
     deep: bool = False  # 16 bit per channel
     lossy: bool = False  # lossy coding has left noise around the levels
     ambiguous: bool = False  # whether border and area disagree about which level is the background
-    # share of pixels outside the background that are between the levels
+    # fraction of pixels outside the background that are between the levels
     soft: float = field(default=0.0, compare=False)
 
     @property
@@ -61,9 +62,9 @@ class MaskLevels:
         return self.teeth < self.background
 
     def coverage(self, image: RawImage) -> tuple[MaskImage | None, str]:
-        """Return the mask of a picture, 0 .. 255 with the outline at half, or None; and why the picture is rejected.
+        """Return the mask of an image, 0 .. 255 with the outline at half, or None; and why the image is rejected.
 
-        The reason, phrased to follow the picture's name, is empty for masks and empty pictures. The mask may be the
+        The reason, phrased to follow the image's name, is empty for masks and empty images. The mask may be the
         input array itself.
         """
         if (image.dtype == np.uint16) != self.deep:
@@ -73,7 +74,7 @@ class MaskLevels:
         if low == high:
             empty = self.plane == "alpha" or abs(low - self.teeth) > abs(low - self.background)
             return None, "" if empty else f"is uniformly {low:g}, which means teeth everywhere"
-        box = self._around_teeth(plane)  # usually a tenth of the picture
+        box = self._around_teeth(plane)  # usually a tenth of the image
         part = self._shares(plane[box])
         inside = cv2.countNonZero(cv2.inRange(part, 128, 255))
         if inside == 0:
@@ -133,7 +134,7 @@ class MaskLevels:
 
 
 def channel(image: RawImage, plane: str) -> RawImage:
-    """Return one channel (h, w) of a picture; see `MaskLevels`."""
+    """Return one channel (h, w) of an image; see `MaskLevels`."""
     if image.ndim == 2:
         return image
     parts = cv2.split(image)
@@ -147,35 +148,35 @@ def channel(image: RawImage, plane: str) -> RawImage:
 
 
 def spread_of_colours(image: RawImage) -> float:
-    """Return the largest difference between the channels of a pixel in a picture (h, w, 3 or 4)."""
+    """Return the largest difference between the channels of a pixel in an image (h, w, 3 or 4)."""
     return float(cv2.minMaxLoc(cv2.subtract(channel(image, "brightest"), channel(image, "darkest")))[1])
 
 
 def border_share(image: MaskImage, above: float) -> float:
-    """Return the share of the outermost pixels above a value."""
+    """Return the fraction of the outermost pixels above a value."""
     return float((np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]) > above).mean())
 
 
 class NotMasks(Exception):
-    """Pictures are not masks, for a `reason`, with a `hint`; `index` is the picture that shows it, if there is one."""
+    """Images are not masks, for a `reason`, with a `hint`; `index` is the image that shows it, if there is one."""
 
     def __init__(self, index: int | None, reason: str, hint: str) -> None:
-        """Store the index of the picture among those given, None for all of them."""
+        """Store the index of the image among those given, None for all of them."""
         super().__init__(reason)
         self.index, self.reason, self.hint = index, reason, hint
 
 
 @dataclass(frozen=True)
 class _Levels:
-    """The two levels of one channel of a picture, and their distribution."""
+    """The two levels of one channel of an image, and their distribution."""
 
     low: float
     high: float
-    light: float  # share of the picture closer to the high level
+    light: float  # fraction of the image closer to the high level
     light_border: float  # the same along its border
-    gray: float  # share of the picture at neither level
-    soft: float  # share at neither level of everything not dark, if teeth are light
-    soft_dark: float  # share at neither level of everything not light, if teeth are dark
+    gray: float  # fraction of the image at neither level
+    soft: float  # fraction at neither level of everything not dark, if teeth are light
+    soft_dark: float  # fraction at neither level of everything not light, if teeth are dark
     third: float | None  # a third level of large area
 
     @property
@@ -185,27 +186,27 @@ class _Levels:
 
 @dataclass(frozen=True)
 class _Looked:
-    """Levels of each non-uniform channel of one picture."""
+    """Levels of each non-uniform channel of one image."""
 
-    number: int  # index among the sampled pictures
+    number: int  # index among the sampled images
     planes: dict[str, _Levels]
     opaque: bool  # has an alpha channel that is opaque
     deep: bool
 
 
 def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], Iterable[RawImage]]) -> MaskLevels | None:
-    """Return the meaning of a source's values, None if all its pictures are empty.
+    """Return the meaning of a source's values, None if all its images are empty.
 
-    The two levels are those of most pictures. The background is the darker one, unless the lighter one has most of the
-    area and of the border, since teeth are inside the picture.
+    The two levels are those of most images. The background is the darker one, unless the lighter one has most of the
+    area and of the border, since teeth are inside the image.
 
     Args:
         pictures: samples from the whole take.
         lossy: whether coding is lossy.
-        more: returns all other pictures, used if the samples are empty.
+        more: returns all other images, used if the samples are empty.
 
     Raises:
-        NotMasks: most non-empty pictures are not masks, or have more than two levels.
+        NotMasks: most non-empty images are not masks, or have more than two levels.
     """
     looked = [_looked(k, image) for k, image in enumerate(pictures)]
     shown = _shown(looked)
@@ -224,7 +225,7 @@ def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], It
 
 
 def _shown(looked: Sequence[_Looked]) -> list[_Looked]:
-    """Return the pictures with content; some programs write opaque photographs for frames without a mask."""
+    """Return the images with content; some programs write opaque photographs for frames without a mask."""
     if any("alpha" in one.planes for one in looked):
         return [one for one in looked if "alpha" in one.planes]
     return [one for one in looked if one.planes and not (one.opaque and one.planes["brightest"].gray > MOST_GRAY)]
@@ -261,7 +262,7 @@ def _agreed(shown: Sequence[_Looked], lossy: bool) -> MaskLevels:
 
 def _alike(levels: _Levels, of: _Levels, lossy: bool) -> bool:
     if lossy and of.contrast <= _NEAR < levels.contrast:
-        return False  # noise of an empty picture
+        return False  # noise of an empty image
     near = _ALIKE * of.contrast
     return abs(levels.low - of.low) <= near and abs(levels.high - of.high) <= near
 

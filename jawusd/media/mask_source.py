@@ -16,7 +16,7 @@ from jawusd.media.pictures import has_palette, read_palette_numbers, read_pictur
 from jawusd.media.pixels import Colour
 from jawusd.media.video import Video
 
-_SAMPLED = 10  # sampled pictures per take
+_SAMPLED = 10  # sampled images per take
 _FEWEST_OF_VIDEO = 4
 _NEUTRAL = 12  # of 255: colour left in gray by lossy coding
 
@@ -25,7 +25,7 @@ _NEUTRAL = 12  # of 255: colour left in gray by lossy coding
 class SourceLevels:
     """The meaning of one source's values.
 
-    `levels` is None if all its pictures are empty. `palette_numbers`: read palette indices, as all colours are equal.
+    `levels` is None if all its images are empty. `palette_numbers`: read palette indices, as all colours are equal.
     `sizes_px` are the (width, height) of sampled files, one file per size.
     """
 
@@ -35,10 +35,10 @@ class SourceLevels:
 
 
 def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | None = None) -> SourceLevels:
-    """Find the levels of numbered files from samples; `is_other` detects pictures that are not masks.
+    """Find the levels of numbered files from samples; `is_other` detects images that are not masks.
 
     Raises:
-        CaptureError: the pictures are not masks.
+        CaptureError: the images are not masks.
     """
     chosen = _spread(len(files), _SAMPLED)
     sample = [files[k] for k in chosen]
@@ -54,7 +54,7 @@ def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
     """Find the levels of a video from samples, and the format to decode.
 
     Raises:
-        CaptureError: it cannot be decoded, or the pictures are not masks.
+        CaptureError: it cannot be decoded, or the images are not masks.
     """
     return _video_levels_of_version(path, path.stat().st_mtime_ns)
 
@@ -168,7 +168,7 @@ def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels,
 
 
 def load_png(path: Path) -> RawImage:
-    """Read a picture as stored.
+    """Read an image as stored.
 
     Raises:
         CaptureError: it cannot be decoded.

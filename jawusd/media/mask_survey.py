@@ -25,12 +25,12 @@ _HALF = 128
 def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding]:
     """Return findings about the masks of one camera, from samples of the whole take.
 
-    `size_px` is the (width, height) of the camera's pictures. Kinds: "camera_without_masks" and "masks_black", warnings
+    `size_px` is the (width, height) of the camera's images. Kinds: "camera_without_masks" and "masks_black", warnings
     about unused masks; "mask_levels", a note about values other than 0 and full white; "masks_soft" and
     "mask_polarity", warnings that the outline, or which level is teeth, is ambiguous.
 
     Raises:
-        CaptureError: the masks cannot be used: missing, damaged, not of the size or number of the camera's pictures, or
+        CaptureError: the masks cannot be used: missing, damaged, not of the size or number of the camera's images, or
             not masks; the message names the file and its content.
     """
     if source.masks is None:
@@ -61,7 +61,7 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
 
 
 def odd_pictures(source: CameraSource, arch: str, odd: Sequence[str]) -> list[Finding]:
-    """Return findings about pictures that are inconsistent with the others, see `MaskReader.odd`."""
+    """Return findings about images that are inconsistent with the others, see `MaskReader.odd`."""
     if not odd:
         return []
     more = f"; and {len(odd) - _LISTED} more" if len(odd) > _LISTED else ""
@@ -161,7 +161,7 @@ def sample_masks(source: CameraSource, size_px: tuple[int, int], files: ExitStac
 
     Args:
         source: a camera with masks.
-        size_px: (width, height) of its pictures.
+        size_px: (width, height) of its images.
         files: exit stack that closes the masks.
 
     Raises:

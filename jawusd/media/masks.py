@@ -21,8 +21,8 @@ from jawusd.media.mask_levels import MaskImage, MaskLevels
 from jawusd.media.timeline import Timeline
 from jawusd.media.video import Video
 
-_LOOKED_AT = 10  # sampled pictures of labels
-_AHEAD = 4  # buffered pictures: 8 MB of full HD per reader
+_LOOKED_AT = 10  # sampled images of labels
+_AHEAD = 4  # buffered images: 8 MB of full HD per reader
 
 
 class MaskReader:
@@ -31,8 +31,8 @@ class MaskReader:
     Sequential reads decode the next frames in a background thread; random access decodes on demand. A reader is not
     thread-safe. Use it as a context manager or close it, or its thread never ends.
 
-    Frames follow the camera's clock: frame k is shown k nominal frame durations after its first picture. In videos of
-    variable rate some frames have no picture, and no mask.
+    Frames follow the camera's clock: frame k is shown k nominal frame durations after its first image. In videos of
+    variable rate some frames have no image, and no mask.
 
     Attributes:
         count: one past the last frame of the source.
@@ -51,8 +51,8 @@ class MaskReader:
         """Find the masks, and the meaning of their values from samples of the whole take.
 
         Args:
-            path: a PNG pattern with one `%d` or `%06d` (the number of the picture in the camera's video), or a video
-                with one picture per picture, or per frame, of the camera's video.
+            path: a PNG pattern with one `%d` or `%06d` (the number of the image in the camera's video), or a video
+                with one image per image, or per frame, of the camera's video.
             timeline: timeline of the camera's video; without one, PNG files are numbered by frames.
             labels: for label images, the gray values of the requested and the other arch.
             prepare: applied to each mask in the background thread, such as `WorkingView.mask`.
@@ -80,10 +80,10 @@ class MaskReader:
     def read(self, frame: int) -> MaskImage | None:
         """Return the prepared mask (h, w) of a frame of the camera: 255 = tooth, 0 = background, soft edges between.
 
-        None if the frame is not segmented: outside the video, without a picture, or black.
+        None if the frame is not segmented: outside the video, without an image, or black.
 
         Raises:
-            CaptureError: the picture cannot be decoded, has the wrong size, or is not a mask.
+            CaptureError: the image cannot be decoded, has the wrong size, or is not a mask.
         """
         if not 0 <= frame < self.count:
             self._previous = frame
@@ -101,7 +101,7 @@ class MaskReader:
 
     @cached_property
     def is_black(self) -> bool:
-        """Tell whether all pictures are empty.
+        """Tell whether all images are empty.
 
         Raises:
             CaptureError: a label image cannot be decoded, has the wrong size or unknown values.
@@ -114,14 +114,14 @@ class MaskReader:
 
     @property
     def odd(self) -> list[str]:
-        """Return the rejected pictures read so far, with reasons; they count as not segmented."""
+        """Return the rejected images read so far, with reasons; they count as not segmented."""
         return [self._source.odd[number] for number in sorted(self._source.odd)]
 
     def read_some(self, first: int, stop: int) -> list[MaskImage | None]:
         """Return the masks of consecutive frames [first, stop), like `read`, without decoding ahead.
 
         Raises:
-            CaptureError: a picture cannot be decoded, has the wrong size, or is not a mask.
+            CaptureError: an image cannot be decoded, has the wrong size, or is not a mask.
         """
         inside = range(max(first, 0), min(stop, self.count))
         if not inside:
@@ -163,7 +163,7 @@ class MaskReader:
                 continue
             if pictures is None:
                 pictures, at = self._source.masks(picture), picture
-            while at < picture:  # of two pictures in one frame, use the first
+            while at < picture:  # of two images in one frame, use the first
                 next(pictures)
                 at += 1
             yield next(pictures)
@@ -201,7 +201,7 @@ def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks) -> Calla
 
 
 def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -> Timeline:
-    """Return the timeline that maps the camera's frames to pictures of a mask video."""
+    """Return the timeline that maps the camera's frames to images of a mask video."""
     if video is None or source.timeline.count == video.count != len(video.numbers) != source.count:
         return source.timeline  # converted from variable to constant rate
     if source.count != len(video.numbers):

@@ -28,9 +28,9 @@ UPPER_COLOUR: Colour = (255, 170, 0)
 LOWER_COLOUR: Colour = (0, 200, 255)
 _LINE_PX = 2
 CAPTION_PX = 22
-#: Background where a camera has no picture.
+#: Background where a camera has no image.
 EMPTY_GRAY = 60
-_MARGIN = 0.25  # margin around the teeth in a tile [share of their extent]
+_MARGIN = 0.25  # margin around the teeth in a tile [fraction of their extent]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +45,10 @@ class PlacedScan:
 def draw_overlay(
     image: NDArray[np.uint8], camera: Camera, scans: Sequence[PlacedScan], *, fill: float = 0.3
 ) -> NDArray[np.uint8]:
-    """Return a copy of a recorded picture (h, w, 3) RGB with the visible crowns tinted (opacity `fill`) and outlined.
+    """Return a copy of a recorded image (h, w, 3) RGB with the visible crowns tinted (opacity `fill`) and outlined.
 
     Raises:
-        ValueError: the picture does not have the camera's size.
+        ValueError: the image does not have the camera's size.
     """
     if image.shape != (camera.size_px[1], camera.size_px[0], 3) or image.dtype != np.uint8:
         raise ValueError(f"picture must be RGB of {camera.size_px} px, got {image.dtype} {image.shape}")
@@ -91,13 +91,13 @@ def tracking_sheet(
     *,
     tile_px: tuple[int, int] = (480, 270),
 ) -> NDArray[np.uint8]:
-    """Return one RGB picture with a row per frame and a column per camera, cropped to the teeth and captioned.
+    """Return one RGB image with a row per frame and a column per camera, cropped to the teeth and captioned.
 
-    A tile is gray without a picture, and has no tint where the jaw was lost.
+    A tile is gray without an image, and has no tint where the jaw was lost.
 
     Args:
         frames: frames of the reference camera, all of them in tracks.
-        backdrops: pictures by camera.
+        backdrops: images by camera.
 
     Raises:
         ValueError: a frame is not in tracks.
@@ -120,10 +120,10 @@ def tracking_sheet(
 
 
 def contact_sheet(tiles: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
-    """Arrange pictures of equal size in rows; return RGB uint8, the last row padded with black.
+    """Arrange images of equal size in rows; return RGB uint8, the last row padded with black.
 
     Raises:
-        ValueError: there are no pictures, or they differ in size.
+        ValueError: there are no images, or they differ in size.
     """
     if not tiles or columns < 1 or len({tile.shape for tile in tiles}) != 1:
         raise ValueError(f"pictures must have equal sizes, got {[tile.shape for tile in tiles]}")
@@ -137,7 +137,7 @@ def contact_sheet(tiles: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[n
 
 
 def save_png(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
-    """Write an RGB picture (h, w, 3) as PNG.
+    """Write an RGB image (h, w, 3) as PNG.
 
     Raises:
         OutputError: the file cannot be written.
@@ -146,7 +146,7 @@ def save_png(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """Return an RGB picture (h, w, 3) as a JPEG file; quality 0 .. 100."""
+    """Return an RGB image (h, w, 3) as a JPEG file; quality 0 .. 100."""
     return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
@@ -179,7 +179,7 @@ def _visible_crowns(camera: Camera, scans: Sequence[PlacedScan]) -> NDArray[np.u
 def _cut_to_teeth(
     image: NDArray[np.uint8], camera: Camera, scans: Sequence[PlacedScan], tile_px: tuple[int, int]
 ) -> NDArray[np.uint8]:
-    """Crop a picture around the scans and scale it to a tile, keeping the aspect ratio."""
+    """Crop an image around the scans and scale it to a tile, keeping the aspect ratio."""
     seen = [_points(camera, scan)[:, :2] for scan in scans if np.isfinite(scan.T_world_scan).all()]
     whole = np.array([[0, 0], camera.size_px], float)
     low, high = whole if not seen else (np.min(np.vstack(seen), axis=0), np.max(np.vstack(seen), axis=0))

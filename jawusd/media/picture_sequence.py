@@ -22,7 +22,7 @@ from jawusd.media.timeline import Timeline
 #: Frame rate if neither the capture nor the files have one.
 _USUAL_RATE = 24.0
 _FASTEST_COUNT = 30.0  # of time codes in headers [frames per second]
-_AHEAD = 2  # pictures decoded ahead
+_AHEAD = 2  # images decoded ahead
 
 
 class PictureSequence(Clip):
@@ -51,7 +51,7 @@ class PictureSequence(Clip):
         self.keys = np.arange(self.count)
         self.start_s, self.rotation_deg = 0.0, 0
         self.timecode = header.timecode
-        # Headers can count 39 frames per second; at higher rates several pictures share a number (SMPTE ST 12-3).
+        # Headers can count 39 frames per second; at higher rates several images share a number (SMPTE ST 12-3).
         self.timecode_fps = self.fps / math.ceil(self.fps / _FASTEST_COUNT - 0.01)
         self.pixel_aspect = header.pixel_aspect
         self._space = source.colour_space or header.colour_space
@@ -62,7 +62,7 @@ class PictureSequence(Clip):
         self.has_alpha, self.is_gray, self.is_rgb = False, first.pixels.ndim == 2, first.pixels.ndim == 3
 
     def stored(self, index: int) -> StoredPicture:
-        """Return a picture as stored.
+        """Return an image as stored.
 
         Raises:
             CaptureError: it cannot be read, or differs in size from the first one.
@@ -77,7 +77,7 @@ class PictureSequence(Clip):
         return found
 
     def light(self, index: int) -> NDArray[np.float32]:
-        """Return a floating-point picture as light, (h, w, 3) RGB float32.
+        """Return a floating-point image as light, (h, w, 3) RGB float32.
 
         Raises:
             CaptureError: as `stored`.

@@ -1,4 +1,4 @@
-"""Read single picture files of any depth: PNG, TIFF, EXR, DPX, JPEG; and their headers.
+"""Read single image files of any depth: PNG, TIFF, EXR, DPX, JPEG; and their headers.
 
 Headers: OpenEXR, "Reading and Writing Image Files", https://openexr.com/en/latest/OpenEXRFileLayout.html; DPX,
 SMPTE ST 268-1.
@@ -28,7 +28,7 @@ RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 _PNG = b"\x89PNG\r\n\x1a\n"
 _HINT = "Export the pictures again, as PNG, TIFF, EXR, DPX or JPEG."
 _MOST_HEADER_BYTES = 1 << 16
-#: Largest picture, 8K [px]: small files can declare pictures that exhaust memory, at up to 28 bytes per pixel.
+#: Largest image, 8K [px]: small files can declare images that exhaust memory, at up to 28 bytes per pixel.
 MOST_STORED_PX = 36_000_000
 _EXR, _DPX = b"\x76\x2f\x31\x01", (b"SDPX", b"XPDS")
 _QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # orientations of Exif
@@ -36,7 +36,7 @@ _DPX_LOG = (1, 3)  # transfer characteristics of printing density and of logarit
 
 
 def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
-    """Return a picture, or None if the file cannot be decoded."""
+    """Return an image, or None if the file cannot be decoded."""
     try:
         check_input(path, CaptureError)
         if _pixels(path) > MOST_PX:
@@ -67,7 +67,7 @@ def _pixels(path: Path) -> int:
 
 
 def read_gray(path: Path) -> NDArray[np.uint8] | None:
-    """Return a picture in 8-bit gray, shape (h, w), or None if the file cannot be decoded."""
+    """Return an image in 8-bit gray, shape (h, w), or None if the file cannot be decoded."""
     picture = read_picture(path, cv2.IMREAD_GRAYSCALE)
     return None if picture is None else np.asarray(picture, np.uint8)
 
@@ -80,7 +80,7 @@ def has_palette(path: Path) -> bool:
 
 
 def read_palette_numbers(path: Path, picture: RawPicture) -> RawPicture:
-    """Return the palette indices (h, w) of a PNG with a palette; otherwise the given picture."""
+    """Return the palette indices (h, w) of a PNG with a palette; otherwise the given image."""
     if not has_palette(path):
         return picture
     with Image.open(path) as image:
@@ -89,7 +89,7 @@ def read_palette_numbers(path: Path, picture: RawPicture) -> RawPicture:
 
 @dataclass(frozen=True, eq=False)
 class StoredPicture:
-    """A picture as stored: (h, w) or (h, w, 3) RGB; integers 0 .. largest, or floating point."""
+    """An image as stored: (h, w) or (h, w, 3) RGB; integers 0 .. largest, or floating point."""
 
     pixels: Stored
     largest: int
@@ -97,7 +97,7 @@ class StoredPicture:
 
 @dataclass(frozen=True)
 class PictureHeader:
-    """Metadata of a picture file; "" or None if missing."""
+    """Metadata of an image file; "" or None if missing."""
 
     timecode: str = ""
     fps: float | None = None
@@ -106,10 +106,10 @@ class PictureHeader:
 
 
 def read_stored(path: Path) -> StoredPicture:
-    """Read a picture file.
+    """Read an image file.
 
     Raises:
-        CaptureError: it is missing, damaged, or not a picture.
+        CaptureError: it is missing, damaged, or not an image.
     """
     check_input(path, CaptureError)
     try:
@@ -125,7 +125,7 @@ def read_stored(path: Path) -> StoredPicture:
 
 
 def _quarters(path: Path) -> int:
-    """Return the counter-clockwise quarter turns in the Exif orientation of a picture.
+    """Return the counter-clockwise quarter turns in the Exif orientation of an image.
 
     Raises:
         CaptureError: the orientation is mirrored.

@@ -1,4 +1,4 @@
-"""Decoded pictures as arrays: full-range gray, RGB or RGBA, rotated as the file requires."""
+"""Decoded images as arrays: full-range gray, RGB or RGBA, rotated as the file requires."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def turn_deg(frame: av.VideoFrame) -> int:
     """Return the counter-clockwise rotation stored in a file: 0, 90, 180 or 270.
 
     Raises:
-        CaptureError: its display matrix mirrors the picture, or is not a multiple of 90 degrees.
+        CaptureError: its display matrix mirrors the image, or is not a multiple of 90 degrees.
     """
     try:
         stored = frame.side_data.get("DISPLAYMATRIX")
@@ -82,7 +82,7 @@ def _deep_table(bits: int, high: bool, full: bool) -> NDArray[np.uint8]:
 
 
 class DecodedPicture:
-    """A decoded picture that converts regions to RGB on access, like an array.
+    """A decoded image that converts regions to RGB on access, like an array.
 
     Attributes:
         shape: height, width, 3.
@@ -99,17 +99,17 @@ class DecodedPicture:
         return converted(self._frame, "rgb", self._rotation_deg, window)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.uint8]:
-        """Return the whole picture."""
+        """Return the whole image."""
         whole = (slice(0, self.shape[0], 1), slice(0, self.shape[1], 1))
         return np.asarray(self[whole], dtype)
 
 
-#: An RGB picture, (h, w, 3) uint8, as an array or converted on access.
+#: An RGB image, (h, w, 3) uint8, as an array or converted on access.
 ColourPicture: TypeAlias = "NDArray[np.uint8] | DecodedPicture"
 
 
 def converted(frame: av.VideoFrame, colour: Colour, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
-    """Return a window (h, w), (h, w, 3) or (h, w, 4) of a decoded picture after rotation."""
+    """Return a window (h, w), (h, w, 3) or (h, w, 4) of a decoded image after rotation."""
     if colour == "gray":
         return _gray(frame, rotation_deg, window)
     part, inside = _around(frame, _stored_window(frame, rotation_deg, window))
@@ -133,7 +133,7 @@ def _plane(plane: av.video.plane.VideoPlane) -> NDArray[np.uint8]:
 
 
 def _stored_window(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> Slices:
-    """Return the rows and columns of a stored picture that rotation maps to a window."""
+    """Return the rows and columns of a stored image that rotation maps to a window."""
     turns = rotation_deg // 90
     height, width = (frame.width, frame.height) if turns % 2 else (frame.height, frame.width)
     rows, columns = (slice(*part.indices(side)[:2]) for part, side in zip(window, (height, width), strict=True))
@@ -150,7 +150,7 @@ def _widened(part: slice[int, int, int], limit: int) -> tuple[int, int]:
 
 
 def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices]:
-    """Return a crop around a window of a stored picture, and the window in it; the whole if not much larger."""
+    """Return a crop around a window of a stored image, and the window in it; the whole if not much larger."""
     rows, columns = window
     (top, bottom), (left, right) = (_widened(*sides) for sides in zip(window, (frame.height, frame.width)))
     height, width = bottom - top, right - left
@@ -170,7 +170,7 @@ def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices
 
 
 def deep_rgb(frame: av.VideoFrame) -> tuple[NDArray[np.uint16], int]:
-    """Return a decoded picture as 16-bit RGB (h, w, 3), not rotated, and its white value."""
+    """Return a decoded image as 16-bit RGB (h, w, 3), not rotated, and its white value."""
     stored = np.asarray(frame.to_ndarray(format="rgb48le", interpolation=TO_RGB), np.uint16)
     if frame.format.is_rgb:
         return stored, 65535
@@ -199,7 +199,7 @@ def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np
 
 
 def coloured(shown: NDArray[np.uint8], colour: Colour) -> NDArray[np.uint8]:
-    """Return a picture (h, w) or (h, w, 3) RGB in the requested format, opaque."""
+    """Return an image (h, w) or (h, w, 3) RGB in the requested format, opaque."""
     if colour == "gray":
         gray = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY)
         return np.ascontiguousarray(gray, np.uint8)

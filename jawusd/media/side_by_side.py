@@ -1,4 +1,4 @@
-"""All cameras of a take in one picture, each cropped to the teeth, with scans drawn over it and a status bar below."""
+"""All cameras of a take in one image, each cropped to the teeth, with scans drawn over it and a status bar below."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Part = tuple[int, int, int, int]
 _MOST_IN_ROW = 3
 _MOST_FRAMES, _MOST_POINTS = 200, 300  # sampled per take and per scan to locate the teeth
 _STRAYS_PERCENT = 1.0  # frames whose teeth may leave the crop, at each side
-_ROOM = 0.25  # margin around the teeth [share of their extent]
+_ROOM = 0.25  # margin around the teeth [fraction of their extent]
 _LEAST_PX = 32
 _SHOW_PARTLY_S = 0.3  # time after which partial results are shown
 _WHITE: Colour = (240, 240, 240)
@@ -51,7 +51,7 @@ class CameraWall:
     """All cameras of a take side by side.
 
     Attributes:
-        size_px: (width, height) of the pictures.
+        size_px: (width, height) of the images.
     """
 
     def __init__(
@@ -62,13 +62,13 @@ class CameraWall:
         scans: Sequence[Mesh],
         tile_px: tuple[int, int],
     ) -> None:
-        """Crop the pictures of cameras to the teeth over a take; without tracks, show them whole.
+        """Crop the images of cameras to the teeth over a take; without tracks, show them whole.
 
         Args:
             cameras: calibrated cameras; others are shown without scans.
-            backdrops: pictures by camera.
+            backdrops: images by camera.
             scans: teeth scans of the tracks, upper and lower [mm].
-            tile_px: (width, height) of each camera's picture.
+            tile_px: (width, height) of each camera's image.
         """
         parts = {} if tracks is None else _teeth_parts(cameras, tracks, scans, tile_px[0] / tile_px[1])
         whole = {name: (0, 0, *one.size_px) for name, one in backdrops.items()}
@@ -88,15 +88,15 @@ class CameraWall:
         fill: float,
         partly: Callable[[NDArray[np.uint8]], None] | None = None,
     ) -> NDArray[np.uint8]:
-        """Return the picture of a frame of the reference camera, (h, w, 3) RGB.
+        """Return the image of a frame of the reference camera, (h, w, 3) RGB.
 
         Args:
             scans: scans to draw.
             fill: opacity of the crowns.
-            partly: called with partial pictures while cameras are decoded, if that takes long.
+            partly: called with partial images while cameras are decoded, if that takes long.
 
         Raises:
-            CaptureError: a camera's picture cannot be decoded.
+            CaptureError: a camera's image cannot be decoded.
         """
         tiles = {name: self._pool.submit(self._tile, name, frame, scans, fill) for name in self._cells}
         if partly is not None:
@@ -125,7 +125,7 @@ class CameraWall:
 
 
 class _Cell:
-    """The mapping of a region of one camera's pictures to a tile."""
+    """The mapping of a region of one camera's images to a tile."""
 
     def __init__(self, part: Part, camera: Camera | None, tile_px: tuple[int, int]) -> None:
         x, y, width, height = part
@@ -137,7 +137,7 @@ class _Cell:
         self._camera = None if camera is None else camera.cropped(x, y, (width, height)).scaled(self._size_px)
 
     def draw(self, image: NDArray[np.uint8] | None, scans: Sequence[PlacedScan], fill: float) -> NDArray[np.uint8]:
-        """Return the tile (h, w, 3) of a picture; empty for None."""
+        """Return the tile (h, w, 3) of an image; empty for None."""
         width, height = self._tile_px
         tile = np.full((height, width, 3), EMPTY_GRAY, np.uint8)
         if image is not None:
@@ -152,7 +152,7 @@ class _Cell:
 def _teeth_parts(
     cameras: Mapping[str, Camera], tracks: Tracks, meshes: Sequence[Mesh], aspect: float
 ) -> dict[str, Part]:
-    """Return the region of each camera's pictures that contains the teeth over a take, by name.
+    """Return the region of each camera's images that contains the teeth over a take, by name.
 
     Regions have the given aspect (width over height) where possible.
     """
@@ -167,7 +167,7 @@ def _teeth_parts(
 
 
 def _part_around(camera: Camera, world: Array, aspect: float) -> Part:
-    """Return the region around points (F, n, 3) [mm] of many frames, NaN where unknown, inside the picture."""
+    """Return the region around points (F, n, 3) [mm] of many frames, NaN where unknown, inside the image."""
     size = np.array(camera.size_px)
     pixels = camera.project(world)
     pixels[camera.depth(world) <= 0] = np.nan

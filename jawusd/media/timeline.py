@@ -1,4 +1,4 @@
-"""Map evenly spaced frames to the pictures of a video, which may be irregular."""
+"""Map evenly spaced frames to the images of a video, which may be irregular."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from jawusd.base.arrays import Array
 
 
 class Timeline:
-    """The pictures of a video on a regular grid of frames, by presentation time.
+    """The images of a video on a regular grid of frames, by presentation time.
 
-    Frame k is the picture shown k nominal frame durations after the first one. At a constant rate that is picture k; at
-    a variable rate some frames have no picture.
+    Frame k is the image shown k nominal frame durations after the first one. At a constant rate that is image k; at
+    a variable rate some frames have no image.
 
     Attributes:
-        numbers: frame of each picture, increasing, shape (n,).
-        count: one past the frame of the last picture.
-        stored: number of each picture in its files, increasing, shape (n,); for videos 0, 1, 2, ...
+        numbers: frame of each image, increasing, shape (n,).
+        count: one past the frame of the last image.
+        stored: number of each image in its files, increasing, shape (n,); for videos 0, 1, 2, ...
     """
 
     def __init__(self, times_s: Array, fps: float) -> None:
-        """Fit the grid to presentation times (n,) [s]; the file's average rate is used for one or two pictures."""
+        """Fit the grid to presentation times (n,) [s]; the file's average rate is used for one or two images."""
         self._set(*_grid(times_s, fps), np.arange(len(times_s)))
 
     @classmethod
     def of_files(cls, stored: NDArray[np.int64], fps: float) -> Timeline:
-        """Return the timeline of numbered pictures, (n,) increasing: the first is frame 0, gaps have no picture."""
+        """Return the timeline of numbered images, (n,) increasing: the first is frame 0, gaps have no image."""
         line = cls.__new__(cls)
         line._set(stored - stored[0], fps, stored)
         return line
@@ -34,31 +34,31 @@ class Timeline:
     def _set(self, numbers: NDArray[np.int64], rate: float, stored: NDArray[np.int64]) -> None:
         self.numbers, self.rate, self.stored = numbers, rate, stored
         self.count = int(numbers[-1]) + 1
-        # Of two pictures in one frame, use the first.
+        # Of two images in one frame, use the first.
         self._picture = dict(zip(numbers[::-1].tolist(), range(len(numbers) - 1, -1, -1)))
 
     @property
     def is_numbered(self) -> bool:
-        """Whether the pictures are numbered other than 0, 1, 2, ..."""
+        """Whether the images are numbered other than 0, 1, 2, ..."""
         return bool(self.stored[0] != 0 or self.stored[-1] != len(self.stored) - 1)
 
     def number(self, frame: int) -> int | None:
-        """Return the file number of the picture shown at a frame, or None."""
+        """Return the file number of the image shown at a frame, or None."""
         picture = self.picture(frame)
         return None if picture is None else int(self.stored[picture])
 
     @property
     def missing(self) -> int:
-        """Return the number of frames without a picture."""
+        """Return the number of frames without an image."""
         return self.count - len(self._picture)
 
     def picture(self, frame: int) -> int | None:
-        """Return the index of the picture shown at a frame; None outside the video or without a picture."""
+        """Return the index of the image shown at a frame; None outside the video or without an image."""
         return self._picture.get(int(frame))
 
 
 def _grid(times_s: Array, fps: float) -> tuple[NDArray[np.int64], float]:
-    """Return the frame of each picture and frames per second."""
+    """Return the frame of each image and frames per second."""
     steps = np.diff(times_s)
     if len(steps) < 2 or not (median := float(np.median(steps))) > 0:
         return np.arange(len(times_s)), fps

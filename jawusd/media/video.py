@@ -1,7 +1,7 @@
 """Read videos by presentation time with PyAV.
 
-Frame k is the k-th picture in presentation order. The table of times is read once from the packets, without decoding.
-Seeking goes to the previous key frame and decodes from there. Every decoded picture is identified by its time stamp, so
+Frame k is the k-th image in presentation order. The table of times is read once from the packets, without decoding.
+Seeking goes to the previous key frame and decodes from there. Every decoded image is identified by its time stamp, so
 that B-frames, edit lists and variable rates cannot shift the count.
 """
 
@@ -28,7 +28,7 @@ _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp
 _CUT_OFF = "Copy it again from the camera; repair an interrupted recording first."
 # WebM stores alpha in a second stream, which only these decoders read; flagged in the metadata.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
-# Decoders that report damage with any number of threads. Those with error concealment (H.264, MPEG-4) mark a picture
+# Decoders that report damage with any number of threads. Those with error concealment (H.264, MPEG-4) mark an image
 # only after threads have returned it: with eight threads, a third of the damage in H.264 was missed.
 _THREADED = ("hevc", "prores", "ffv1")
 _PROGRESSIVE = (0, 1)  # FFmpeg's field order: unknown, or progressive
@@ -43,11 +43,11 @@ class Video(Clip):
         colour_space: str | None = None,
         colour_config: Path | None = None,
     ) -> None:
-        """Read the table of frames and the first picture.
+        """Read the table of frames and the first image.
 
         Args:
             path: the file.
-            colour_space, colour_config: of its pictures, if they are not display-referred; see `display`.
+            colour_space, colour_config: of its images, if they are not display-referred; see `display`.
 
         Raises:
             CaptureError: the file is missing, empty, truncated, not a video, or has no presentation times.
@@ -64,7 +64,7 @@ class Video(Clip):
             stream = container.streams.video[0]
             announced = stream.frames
             self._time_base = float(stream.time_base or 1)
-            self._has_checksums = False  # of the slices of each picture
+            self._has_checksums = False  # of the slices of each image
             self._pts, self._seek_dts, self._key_before, stored = self._packet_table(container, stream)
             self.fps = float(stream.average_rate or 0)
             stored_aspect = stream.sample_aspect_ratio
@@ -153,9 +153,9 @@ class Video(Clip):
     def _packet_table(
         self, container: av.container.InputContainer, stream: av.VideoStream
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.intp], int]:
-        """Return per picture its time stamp, the decoding time of its key frame and that frame's index.
+        """Return per image its time stamp, the decoding time of its key frame and that frame's index.
 
-        The last value is the number of stored pictures.
+        The last value is the number of stored images.
         """
         pts, dts, key, stored = [], [], [], 0
         may_have_checksums = stream.codec_context.name == "ffv1"
@@ -173,7 +173,7 @@ class Video(Clip):
                     dts.append(packet.pts if packet.dts is None else packet.dts)
                     key.append(packet.is_keyframe)
         except av.FFmpegError:
-            # Truncated file: use the pictures before the break; `announced` tells whether more were declared.
+            # Truncated file: use the images before the break; `announced` tells whether more were declared.
             pass
         order = np.argsort(pts, kind="stable")
         times = np.array(pts, np.int64)[order]
@@ -197,7 +197,7 @@ class Video(Clip):
                         return
                     if frame.pts is None or frame.pts < key:
                         continue
-                    damaged = damaged or frame.is_corrupt or frame.pts in broken  # later pictures may depend on it
+                    damaged = damaged or frame.is_corrupt or frame.pts in broken  # later images may depend on it
                     if frame.pts < self._pts[wanted]:
                         continue
                     if frame.pts > self._pts[wanted] or damaged:
@@ -211,9 +211,9 @@ class Video(Clip):
             raise self._undecodable(wanted)
 
     def _seek(self, container: av.container.InputContainer, stream: av.VideoStream, index: int) -> None:
-        """Seek to the last key frame shown no later than a picture, or to an earlier one.
+        """Seek to the last key frame shown no later than an image, or to an earlier one.
 
-        Containers seek by presentation or decoding time of a key frame; if the former leads past the picture, the
+        Containers seek by presentation or decoding time of a key frame; if the former leads past the image, the
         latter does not. MP4 uses presentation time; decoding time would start one key frame too early.
         """
         for time in (self._pts[self._key_before[index]], self._seek_dts[index]):
@@ -226,7 +226,7 @@ class Video(Clip):
     def _decoded(
         self, container: av.container.InputContainer, stream: av.VideoStream, alpha: bool, first: int, broken: set[int]
     ) -> Iterator[av.VideoFrame]:
-        """Yield decoded pictures from here on; before a time stamp, decode only reference pictures.
+        """Yield decoded images from here on; before a time stamp, decode only reference images.
 
         Time stamps of packets that are damaged by container flags or checksums are added to a set, together with those
         up to the next key frame.
@@ -256,6 +256,6 @@ class Video(Clip):
 
 
 def _timecode(container: av.container.InputContainer, stream: av.VideoStream) -> str:
-    """Return the time code of the first picture: from the video stream, a time code track, or the file."""
+    """Return the time code of the first image: from the video stream, a time code track, or the file."""
     tables = [stream.metadata, *(other.metadata for other in container.streams), container.metadata]
     return next((table["timecode"] for table in tables if table.get("timecode")), "")

@@ -1,4 +1,4 @@
-"""Resample pictures to the undistorted working size of the tracker."""
+"""Resample images to the undistorted working size of the tracker."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pi
 
 
 def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Convert only the bounding box of positions (h, w, 2) [px] of a picture.
+    """Convert only the bounding box of positions (h, w, 2) [px] of an image.
 
     The rest is black and costs no memory, as untouched pages are not allocated.
     """
@@ -43,19 +43,19 @@ def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[
 
 
 class WorkingView:
-    """Undistortion and downscaling of the pictures of one camera; thread-safe.
+    """Undistortion and downscaling of the images of one camera; thread-safe.
 
-    A working pixel is the mean of n x n bilinear samples of the recorded picture, n = the reduction rounded up, at the
-    undistorted positions of an n times larger working picture. This equals undistortion at full size followed by area
+    A working pixel is the mean of n x n bilinear samples of the recorded image, n = the reduction rounded up, at the
+    undistorted positions of an n times larger working image. This equals undistortion at full size followed by area
     averaging, with one interpolation and only where needed.
 
     Attributes:
-        camera: the pinhole camera of the working pictures.
+        camera: the pinhole camera of the working images.
         source: the camera as recorded.
     """
 
     def __init__(self, source: Camera, size_px: tuple[int, int]) -> None:
-        """Prepare the maps to working pictures of size_px (width, height).
+        """Prepare the maps to working images of size_px (width, height).
 
         Raises:
             ValueError: the working size is larger than the recorded one, or empty.
@@ -72,7 +72,7 @@ class WorkingView:
         )
         self._map = np.asarray(maps[0], np.float32)
         self._nodes = np.ascontiguousarray(np.moveaxis(self._map[::_NODE_PX, ::_NODE_PX], 2, 0))
-        # Largest distance between neighbouring nodes [px of the recorded picture].
+        # Largest distance between neighbouring nodes [px of the recorded image].
         steps = [np.abs(np.diff(self._nodes, axis=axis)).max(initial=_NODE_PX) for axis in (1, 2)]
         self._reach_px = float(max(steps)) + 1
 
@@ -82,7 +82,7 @@ class WorkingView:
         Only the surroundings of non-black pixels are processed.
 
         Raises:
-            ValueError: the mask does not have the size of the recorded pictures.
+            ValueError: the mask does not have the size of the recorded images.
         """
         self._check(mask)
         width, height = self.camera.size_px
@@ -93,10 +93,10 @@ class WorkingView:
         return out
 
     def picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return a recorded picture, (H, W) or (H, W, 3), at the working size; black where nothing was recorded.
+        """Return a recorded image, (H, W) or (H, W, 3), at the working size; black where nothing was recorded.
 
         Raises:
-            ValueError: the picture does not have the recorded size.
+            ValueError: the image does not have the recorded size.
         """
         self._check(image)
         width, height = self.camera.size_px
@@ -106,7 +106,7 @@ class WorkingView:
         """Return undistorted light of recorded light (H, W, 3), at full size; 0 where nothing was recorded.
 
         Raises:
-            ValueError: the picture does not have the recorded size, or the view is smaller.
+            ValueError: the image does not have the recorded size, or the view is smaller.
         """
         if image.shape[1::-1] != self.source.size_px or self._map.shape[1::-1] != self.source.size_px:
             raise ValueError(f"light must have {self.source.size_px} px, as the view, got {image.shape}")
@@ -116,7 +116,7 @@ class WorkingView:
         """Return the part of `picture` at rows and columns inside it.
 
         Raises:
-            ValueError: the picture does not have the recorded size.
+            ValueError: the image does not have the recorded size.
         """
         self._check(image)
         return self._averaged(image, window)
@@ -160,11 +160,11 @@ class WorkingView:
 def warp_nearest(
     picture: NDArray[np.uint8] | NDArray[np.float32], to_picture: Array, out: NDArray[np.uint8] | NDArray[np.float32]
 ) -> None:
-    """Resample by nearest neighbour through an affine map; 0 outside the picture.
+    """Resample by nearest neighbour through an affine map; 0 outside the image.
 
     Args:
         picture: shape (H, W).
-        to_picture: maps pixels of `out` to those of the picture, shape (2, 3).
-        out: output, of the picture's dtype, shape (h, w).
+        to_picture: maps pixels of `out` to those of the image, shape (2, 3).
+        out: output, of the image's dtype, shape (h, w).
     """
     cv2.warpAffine(picture, to_picture, out.shape[::-1], out, cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)

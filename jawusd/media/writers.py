@@ -65,7 +65,7 @@ class VideoWriter:
             stream = container.add_stream("ffv1" if self._lossless else "libx264", rate=self._rate)
             stream.width, stream.height = self._size_px
             stream.pix_fmt = "gray" if self._lossless else "yuv420p"
-            # Only key frames in FFV1: fast seeking, and damage affects one picture.
+            # Only key frames in FFV1: fast seeking, and damage affects one image.
             stream.options = {"level": "3", "g": "1"} if self._lossless else {"crf": str(self._crf)}
             self._stream = stream
             self._next = 0
@@ -73,10 +73,10 @@ class VideoWriter:
         return self
 
     def write(self, image: NDArray[np.uint8]) -> None:
-        """Append a picture: (h, w) gray, or (h, w, 3) RGB for H.264; uint8.
+        """Append an image: (h, w) gray, or (h, w, 3) RGB for H.264; uint8.
 
         Raises:
-            ValueError: the picture's shape or type does not fit.
+            ValueError: the image's shape or type does not fit.
         """
         shape = (self._size_px[1], self._size_px[0])
         colour = image.ndim == 3
@@ -98,9 +98,9 @@ class VideoWriter:
 
 
 class PlateWriter:
-    """Writer of the undistorted pictures of one camera at full size, as JPEG, or EXR for light.
+    """Writer of the undistorted images of one camera at full size, as JPEG, or EXR for light.
 
-    A plate has the intrinsics K and size of the recorded picture, so that the same pinhole camera applies; corners that
+    A plate has the intrinsics K and size of the recorded image, so that the same pinhole camera applies; corners that
     were not recorded are black.
     """
 
@@ -109,7 +109,7 @@ class PlateWriter:
         self._view = WorkingView(camera, camera.size_px)
 
     def write(self, path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
-        """Undistort and write a recorded picture (h, w, 3) RGB.
+        """Undistort and write a recorded image (h, w, 3) RGB.
 
         Raises:
             OutputError: the file cannot be written.

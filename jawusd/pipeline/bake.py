@@ -127,7 +127,7 @@ def joint_deltas(rig: JawRig, mapping: ArkitMapping | None = None) -> list[Joint
     The other weights are neutral. d is brought inside the bound, as `jawusd animate` does.
 
     Args:
-        mapping: the person's own; None for shares of the ranges, whose neutral face is the closed bite.
+        mapping: the person's own; None for fractions of the ranges, whose neutral face is the closed bite.
     """
     from jawusd.rig.skel import joint_poses
 

@@ -215,7 +215,7 @@ def _calibrated(run: Workspace) -> StageRecord[CalibrationSummary]:
 
 
 def _check(run: Workspace) -> tuple[list[Path], CheckResult]:
-    """Check the capture before any work, and refuse it with all errors at once."""
+    """Check the capture before any work, and reject it with all errors at once."""
     findings = check_capture(run.capture, run.folder, progress=run.progress)
     refuse_errors(findings, run.capture)
     return [], {"findings": [finding.as_json() for finding in findings]}
@@ -307,7 +307,7 @@ def _stages(capture: Capture) -> list[Stage[Mapping[str, object]]]:
 
 
 def _pictures(capture: Capture) -> int:
-    """Return the number of pictures of all cameras that are processed."""
+    """Return the number of images of all cameras that are processed."""
     from jawusd.media.footage import open_clip
 
     counts = [open_clip(camera.clip).count for camera in capture.cameras if camera.clip is not None]

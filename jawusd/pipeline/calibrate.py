@@ -31,7 +31,7 @@ _SIZE_SIGMA = 0.005  # standard deviation of the scale estimated from masks
 
 
 class CameraReport(TypedDict):
-    """Calibration quality of one camera; `blurred` and `missed` list picture numbers."""
+    """Calibration quality of one camera; `blurred` and `missed` list image numbers."""
 
     views: int
     rms_px: float
@@ -168,7 +168,7 @@ def _sync_result(alignment: Alignment) -> SyncResult:
 
 @explain_missing_packages()
 def light_curves(videos: Mapping[str, Path | ClipSource], progress: Progress) -> dict[str, LightCurve]:
-    """Return the brightness of every picture of every video, by camera; decodes all of them.
+    """Return the brightness of every image of every video, by camera; decodes all of them.
 
     Raises:
         CaptureError: a video cannot be read.
@@ -184,7 +184,7 @@ def light_curves(videos: Mapping[str, Path | ClipSource], progress: Progress) ->
 
 
 def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
-    """Write the mean brightness of every picture as CSV: camera, picture, time_s, brightness.
+    """Write the mean brightness of every image as CSV: camera, image, time_s, brightness.
 
     Raises:
         OutputError: the file cannot be written.

@@ -33,7 +33,7 @@ def read_calibration(path: Path, unit_mm: float, sizes: Callable[[], Mapping[str
     Args:
         path: the file or folder.
         unit_mm: length of its unit; ignored for stages, which state theirs.
-        sizes: returns (width, height) [px] of the pictures by camera; called only if the file does not state them.
+        sizes: returns (width, height) [px] of the images by camera; called only if the file does not state them.
 
     Raises:
         CalibrationError, FormatError, RigError: the file contains no usable cameras.
@@ -46,7 +46,7 @@ def read_calibration(path: Path, unit_mm: float, sizes: Callable[[], Mapping[str
 
 
 class SameSize(dict[str, Size]):
-    """A mapping that returns one picture size for every camera name."""
+    """A mapping that returns one image size for every camera name."""
 
     def __init__(self, size: Size | None) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
         source: see `cameras.files.load_cameras_file`; or a stage.
         out: what to write.
         unit_mm: length of the source's unit.
-        size: (width, height) [px] of the pictures, for formats that do not state it.
+        size: (width, height) [px] of the images, for formats that do not state it.
 
     Raises:
         CalibrationError, FormatError, RigError: the source contains no usable cameras, or OUT cannot represent them.
@@ -94,13 +94,13 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
 
 @explain_missing_packages()
 def load_cameras(capture: Capture) -> list[Camera]:
-    """Return the calibrated cameras in the capture's order, at the size the pictures were recorded in.
+    """Return the calibrated cameras in the capture's order, at the size the images were recorded in.
 
     A calibration at another size of the same aspect ratio is scaled; see `rescaled_cameras`.
 
     Raises:
         CalibrationError: there is no calibration, it lacks a camera of the capture, or the aspect ratio of the
-            pictures differs.
+            images differs.
         CaptureError: a video or mask cannot be read.
     """
     return [_at_recorded_size(camera, capture, source) for camera, source in _calibrated(capture)]
@@ -175,7 +175,7 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     if tuple(recorded) == (width, height):
         return camera
     # The tolerance of one pixel allows for rounding of a scaled height.
-    # An anamorphic picture is stored narrower (or, as DV, wider) than it is shown, and may be calibrated either way.
+    # An anamorphic image is stored narrower (or, as DV, wider) than it is shown, and may be calibrated either way.
     if min(abs(recorded[0] * share * height / width - recorded[1]) for share in (1.0, aspect)) > 1.0:
         raise CalibrationError(
             f"calibrated for pictures of {width} x {height} px, but {path.name} has "

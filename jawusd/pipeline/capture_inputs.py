@@ -107,7 +107,7 @@ class InputWatch:
 
 
 def _sequence_files(path: Path) -> list[Path]:
-    """Return the numbered files of a picture pattern, or the path itself for a video."""
+    """Return the numbered files of an image pattern, or the path itself for a video."""
     if not is_pattern(path):
         return [path]
     try:

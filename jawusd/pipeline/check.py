@@ -1,4 +1,4 @@
-"""Check a capture in seconds, before any work: a few pictures of each file, no tracking."""
+"""Check a capture in seconds, before any work: a few images of each file, no tracking."""
 
 from __future__ import annotations
 

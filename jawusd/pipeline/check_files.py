@@ -63,7 +63,7 @@ class Parts:
         return self.capture
 
     def usable(self, path: Path) -> bool:
-        """Return whether a file, or the folder of a picture pattern, exists and lies in an allowed folder."""
+        """Return whether a file, or the folder of an image pattern, exists and lies in an allowed folder."""
         place = path.parent if is_pattern(path) else path
         try:
             inside = self.allow_outside or place.resolve().is_relative_to(self.given.folder)
@@ -238,7 +238,7 @@ def calibration(parts: Parts) -> Iterator[Finding]:
 
 
 def _rescaled(parts: Parts) -> Iterator[Finding]:
-    """Report calibrations at another picture size; if only some cameras differ, it is likely a mistake."""
+    """Report calibrations at another image size; if only some cameras differ, it is likely a mistake."""
     found = rescaled_cameras(parts.given)
     for name, (was, now) in found.items():
         every = len(found) == len(parts.cameras)

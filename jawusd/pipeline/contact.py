@@ -1,4 +1,4 @@
-"""Contact of teeth and condyles in a jaw model: clearances measured on the scans, and pictures of the contacts."""
+"""Contact of teeth and condyles in a jaw model: clearances measured on the scans, and images of the contacts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jawusd.meshes.contact import Teeth
     from jawusd.meshes.joints import Joints
 
-_QUALITY = 88  # of JPEG pictures
+_QUALITY = 88  # of JPEG images
 
 
 class ContactSummary(TypedDict, total=False):

@@ -13,7 +13,7 @@ from jawusd.formats.capture_template import CameraSketch
 from jawusd.formats.file_names import MESHES, PICTURES, VIDEOS, groups
 
 _CALIBRATIONS = (".toml", ".json", ".xml", ".csv", ".yaml", ".yml", ".txt", ".usda", ".usdc", ".usd", ".nk")
-_FEWEST_PICTURES = 5  # minimum length of a picture sequence
+_FEWEST_PICTURES = 5  # minimum length of an image sequence
 _DEPTH = 4
 
 _BOARD = {"board", "boards", "calib", "calibration", "calibrate", "checker", "checkerboard", "chess", "chessboard"}
@@ -56,7 +56,7 @@ def words(path: PurePath) -> list[str]:
 
 
 def find_files(folder: Path) -> FoundFiles:
-    """Classify the files below a folder; numbered pictures count as one file, named by their pattern.
+    """Classify the files below a folder; numbered images count as one file, named by their pattern.
 
     Folders of rigs and hidden folders are skipped.
     """

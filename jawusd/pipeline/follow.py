@@ -33,7 +33,7 @@ _WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # working resolution at the teeth, an
 
 
 class Cutter:
-    """Crop the pictures of all cameras to the teeth."""
+    """Crop the images of all cameras to the teeth."""
 
     def __init__(
         self, cameras: Mapping[str, Camera], scans: Sequence[Scan], centre: Array, executor: Executor | None = None
@@ -44,7 +44,7 @@ class Cutter:
             cameras: calibrated, by name.
             scans: upper and lower.
             centre: approximate position of the teeth in the world [mm], shape (3,).
-            executor: threads for the pictures of all cameras.
+            executor: threads for the images of all cameras.
         """
         from jawusd.segmentation.picture import PictureFrame
 
@@ -55,7 +55,7 @@ class Cutter:
         self._probes = [scan.probes for scan in scans]
 
     def cut(self, pictures: Pictures) -> Cut:
-        """Return a function that crops the pictures of an instant around poses."""
+        """Return a function that crops the images of an instant around poses."""
 
         def cut(poses: Array) -> list[Picture | None]:
             around = np.concatenate([transform_points(T, own) for T, own in zip(poses, self._probes, strict=True)])
@@ -67,7 +67,7 @@ class Cutter:
         """Yield such a function for each frame.
 
         Raises:
-            CaptureError: a picture cannot be decoded.
+            CaptureError: an image cannot be decoded.
         """
         return (self.cut(pictures) for _, pictures in footage.walk(frames))
 
@@ -105,7 +105,7 @@ class Follower:
         """Prepare to follow.
 
         Args:
-            footage, cameras: pictures, and the calibrated cameras by name.
+            footage, cameras: images, and the calibrated cameras by name.
             scans: upper and lower, prepared.
             subject: provides axes and condyles.
             pool: threads for the cameras.
@@ -118,10 +118,10 @@ class Follower:
     def start_at(self, frame: int, poses: Array) -> tuple[RegionPose, float]:
         """Refine T_world_upper, T_world_lower (2, 4, 4) on a frame, from which `run` starts; return also the fit.
 
-        The fit is the share of the visible contour that matches the colours, 0 .. 1, of the worse arch.
+        The fit is the fraction of the visible contour that matches the colours, 0 .. 1, of the worse arch.
 
         Raises:
-            CaptureError: a picture cannot be decoded.
+            CaptureError: an image cannot be decoded.
         """
         from jawusd.tracking.contour.scan import teeth_centre
         from jawusd.tracking.region.tracker import RegionTracker
@@ -138,7 +138,7 @@ class Follower:
         """Return the poses of all frames, starting from the frame last passed to `start_at`.
 
         Raises:
-            CaptureError: a picture cannot be decoded.
+            CaptureError: an image cannot be decoded.
         """
         frame, begin, tracker, cutter = self._start
         self.sampled_views.clear()
@@ -197,7 +197,7 @@ def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, Regi
 
 
 FEWEST_VIDEOS = 2
-# Share of the visible contour that matches the colours, below which picks are rejected. Six path-traced mouths had 0.26
+# Fraction of the visible contour that matches the colours, below which picks are rejected. Six path-traced mouths had 0.26
 # to 0.5; three in the dark, with noise or without colour 0.13 to 0.27, with errors up to 0.3 mm. Focal lengths 15 % off
 # gave 0.05, another person's lower scan 0.08 and 0.12, with errors above 1 mm.
 _LEAST_PICKED_FIT = 0.1
@@ -262,7 +262,7 @@ def _picked_start(rows: ArchStart, follower: Follower, picks: Bootstrap, frames:
     """Return a start from the picks.
 
     Raises:
-        TrackingError: the picks are inconsistent, or do not fit the pictures.
+        TrackingError: the picks are inconsistent, or do not fit the images.
     """
     if picks.frame not in frames:
         raise picks_outside(picks.frame, frames)
@@ -285,7 +285,7 @@ def searched_start(
 
     Raises:
         TrackingError: the teeth were not found.
-        CaptureError: a picture cannot be decoded.
+        CaptureError: an image cannot be decoded.
     """
 
     def near(sources: Sequence[CameraSource], frame: int) -> Array | None:

@@ -200,16 +200,16 @@ class Retargeted:
 
     frames: Array  # frame numbers, shape (G,)
     d: Array  # parameters of the target [mm], inside its bound, NaN where the motion is lost, shape (G, 3)
-    outside: Mask  # samples at which equal shares of the ranges would leave the bound, shape (G,)
+    outside: Mask  # samples at which equal fractions of the ranges would leave the bound, shape (G,)
     moved_mm: Array  # distance of each sample from equal shares, in d, NaN where lost, shape (G,)
 
 
 def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retargeted:
-    """Retarget a motion to another person: equal shares of both ranges, with the timing kept, inside the bound.
+    """Retarget a motion to another subject: equal fractions of both ranges, same timing, inside the bound.
 
-    Motion is linear in d between samples, but shares of the ranges are not; therefore all whole frames become samples.
-    Equal shares alone would shift peaks by some frames and may leave the bound, so the motion is alternately made to
-    rise and fall with the source (see `library.timing`) and projected into the bound.
+    The motion is resampled at all whole frames, because it is linear in d between samples, but not in the fractions
+    of the ranges. Equal fractions alone would shift peaks by some frames and might leave the bound, so the motion is
+    alternately made to rise and fall with the source (see `library.timing`) and projected into the bound.
 
     Args:
         frames: increasing frame numbers, shape (F,).

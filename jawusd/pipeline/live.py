@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 _PATIENCE_S = 2.0  # time without teeth before a new search
 _WAIT_S = 0.25
-_MOST_BEHIND_S = 0.15  # lag behind the newest pictures above which frames are dropped
+_MOST_BEHIND_S = 0.15  # lag behind the newest images above which frames are dropped
 _BEFORE = 6  # frames followed before a file is played, to estimate the motion
 
 
@@ -47,12 +47,12 @@ class LiveFrame:
     """Result of one instant.
 
     Attributes:
-        time_s: capture time of its pictures since the start of the sources; in files, since their first pictures.
+        time_s: capture time of its images since the start of the sources; in files, since their first images.
         d, sigma: jaw parameters and their standard deviations [mm], shape (3,).
         margin_mm: signed distance to the rig's bound, > 0 inside.
         verdict: verdict of the rig on the pose.
         state: solved or carried.
-        latency_ms: time since the pictures were captured.
+        latency_ms: time since the images were captured.
         dropped: number of instants dropped since the last one.
     """
 
@@ -92,7 +92,7 @@ def live(
     silence_s: float = 10.0,
     allow_outside: bool = False,
 ) -> Iterator[LiveFrame]:
-    """Yield a result per instant; frames are dropped if pictures arrive too fast.
+    """Yield a result per instant; frames are dropped if images arrive too fast.
 
     Args:
         rig: `actor.usda`, another layer of it, or `model.npz`.
@@ -103,7 +103,7 @@ def live(
         fixed_head: the cameras are head-mounted.
         jobs: number of threads.
         seconds: stop after this time; None: when the sources end.
-        silence_s: longest time without a picture from a device or stream [s].
+        silence_s: longest time without an image from a device or stream [s].
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
@@ -121,13 +121,13 @@ def live(
 
 
 def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:
-    """Return the next instant to process, None if some source has no picture of it yet.
+    """Return the next instant to process, None if some source has no image of it yet.
 
     It is the first one that is not too old: a search takes as long as several frames, and tracking, which is faster
     than real time, catches up.
 
     Args:
-        times_s: increasing times of the buffered pictures of each source.
+        times_s: increasing times of the buffered images of each source.
         after_s: earliest time.
     """
     if not all(len(kept) for kept in times_s):
@@ -251,7 +251,7 @@ class _Follower:
         return after.stop
 
     def _learn(self, pictures: Pictures, near: Pose) -> None:
-        """Learn colours from pictures, given an approximate pose; start following if the teeth fit."""
+        """Learn colours from images, given an approximate pose; start following if the teeth fit."""
         from jawusd.tracking.contour.scan import teeth_centre
 
         centre = teeth_centre(self._teeth.scans, self._take.coordinates.arches(near))
@@ -260,7 +260,7 @@ class _Follower:
             self._cutter = cutter
 
     def _begin_in_pictures(self, pictures: Pictures) -> None:
-        """Search for the teeth in pictures, if the arches are apart in them."""
+        """Search for the teeth in images, if the arches are apart in them."""
         from jawusd.segmentation.rows import tooth_rows
 
         rows = {name: tooth_rows(np.asarray(image)) for name, image in pictures.items() if image is not None}
@@ -286,7 +286,7 @@ class _Follower:
                 source.refuse_silence(silence_s)
 
     def _pictures(self, at: float) -> Pictures:
-        """Return the pictures of an instant, None for sources without a picture near it."""
+        """Return the images of an instant, None for sources without an image near it."""
         found = {name: source.at(at) for name, source in self._sources.items()}
         near = self._period_s
         return {n: None if p is None or abs(p.time_s - at) > near else p.rgb for n, p in found.items()}

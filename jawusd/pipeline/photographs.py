@@ -21,7 +21,7 @@ from jawusd.pipeline.state import Progress, no_progress
 
 RESULT = "photos.json"
 _COLOURS = np.array([[60, 220, 60], [60, 160, 255]], np.uint8)  # upper, lower; red, green, blue
-# Share of bright pixels above which a picture is taken to show filled areas: 4 px lines around 20 teeth cover 4 %.
+# Fraction of bright pixels above which an image is taken to show filled areas: 4 px lines around 20 teeth cover 4 %.
 _FILLED = 0.08
 
 
@@ -47,15 +47,15 @@ def align_photograph_files(
     """Align scans with outlines drawn in photographs, and write poses, lenses, bite and overlays.
 
     Args:
-        outlines: a picture per photograph, all of one bite and one camera: tooth outlines as bright lines on black, or
+        outlines: an image per photograph, all of one bite and one camera: tooth outlines as bright lines on black, or
             filled teeth with one gray value each.
         upper_teeth, lower_teeth: scans, each in any frame.
         out: folder of photos.json and an overlay per photograph.
         force: overwrite existing files.
 
     Raises:
-        CaptureError: a picture or scan cannot be read, or two pictures have the same name.
-        TrackingError: too few outlines in a picture, or too few faces in a scan.
+        CaptureError: an image or scan cannot be read, or two images have the same name.
+        TrackingError: too few outlines in an image, or too few faces in a scan.
         OutputError: the output exists already, or cannot be written.
     """
     paths, folder = [Path(path) for path in outlines], Path(out)
@@ -79,10 +79,10 @@ def align_photograph_files(
 
 
 def read_drawing(picture: NDArray[np.uint8], name: str) -> Drawing:
-    """Return the lines of a gray picture (h, w), or the borders of its areas if it shows areas.
+    """Return the lines of a gray image (h, w), or the borders of its areas if it shows areas.
 
     Raises:
-        TrackingError: the picture shows too few outlines.
+        TrackingError: the image shows too few outlines.
     """
     if np.count_nonzero(picture) > _FILLED * picture.size:
         border = np.zeros(picture.shape, bool)
@@ -93,7 +93,7 @@ def read_drawing(picture: NDArray[np.uint8], name: str) -> Drawing:
 
 
 def drawn_over(picture: NDArray[np.uint8], found: PhotoAlignment, number: int) -> NDArray[np.uint8]:
-    """Return an RGB picture (h, w, 3) with the aligned crowns' outlines, upper green and lower blue."""
+    """Return an RGB image (h, w, 3) with the aligned crowns' outlines, upper green and lower blue."""
     photo, solved = found.bite.photos[number], found.result.photos[number]
     seen = seen_outlines(found.rows.fine, photo, found.bite)
     out = picture.copy()

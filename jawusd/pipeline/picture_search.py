@@ -24,10 +24,10 @@ _EVERY, _PART, _TRIED = 8, 240, 4
 # Starts tried in total, at about ten seconds of CPU time each. If six parts yield none that fits, scans, cameras or
 # the detection are wrong, and more tries would not help. A count, so that results do not depend on the machine.
 _MOST_TRIED = 24
-#: Share of the line between the arches without a gap, below which they count as apart: all such of 64 pictures of eight
-#: mouths were separated correctly.
+#: Largest fraction of the line between the arches that may be bridged for them to count as apart. All images with less,
+#: of 64 images of eight mouths, were separated correctly.
 MOST_BRIDGED = 0.1
-#: Share of the visible contour that matches the colours, below which a start is rejected: 20 starts found in one take,
+#: Fraction of the visible contour that matches the colours, below which a start is rejected: 20 starts found in one take,
 #: all but one within 0.5 mm, had 0.19 to 0.48. Above the other limits (several cameras, or a single one, whose depth
 #: may be wrong), a start is accepted without further search.
 LEAST_FIT, _CLEAR_FIT, _CLEAR_FIT_SINGLE = 0.15, 0.25, 0.4
@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Start(Generic[T]):
-    """A start: frame, pose, share of the contour that fits, and how it was found."""
+    """A start: frame, pose, fraction of the contour that fits, and how it was found."""
 
     frame: int
     pose: T
@@ -63,10 +63,10 @@ class PictureSearch(Generic[T]):
     """A search for the teeth.
 
     Attributes:
-        capture, footage: the capture, and the pictures of its cameras with a video.
+        capture, footage: the capture, and the images of its cameras with a video.
         cameras: number of these cameras.
         near: estimates a pose on a frame from cameras with rough masks; None if that fails.
-        judged: refines a pose on a frame, and returns the share of the visible contour that fits, 0 .. 1.
+        judged: refines a pose on a frame, and returns the fraction of the visible contour that fits, 0 .. 1.
     """
 
     capture: Capture
@@ -80,7 +80,7 @@ class PictureSearch(Generic[T]):
 
         Raises:
             TrackingError: no start fits.
-            CaptureError: a picture cannot be decoded.
+            CaptureError: an image cannot be decoded.
         """
         best: Start[T] | None = None
         tried: list[int] = []
@@ -156,7 +156,7 @@ def masked_cameras(
 
 
 def picks_mismatch(frame: int, fit: float, least: float = LEAST_FIT) -> TrackingError:
-    """Return the error for picks on a frame where too small a share of the visible contour fits, 0 .. 1."""
+    """Return the error for picks on a frame where too small a fraction of the visible contour fits, 0 .. 1."""
     return TrackingError(
         f"the picks do not match the pictures: {fit:.0%} of the visible contour fits the colours, at least "
         f"{least:.0%} is needed",

@@ -1,4 +1,4 @@
-"""Pictures and videos of a capture with its tracks: overlays, worst frames, plates, the report's 3-D replay."""
+"""Images and videos of a capture with its tracks: overlays, worst frames, plates, the report's 3-D replay."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ def draw_frames(
     backdrops: Mapping[str, Backdrop],
     scans: tuple[Mesh, Mesh],
 ) -> tuple[Overlay, ...]:
-    """Draw the scans over the pictures of frames, given by row of the tracks and reason.
+    """Draw the scans over the images of frames, given by row of the tracks and reason.
 
     Raises:
-        CaptureError: a picture cannot be decoded.
+        CaptureError: an image cannot be decoded.
     """
     from jawusd.media.overlay import encode_jpeg, tracking_sheet
 
@@ -105,7 +105,7 @@ def write_plates(
 
     Args:
         offsets: frame offset by camera.
-        frames: increasing frames of the reference camera, shape (F,); frames without a picture get no plate.
+        frames: increasing frames of the reference camera, shape (F,); frames without an image get no plate.
         folder: the rig's folder.
 
     Returns:
@@ -196,8 +196,8 @@ def write_overlay(
 ) -> list[Path]:
     """Write H.264 video of the tracked frames with both scans drawn over them. Returns `overlay_files`.
 
-    A folder gets a contact sheet, and for each camera with footage a synchronised video of whole pictures, gray where a
-    picture is missing. An .mp4 file shows all cameras side by side, cropped to the teeth; cameras without footage show
+    A folder gets a contact sheet, and for each camera with footage a synchronised video of whole images, gray where a
+    image is missing. An .mp4 file shows all cameras side by side, cropped to the teeth; cameras without footage show
     their masks. Existing files are overwritten.
 
     Args:
@@ -243,7 +243,7 @@ def _write_cameras(
 
 
 def _drawn(tracks: Tracks, backdrop: Backdrop, camera: Camera, scans: tuple[Mesh, Mesh]) -> Iterator[NDArray[np.uint8]]:
-    """Yield the picture of every tracked frame, (h, w, 3) RGB."""
+    """Yield the image of every tracked frame, (h, w, 3) RGB."""
     from jawusd.media.overlay import EMPTY_GRAY, draw_overlay, placed_scans
 
     for row, frame in enumerate(tracks.frames.tolist()):

@@ -99,7 +99,7 @@ def write_build_report(
     tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
     subject = subject_of_build(folder)
     unmet, unseen = list[str](), list[str]()
-    # Decoding, drawing and measuring pictures releases the GIL.
+    # Decoding, drawing and measuring images releases the GIL.
     with ThreadPoolExecutor(1) as pool:
         drawn = pool.submit(attempt, "pictures of the footage", unseen, lambda: _overlays(facts, tracks))
         met = pool.submit(attempt, "contacts of the teeth", unmet, lambda: contact_pictures(model, subject))
@@ -119,7 +119,7 @@ def write_build_report(
 def _without_pictures(
     folder: Path, facts: BuildFacts, tracks: Tracks, model: JawModel, subject: Subject, experiments: Experiments | None
 ) -> ReportData:
-    """Return the data of a report without the pictures of footage and teeth."""
+    """Return the data of a report without the images of footage and teeth."""
     from jawusd.rig.read import describe
 
     left_out: list[str] = []
@@ -284,7 +284,7 @@ def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:
 
 
 def camera_facts(capture: Capture) -> tuple[CameraFacts, ...]:
-    """Return the footage, masks and picture size of each camera.
+    """Return the footage, masks and image size of each camera.
 
     Raises:
         CalibrationError, CaptureError: see `load_cameras`.

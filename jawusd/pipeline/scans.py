@@ -36,12 +36,12 @@ class ScanSummary(TypedDict):
     empty_faces: int
     repeated_faces: int
     crown_percent: float  # of the vertices
-    weak_border_percent: float | None  # share of the crown border without a crease
+    weak_border_percent: float | None  # fraction of the crown border without a crease
     findings: list[dict[str, str | float | int]]
 
 
 class ScansSummary(TypedDict):
-    """Both scans, and the picture of their labels."""
+    """Both scans, and the image of their labels."""
 
     picture: str
     scans: list[ScanSummary]
@@ -56,13 +56,13 @@ def label_scans(
     allow_outside: bool = False,
     progress: Progress = no_progress,
 ) -> ScansSummary:
-    """Label both teeth scans of a capture, store labels found by shape, and draw a picture of the labels.
+    """Label both teeth scans of a capture, store labels found by shape, and draw an image of the labels.
 
     Paint and existing labels are kept.
 
     Args:
-        out: folder of labels and picture; None: labels go to the labels folder of the capture or beside the scans, the
-            picture to the capture's folder.
+        out: folder of labels and image; None: labels go to the labels folder of the capture or beside the scans, the
+            image to the capture's folder.
         force: label again, and overwrite existing labels.
 
     Raises:

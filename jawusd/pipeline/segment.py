@@ -74,7 +74,7 @@ def segment_teeth(
 
 @dataclass(eq=False)
 class _OpenFrame:
-    """A frame being tracked: its pictures, and the latest masks by camera, None without a picture."""
+    """A frame being tracked: its images, and the latest masks by camera, None without an image."""
 
     pictures: Pictures
     segments: dict[str, Segment | None] = field(default_factory=dict)
@@ -188,7 +188,7 @@ class _Segmentation:
 
     @contextlib.contextmanager
     def _opened(self, frame: int, pictures: Pictures) -> Iterator[_OpenFrame]:
-        """Make the pictures of a frame available to the tracker, and collect their masks."""
+        """Make the images of a frame available to the tracker, and collect their masks."""
         self._open[frame] = _OpenFrame(pictures)
         try:
             yield self._open[frame]
@@ -288,7 +288,7 @@ class _Segmentation:
             self._advance("segment again", frame + 1 - self._first)
 
     def _see(self, frame: int, poses: Array, turn: int) -> list[View]:
-        """Segment the pictures of an open frame, and return them as views for the tracker."""
+        """Segment the images of an open frame, and return them as views for the tracker."""
         from jawusd.tracking.contour.views import View
 
         shown = self._open[frame]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jawusd.tracking.region.tracker import RegionPose
 
 # Distance between jaw poses by masks and by colours above which one must be wrong [mm]; correct ones of three takes
-# differed by at most 0.9. Shares of such or lost frames above which a take is questionable, and unusable.
+# differed by at most 0.9. Fractions of such or lost frames above which a take is questionable, and unusable.
 _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 

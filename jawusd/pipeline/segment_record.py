@@ -33,9 +33,9 @@ _DOUBTFUL = 0.5
 _SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
 _LEAST_SPREAD = {"contrast": 0.03, "unexpected": 0.01, "residual_px": 0.05, "uncovered": 0.01}
 _USUAL_OFF = 3.0  # deviation, in robust sigmas, at which a single symptom halves the confidence
-# Likely outline error [px of the working picture] with a picture edge, without one, and between the arches; divided by
-# the mask's area, it gives the share of the mask that may be wrong. This symptom is comparable across cameras, so all
-# are pooled, with a stricter limit.
+# Likely outline error [px of the working image]: at an image edge, without one, and between the arches. Integrated
+# along the outline and divided by the mask's area, it is the fraction of the mask that may be wrong. It is comparable
+# across cameras, so frames of all cameras are pooled, with a stricter limit.
 _OUTLINE_PX = (0.4, 2.0, 0.6)
 _OUTLINE, _OUTLINE_SPREAD, _OUTLINE_OFF = "outline", 0.01, 1.5
 _SHEET_FRAMES = 12
@@ -75,7 +75,7 @@ class FrameEntry(TypedDict):
 
 
 class MaskConfidence(TypedDict):
-    """Confidence 0 .. 1 in the worse of the two masks of a picture, with the reason."""
+    """Confidence 0 .. 1 in the worse of the two masks of an image, with the reason."""
 
     frame: int
     camera: str
@@ -196,7 +196,7 @@ def _entry(line: str) -> tuple[int, FrameEntry] | None:
 
 
 def summarise(entries: Mapping[int, FrameEntry]) -> list[MaskConfidence]:
-    """Return the confidence of every picture's masks, in order of frames and cameras."""
+    """Return the confidence of every image's masks, in order of frames and cameras."""
     keys = [(frame, name) for frame in sorted(entries) for name in entries[frame]["cameras"]]
     found = [entries[frame]["cameras"][name] for frame, name in keys]
     cameras = np.array([name for _, name in keys])
@@ -234,7 +234,7 @@ def _pairs(values: Sequence[Pair]) -> Array:
 
 
 def _outline_doubt(found: Sequence[CameraEntry]) -> Array:
-    """Return the share of every mask that may be wrong, NaN without a mask, shape (N, 2)."""
+    """Return the fraction of every mask that may be wrong, NaN without a mask, shape (N, 2)."""
     outline = np.array([entry["outline"] for entry in found], np.float64)
     area = np.array([entry["pixels"] for entry in found], np.float64)
     return np.where(area > 0, outline @ np.array(_OUTLINE_PX) / np.maximum(area, 1), np.nan)
@@ -262,7 +262,7 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
         folder: folder of the masks.
 
     Raises:
-        CaptureError: a picture or mask cannot be read.
+        CaptureError: an image or mask cannot be read.
         FormatError: the file of learned parameters is corrupt.
         OutputError: a file cannot be written.
     """

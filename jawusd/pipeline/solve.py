@@ -55,7 +55,7 @@ class PreparedTeeth:
     Attributes:
         scans: upper and lower teeth.
         axes: rotation from scan to anatomical axes (left, up, front), shape (3, 3).
-        search: finds the teeth in pictures.
+        search: finds the teeth in images.
     """
 
     def __init__(self, capture: Capture, meshes: Mapping[str, Mesh], jaw: JawRig, map_: Mapper) -> None:
@@ -78,7 +78,7 @@ class VideoShot:
 
     Attributes:
         cameras: calibrated cameras with a video, by name.
-        footage: their pictures.
+        footage: their images.
         take: follows the teeth.
     """
 
@@ -123,7 +123,7 @@ class VideoShot:
 
         Raises:
             TrackingError: the teeth were not found.
-            CaptureError: a picture cannot be decoded.
+            CaptureError: an image cannot be decoded.
         """
         if self._capture.bootstrap is not None and len(self.cameras) > 1:
             return self._picked(self._capture.bootstrap)
@@ -180,7 +180,7 @@ class SolveSummary(TypedDict):
     frames: int
     solved: int
     carried: list[tuple[int, int]]  # runs of frames, first and last, in which an arch is occluded
-    lost: list[tuple[int, int]]  # runs in which no pose fits the pictures
+    lost: list[tuple[int, int]]  # runs in which no pose fits the images
     within_tolerance: int  # outside the bound, within the tolerance of measured poses
     outside: int  # beyond the tolerance
     cameras: list[str]
@@ -217,7 +217,7 @@ def solve(
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
         prim: path of the rig's prim, if a stage has several; an animation layer then targets the stage.
         overlay: video to write (.mp4) of the solved scans over all cameras side by side.
-        report: page to write (.html): d with sigma, unseen frames, verdicts, findings and pictures.
+        report: page to write (.html): d with sigma, unseen frames, verdicts, findings and images.
         fixed_head: the cameras are head-mounted.
         free_focal: estimate focal lengths; those of the calibration are good to 10 %.
         jobs: number of threads; the result does not depend on it.

@@ -46,7 +46,7 @@ def report_solve(
 
     Args:
         tracks: the .npz that `solve` wrote.
-        capture: the shot, its capture.toml or folder; None: a report without pictures and cameras.
+        capture: the shot, its capture.toml or folder; None: a report without images and cameras.
         page: file to write.
         allow_outside: let paths in the capture leave its folder.
 

@@ -21,7 +21,7 @@ from jawusd.pipeline.state import Progress
 if TYPE_CHECKING:
     from jawusd.media.clip import Clip
 
-_PICTURES = 5  # number of pictures of a board clip that are examined
+_PICTURES = 5  # number of images of a board clip that are examined
 _USUAL_RATES = tuple(Fraction(n, d) for d in (1, 1001) for n in (24 * d, 25 * d, 30 * d, 50 * d, 60 * d, 120 * d)) + (
     *(Fraction(n * 1000, 1001) for n in (24, 30, 60, 120)),
 )
@@ -45,7 +45,7 @@ def start_capture(folder: Path, square_mm: float | None, fps: float | None, prog
 
     Args:
         folder: folder with footage, scans, and board clips or a calibration.
-        square_mm: side of the board's squares, which pictures do not show [mm].
+        square_mm: side of the board's squares, which images do not show [mm].
         fps: frame rate; None: that of the clips.
 
     Raises:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 TEETH = {"upper": "upper_teeth", "lower": "lower_teeth"}
 
-# Share of the crown border without a crease above which the labels need review. Of 58 synthetic scans, all 51 with a
+# Fraction of the crown border without a crease above which the labels need review. Of 58 synthetic scans, all 51 with a
 # mean border error below 0.3 mm are below it; plaster casts of patients have 0.07 to 0.11, a toothless one 0.77.
 _WEAK_SHARE = 0.15
 

@@ -81,7 +81,7 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
 
 
 class ContactView:
-    """Draws the contacts of a rig's teeth; the scans are loaded with the first picture."""
+    """Draws the contacts of a rig's teeth; the scans are loaded with the first image."""
 
     def __init__(self, path: Path, rig: JawRig, prim: str) -> None:
         self._path, self._rig, self._prim = path, rig, prim
@@ -95,7 +95,7 @@ class ContactView:
 
     @explain_missing_packages()
     def draw(self, d: Array) -> NDArray[np.uint8]:
-        """Return a picture, RGB (h, w, 3), of both arches at d (3,) [mm].
+        """Return an image, RGB (h, w, 3), of both arches at d (3,) [mm].
 
         Raises:
             RigError: the meshes of the rig do not show how the teeth meet.

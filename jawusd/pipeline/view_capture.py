@@ -135,7 +135,7 @@ def viewed_capture(
 
 
 def _tile_px(backdrops: Mapping[str, Backdrop], cut: bool) -> tuple[int, int]:
-    """Return the tile size of each camera; whole pictures keep the aspect ratio of the first camera."""
+    """Return the tile size of each camera; whole images keep the aspect ratio of the first camera."""
     if cut:
         return _TILE_PX
     width, height = next(iter(backdrops.values())).size_px
@@ -169,7 +169,7 @@ def _frames(
         return int(poses.frames[0]), int(poses.frames[-1])
     if capture.frames is not None:
         return capture.frames[0], capture.frames[1] - 1
-    # from the first picture of any camera to the last
+    # from the first image of any camera to the last
     return (
         max(0, min(offsets[name] for name in backdrops)),
         max(offsets[name] + backdrop.count - 1 for name, backdrop in backdrops.items()),
@@ -178,7 +178,7 @@ def _frames(
 
 @dataclass(frozen=True, eq=False)
 class _Footage:
-    """Pictures, regions and poses of a capture for the pages of the viewer; thread-safe."""
+    """Images, regions and poses of a capture for the pages of the viewer; thread-safe."""
 
     capture: Capture
     backdrops: Mapping[str, Backdrop]
@@ -189,7 +189,7 @@ class _Footage:
     tracks: Tracks | None
 
     def picture(self, name: str, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
-        """Return a camera's picture at a frame of the reference camera, with the teeth drawn over it."""
+        """Return a camera's image at a frame of the reference camera, with the teeth drawn over it."""
         from jawusd.media.overlay import EMPTY_GRAY, draw_overlay
 
         image = self.backdrops[name].picture(frame)
@@ -208,7 +208,7 @@ class _Footage:
         look: Look,
         partly: Callable[[NDArray[np.uint8]], None] | None = None,
     ) -> NDArray[np.uint8]:
-        """Return the pictures of all cameras side by side with the teeth; `partly` as in `CameraWall.draw`."""
+        """Return the images of all cameras side by side with the teeth; `partly` as in `CameraWall.draw`."""
         return self.wall.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0), partly=partly)
 
     def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:

@@ -54,7 +54,7 @@ _PARAMETERS = {
     "protrusion": ("protrusion d3, + forward", SKY),
 }
 _ROW_IN, _MARGINS_IN = 0.22, 0.9
-_MOST_ROWS = 400  # programs cannot open taller pictures
+_MOST_ROWS = 400  # programs cannot open taller images
 
 
 def tracking_figure(tracks: Tracks) -> Figure:

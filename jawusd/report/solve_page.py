@@ -26,7 +26,7 @@ from jawusd.report.document import package_file, page_environment
 from jawusd.report.figures import larger_magnitude, legend_beside, runs, thinned
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, VERMILION, inline_svg, new_figure
 
-#: Colours of the states: close to those in the pictures, and legible on light and dark pages.
+#: Colours of the states: close to those in the images, and legible on light and dark pages.
 STATE_INKS = {SolveState.SOLVED: GREEN, SolveState.CARRIED: ORANGE, SolveState.LOST: MAGENTA}
 _NAMES = ("d1 opening", "d2 laterotrusion,\nleft is positive", "d3 protrusion,\nforward is positive")
 _INKS = (BLACK, BLUE, VERMILION)

@@ -23,7 +23,7 @@ from jawusd.viewer.viewed import Region, ViewedCapture
 from jawusd.viewer.widgets import begin_panel, errors_shown, guarded, limit_uploads
 
 _PANEL_PX = 370
-_SLOW_S = 0.3  # show "loading" when a picture takes longer
+_SLOW_S = 0.3  # show "loading" when an image takes longer
 _USUAL_MM, _USUAL_WEIGHT = 250.0, 1e-3  # prior on the distance from a camera to the mouth
 _SPACE_SIDE = (0.9, -0.7, 0.0)  # offset of the 3-D view direction from that of the first camera
 
@@ -33,7 +33,7 @@ class CapturePage:
 
     Attributes:
         footage, picks, labels: the panels.
-        layout: layout of the picture shown; None before the first one.
+        layout: layout of the image shown; None before the first one.
         poses: T_page_scan (4, 4) of the scans shown, by arch.
         drawn: number of the last state drawn.
     """
@@ -129,7 +129,7 @@ class CapturePage:
             self._look()
 
     def _show_partly(self) -> Callable[[NDArray[np.uint8]], None] | None:
-        """Return a thread-safe callback that shows a partial picture of all cameras; None during playback."""
+        """Return a thread-safe callback that shows a partial image of all cameras; None during playback."""
         if self.footage.player.playing:
             return None
         loop, layout = asyncio.get_running_loop(), self._lay_out(ALL, self.footage.frame)
@@ -189,7 +189,7 @@ class CapturePage:
             self.picks.show_fit(error.statement())
 
     def _lay_out(self, view: str, frame: int) -> PickingLayout:
-        """Return the layout of a camera's picture, or of all of them."""
+        """Return the layout of a camera's image, or of all of them."""
         capture = self._capture
         if view not in capture.sizes_px:
             width, height = capture.wall_px
@@ -197,7 +197,7 @@ class CapturePage:
         return PickingLayout(capture.sizes_px[view], self._region(view, frame))
 
     def _region(self, camera: str, frame: int) -> Region:
-        """Return the region of a camera's picture to show: around the teeth if their position is known."""
+        """Return the region of a camera's image to show: around the teeth if their position is known."""
         capture, size = self._capture, self._capture.sizes_px[camera]
         tracked = self._poses_at(frame)
         if tracked is not None and camera in capture.cameras and all(np.isfinite(T).all() for T in tracked):

@@ -92,7 +92,7 @@ class FootagePanel:
 
     @property
     def look(self) -> Look:
-        """Return what is drawn into the pictures."""
+        """Return what is drawn into the images."""
         return _LOOKS[self._look.value]
 
     def _draw_plot(self, tracks: Tracks) -> Plot:
@@ -113,13 +113,13 @@ class FootagePanel:
         self._show(self.frame)
 
     def show_loading(self, loading: bool) -> None:
-        """Show or hide the note that a picture is being decoded."""
+        """Show or hide the note that an image is being decoded."""
         if loading != self._loading:
             self._loading = loading
             self.refresh()
 
     def follow(self, frame: int) -> None:
-        """During playback, update the widgets to the frame just drawn, so that they never run ahead of the picture."""
+        """During playback, update the widgets to the frame just drawn, so that they never run ahead of the image."""
         if self.player.playing:
             self._show(frame)
 
@@ -191,7 +191,7 @@ class PicksPanel:
     Attributes:
         book: the picks.
         side: side of the scans facing the viewer, one of `picking.SIDES`.
-        scans_shown: whether there are scans in front of the picture.
+        scans_shown: whether there are scans in front of the image.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A capture in 3-D: a picture with the scans in front of it, or the calibrated cameras around the scans."""
+"""A capture in 3-D: an image with the scans in front of it, or the calibrated cameras around the scans."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ _MOST_FACES = 7_000  # drawn per part of an arch; clicks are tested against the 
 _MOST_PAINTED_FACES = 25_000  # the same while labels are edited
 _JPEG_QUALITY = 88
 _THUMB_PX = 480
-_FRUSTUM_MM = 60.0  # distance from a camera's centre to its picture
+_FRUSTUM_MM = 60.0  # distance from a camera's centre to its image
 _FRUSTUM_COLOR = (120, 120, 120)
 _BALL_MM = 0.7
 _CROSS_MM = (0.35, 1.3)  # inner and outer radius of a cross
 _FIRST_EYE_MM, _NEAR_MM, _FAR_MM = 300.0, 1.0, 10_000.0
-_LIFT_MM = 0.05  # offset of marks in front of the picture
+_LIFT_MM = 0.05  # offset of marks in front of the image
 
 
 class CaptureScene:
     """3-D scene of a capture in one page.
 
     Attributes:
-        T_page_world: the page has the axes of the first camera, so that pictures are upright, shape (4, 4).
+        T_page_world: the page has the axes of the first camera, so that images are upright, shape (4, 4).
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
-        """Draw everything that does not depend on the picture."""
+        """Draw everything that does not depend on the image."""
         self._client, self._scene, self._capture = client, client.scene, capture
         scene = self._scene
         scene.configure_default_lights(cast_shadow=False)
@@ -104,7 +104,7 @@ class CaptureScene:
                 )
 
     def show_picture(self, image: NDArray[np.uint8], layout: PickingLayout) -> None:
-        """Show a picture in the layout."""
+        """Show an image in the layout."""
         width, height = (side / layout.px_per_mm for side in layout.size_px)
         if self._picture is None:
             self._picture = self._scene.add_image(
@@ -121,7 +121,7 @@ class CaptureScene:
         self._frustums[name].image = np.ascontiguousarray(image[::step, ::step])
 
     def place(self, in_space: bool, poses: Mapping[str, Array]) -> None:
-        """Show the picture or the cameras in 3-D, and the scans whose poses (4, 4) are given and finite."""
+        """Show the image or the cameras in 3-D, and the scans whose poses (4, 4) are given and finite."""
         with self._client.atomic():
             self._layout.visible, self._space.visible = not in_space, in_space
             for arch, frame in self._arches.items():
@@ -132,7 +132,7 @@ class CaptureScene:
                 frame.visible = shown
 
     def show_marks(self, book: PickBook, camera: str | None, frame: int, layout: PickingLayout | None) -> None:
-        """Mark the picks on the scans, and those of this frame in the picture of a camera."""
+        """Mark the picks on the scans, and those of this frame in the image of a camera."""
         with self._client.atomic():
             for mark in self._marks:
                 mark.remove()
@@ -181,7 +181,7 @@ class CaptureScene:
 
 
 def set_first_view(server: viser.ViserServer) -> None:
-    """Start every page in front of the picture, upright."""
+    """Start every page in front of the image, upright."""
     server.scene.set_up_direction("-y")
     first = server.initial_camera
     first.position, first.look_at, first.up = (0.0, 0.0, -_FIRST_EYE_MM), (0.0, 0.0, 0.0), UP

@@ -1,6 +1,6 @@
-"""Picks of one visitor, and the layout of picture and scans in which they are made.
+"""Picks of one visitor, and the layout of image and scans in which they are made.
 
-The layout frame has x to the right, y down and z away from the camera, in mm. The picture lies in z = 0, centred on the
+The layout frame has x to the right, y down and z away from the camera, in mm. The image lies in z = 0, centred on the
 origin, scaled so that its teeth are about as large as the scans.
 """
 
@@ -146,7 +146,7 @@ def _finished(pick: PickDraft) -> Pick:
 
 @dataclass(frozen=True)
 class PickingLayout:
-    """Layout of a picture of a given size [px] and the scans, with a region of the picture in view."""
+    """Layout of an image of a given size [px] and the scans, with a region of the image in view."""
 
     size_px: tuple[int, int]
     region: Region
@@ -163,7 +163,7 @@ class PickingLayout:
         return np.concatenate([flat, np.zeros((*flat.shape[:-1], 1))], axis=-1)
 
     def pixel(self, origin: ArrayLike, direction: ArrayLike) -> tuple[float, float] | None:
-        """Return the pixel hit by a ray, origin and direction (3,); None outside the picture."""
+        """Return the pixel hit by a ray, origin and direction (3,); None outside the image."""
         o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
         if abs(d[2]) < 1e-9 or -o[2] / d[2] <= 0:
             return None
@@ -172,7 +172,7 @@ class PickingLayout:
         return (float(x), float(y)) if -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5 else None
 
     def scan_poses(self, scans: Mapping[str, Mesh], T_anatomical_skull: Array, side: str) -> dict[str, Array]:
-        """Return T_layout_scan (4, 4) of both arches: in front of the picture, below the region, showing a side."""
+        """Return T_layout_scan (4, 4) of both arches: in front of the image, below the region, showing a side."""
         top = float(self.place([self.region[0], self.region[3]])[1]) + _GAP_MM
         middle = float(self.place([(self.region[0] + self.region[2]) / 2, 0.0])[0])
         found = {}
@@ -215,7 +215,7 @@ def fit_view(points: ArrayLike, away: ArrayLike, up: ArrayLike, aspect: float) -
 
 
 def region_around(points_px: ArrayLike, size_px: tuple[int, int]) -> Region:
-    """Return the part of a picture around points (n, 2) [px], padded and clipped to the picture."""
+    """Return the part of an image around points (n, 2) [px], padded and clipped to the image."""
     points = np.asarray(points_px, dtype=np.float64)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = np.maximum(0.18 * (high - low), 0.03 * size_px[0])

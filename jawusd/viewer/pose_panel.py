@@ -196,7 +196,7 @@ def _moved(moved_mm: tuple[float, float, float]) -> str:
 
 
 class ContactPanel:
-    """Picture of both arches with their contacts, drawn only while switched on."""
+    """Image of both arches with their contacts, drawn only while switched on."""
 
     def __init__(
         self,
@@ -205,7 +205,7 @@ class ContactPanel:
         draw: Callable[[Array], NDArray[np.uint8]],
         changed: Callable[[], None],
     ) -> None:
-        """Add the widgets to the current container; call `changed` when the picture is switched on or off."""
+        """Add the widgets to the current container; call `changed` when the image is switched on or off."""
         self._rig, self._draw, self._changed = rig, draw, changed
         self._drawn: tuple[float, float, float] | None = None
         gui = client.gui
@@ -219,7 +219,7 @@ class ContactPanel:
         self._changed()
 
     def refresh(self, d: tuple[float, float, float]) -> None:
-        """Show the contacts of a pose [mm] if the picture is on."""
+        """Show the contacts of a pose [mm] if the image is on."""
         if not self.shown.value or d == self._drawn:
             return
         try:

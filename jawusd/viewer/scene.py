@@ -44,7 +44,7 @@ FIRST_VIEW = "front"
 #: Aspect ratio (width over height) below which the screen is a phone, whose panel covers the lower half.
 PHONE = 0.6
 _NARROW = 0.75  # aspect ratio below which the camera moves back, so that the jaw fits the width
-_LOWER = 0.25  # fraction of the picture height by which the camera aims below the jaw on a phone
+_LOWER = 0.25  # fraction of the image height by which the camera aims below the jaw on a phone
 _FOV_RAD, _NEAR_MM, _FAR_MM = 0.6, 1.0, 5000.0
 
 

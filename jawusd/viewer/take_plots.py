@@ -27,7 +27,7 @@ _STATUS: dict[int, str] = {
     RECOVERED: "recovered",
     PARTIAL: "tracked without one camera",
 }
-_COLORS = (ORANGE, BLUE)  # upper, lower; same as the outlines in the pictures
+_COLORS = (ORANGE, BLUE)  # upper, lower; same as the outlines in the images
 _NAMES = ("d1 opening", "d2 laterotrusion", "d3 protrusion")
 _BAND = 2.0  # sigmas: 95 % of normal errors
 _MOST_SAMPLES = 400

@@ -22,7 +22,7 @@ from jawusd.viewer.motion import Clip
 STILL, MOVING = ("skull", "upper_teeth", "upper_gum"), ("mandible", "lower_teeth", "lower_gum")
 
 Look = Literal["outlines", "tinted", "footage"]
-#: A part of a picture: left, top, right, bottom [px].
+#: A region of an image: left, top, right, bottom [px].
 Region = tuple[float, float, float, float]
 _STEPS, _NEAR = 8, 0.93  # iterations; stop above this fraction of the requested number of faces
 
@@ -43,7 +43,7 @@ class ViewedActor:
     load_clip: Callable[[str], Clip]  # reads a motion by name; raises a JawusdError
     # writes an animation layer (file name, clip, overwrite) beside the rig and returns its path; raises a JawusdError
     save_layer: Callable[[str, Clip, bool], Path]
-    # maps d (3,) [mm] to a picture of both arches with their contacts, RGB (h, w, 3); raises a JawusdError; None if the
+    # maps d (3,) [mm] to an image of both arches with their contacts, RGB (h, w, 3); raises a JawusdError; None if the
     # rig has no occlusion
     contacts: Callable[[Array], NDArray[np.uint8]] | None = None
 
@@ -56,7 +56,7 @@ class ViewedCapture:
     fps: float
     frames: tuple[int, int]  # first and last frame to step through, of the reference camera, both inclusive
     offsets: Mapping[str, int]  # frame k of a camera shows the instant of frame k + offset of the reference camera
-    # (width, height) of the pictures of every camera with footage, in the capture's order
+    # (width, height) of the images of every camera with footage, in the capture's order
     sizes_px: Mapping[str, tuple[int, int]]
     cameras: Mapping[str, Camera]  # calibrated cameras by name; empty without a calibration
     scans: Mapping[str, Mesh]  # the teeth by arch, "upper" and "lower" [mm], vertices as in their files
@@ -66,10 +66,10 @@ class ViewedCapture:
     tracks: Tracks | None  # tracked poses, if any
     picks: Bootstrap | None  # picks of the capture file, if any
     # maps (camera, frame of the reference camera, T_world_upper and T_world_lower or None, look) to RGB (h, w, 3)
-    # uint8, gray if the camera has no picture; raises a JawusdError
+    # uint8, gray if the camera has no image; raises a JawusdError
     picture: Callable[[str, int, tuple[Array, Array] | None, Look], NDArray[np.uint8]]
     # the same for all cameras side by side, each of the size `wall_px`; the last argument is called with partial
-    # pictures while cameras are being decoded
+    # images while cameras are being decoded
     wall: Callable[
         [int, tuple[Array, Array] | None, Look, Callable[[NDArray[np.uint8]], None] | None], NDArray[np.uint8]
     ]

@@ -31,7 +31,7 @@ def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
     gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, dark_mode=dark)
 
 
-# Sets the page title and, below viser's phone breakpoint, widens the panel, which would hide half of the picture.
+# Sets the page title and, below viser's phone breakpoint, widens the panel, which would hide half of the image.
 _STYLE = """<style onload="document.title={title}">
 @media (max-width: 36em) {{
   .mantine-Paper-root:has(.jawusd-page) {{ width: 100% !important; max-height: 50% !important; }}
