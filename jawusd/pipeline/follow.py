@@ -197,9 +197,9 @@ def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, Regi
 
 
 FEWEST_VIDEOS = 2
-# Fraction of the visible contour that matches the colours, below which picks are rejected. Six path-traced mouths had 0.26
-# to 0.5; three in the dark, with noise or without colour 0.13 to 0.27, with errors up to 0.3 mm. Focal lengths 15 % off
-# gave 0.05, another person's lower scan 0.08 and 0.12, with errors above 1 mm.
+# Least fraction of the visible contour that matches the colours; picks below it are rejected. Six path-traced mouths
+# had 0.26 to 0.5. Three that were dark, noisy or without colour had 0.13 to 0.27, with errors up to 0.3 mm. Focal
+# lengths 15 % off gave 0.05, another subject's lower scan 0.08 and 0.12, with errors above 1 mm.
 _LEAST_PICKED_FIT = 0.1
 
 
