@@ -28,8 +28,8 @@ _MOST_TRIED = 24
 #: of 64 images of eight mouths, were separated correctly.
 MOST_BRIDGED = 0.1
 #: Least fraction of the visible contour that matches the colours; starts below it are rejected. The 20 starts found in
-#: one take, all but one within 0.5 mm, had 0.19 to 0.48. Above the other two limits (for several cameras, and for a single
-#: one, whose depth may be wrong), a start is accepted without further search.
+#: one take, all but one within 0.5 mm, had 0.19 to 0.48. Above the other two limits (for several cameras, and for one
+#: camera, whose depth may be wrong), a start is accepted without further search.
 LEAST_FIT, _CLEAR_FIT, _CLEAR_FIT_SINGLE = 0.15, 0.25, 0.4
 
 T = TypeVar("T")
