@@ -138,7 +138,7 @@ def _print_rows(header: list[str], rows: Sequence[Sequence[object]], *, as_json:
 
 
 def _plain(value: object) -> object:
-    """Return the value with non-finite numbers as null, since JSON has no NaN."""
+    """Return the value with non-finite numbers replaced by None, since JSON has no NaN."""
     if isinstance(value, list):
         return [_plain(each) for each in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value

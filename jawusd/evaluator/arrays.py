@@ -18,7 +18,7 @@ from jawusd.geometry.se3 import rigidity_defect
 _RIGID_TOLERANCE = 1e-6
 
 _POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
-_LARGEST = 1e9  # [mm, rad] far beyond any jaw; sums of squares do not overflow
+_LARGEST = 1e9  # [mm, rad] far beyond any jaw, but small enough that sums of squares do not overflow
 _RISING = ("slice_d1", "path_limits", "glide_d2", "glide_d3", "curve1_knots", "curve2_knots", "curve3_knots")
 
 
@@ -31,7 +31,7 @@ class RigArrays:
     """
 
     def __init__(self, arrays: Mapping[str, ArrayLike], meta: Mapping[str, object]) -> None:
-        """Check and store both.
+        """Check and store the arrays and the header.
 
         Raises:
             EvaluatorError: an unknown kind, or an array missing, of a wrong shape, not finite or out of range.
@@ -67,7 +67,7 @@ class RigArrays:
 
     @property
     def T_anatomical_skull(self) -> Array:
-        """Skull to anatomical coordinates (x left, y up, z anterior), shape (4, 4)."""
+        """Transform from skull to anatomical coordinates (x left, y up, z anterior), shape (4, 4)."""
         return self.arrays["T_anatomical_skull"]
 
     @property
@@ -87,7 +87,7 @@ class RigArrays:
 
     @property
     def d_range(self) -> Array:
-        """The box around the valid parameters [mm], rows (low, high), shape (3, 2)."""
+        """Bounding box of the valid parameters [mm], rows (low, high), shape (3, 2)."""
         return self.arrays["d_range"]
 
     @property
@@ -97,7 +97,7 @@ class RigArrays:
 
     @property
     def model_hash(self) -> str:
-        """SHA-256 of the arrays: names, shapes and little-endian float64 values, in order of name."""
+        """SHA-256 over the names, shapes and little-endian float64 values of all arrays, sorted by name."""
         # The tolerance is hashed under its version 1 name and sign, so that old rigs keep their hash.
         named = {name: value for name, value in self.arrays.items() if name != "tolerance_mm"}
         named["margin_limit_mm"] = np.negative(self.arrays["tolerance_mm"])
@@ -146,7 +146,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
 
 
 def flat_arrays(arrays: Mapping[str, Array]) -> dict[str, list[float]]:
-    """Return the arrays flattened row by row, as `jawusd.evaluator.formula` expects them."""
+    """Return the arrays flattened in row-major order, as `jawusd.evaluator.formula` expects them."""
     return {name: value.ravel().tolist() for name, value in arrays.items()}
 
 

@@ -18,7 +18,7 @@ from jawusd.evaluator.search import nearest_distance
 
 
 class RigAuthoring(RigArrays):
-    """The part of a rig that deals with motions of d and the bound.
+    """Authoring functions of a rig: motions of d, and ranges within the bound.
 
     Attributes:
         bound: The slice bound.
@@ -60,7 +60,7 @@ class RigAuthoring(RigArrays):
         """Return a motion brought inside the bound, at its samples and between them.
 
         Poses outside are moved inside continuously, and no step becomes more than 5 % longer than it was. Where the
-        path inside is longer than that, the motion borrows time from before and after.
+        path inside needs more time than that, the motion just before and after is retimed as well.
 
         Args:
             times: Increasing sample times, shape (F,).
@@ -85,7 +85,7 @@ class RigAuthoring(RigArrays):
 
         Returns:
             The limits [mm]; NaN where the section does not reach that line. The bound closes a few tenths of a mm
-            before the ends of ``d_range[0]``; in between, the limits at the nearest valid opening.
+            before the ends of ``d_range[0]``; beyond that point, the limits at the nearest valid opening are returned.
         """
         each = (as_floats(x, name) for x, name in ((d1, "d1"), (d2, "d2"), (d3, "d3")))
         d = np.stack(np.broadcast_arrays(*each), axis=-1)
@@ -116,6 +116,6 @@ class RigAuthoring(RigArrays):
         return in_chunks(lambda n: denormalized(self.bound, self.d_range, n), rows).reshape(*batch, 3)
 
     def captured_distance(self, d: ArrayLike) -> Array:
-        """Return the distance [mm] (...) of d (..., 3) [mm] to the nearest captured pose, in d; inf without any."""
+        """Return the distance (...) [mm] from d (..., 3) to that of the nearest captured pose; inf if there is none."""
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(lambda d: nearest_distance(self.captured_d, d), rows).reshape(batch)

@@ -1,8 +1,8 @@
 """The bounds: which jaw parameters are anatomically possible.
 
-The slice hull is a smooth signed distance in mm. Every opening d1 has a convex section in (d2, d3), the half-planes
-``n_k . (d2, d3) <= h_k(d1)``; d1 itself is limited to the captured openings. The half-spaces are joined by a soft
-maximum,
+The slice hull is a smooth signed distance in mm. Its section at an opening d1 is convex in (d2, d3), the intersection
+of the half-planes ``n_k . (d2, d3) <= h_k(d1)``; d1 itself is limited to the captured openings. All constraints are
+combined by a soft maximum,
 
     v_k = n_k . (d2, d3) - h_k(d1),   v_low = d1_first - d1,   v_high = d1 - d1_last,
     distance(d) = softness log sum exp(v / softness) - offset_mm,
@@ -27,7 +27,8 @@ _ARRAYS = ("slice_d1", "slice_directions", "slice_support", "slice_softness_mm",
 _NEWTON_ITERATIONS = 60
 _ROOT_TOLERANCE_MM = 1e-12
 _CANDIDATE_SLICES = 48
-_CANDIDATE_RADII = (0.4, 0.75, 0.9, 0.97, 1.0)  # denser near the outline, where nearest points lie
+# fractions of the way from the centre of a section to its outline; denser near the outline, where nearest points lie
+_CANDIDATE_RADII = (0.4, 0.75, 0.9, 0.97, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +39,12 @@ class SliceHull:
         supports: h_k(d1) [mm], constant outside the captured openings.
         directions: Unit normals n_k in (d2, d3) around the full circle, shape (K, 2).
         softness_mm: Radius of the rounding where half-spaces meet.
-        offset_mm: Distance by which the bound is wider than its supports.
-        slopes: Derivatives of the half-spaces by d, shape (K + 2, 3); those of the sides by d1 are left 0.
+        offset_mm: Distance by which the bound extends beyond its supports.
+        slopes: Derivatives of v_k, v_low and v_high with respect to d, shape (K + 2, 3), without the d1 derivatives of
+            v_k, which depend on d1 and are 0 here.
         formula: The same bound for one d, in floats.
-        first_mm: First captured opening.
-        last_mm: Last captured opening.
+        first_mm: Smallest captured opening.
+        last_mm: Largest captured opening.
     """
 
     supports: HermiteCurve
@@ -55,7 +57,7 @@ class SliceHull:
     last_mm: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        # d v_j / dd of the K sides (their d1 column is -h_k' and filled in per row), then of v_low and v_high
+        # the K rows of v_k (their d1 column, -h_k', is added during evaluation), then v_low and v_high
         gradients = np.zeros((len(self.directions) + 2, 3))
         gradients[:-2, 1:] = self.directions
         gradients[-2:, 0] = -1.0, 1.0
@@ -81,7 +83,7 @@ class SliceHull:
         return self._joined(d, self.supports.value(d[:, 0]))[0]
 
     def signed_distance_gradient(self, d: Array) -> tuple[Array, Array]:
-        """Return the signed distance (n,) [mm] and its gradient by d, shape (n, 3)."""
+        """Return the signed distance (n,) [mm] and its gradient with respect to d, shape (n, 3)."""
         reach, reach_1 = self.supports.value_and_slope(d[:, 0])
         distance, weights = self._joined(d, reach)
         gradient = weights @ self.slopes
@@ -127,8 +129,8 @@ class SliceHull:
         return found
 
     def _chord_end(self, d: Array, axis: int, sign: float) -> Array:
-        # Newton from the edge of the sharp polygon, which contains the soft one: the signed distance is convex along
-        # the line, so the search moves inwards without overshooting unless the line misses the section.
+        # Newton from the edge of the unrounded polygon, which contains the rounded section: the signed distance is
+        # convex along the line, so the iterates move inwards without overshooting unless the line misses the section.
         along, across = self.directions[:, axis - 1], self.directions[:, 2 - axis]
         room = self.supports.value(d[:, 0]) + self.offset_mm - d[:, 3 - axis, None] * across
         facing = along * sign > 0
@@ -150,7 +152,7 @@ class SliceHull:
         return end
 
     def section_centres(self, count: int) -> tuple[Array, Array]:
-        """Return up to ``count`` openings (n,) [mm] over the bound, and the middle (n, 2) [mm] of each section."""
+        """Return up to ``count`` openings (n,) [mm] within the bound, and the centres (n, 2) [mm] of the sections."""
         reach = self.offset_mm - self.softness_mm
         found = [
             (d1, self._sharp_outline(d1)) for d1 in np.linspace(self.first_mm - reach, self.last_mm + reach, count)
@@ -206,7 +208,7 @@ class SliceHull:
 
 
 def largest_share(outside: Callable[[Array], Mask], count: int, iterations: int) -> Array:
-    """Return the largest fractions (count,) in [0, 1] that are not outside, by bisection."""
+    """Return, by bisection, the largest fractions (count,) in [0, 1] for which ``outside`` is false."""
     low, high = np.zeros(count), np.ones(count)
     for _ in range(iterations):
         share = 0.5 * (low + high)
@@ -229,7 +231,7 @@ class Ranges(NamedTuple):
 
 
 def normalized(bound: SliceHull, d_range: Array, d: Array) -> Array:
-    """Return d (n, 3) [mm] as fractions of the full opening and of the range on its side at that opening."""
+    """Return d (n, 3) [mm] as fractions: d1 of the full opening, d2, d3 of the range on their side at that opening."""
     return d / _scale(bound, d_range, d[:, 0], d)
 
 
@@ -239,7 +241,7 @@ def denormalized(bound: SliceHull, d_range: Array, shares: Array) -> Array:
 
 
 def _scale(bound: SliceHull, d_range: Array, d1: Array, sides: Array) -> Array:
-    """Return the length of one unit [mm], shape (n, 3), at openings d1 (n,) for the signs of ``sides`` (n, 3)."""
+    """Return the lengths [mm] of a fraction of 1, (n, 3), at openings d1 (n,), for the signs of ``sides`` (n, 3)."""
     knots = bound.supports.knots
     on_path = np.zeros((len(d1), 3))
     on_path[:, 0] = np.clip(d1, knots[0], knots[-1])
@@ -257,8 +259,8 @@ class PolygonBound:
     """The bound of the paper: two alpha shapes.
 
     Attributes:
-        opening_lateral: Edges of the outlines in (d1, d2) [mm], from start to end, shape (e, 2, 2).
-        opening_protrusion: Edges of the outlines in (d1, d3) [mm], shape (f, 2, 2).
+        opening_lateral: Edges of the outlines in (d1, d2) [mm], each as its start and end point, shape (e, 2, 2).
+        opening_protrusion: Edges of the outlines in (d1, d3) [mm], likewise, shape (f, 2, 2).
     """
 
     opening_lateral: Array

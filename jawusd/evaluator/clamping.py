@@ -1,8 +1,8 @@
 """Bring motions inside the bound, continuously and no faster than they were.
 
 Poses outside are moved towards the spine of the bound. Where the resulting path is longer than the original one, it is
-cut short across the inside. The motion then runs along the path no faster than the original allows at each moment, as
-near as possible to its original timing (the mean of the two envelopes of McShane and Whitney 1934).
+shortened by shortcuts through the interior. The motion then follows the path no faster than the original allows at each
+moment, as close as possible to its original timing (the mean of the two envelopes of McShane and Whitney 1934).
 """
 
 from __future__ import annotations
@@ -15,19 +15,20 @@ from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.spine import INSET_MM, Spine, distances, moved_to_spine
 
-MAX_STRETCH = 1.045  # limit of how much longer a step may become: 5 %, with room for rounding
+MAX_STRETCH = 1.045  # largest factor by which a step may grow: 5 %, less an allowance for rounding
 
 _SAMPLE_MM = 0.2  # sample spacing near the bound
-_MAX_PIECES = 400  # samples of one step
-_STEEPEST = 5.0  # upper limit of the slope of the margin: steps deeper than this many step lengths stay inside
+_MAX_PIECES = 400  # largest number of samples in one step
+_STEEPEST = 5.0  # largest gradient norm of the margin: a step stays inside if its ends are this many step lengths deep
 _STILL_MM = 1e-12
-_TIME_SHARE = 0.998  # of the available time; a path grows slightly when it is sampled finer
+_TIME_SHARE = 0.998  # fraction of the available time a path may take: finer sampling makes it slightly longer
+# Lines between samples are checked at this spacing, and again more finely where the margin is below the second length.
 _CHECK_MM, _NEAR_MM, _MAX_ROUNDS, _ROUNDING_MM = 0.03, 1e-3, 8, 1e-9
 
 _LINE_MM = 0.1  # sample spacing of shortcuts
-_SHORTCUTS = 24  # ends of a shortcut tried at once
+_SHORTCUTS = 24  # end points tried at once for a shortcut
 _TIGHT_POINTS, _TIGHT_ROUNDS, _TIGHT_GAIN_MM = 49, 20, 0.01
-_TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)  # the largest first
+_TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)  # fractions of the way to the straight line that tightening tries, in this order
 
 
 class Inside(NamedTuple):
@@ -51,8 +52,8 @@ def kept_inside(bound: SliceHull, times: Array, d: Array, *, ends_stay: bool = F
     Args:
         times: Increasing times, shape (F,).
         d: Jaw parameters [mm], finite, linear between the times, shape (F, 3).
-        ends_stay: Where every path inside is too long, exceed the speed limit instead of borrowing time from the
-            motion before and after.
+        ends_stay: Where every path inside is too long, exceed the speed limit instead of retiming the motion before
+            and after.
 
     Returns:
         The motion inside the bound: unchanged where it is inside, elsewhere with no step more than 5 % longer than the
@@ -82,7 +83,7 @@ def kept_inside(bound: SliceHull, times: Array, d: Array, *, ends_stay: bool = F
 
 
 def _refined(bound: SliceHull, times: Array, d: Array) -> tuple[Array, Array, Mask]:
-    """Return times (n,), d (n, 3) and which are original: the samples, refined where the bound is near."""
+    """Return the motion sampled more finely near the bound: times (n,), d (n, 3), and which are original (n,)."""
     length = np.linalg.norm(np.diff(d, axis=0), axis=1)
     margin = -distances(bound, d)
     near = np.minimum(margin[:-1], margin[1:]) < _STEEPEST * length
@@ -102,7 +103,7 @@ def _runs(moved: Mask) -> list[tuple[int, int]]:
 
 
 def _widened(path: Array, allowed: Array, first: int, last: int) -> tuple[int, int]:
-    """Return the run widened until the motion has enough time for the path, at most to the whole motion."""
+    """Return the run of samples, widened until the motion has enough time for the path or includes all samples."""
     reach, end = max(last - first, 1), len(path) - 1
     while first > 0 or last < end:
         if lengths(path[first : last + 1])[-1] <= _TIME_SHARE * (allowed[last] - allowed[first]):
@@ -147,7 +148,7 @@ def _thinned(bound: SliceHull, times: Array, d: Array, given: Mask) -> Inside:
 
 
 def _without_gaps(bound: SliceHull, spine: Spine, motion: Inside) -> Inside:
-    """Return the motion with samples added where a line between two still leaves the bound, by a thin sliver."""
+    """Return the motion with samples added where the line between two samples still slightly leaves the bound."""
     for _ in range(_MAX_ROUNDS):
         times, d, given = motion
         leaves = np.flatnonzero(_leaves(bound, d[:-1], d[1:]))
@@ -197,13 +198,13 @@ def lengths(path: Array) -> Array:
 
 
 def along(path: Array, length: Array, at: Array) -> Array:
-    """Return the points (m, 3) of a path (n, 3) at lengths ``at`` (m,), given its cumulative lengths (n,)."""
+    """Return the points (m, 3) of a path (n, 3) at arc lengths ``at`` (m,), given its cumulative lengths (n,)."""
     keep = np.concatenate([[True], np.diff(length) > 0])
     return np.stack([np.interp(at, length[keep], column[keep]) for column in path.T], axis=1)
 
 
 def short_enough(bound: SliceHull, path: Array, allowed: Array) -> Array:
-    """Return a path (n, 3) inside, shortened across the inside if it is longer than ``allowed`` (n,) permits."""
+    """Return a path (n, 3) inside, shortened through the interior if it is longer than ``allowed`` (n,) permits."""
     most = allowed[-1] - allowed[0]
     if lengths(path)[-1] <= most:
         return path
@@ -215,7 +216,7 @@ def short_enough(bound: SliceHull, path: Array, allowed: Array) -> Array:
 
 
 def _cut_short(bound: SliceHull, path: Array) -> Array:
-    """Return the corners (m, 3) of a shorter path: each point is joined to the farthest visible one."""
+    """Return the corners (m, 3) of a shorter path: each corner is joined to the farthest one visible from it."""
     corners, i, last = [0], 0, len(path) - 1
     while i < last:
         tried = np.unique(np.linspace(i + 1, last, _SHORTCUTS).astype(int))
@@ -228,8 +229,7 @@ def _cut_short(bound: SliceHull, path: Array) -> Array:
 def _tightened(bound: SliceHull, corners: Array, most_mm: float) -> Array:
     """Return a path (n, 3) between the same ends, tightened until it is no longer than ``most_mm``.
 
-    Segment by segment, long ones first, it is moved towards the straight line between its ends as far as the bound
-    allows.
+    Segments of it, long ones first, are moved towards the straight line between their ends as far as the bound allows.
     """
     length = lengths(corners)
     path = along(corners, length, np.union1d(np.linspace(0.0, length[-1], _TIGHT_POINTS), length))

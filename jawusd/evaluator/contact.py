@@ -27,7 +27,7 @@ AUTHORED_MM = 0.15
 NEAR_MM = 0.5
 
 
-#: The surfaces of a clearance, and the prefix of its array names.
+#: The pairs of surfaces with a clearance, and the prefixes of their array names.
 Meeting = Literal["teeth", "condyles"]
 PREFIXES: dict[Meeting, str] = {"teeth": "contact", "condyles": "joint"}
 
@@ -36,8 +36,8 @@ class Clearance(NamedTuple):
     """Result of `JawRig.clearance`.
 
     Attributes:
-        clearance_mm: Below 0 where surfaces penetrate deeper than in the closed bite, shape (...).
-        gradient: Its derivative by d [mm/mm], shape (..., 3).
+        clearance_mm: Negative where surfaces penetrate deeper than in the closed bite, shape (...).
+        gradient: Its derivative with respect to d [mm/mm], shape (..., 3).
     """
 
     clearance_mm: Array
@@ -54,7 +54,7 @@ class ContactField:
         values: Clearances [mm], shape (n1, n2, n3).
         closed_mm: Penetration depth of the scans in the closed bite; negative for a gap.
         error_mm: Largest interpolation error at random valid parameters with a clearance below `NEAR_MM`, or 0.
-        limit_mm: Smallest clearance of the captured poses, at most 0; measured poses with less have colliding teeth.
+        limit_mm: Smallest clearance of the captured poses, at most 0; teeth count as colliding in measured poses below.
     """
 
     first_mm: Array
@@ -130,7 +130,7 @@ class ContactField:
         return self.clearance(d).clearance_mm < limit_mm - self.error_mm
 
     def collides_at(self, d: Array, limit_mm: float) -> bool:
-        """Return the same for one d (1, 3) [mm], in floats, which is faster."""
+        """Return `collides` for one d (1, 3) [mm], computed in floats, which is faster."""
         return self._single(*d[0].tolist()) < limit_mm - self.error_mm
 
     def _single(self, d1: float, d2: float, d3: float) -> float:
@@ -165,7 +165,7 @@ class RigClearance:
     """The clearances of a rig.
 
     Attributes:
-        contact: Clearance of the teeth over d; None if the scans do not include it.
+        contact: Clearance of the teeth over d; None if the rig was built without it.
         joints: Clearance of the condyles; None unless the bones of both jaws were scanned. Cartilage and disc are not
             in the scans, so this clearance never rejects a pose.
     """
@@ -181,8 +181,8 @@ class RigClearance:
             of: "teeth", or "condyles" for the clearance between condyles and skull.
 
         Returns:
-            The clearance [mm], shape (...), and its derivative by d [mm/mm], shape (..., 3). It saturates at about
-            1.5 mm and is constant far outside the bound. The clearance of the teeth is 0 in the closed bite.
+            The clearance [mm], shape (...), and its derivative with respect to d [mm/mm], shape (..., 3). The clearance
+            saturates at about 1.5 mm and is constant far outside the bound. That of the teeth is 0 in the closed bite.
 
         Raises:
             EvaluatorError: The rig has no such clearance, see `contact` and `joints`.
@@ -220,7 +220,7 @@ class RigClearance:
 
 
 def check_contact(arrays: Mapping[str, Array], name: str) -> None:
-    """Check the clearances in the named arrays of a rig, by the prefix of their names.
+    """Check the clearance whose arrays have a given name prefix.
 
     Raises:
         EvaluatorError: Values out of range, or counts that do not match.

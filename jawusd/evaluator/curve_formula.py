@@ -9,7 +9,7 @@ from jawusd.geometry.rodrigues import N
 
 
 def cubic(h: N, y0: N, y1: N, m0: N, m1: N) -> tuple[N, N, N, N]:
-    """Return the powers 0..3 of the cubic Hermite polynomial over an interval of length h.
+    """Return the coefficients, powers 0..3, of the cubic Hermite polynomial over an interval of length h.
 
     Args:
         h: Length of the interval.
@@ -23,7 +23,7 @@ def cubic(h: N, y0: N, y1: N, m0: N, m1: N) -> tuple[N, N, N, N]:
 
 
 def catmull_rom(before: N, after: N, span: N) -> N:
-    """Return the slope at a knot from the values before and after it, span apart."""
+    """Return the slope at a knot from the values at its two neighbours, which are ``span`` apart."""
     return (after - before) / span
 
 
@@ -49,7 +49,8 @@ def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) 
         slopes: Derivatives at the knots, n rows.
 
     Returns:
-        The knots, and the start and the powers 0..3 of each of the n + 1 intervals, including the straight ends.
+        The knots, and the start and the polynomial coefficients, powers 0..3, of each of the n + 1 intervals, including
+        the straight ends.
     """
     still = [0.0] * len(values[0])
     pieces = [[[knots[0]], values[0], slopes[0], still, still]]
@@ -63,7 +64,7 @@ def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) 
 
 
 def curve(name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]) -> list[N]:
-    """Return the point at x, a row, of the curve of `curve_tables`."""
+    """Return the point, a row, at x on the curve with the tables of `curve_tables`."""
     s, powers = _interval(name, x, tables, ops)
     return [((c3 * s + c2) * s + c1) * s + c0 for c0, c1, c2, c3 in zip(*powers)]
 
@@ -83,6 +84,6 @@ def curve_derivatives(
 def _interval(
     name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]
 ) -> tuple[N, Sequence[Sequence[N]]]:
-    """Return the offset of x from the start of its interval, and the powers 0..3 of the curve there."""
+    """Return the offset of x from the start of its interval, and the polynomial coefficients of that interval."""
     found = ops.lookup(x, tables[f"{name}_knot"], [tables[f"{name}_{part}"] for part in _CURVE_TABLES])
     return x - found[0][0], found[1:]

@@ -24,8 +24,8 @@ class HermiteCurve:
         knots: Increasing parameter values, shape (n,), n >= 2.
         values: Points of the curve at the knots, shape (n, k).
         slopes: Derivatives at the knots, shape (n, k).
-        starts: Origin of the powers of each interval, the straight ends first and last, shape (n + 1,).
-        coefficients: Powers 0..3 of (x - start) per interval, shape (n + 1, 4, k).
+        starts: Origin of the polynomial of each interval, the straight ends first and last, shape (n + 1,).
+        coefficients: Coefficients of the powers 0..3 of (x - start) per interval, shape (n + 1, 4, k).
     """
 
     knots: Array
@@ -35,7 +35,7 @@ class HermiteCurve:
     coefficients: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        # powers 0..3 of s = x - knot per interval; intervals 0 and n are the straight ends, so that evaluation needs
+        # coefficients of s = x - knot per interval; intervals 0 and n are the straight ends, so that evaluation needs
         # no special case
         y, m = self.values, self.slopes
         inner = np.stack(cubic(np.diff(self.knots)[:, None], y[:-1], y[1:], m[:-1], m[1:]), axis=1)
@@ -79,8 +79,8 @@ def flat_ended(knots: Array, values: Array) -> HermiteCurve:
 class GlideTable:
     """The tooth-glide surface measured on scans: how far the jaw must open to slide with the teeth together.
 
-    ``sum_r a_r(d2) b_r(d3)`` [mm], each factor a C1 cubic Hermite curve that is constant outside its knots. Stored
-    multiplied out, as one bicubic polynomial for every cell between knots.
+    ``sum_r a_r(d2) b_r(d3)`` [mm], each factor a C1 cubic Hermite curve that is constant outside its knots. The sum is
+    stored expanded, as one bicubic polynomial for every cell between knots.
 
     Attributes:
         knots: Increasing knots of d2 and of d3 [mm].
@@ -103,7 +103,7 @@ class GlideTable:
         """Build the surface from the named arrays of a rig; None if it has none.
 
         Raises:
-            EvaluatorError: It is not 0 at the closed bite.
+            EvaluatorError: The surface is not 0 at the closed bite.
         """
         if "glide_d2" not in arrays:
             return None
@@ -125,7 +125,7 @@ class GlideTable:
         return {"glide_d2": k2, "glide_d2_factors": f2, "glide_d3": k3, "glide_d3_factors": f3}
 
     def at_floats(self, d2: float, d3: float) -> tuple[float, float, float]:
-        """Return the drop [mm] at d2, d3 [mm], and its derivatives by both."""
+        """Return the drop [mm] at d2, d3 [mm], and its derivatives with respect to both."""
         i, j = bisect_right(self._rising[0], d2), bisect_right(self._rising[1], d3)
         s, t = d2 - self._first[0][i], d3 - self._first[1][j]
         powers = np.array(((1.0, s, s * s, s * s * s), (0.0, 1.0, 2.0 * s, 3.0 * s * s)))
@@ -134,7 +134,7 @@ class GlideTable:
         return down, ((b[3] * t + b[2]) * t + b[1]) * t + b[0], (3.0 * a[3] * t + 2.0 * a[2]) * t + a[1]
 
     def at_arrays(self, d2: Array, d3: Array) -> tuple[Array, Array, Array]:
-        """Return the drop [mm] at d2, d3 [mm], any shape, and its derivatives by both."""
+        """Return the drop [mm] at d2, d3 [mm], any shape, and its derivatives with respect to both."""
         i, j = self.knots[0].searchsorted(d2, side="right"), self.knots[1].searchsorted(d3, side="right")
         s, t = d2 - self.starts[0][i], d3 - self.starts[1][j]
         c = self.coefficients[i, j]

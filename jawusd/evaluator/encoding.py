@@ -40,7 +40,7 @@ def landmark_vectors(landmarks: Array) -> Array:
 
 
 def handle_vectors(points: Array, weights: ArrayLike | None) -> Array:
-    """Return points (H, 3) [mm] as homogeneous vectors (4, H), scaled so that squared sums are weighted means.
+    """Return points (H, 3) [mm] as homogeneous vectors (4, H), scaled so that sums of squares are weighted means.
 
     Raises:
         ValueError: weights of a wrong shape, negative, not finite or all zero.
@@ -57,13 +57,13 @@ def vector_images(R: Array, t: Array, vectors: Array) -> Array:
 
 
 def point_velocities(R: Array, t: Array, S: Array, points: Array) -> Array:
-    """Return the derivatives (n, p, 3, 3) of the images of points (p, 3) [mm] by d.
+    """Return the derivatives (n, p, 3, 3) of the images of points (p, 3) [mm] with respect to d.
 
     Args:
         R: Rotations, shape (n, 3, 3).
         t: Translations [mm], shape (n, 3).
         S: Their spatial derivatives, see `jawusd.evaluator.models`, shape (n, 6, 3).
-        points: Points before the motion.
+        points: Points before the motion [mm], shape (p, 3).
     """
     image = points @ np.swapaxes(R, 1, 2) + t[:, None]
     return np.cross(S[:, None, :3], image[..., None], axis=2) + S[:, None, 3:]
@@ -101,7 +101,7 @@ class Encoder:
 
     Args:
         model: The jaw model.
-        frames: The frames of the rig.
+        frames: The coordinate frames of the rig.
         vectors: The four vectors that represent the landmarks, see `landmark_vectors`.
     """
 

@@ -34,16 +34,16 @@ from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 ON_BOUND_MM = 1e-6
 FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
 LIMIT_SOFTNESS_MM = 4.0  # [mm] rounding of the kinks at both ends of the path limits
-ARCH_BOW_MM = 10.0  # the quadratic arch terms are d2^2 / 10 mm, so that all coefficients have the same order
-DROP_BEND = 0.15  # [1/mm] curvature of the bent drop terms, which saturates at 4 mm (next line)
-DROP_SATURATION_MM2 = 16.0
+ARCH_BOW_MM = 10.0  # the quadratic arch terms are d2^2 / 10 mm, so that all coefficients have similar magnitude
+DROP_BEND = 0.15  # [1/mm] second-order coefficient of the bent drop terms
+DROP_SATURATION_MM2 = 16.0  # square of the distance, 4 mm, beyond which they become straight
 
 Arrays = Mapping[str, Sequence[float]]  # the named arrays of a rig, flattened row by row
 Numbers = tuple[object, ...]  # nested tuples of floats, or of their counterparts of another number type
 
 
 class GaugeNumbers(NamedTuple):
-    """The numbers of a gauge.
+    """The scalars of a gauge.
 
     Attributes:
         path_x: Coefficients of gx: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm].
@@ -73,7 +73,7 @@ class GaugeNumbers(NamedTuple):
 def long_angle_series() -> list[list[float]]:
     """Return the coefficients of a, b and c of `jawusd.geometry.rodrigues` as series of the squared angle [rad^2].
 
-    Eight terms each: to 1e-8 up to 2 rad.
+    Eight terms each: accurate to 1e-8 up to 2 rad.
     """
     return [[(-1.0) ** k / math.factorial(2 * k + start) for k in range(8)] for start in (1, 2, 3)]
 
@@ -214,7 +214,7 @@ class JawFormula(Protocol):
     """The motion of one kind of model.
 
     Attributes:
-        tables: The rows of floats it needs, which each number type stores in its own form.
+        tables: The rows of floats the formula needs; each number type stores them in its own form.
     """
 
     tables: dict[str, Rows]
@@ -223,7 +223,7 @@ class JawFormula(Protocol):
 
     @property
     def numbers(self) -> Numbers:
-        """The scalars it needs, in nested tuples."""
+        """The scalars the formula needs, in nested tuples."""
 
     def motion(
         self,
@@ -238,7 +238,7 @@ class JawFormula(Protocol):
             d: Jaw parameters [mm].
             tables: The formula's tables in the form of the number type.
             ops: Operations of the number type.
-            numbers: The formula's numbers, unless they are floats.
+            numbers: The formula's scalars in the number type; default: its own floats.
         """
 
 
@@ -253,7 +253,7 @@ class AnchoredNumbers(NamedTuple):
 
 
 class AnchoredFormula:
-    """Rotation as a function of where the lower incisal point is: ``omega = f(u), t = u + p - R(omega) p``."""
+    """Rotation as a function of the position of the lower incisal point: ``omega = f(u), t = u + p - R(omega) p``."""
 
     def __init__(self, arrays: Arrays) -> None:
         path_x, path_z = rows(arrays["path_coefficients"], 5)
@@ -352,7 +352,7 @@ class BoundFormula:
     ) -> N:
         """Return the signed distance of d [mm] to the bound [mm], positive inside.
 
-        The soft maximum of the half-planes ``n_k . (d2, d3) <= h_k(d1)`` and of the ends of the captured openings.
+        A soft maximum combines the half-planes ``n_k . (d2, d3) <= h_k(d1)`` and the ends of the captured openings.
         """
         first_mm, last_mm, softness_mm, offset_mm = cast("BoundNumbers", numbers or self.numbers)
         d1, d2, d3 = d

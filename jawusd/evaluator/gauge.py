@@ -1,9 +1,9 @@
 """The gauge: jaw parameters to the displacement of the incisal point and back, with derivatives.
 
-The formulas of `jawusd.evaluator.formula`, differentiated by hand. The functions take ``+ - * /`` and an `Elementary`
-for the rest, so that they run on floats, arrays and tensors, and compiled: `jawusd.fast` compiles them unchanged, which
-is why they use tuples instead of lists. A suffix names the variable of a derivative: ``rho_2`` is the derivative of rho
-by d2. `Gauge` applies them to batches.
+The formulas of `jawusd.evaluator.formula`, differentiated by hand. The functions use only ``+ - * /`` and the functions
+of an `Elementary`, so that they run on floats, arrays and tensors. `jawusd.fast` compiles them unchanged, which is why
+they use tuples instead of lists. A suffix names the variable of a derivative: ``rho_2`` is the derivative of rho with
+respect to d2. `Gauge` applies them to batches.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ INVERSE_TOLERANCE_MM = 1e-13
 INVERSE_ITERATIONS = 120
 PATIENCE = 8  # iterations before Newton counts as stalled: then steps double, or an existing bracket is halved
 INVERSE_STEP_MM = 20.0
-MIN_INVERSE_SLOPE = 0.2  # smaller slopes lead away from the root
+MIN_INVERSE_SLOPE = 0.2  # lower limit of the derivative: with a smaller one, Newton steps lead away from the root
 MAX_DOUBLINGS = 64
 
 
@@ -41,7 +41,7 @@ class Elementary(NamedTuple, Generic[N]):
     sqrt: Callable[[N], N]
     exp: Callable[[N], N]
     clip: Callable[[N, float, float], N]
-    glide: Callable[[object, N, N], Triple[N]]  # (glide table, d2, d3) -> drop [mm] and its derivatives by d2 and d3
+    glide: Callable[[object, N, N], Triple[N]]  # (glide table, d2, d3) -> drop [mm], drop_2, drop_3
 
 
 def _clip_float(x: float, low: float, high: float) -> float:
@@ -65,7 +65,7 @@ ARRAYS: Elementary[Array] = Elementary(np.sqrt, np.exp, _clip_array, _glide_arra
 
 
 def path(gauge: GaugeNumbers, d1: N, f: Elementary[N]) -> tuple[N, N, N, N]:
-    """Return gx, gz [mm] and their slopes gx_1, gz_1 at opening d1 [mm] (Horner's scheme for both)."""
+    """Return gx, gz [mm] and their derivatives gx_1, gz_1 at opening d1 [mm] (Horner's scheme for both)."""
     scale = gauge.path_scale_mm
     inside = f.clip(d1, gauge.low_mm, gauge.high_mm)
     s, beyond = inside / scale, d1 - inside
@@ -118,7 +118,7 @@ def drop(gauge: GaugeNumbers, d2: N, d3: N, f: Elementary[N]) -> tuple[N, N, N]:
 
 
 def fade(gauge: GaugeNumbers, d1: N, f: Elementary[N]) -> tuple[N, N]:
-    """Return the weight of the glide surface at opening d1 [mm], and its slope."""
+    """Return the weight of the glide surface at opening d1 [mm], and its derivative."""
     root = f.sqrt(d1 * d1 + FADE_SOFTNESS_MM * FADE_SOFTNESS_MM)
     x = 0.5 * (d1 + root - FADE_SOFTNESS_MM) / gauge.fade_mm
     share = f.exp(-x * x)
@@ -144,8 +144,8 @@ def opening_equation(gauge: GaugeNumbers, u: Triple[N], d1: N, f: Elementary[N])
     """Return the inverse gauge reduced to one equation in d1 [mm].
 
     Returns:
-        d2, d3 [mm] that match the x and z of u at d1, the remainder ``d1 + drop fade + y`` [mm], which is zero at the
-        solution, and its slope by d1.
+        d2, d3 [mm] that match the x and z of u at d1, the residual ``d1 + drop fade + y`` [mm], which is zero at the
+        solution, and its derivative with respect to d1.
     """
     gx, gz, gx_1, gz_1 = path(gauge, d1, f)
     d2 = u[0] - gx
@@ -183,14 +183,14 @@ def inverse(gauge: GaugeNumbers, u: Triple[float], f: Elementary[float]) -> Trip
 def spline_input(
     gauge: GaugeNumbers, scales: Sequence[float], u: Triple[N], f: Elementary[N]
 ) -> tuple[Triple[N], tuple[N, N]]:
-    """Return the spline's argument q at u [mm], and the slopes of the path there for `gradient_by_u`."""
+    """Return the spline's argument q at u [mm], and the derivatives of the path there for `gradient_by_u`."""
     opening = -u[1]
     gx, gz, gx_1, gz_1 = path(gauge, opening, f)
     return (opening / scales[0], (u[0] - gx) / scales[1], (u[2] - gz) / scales[2]), (gx_1, gz_1)
 
 
 def gradient_by_u(by_q: Triple[N], scales: Sequence[float], slopes: tuple[N, N]) -> Triple[N]:
-    """Return the gradient by u of a function with gradient ``by_q``, see `spline_input`."""
+    """Return the gradient with respect to u of a function whose gradient with respect to q is ``by_q``."""
     opening, side, front = by_q[0] / scales[0], by_q[1] / scales[1], by_q[2] / scales[2]
     return side, side * slopes[0] + front * slopes[1] - opening, front
 
@@ -259,15 +259,15 @@ class Gauge:
         )
 
     def path(self, d1: Array) -> tuple[Array, Array, Array, Array]:
-        """Return gx, gz [mm] and their slopes at the openings d1 [mm], each of the shape of d1."""
+        """Return gx, gz [mm] and their derivatives at the openings d1 [mm], each of the shape of d1."""
         return path(self.numbers, d1, ARRAYS)
 
     def arch(self, d1: Array, d2: Array) -> tuple[Array, Array, Array]:
-        """Return rho(d2, d1) [mm] and its derivatives by d1 and by d2."""
+        """Return rho(d2, d1) [mm] and its derivatives with respect to d1 and d2."""
         return arch(self.numbers, d1, d2, ARRAYS)
 
     def drop(self, d2: Array, d3: Array) -> tuple[Array, Array, Array]:
-        """Return drop(d2, d3) [mm] and its derivatives by d2 and by d3."""
+        """Return drop(d2, d3) [mm] and its derivatives with respect to d2 and d3."""
         return drop(self.numbers, d2, d3, ARRAYS)
 
     def displacement(self, d: Array) -> Array:
@@ -289,8 +289,8 @@ class Gauge:
         """Return the d (n, 3) [mm] whose incisal displacement is u (n, 3) [mm].
 
         For a given d1 the other two follow in closed form, so this is a root search in one variable: Newton with the
-        analytic slope, inside the tightest bracket so far. Rows that do not converge become NaN. A single row uses
-        `inverse`, the same search in floats.
+        analytic derivative, inside the tightest bracket so far. Rows that do not converge become NaN. A single row is
+        solved by the function `inverse`, the same search in floats.
         """
         finite = np.isfinite(u).all(axis=1)
         if len(u) == 1 and finite.all():

@@ -1,4 +1,4 @@
-"""The kernels of a rig: the functions that compute rows.
+"""The kernels of a rig: the functions that evaluate rows.
 
 Rows are float64 arrays; rows with a value that is not finite, or above 1e9, give NaN.
 """
@@ -21,17 +21,17 @@ from jawusd.evaluator.solver import Residual, minimise
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
 from jawusd.geometry.se3 import rigidity_defect, transform_points
 
-_FEW_ROWS = 3  # up to this many rows, searching one by one is faster
+_FEW_ROWS = 3  # up to this many rows, one search per row in floats is faster
 
 
 @dataclass(frozen=True)
 class RigParts:
-    """The inputs of kernels.
+    """The parts of a rig from which kernels are built.
 
     Attributes:
         model: The jaw model.
         bound: The bound.
-        frames: The frames of the rig.
+        frames: The coordinate frames of the rig.
         landmarks: Landmarks of the mandible [mm], mandible frame, shape (n, 3).
     """
 
@@ -70,7 +70,7 @@ class NumpyKernels:
         return in_chunks(lambda d: self._model.log(d) @ self._frames.adjoint.T, usable_rows(d))
 
     def jacobians(self, d: Array) -> Array:
-        """Return the derivatives (n, 6, 3) of the twists by d (n, 3) [mm]."""
+        """Return the derivatives (n, 6, 3) of the twists with respect to d (n, 3) [mm]."""
         return in_chunks(lambda d: self._frames.adjoint @ self._model.log_jacobian(d), usable_rows(d))
 
     def margins(self, d: Array) -> Array:
@@ -78,7 +78,7 @@ class NumpyKernels:
         return -in_chunks(self._bound.signed_distance, usable_rows(d))
 
     def margin_gradients(self, d: Array) -> Array:
-        """Return the derivatives (n, 3) of the margins by d (n, 3) [mm]."""
+        """Return the derivatives (n, 3) of the margins with respect to d (n, 3) [mm]."""
         return -in_chunks(lambda d: self._bound.signed_distance_gradient(d)[1], usable_rows(d))
 
     def encode(self, T: Array) -> tuple[Array, Array]:
@@ -104,7 +104,7 @@ class NumpyKernels:
         return judge(finite, rigid, residual_mm, self.margins(d), d, limits)
 
     def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
-        """Return verdicts on d (n, 3) [mm], all with the residual 0; the speed limit is ignored."""
+        """Return verdicts on d (n, 3) [mm], whose residuals are all 0; the speed limit is ignored."""
         d = usable_rows(d)
         finite = np.isfinite(d[:, 0])
         return judge(finite, np.ones_like(finite), np.where(finite, 0.0, np.nan), self.margins(d), d, limits)

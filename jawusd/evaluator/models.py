@@ -2,13 +2,14 @@
 
 Everything here is in the anatomical frame (x left, y up, z anterior, mm, origin at the upper incisal point): a model
 gives the motion ``M(d)`` away from the closed bite, ``M(0) = I``. `jawusd.evaluator.rig` maps it to the skull frame.
-Rows only: d has shape (n, 3); a row with a NaN gives NaN.
+All functions take rows: d has shape (n, 3); a row with a NaN gives NaN.
 
 Derivatives are *spatial*: ``S`` of shape (n, 6, 3) with ``M(d + e) = exp(S e) M(d)`` to first order; twists are
 (omega [rad], v [mm]).
 
-The search for the nearest pose runs in a chart chosen by the model, coordinates x of shape (n, 3) [mm]: the incisal
-displacement where that avoids the gauge, otherwise d itself. The nearest pose does not depend on the chart.
+The search for the nearest pose runs in a chart chosen by the model, with coordinates x of shape (n, 3) [mm]: the
+incisal displacement if the model can be evaluated from it without the gauge, otherwise d itself. The nearest pose does
+not depend on the chart.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class JawModelForm(Protocol):
         ...
 
     def chart_start(self, R: Array, t: Array) -> Array:
-        """Return starting points (n, 3) in the chart of searches for motions (R, t)."""
+        """Return starting points (n, 3), in chart coordinates, of searches for motions (R, t)."""
         ...
 
     def chart_motion(self, x: Array) -> tuple[Array, Array]:
@@ -83,7 +84,7 @@ class JawModelForm(Protocol):
         ...
 
     def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) by x."""
+        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) with respect to x."""
         ...
 
     def chart_parameters(self, x: Array) -> Array:
@@ -93,7 +94,7 @@ class JawModelForm(Protocol):
 
 @dataclass(frozen=True)
 class AnchoredModel:
-    """Rotation as a function of where the lower incisal point is: ``omega = f(u), t = u + p - R(omega) p``.
+    """Rotation as a function of the position of the lower incisal point: ``omega = f(u), t = u + p - R(omega) p``.
 
     f is a polyharmonic r^3 spline with a linear tail (Duchon 1977) in the displacement u of the incisal point p,
     sheared by the habitual opening path so that its first axis runs along opening; ``f(0) = 0``.
@@ -106,7 +107,7 @@ class AnchoredModel:
         weights: Weights of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
         centres_squared: |c_i|^2, shape (m,).
         moments: Kernel weights times 1, c_i and |c_i|^2, shape (m, 15); see `_spline`.
-        offset: Value of the bare spline at u = 0 [rad], subtracted so that f(0) = 0, shape (3,).
+        offset: Value of the spline itself at u = 0 [rad], subtracted so that f(0) = 0, shape (3,).
         single: The model for one row, in floats.
     """
 
@@ -184,7 +185,7 @@ class AnchoredModel:
         return M[:, :3, :3], M[:, :3, 3]
 
     def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) by x (n, 3) [mm]."""
+        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) with respect to x (n, 3) [mm]."""
         if len(x) == 1 and np.isfinite(x).all():
             return self.single.chart_derivative(x)
         omega, omega_x = self.rotation_jacobian(x)
@@ -322,7 +323,7 @@ class AdditiveModel:
         return self.decode(x)
 
     def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) by x, which is d."""
+        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) with respect to x, which is d."""
         return self.decode_derivative(x)
 
     def chart_parameters(self, x: Array) -> Array:
@@ -332,7 +333,7 @@ class AdditiveModel:
 
 @dataclass(frozen=True)
 class StartGrid:
-    """A grid of parameters, for searches in models without a closed-form inverse.
+    """A grid of starting points for searches in models without a closed-form inverse.
 
     Attributes:
         d: Jaw parameters [mm], shape (s, 3).
@@ -345,7 +346,8 @@ class StartGrid:
     @classmethod
     def of(cls, decode: Callable[[Array], tuple[Array, Array]], incisor: Array, d_range: Array) -> StartGrid:
         """Decode a grid over the box d_range (3, 2) [mm]."""
-        # opening is long and curved, the others short: every point has a node of 13 x 9 x 9 in its Gauss-Newton basin
+        # opening is long and curved, the other axes short: with 13 x 9 x 9 nodes, every point lies in the Gauss-Newton
+        # basin of one
         axes = [np.linspace(low, high, n) for (low, high), n in zip(d_range, (13, 9, 9))]
         d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         R, t = decode(d)

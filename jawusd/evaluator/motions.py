@@ -1,11 +1,11 @@
 """Rigid motions of the mandible: for batches, for one pose in plain floats, and their frames.
 
-A call on one pose through the array functions spends nearly all its time starting numpy operations on three numbers.
-DCC callbacks and face solvers evaluate single poses, so the models of `jawusd.evaluator.models` have a second form in
-floats; tests compare the two.
+Evaluating one pose with the array functions spends nearly all its time on the call overhead of numpy. DCC callbacks and
+face solvers evaluate single poses, so the models of `jawusd.evaluator.models` have a second form in floats; tests
+compare the two.
 
-A motion (R, t) in floats is twelve numbers: the rows of ``R - I``, then the displacement [mm] of a point p, the anchor:
-``u = R p + t - p``.
+A motion (R, t) in floats consists of twelve numbers: the rows of ``R - I``, then the displacement [mm] of a point p,
+the anchor: ``u = R p + t - p``.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class SingleAnchored:
         scales: Lengths dividing the sheared displacement [mm], shape (3,).
         centres: Spline centres, shape (m, 3).
         weights: Weights of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
-        offset: Value of the bare spline at u = 0 [rad], shape (3,).
+        offset: Value of the spline itself at u = 0 [rad], shape (3,).
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class SingleAnchored:
         return self._derivative(u, np.array(((x_1, 1.0, 0.0), (y_1, y_2, y_3), (z_1, z_2, 1.0))))
 
     def chart_derivative(self, u: Array) -> tuple[Array, Array, Array]:
-        """Return R (1, 3, 3), t (1, 3) and S (1, 6, 3) by u for one row u (1, 3)."""
+        """Return R (1, 3, 3), t (1, 3) and S (1, 6, 3) with respect to u for one row u (1, 3)."""
         x, y, z = u[0].tolist()
         return self._derivative((x, y, z), np.eye(3))
 
@@ -215,7 +215,7 @@ class RigFrames:
     """
 
     def __init__(self, T_anatomical_skull: Array, T_rest: Array, anchor: Vector) -> None:
-        """Precompute the products; ``anchor`` [mm] is that of the motions in floats, anatomical frame."""
+        """Precompute the products; ``anchor`` [mm] is the anchor of the motions in floats, anatomical frame."""
         self.T_anatomical_skull = T_anatomical_skull
         self.T_skull_anatomical = se3_inverse(T_anatomical_skull)
         self.T_anatomical_mandible_rest = T_anatomical_skull @ T_rest

@@ -22,12 +22,12 @@ TOLERANCE_MM = 1e-6
 START_DAMPING = 1e-6
 MAX_DAMPING = 1e8
 MIN_DAMPING = 1e-9
-INSIDE_MM = 1e-10  # depth of a point after it is pulled back onto the surface
-MAX_STEP_MM = 1.0  # within a bound; a longer step may end in another valley
-PULL_BACKS = 12
-PULL = 1.01  # overshoot, so that one pull is usually enough; the loss vanishes as steps shrink
+INSIDE_MM = 1e-10  # depth of a point after it is moved back onto the surface
+MAX_STEP_MM = 1.0  # longest step within a bound; a longer one may end in another basin
+PULL_BACKS = 12  # largest number of iterations that move a point back onto the surface
+PULL = 1.01  # overshoot of such an iteration, so that one is usually enough; the loss vanishes as steps shrink
 MIN_STIFFNESS = 1e-12  # keeps steps finite where the cost does not depend on a parameter
-MIN_SLOPE = 1e-6  # squared; keeps pulls finite where the bound is flat
+MIN_SLOPE = 1e-6  # lower limit of the squared gradient of the bound; keeps such iterations finite where it is flat
 TOUCHING_MM = 1e-3  # up to this depth a start counts as lying on the bound
 
 Vector = Triple[float]
@@ -43,9 +43,9 @@ class Pull(NamedTuple):
 
     Attributes:
         cost: The squared residual.
-        force: Half its derivative, downhill.
-        stiffness: J^T J of the residual's derivatives J.
-        scale: A third of the trace of the stiffness; damping is relative to it.
+        force: Half the negative gradient of the cost.
+        stiffness: J^T J, with J the Jacobian of the residual.
+        scale: A third of the trace of J^T J; damping is relative to it.
     """
 
     cost: float
@@ -55,7 +55,7 @@ class Pull(NamedTuple):
 
 
 class Place(NamedTuple):
-    """The bound around a point: signed distance [mm], its gradient, and its Hessian [1/mm] in two parts.
+    """The bound to second order at a point: signed distance [mm], its gradient, and its Hessian [1/mm] in two parts.
 
     Attributes:
         distance: Signed distance [mm], negative inside.
@@ -71,7 +71,7 @@ class Place(NamedTuple):
 
 
 def place(bound: BoundFormula, d: Vector) -> Place:
-    """Return the bound around d [mm]."""
+    """Return the bound to second order at d [mm]."""
     d1, d2, d3 = d
     first_mm, last_mm, softness_mm, offset_mm = bound.numbers
     reach, rises, bends = curve_derivatives("support", d1, bound.tables, _FLOATS)
@@ -95,7 +95,7 @@ def place(bound: BoundFormula, d: Vector) -> Place:
 
 
 def nearest_in_valley(bound: BoundFormula, wanted: Vector, start: Vector) -> Vector:
-    """Return the valid point [mm] nearest to ``wanted``, in the valley around a valid start."""
+    """Return the valid point [mm] nearest to ``wanted``, in the basin of a valid start."""
 
     def pull(x: Vector) -> Pull:
         away = (wanted[0] - x[0], wanted[1] - x[1], wanted[2] - x[2])
@@ -107,7 +107,7 @@ def nearest_in_valley(bound: BoundFormula, wanted: Vector, start: Vector) -> Vec
 def lowest_in_valley(
     bound: BoundFormula, pull: Callable[[Vector], Pull], start: Vector, *, exact: bool = False
 ) -> Vector:
-    """Return the minimum of a pull's cost inside the bound, in the valley around a valid start [mm].
+    """Return the minimum of a cost inside the bound, in the basin of a valid start [mm].
 
     Args:
         bound: The bound.
@@ -139,12 +139,12 @@ def lowest_in_valley(
 
 
 def pulled_in(bound: BoundFormula, x: Vector, *, opening: float = 1.0) -> tuple[Vector, Place]:
-    """Return a point [mm] moved along the gradient until just inside, and the bound around it.
+    """Return a point [mm] moved along the gradient until just inside, and the bound to second order there.
 
     Args:
         bound: The bound.
         x: The point.
-        opening: Factor of the gradient by d1; with 0 the point keeps its opening.
+        opening: Factor on the d1 component of the gradient; with 0 the point keeps its opening.
     """
     at = place(bound, x)
     for _ in range(PULL_BACKS):
@@ -165,7 +165,7 @@ def _step(at: Place, now: Pull, multiplier: float, damping: float, *, bent: bool
     first = rows[0]
     bend = multiplier * at.bend
     left = 1.0 - bend * first[0]
-    if bent and left > 0:  # A minus the bend in its first entry is still definite (Sherman and Morrison 1950)
+    if bent and left > 0:  # A minus the bend in its first entry is still positive definite (Sherman and Morrison 1950)
         free = _moved(free, bend * free[0] / left, first)
         inward = _moved(inward, bend * inward[0] / left, first)
     over, yields = at.distance + dot(at.gradient, free), dot(at.gradient, inward)

@@ -1,7 +1,7 @@
 """The operations that formulas need beyond arithmetic, and their implementation for Python floats.
 
 A table is rows of floats, stored in a form that depends on the number type. A column of a table is a sequence of
-numbers, or of one wide number, such as a tensor. This file imports only the standard library and
+numbers, or of one number that is itself an array, such as a tensor. This file imports only the standard library and
 `jawusd.geometry.rodrigues`: it is copied into the single-file reader.
 """
 
@@ -65,7 +65,7 @@ S = TypeVar("S", bound="Symbol")
 
 
 class Symbol(ABC):
-    """A number that stands for a value in a program: each operator appends an operation to the program."""
+    """A symbolic value of a program under construction: each operator appends an operation to the program."""
 
     @abstractmethod
     def operation(self: S, name: str, *operands: S | float) -> S:
@@ -145,11 +145,11 @@ class FloatOperations:
 
 
 def rows(flat: Sequence[float], width: int) -> Rows:
-    """Return the rows of a flat array."""
+    """Return a flat array as rows of ``width`` numbers."""
     return [list(flat[i : i + width]) for i in range(0, len(flat), width)]
 
 
 def triple(values: Sequence[N]) -> Triple[N]:
-    """Return a vector of three numbers."""
+    """Return three values as a tuple."""
     x, y, z = values
     return x, y, z

@@ -40,15 +40,15 @@ class JawRig(RigClearance, RigAuthoring):
     ``twist(d) = log(pose(d) rest^-1)``, skull frame, (omega [rad], v [mm]).
 
     Every function accepts any leading batch shape, float32 or float64, and computes in float64. A row with a NaN or
-    infinity gives NaN. Rigs are immutable: share them between threads, pickle them, fork.
+    infinity gives NaN. Rigs are immutable and can be shared between threads and processes, and pickled.
 
     Attributes:
         model: The function from d to motions.
         bound: The slice bound.
         polygons: The paper's bound.
-        speeds: How fast the jaw moved in its take; None if unknown.
+        speeds: How fast the jaw moved in the take; None if unknown.
         limits: The rig's thresholds of `validate`, for measured poses.
-        kernels: The implementation that computes rows.
+        kernels: The implementation that evaluates rows.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class JawRig(RigClearance, RigAuthoring):
         Args:
             arrays: Named arrays of a model of format jawusd-model/2; others are ignored.
             meta: Its header; ``meta["kind"]`` is "anchored" or "additive".
-            kernels: The implementation that computes rows; `jawusd.fast` has a compiled one.
+            kernels: The implementation that evaluates rows; `jawusd.fast` has a compiled one.
 
         Raises:
             EvaluatorError: an unknown kind, or an array missing, of a wrong shape, not finite or out of range.
@@ -103,21 +103,21 @@ class JawRig(RigClearance, RigAuthoring):
         return self.kernels.twists(rows).reshape(*batch, 6)
 
     def jacobian(self, d: ArrayLike) -> Array:
-        """Return the derivative (..., 6, 3) of `twist` by d (..., 3) [mm]: [rad/mm] for omega, [mm/mm] for v."""
+        """Return the derivative (..., 6, 3) of `twist` with respect to d (..., 3) [mm], in rad/mm and mm/mm."""
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.jacobians(rows).reshape(*batch, 6, 3)
 
     def spatial_jacobian(self, d: ArrayLike) -> Array:
         """Return the spatial velocity (omega [rad/mm], v [mm/mm]) per unit of each d, skull frame, (..., 6, 3).
 
-        The left twists between the poses of d (..., 3) [mm] and of adjacent parameters (Barfoot 2017, section 7.1.5).
+        The left twists from the poses of d (..., 3) [mm] to those of adjacent parameters (Barfoot 2017, section 7.1.5).
         """
         rows, batch = as_rows(d, (3,), "d")
         spatial = in_chunks(lambda d: self._frames.adjoint @ self.model.decode_derivative(d)[2], rows)
         return spatial.reshape(*batch, 6, 3)
 
     def point_jacobian(self, d: ArrayLike, p_mandible: ArrayLike) -> Array:
-        """Return the derivative by d of the positions of mandible points in the skull frame.
+        """Return the derivative with respect to d of the positions of mandible points in the skull frame.
 
         Args:
             d: Jaw parameters [mm], shape (..., 3).
@@ -144,8 +144,8 @@ class JawRig(RigClearance, RigAuthoring):
         The distance is ``residual_mm``, the rms distance of the rig's landmarks between the two poses.
 
         Args:
-            T_skull_mandible: Poses, shape (..., 4, 4). Of a slightly non-rigid matrix the images of the landmarks are
-                matched; matrices that are not rigid to 1e-3 give NaN.
+            T_skull_mandible: Poses, shape (..., 4, 4). If a matrix is slightly non-rigid, the landmark positions it
+                yields are matched; matrices that are not rigid to 1e-3 give NaN.
             inside: Search only inside the bound.
             covariance: If given, return the most likely instead of the nearest parameters of noisy poses. Covariance
                 of xi, (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``, shape (..., 6, 6) or
@@ -186,8 +186,8 @@ class JawRig(RigClearance, RigAuthoring):
 
         Args:
             d: Jaw parameters [mm], shape (..., 3).
-            bound: "slices", the joint bound, or "polygons", the paper's two outlines in (d1, d2) and (d1, d3), whose
-                margin is continuous but not smooth.
+            bound: "slices", the joint bound of all three parameters, or "polygons", the paper's two outlines in
+                (d1, d2) and (d1, d3), whose margin is continuous but not smooth.
 
         Returns:
             Margins [mm], shape (...).
@@ -216,7 +216,7 @@ class JawRig(RigClearance, RigAuthoring):
         return self.polygons
 
     def margin_gradient(self, d: ArrayLike) -> Array:
-        """Return the derivative of `margin` (slice bound) by d [mm/mm], shape (..., 3), for d (..., 3) [mm]."""
+        """Return the derivative of `margin` (slice bound) with respect to d [mm/mm], shape (..., 3), for d (..., 3)."""
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.margin_gradients(rows).reshape(*batch, 3)
 

@@ -14,8 +14,8 @@ class ArraySpec(NamedTuple):
     """Shape and USD attribute of one array.
 
     Attributes:
-        attribute: USD attribute, with the values row by row; None for `d_range`, see `D_RANGE_ATTRIBUTES`.
-        shape: Lengths; equal names mean equal lengths.
+        attribute: USD attribute, with the values in row-major order; None for `d_range`, see `D_RANGE_ATTRIBUTES`.
+        shape: Axis lengths; axes of the same name have the same length.
         kind: The only model kind with this array; None for both.
         integer: Integers in USD; in memory all arrays are float64.
     """
@@ -110,7 +110,7 @@ SPEED_ARRAYS: dict[str, ArraySpec] = {
 }
 
 
-#: Optional groups of arrays, by the name of one array of each.
+#: Optional groups of arrays, each keyed by the name of one of its arrays.
 OPTIONAL = {
     "glide_d2": GLIDE_ARRAYS,
     "contact_values": CONTACT_ARRAYS,

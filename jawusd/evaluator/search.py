@@ -21,7 +21,7 @@ Search = Callable[[Indices, Array], tuple[Array, Array]]
 
 _MAX_VALLEYS = 4
 _RIPPLE_STEPS = (-2.0, -1.0, 1.0, 2.0)
-_MAX_DRAG_MM = 3.0  # change of d between two events of a drag; a larger one may change valleys
+_MAX_DRAG_MM = 3.0  # largest change of d between two events of a drag; beyond it, another basin may be better
 _SCAN_ROWS = 64  # rows compared with all candidates at once: 64 x 6,000 distances take 3 MB
 
 
@@ -35,8 +35,8 @@ class IkResult(NamedTuple):
 class BoundedSearch:
     """Searches inside the bound, started from a cached scan of the valid volume.
 
-    Sections at one opening are convex, but the valid volume is not: along d1 the cost may have several valleys, so a
-    search is started in each of the deepest.
+    Sections at one opening are convex, but the valid volume is not: along d1 the cost may have several local minima
+    ("valleys"), so a search is started at each of the lowest.
     """
 
     def __init__(self, model: JawModelForm, bound: SliceHull, kernels: NumpyKernels) -> None:
@@ -80,10 +80,10 @@ class BoundedSearch:
         return self._multistart(vectors, target)[0]
 
     def solve_ik(self, vectors: Array, target: Array, start: Array) -> Array:
-        """Return the minimum of the valley around start (n, 3) [mm].
+        """Return the local minimum in whose basin start (n, 3) [mm] lies.
 
-        Short steps keep the search in that valley, which makes dragging continuous. Where the result lies far from its
-        start, this is not a drag, and `solve_ik_multistart` is used if it is better.
+        Short steps keep the search in that basin, which makes dragging continuous. A result far from its start is not
+        part of a drag; it is replaced by that of `solve_ik_multistart` if this is better.
         """
         found, left = self._kernels.solve_ik(vectors, target, start)
         far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _MAX_DRAG_MM)
@@ -117,7 +117,7 @@ class BoundedSearch:
         return np.array([[step * spacing_mm, 0.0, 0.0] for step in _RIPPLE_STEPS])
 
     def _best(self, search: Search, features: Array, wanted: Array) -> tuple[Array, Array]:
-        """Return the best d (n, 3) [mm] over searches from every valley, and the squared residuals (n,).
+        """Return the best d (n, 3) [mm] of the searches started in all valleys, and the squared residuals (n,).
 
         Args:
             search: Maps starts to minima.
@@ -169,7 +169,7 @@ class _Scan:
         return rows, self.points[found[rows, places]]
 
     def _deepest(self, distance: Array) -> Indices:
-        """Return the best point in each of the deepest valleys (n, v) of distances (n, p); -1 where there are fewer."""
+        """Return the best point in each of the lowest valleys (n, v) of distances (n, p); -1 where there are fewer."""
         least = np.minimum.reduceat(distance, self._first, axis=1)
         walls = np.pad(least, ((0, 0), (1, 1)), constant_values=np.inf)
         valley = (least <= walls[:, :-2]) & (least <= walls[:, 2:])

@@ -28,7 +28,7 @@ from jawusd.evaluator.nearest import (
     TOUCHING_MM,
 )
 
-# (x (k, 3), row indices (k,)) -> residuals (k, m) and their derivatives by x (k, m, 3)
+# (x (k, 3), row indices (k,)) -> residuals (k, m) and their derivatives with respect to x (k, m, 3)
 Residual = Callable[[Array, Indices], tuple[Array, Array]]
 
 _IDENTITY = np.eye(3)
@@ -86,7 +86,9 @@ def minimise(
             step, multiplier = _bounded_step(bound, x[rows], r, J, damping, multiplier)
         moving = (np.abs(step) > tolerance_mm).any(axis=1) & (damping < MAX_DAMPING)
         if bound is None:
-            x[rows] += np.where(moving[:, None], 0.0, step)  # the last step is free and doubles the digits
+            x[rows] += np.where(
+                moving[:, None], 0.0, step
+            )  # the last step costs nothing more and doubles the correct digits
         rows = rows[moving]
         r, J, damping, multiplier, step = _picked(moving, r, J, damping, multiplier, step)
         if not rows.size:
@@ -144,7 +146,7 @@ def _damped(A: Array, damping: Array) -> Array:
 
 
 def _first_multiplier(bound: Bound, x: Array, r: Array, J: Array) -> Array:
-    """Return the bound's initial multiplier: the pressure of the cost where x lies on the bound, otherwise 0."""
+    """Return the bound's initial multiplier: from the gradient of the cost where x lies on the bound, otherwise 0."""
     distance, normal = bound.signed_distance_gradient(x)
     squared = np.maximum(np.einsum("ni,ni->n", normal, normal), MIN_SLOPE)
     press = -np.einsum("ni,ni->n", normal, _gradient(J, r)) / squared

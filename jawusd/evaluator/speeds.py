@@ -11,12 +11,15 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
 
-_MIN_FRAMES = 30  # fourth differences needed for an estimate
-# Sums of the squared coefficients of first, second and fourth differences: the variance of differenced unit noise.
+_MIN_FRAMES = 30  # smallest number of fourth differences for an estimate
+# Sums of the squared coefficients of first, second and fourth differences: the factor by which differencing multiplies
+# the variance of white noise.
 _NOISE_IN = {1: 2.0, 2: 6.0, 4: 70.0}
 _SIGMA_OF_MEDIAN = 1.4826  # standard deviation over the median absolute value, normal distribution
-_MIN_SIGNAL = 0.05  # lower limit of the share of the observed variance that is motion
-_MIN_SPREAD = 1e-6  # relative; keeps covariances of one-dimensional motion invertible
+_MIN_SIGNAL = 0.05  # lower limit of the fraction of the observed variance that counts as motion
+_MIN_SPREAD = (
+    1e-6  # smallest relative variance in any direction; keeps covariances of one-dimensional motion invertible
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,7 @@ class Speeds:
 
     @classmethod
     def of_take(cls, d: ArrayLike, fps: float) -> Speeds:
-        """Estimate the speeds of a take, corrected for noise between frames.
+        """Estimate the speeds of a take, corrected for noise that is independent between frames.
 
         The noise level is estimated from the median of fourth differences, where noise dominates motion. Its
         contribution to first and second differences is subtracted.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.formula import ON_BOUND_MM
 
-# Accepts matrices with 5 decimals or in half precision; rejects sheared or scaled ones.
+# Accepts matrices rounded to 5 decimals or to half precision; rejects sheared or scaled ones.
 RIGID_TOLERANCE = 1e-3
 
 INSIDE, OUTSIDE = "inside", "outside"
@@ -52,10 +52,10 @@ class Verdicts(NamedTuple):
     """Result of `JawRig.validate`, one entry per pose.
 
     Attributes:
-        valid: Whether there is no reason against the pose, bool, shape (...). Measured poses are also valid within the
+        valid: Whether no `Reason` applies to the pose, bool, shape (...). Measured poses are also valid within the
             tolerance outside the bound.
         reason: `Reason` flags, uint8, shape (...); ``Reason(int(code))`` names them, `words` spells them out.
-        residual_mm: rms landmark distance to the nearest pose of the model, (...); NaN if not finite or not rigid.
+        residual_mm: RMS landmark distance to the nearest pose of the model, (...); NaN if not finite or not rigid.
         margin_mm: Signed distance of d to the bound, > 0 inside, shape (...); NaN if not finite or not rigid.
         d: Nearest jaw parameters [mm], shape (..., 3); NaN if not finite or not rigid.
         tolerance_mm: How far outside the bound a pose may lie and still be valid.
@@ -73,7 +73,7 @@ class Verdicts(NamedTuple):
         return (self.reason & (Reason.NOT_FINITE | Reason.NOT_RIGID).value) == 0
 
     def with_margin(self, margin_mm: Array, limits: Limits) -> Verdicts:
-        """Return the verdicts with their margins replaced by those (n,) to another bound."""
+        """Return the verdicts with their margins replaced by the margins (n,) of another bound."""
         reason = self.reason & ~np.uint8(Reason.OUTSIDE_BOUNDS.value)
         reason[self.measured() & _outside(margin_mm, limits)] |= Reason.OUTSIDE_BOUNDS.value
         return self._replace(valid=reason == 0, reason=reason, margin_mm=margin_mm)
@@ -166,7 +166,7 @@ class Limits:
 
 
 def judge(finite: Mask, rigid: Mask, residual_mm: Array, margin_mm: Array, d: Array, limits: Limits) -> Verdicts:
-    """Return the verdicts (n rows) for measurements and thresholds."""
+    """Return the verdicts (n rows) that follow from measurements and thresholds."""
     reason = np.zeros(len(finite), dtype=np.uint8)
     reason[~finite] |= Reason.NOT_FINITE.value
     reason[finite & ~rigid] |= Reason.NOT_RIGID.value

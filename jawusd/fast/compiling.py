@@ -18,7 +18,7 @@ _cacheable: list[bool] = []  # empty until the first function is compiled
 def compiled(signature: str) -> Callable[[F], F]:
     """Return a decorator that compiles a function for the argument types of a signature.
 
-    Without a writable cache the code stays in memory, after one RuntimeWarning.
+    Without a writable cache folder the code is kept in memory only, and one RuntimeWarning is issued.
     """
 
     def compile_function(function: F) -> F:

@@ -1,7 +1,7 @@
-"""Compiled: the nearest parameters of a pose, by the damped Gauss-Newton of `jawusd.evaluator.solver`, and verdicts.
+"""Compiled: encoding of a pose, by the damped Gauss-Newton of `jawusd.evaluator.solver`, and verdicts.
 
-For one row. A `Problem` names the chart of the unknowns x [mm] and has the homogeneous vectors (4, m) and their targets
-(3, m) [mm].
+All functions take one row. A `Problem` consists of the chart of the unknowns x [mm], homogeneous vectors (4, m), and
+their targets (3, m) [mm].
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Problem(NamedTuple):
 
 
 class Normal(NamedTuple):
-    """Memory for the normal equations of one search."""
+    """Scratch memory for the normal equations of one search."""
 
     A: Array
     g: Array
@@ -73,7 +73,7 @@ class Normal(NamedTuple):
 
 @device
 def normal_scratch() -> Normal:
-    """Return the memory for the normal equations of one search."""
+    """Allocate the scratch memory for the normal equations of one search."""
     return Normal(
         np.empty((3, 3)),
         np.empty(3),
@@ -87,7 +87,7 @@ def normal_scratch() -> Normal:
 
 @device
 def equations(model: Array, problem: Problem, x: Array, w: Scratch, A: Array, g: Array) -> float:
-    """Return the squared residual at x; write the normal equations' A (3, 3) and gradient g (3,)."""
+    """Return the squared residual at x; write the normal matrix A (3, 3) and the gradient g (3,)."""
     A[:, :] = 0.0
     g[:] = 0.0
     cost = 0.0
@@ -129,7 +129,7 @@ def _velocity(S: Array, k: int, y0: float, y1: float, y2: float, h: float) -> Ve
 
 @device
 def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> None:
-    """Move x (3,) to the minimum; NaN if the residual at the start is not finite."""
+    """Move x (3,) to the minimum; set it to NaN if the residual at the start is not finite."""
     cost = equations(model, problem, x, w, n.A, n.g)
     if not isfinite(cost):
         x[:] = np.nan
@@ -141,7 +141,7 @@ def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> 
         for i in range(3):
             n.trial[i] = x[i] - n.step[i]
         if _settled(n.step) or damping >= MAX_DAMPING:
-            x[:] = n.trial  # the last step is free and doubles the digits
+            x[:] = n.trial  # the last step costs nothing more and doubles the correct digits
             return
         trial_cost = equations(model, problem, n.trial, w, n.A_trial, n.g_trial)
         if trial_cost <= cost:
@@ -166,7 +166,7 @@ def _damp(A: Array, damping: float, out: Array) -> None:
 
 
 class Encoding(NamedTuple):
-    """Memory for encoding one pose after another."""
+    """Scratch memory for encoding one pose after another."""
 
     w: Scratch
     n: Normal
@@ -177,7 +177,7 @@ class Encoding(NamedTuple):
 
 @device
 def encoding_scratch(model: Array) -> Encoding:
-    """Return the memory for encoding."""
+    """Allocate the scratch memory for encoding."""
     return Encoding(scratch(model), normal_scratch(), np.empty((3, 4)), np.empty(3), np.empty((4, 4)))
 
 
@@ -197,7 +197,7 @@ def encode(model: Array, T: Array, e: Encoding) -> float:
     for i in range(3):
         e.x[i] = M[i, 0] * p0 + M[i, 1] * p1 + M[i, 2] * p2 + M[i, 3] - model[INCISOR + i]
     if model[KIND] == ANCHORED_KIND:
-        # searching over the displacement avoids the gauge; the nearest pose does not depend on the chart
+        # a search over the displacement need not evaluate the gauge; the nearest pose does not depend on the chart
         descend(model, Problem(DISPLACEMENT, vectors, e.target), e.x, e.w, e.n)
         u = (e.x[0], e.x[1], e.x[2])
         displaced(model, u, e.w)
@@ -245,7 +245,7 @@ def _nearest_start(model: Array, x: Array) -> None:
 
 @device
 def _residual_mm(vectors: Array, e: Encoding) -> float:
-    """Return the distance [mm] between the images under the motion in e.w and their targets."""
+    """Return the distance [mm] between the images of the vectors under the motion in e.w and their targets."""
     total = 0.0
     for i in range(3):
         for j in range(4):
@@ -291,9 +291,9 @@ def judge(
     e: Encoding,
     v: Array,
 ) -> tuple[int, float, float]:
-    """Return reason, residual and margin [mm] of a pose T (4, 4), its d in e.x: `evaluator.verdicts.judge`.
+    """Return reason, residual [mm] and margin [mm] of a pose T (4, 4), as `evaluator.verdicts.judge`; write d to e.x.
 
-    Without `judging`, only d and the residual are computed, and the reason is 0 for every rigid pose.
+    If `judging` is false, only d and the residual are computed, and the reason is 0 for every rigid pose.
     """
     e.x[:] = np.nan
     if not _finite(T):

@@ -1,6 +1,6 @@
 """Compiled: the slice hull of `jawusd.evaluator.bounds`, for one row.
 
-`bound` is the array of `packing.packed_bound`, `v` the memory of `hull_scratch`.
+`bound` is the array from `packing.packed_bound`, `v` the scratch memory from `hull_scratch`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _NEGLIGIBLE = 45.0  # exp(-45) = 3e-20, below rounding
 
 @device
 def hull_scratch(bound: Array) -> Array:
-    """Return the memory of one call: a number for each side of the hull."""
+    """Allocate the scratch memory of one call: a number for each side of the hull."""
     return np.empty(int(bound[SIDES]))
 
 
@@ -35,7 +35,7 @@ def _support_segment(bound: Array, d1: float) -> tuple[Array, float, float, floa
 
 @device
 def signed_distance(bound: Array, d1: float, d2: float, d3: float, v: Array) -> Vector:
-    """Return the signed distance of d [mm] and the weights of both ends; write those of the half-planes to v."""
+    """Return the signed distance of d [mm] and the weights of both ends; write the weights of the half-planes to v."""
     sides, rounding = int(bound[SIDES]), bound[ROUNDING]
     c, s, first, last = _support_segment(bound, d1)
     n2, n3 = bound[HULL:], bound[HULL + sides :]

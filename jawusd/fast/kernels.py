@@ -1,9 +1,9 @@
-"""The kernels of a rig, compiled: functions over rows, and the class that calls them.
+"""The kernels of a rig, compiled: functions that loop over rows, and the class that calls them.
 
 The functions release the GIL and keep no state, so any number of threads may call them at once. Argument types are
 fixed (C-contiguous, writable float64 arrays): other types raise a TypeError instead of compiling a second version. The
-machine code is cached on disk where that is writable. The cache depends on the date of this file only: after changing
-another module of this package, delete it (``rm -r jawusd/fast/__pycache__``).
+machine code is cached on disk if the cache folder is writable. The cache is invalidated only by the modification time
+of this file: after changing another module of this package, delete the cache (``rm -r jawusd/fast/__pycache__``).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def twists(model: Array, d: Array, out: Array) -> None:
 
 @compiled("void(f8[::1], f8[:,::1], f8[:,:,::1])")
 def jacobians(model: Array, d: Array, out: Array) -> None:
-    """Write the derivatives (n, 6, 3) of the twists by d (n, 3) [mm] to out."""
+    """Write the derivatives (n, 6, 3) of the twists with respect to d (n, 3) [mm] to out."""
     w = scratch(model)
     for row in range(len(d)):
         out[row] = np.nan
@@ -98,7 +98,7 @@ def margins(bound: Array, d: Array, out: Array) -> None:
 
 @compiled("void(f8[::1], f8[:,::1], f8[:,::1])")
 def margin_gradients(bound: Array, d: Array, out: Array) -> None:
-    """Write the derivatives (n, 3) of the margins by d (n, 3) [mm] to out."""
+    """Write the derivatives (n, 3) of the margins with respect to d (n, 3) [mm] to out."""
     v = hull_scratch(bound)
     for row in range(len(d)):
         if usable(d[row, 0], d[row, 1], d[row, 2]):
@@ -121,7 +121,7 @@ def judge_rows(
 ) -> None:
     """Write d, residual, margin [mm] and reason (n, 6) of poses T (n, 4, 4), see `encoding.judge`.
 
-    Encoding and judging share one function because it takes a tenth of the whole compile time.
+    Encoding and judging share one function because compiling it takes a tenth of the total compile time.
     """
     e, v = encoding_scratch(model), hull_scratch(bound)
     for row in range(len(T)):
@@ -131,7 +131,7 @@ def judge_rows(
 
 
 class CompiledKernels(NumpyKernels):
-    """The kernels of a rig in machine code, to 1e-10; searches along the bound are those of `NumpyKernels`."""
+    """Compiled kernels of a rig, accurate to 1e-10; searches along the bound are inherited from `NumpyKernels`."""
 
     def __init__(self, parts: RigParts) -> None:
         super().__init__(parts)

@@ -1,6 +1,6 @@
 """Compiled: gauge, spline and curves of a jaw model, its motions M(d), twists, derivatives and poses, for one row.
 
-`jawusd.evaluator.models` documents them. `model` is the array of `packing.packed_model`, `w` the memory of one call.
+See `jawusd.evaluator.models`. `model` is the array from `packing.packed_model`, `w` the scratch memory of one call.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def summed_curves(model: Array, d1: float, d2: float, d3: float, twist: Array, b
 
 
 class Scratch(NamedTuple):
-    """Memory for one call."""
+    """Scratch memory for one call."""
 
     centres: Array
     u_d: Array
@@ -174,7 +174,7 @@ class Scratch(NamedTuple):
 
 @device
 def scratch(model: Array) -> Scratch:
-    """Return the memory for one call; never shared between threads."""
+    """Allocate the scratch memory for one call; it must not be shared between threads."""
     return Scratch(
         np.empty(4 * int(model[COUNT])),
         np.empty((3, 3)),
@@ -214,7 +214,7 @@ def _anchor(model: Array, u: Vector, w: Scratch) -> None:
 
 @device
 def motion_by_displacement(model: Array, u0: float, u1: float, u2: float, w: Scratch) -> None:
-    """Write the motion of an anchored model that displaces the incisal point by u, and S by u, to w.M and w.S."""
+    """Write the motion of an anchored model that displaces the incisal point by u to w.M, and its S to w.S."""
     omega = spline_derivative(model, (u0, u1, u2), w.centres, w.omega_u)
     w.twist[0], w.twist[1], w.twist[2] = omega
     _anchor(model, (u0, u1, u2), w)
@@ -248,7 +248,7 @@ def motion_derivative(model: Array, d1: float, d2: float, d3: float, w: Scratch)
 def _spatial(w: Scratch) -> None:
     """Write the spatial derivative of exp(twist) for changes w.twist_d of the twist to w.S.
 
-    With the translation t = v + b w x v + c w x (w x v), a change of the twist rotates by W = J dw and shifts the
+    The translation is t = v + b w x v + c w x (w x v). A change of the twist adds the rotation W = J dw and shifts the
     origin by dt - W x t.
     """
     omega, v = (w.twist[0], w.twist[1], w.twist[2]), (w.twist[3], w.twist[4], w.twist[5])

@@ -1,7 +1,7 @@
 """The memory layout of a rig for compiled code: one flat array for the model, one for the bound.
 
-Passing an array to compiled code takes about as long as the arithmetic of one pose, so each function receives a single
-array. The constants below are offsets into these arrays, with the contents in their comments.
+Passing an array to compiled code takes about as long as computing one pose, so each function receives a single array.
+The constants below are offsets into these arrays; their comments describe the contents.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from jawusd.evaluator.schema import ADDITIVE, ANCHORED, KINDS
 KIND = 0  # index into `schema.KINDS`
 COUNT = 1  # number of spline centres; 0 for an additive model
 INCISOR = 2  # (3,) [mm]
-FROM_ANATOMICAL = 5  # (4, 4) row by row: L, Q of pose = L M Q
-CLOSED = 21  # (4, 4): Q
+FROM_ANATOMICAL = 5  # (4, 4), row-major: L of pose = L M Q
+CLOSED = 21  # (4, 4): Q of pose = L M Q
 TO_ANATOMICAL = 37  # (4, 4): L^-1
 FROM_CLOSED = 53  # (4, 4): Q^-1
 ADJOINT = 69  # (6, 6): twists from the anatomical to the skull frame
@@ -38,13 +38,13 @@ ARCH = REST + 28  # (7,)
 DROP = REST + 35  # (4,)
 SOFTNESS = REST + 39  # [mm]
 FADE = REST + 40  # [mm]
-SPLINE = REST + 41  # centres column by column (3, m), then kernel weights (m, 3), then the table of the glide surface
-# the table: numbers of knots n2, n3, 0 without a table; knots of d2 (n2,), starts (n2 + 1,), likewise for d3,
+SPLINE = REST + 41  # centres, column-major (3, m), then kernel weights (m, 3), then the table of the glide surface
+# the table: numbers of knots n2 and n3, both 0 without a table; knots of d2 (n2,), starts (n2 + 1,), likewise for d3,
 # coefficients (n2 + 1, n3 + 1, 4, 4)
 
 # additive
 CURVES = REST  # offsets of the three curves
-STARTS = REST + 3  # number n of starting points of searches
+STARTS = REST + 3  # number n of starting points for searches
 GRID = REST + 4  # d (n, 3) and incisal displacements (n, 3) of the starting points [mm], then the curves
 # a curve, from its offset: number of knots n, knots (n,), starts (n + 1,), coefficients (n + 1, 4, k)
 
@@ -52,7 +52,7 @@ GRID = REST + 4  # d (n, 3) and incisal displacements (n, 3) of the starting poi
 ROUNDING = 0  # [mm]
 MARGIN = 1  # [mm]
 SIDES = 2  # number k of half-planes
-HULL = 3  # their normals column by column (2, k), then the curve of the supports
+HULL = 3  # normals of the half-planes, column-major (2, k), then the curve of the supports
 
 
 def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Array:

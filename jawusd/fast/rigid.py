@@ -18,9 +18,9 @@ from jawusd.geometry.rodrigues import angle_coefficients, apply_series, dot, tur
 
 Vector = tuple[float, float, float]
 
-# inlined into the functions of `kernels`, which are cached on disk
+# not cached: inlined into the functions of `kernels`, which are cached on disk
 device = numba.njit(nogil=True, error_model="numpy")
-# the same, with reassociation of sums
+# the same, but sums may be reassociated
 summing = numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 
 # Plain functions of other modules that compiled code calls. Without inlining, the functions in an `Elementary` would be
@@ -33,7 +33,7 @@ for _function in (
 ):
     register_jitable(forceinline=True, nogil=True, error_model="numpy")(_function)
 
-_SERIES_SQUARED = 0.09  # [rad^2] below, derivatives of the coefficients use series, since the closed forms lose digits
+_SERIES_SQUARED = 0.09  # [rad^2] below this, derivatives of the coefficients use series: closed forms lose digits
 
 
 @device
@@ -89,7 +89,7 @@ FLOATS = Elementary(_sqrt, _exp, _clip, cast("Callable[[object, float, float], V
 
 @device
 def coefficient_slopes(squared: float, a: float, b: float, c: float) -> tuple[float, float]:
-    """Return the derivatives by a^2 of the second and third of `angle_coefficients`."""
+    """Return the derivatives of the second and third of `angle_coefficients` with respect to the squared angle."""
     x = squared
     if x < _SERIES_SQUARED:
         return (
@@ -101,7 +101,7 @@ def coefficient_slopes(squared: float, a: float, b: float, c: float) -> tuple[fl
 
 @device
 def inverse_coefficient(squared: float) -> tuple[float, float]:
-    """Return (1 - h cot h)/a^2, h = a/2, of the inverse left Jacobian, and its derivative by a^2."""
+    """Return (1 - h cot h)/a^2, h = a/2, of the inverse left Jacobian, and its derivative with respect to a^2."""
     x = squared
     if x < _SERIES_SQUARED:
         return (

@@ -23,9 +23,9 @@ _CONDYLE_FROM_INCISOR_MM = np.array([50.0, 36.0, -80.0])
 _MOLAR_BEHIND_INCISOR_MM = 25.0
 _MOLAR_ASIDE_MM = 22.0
 _MIDLINE_MM = 4.0  # half width of the front edge
-_MIN_FRONT = 40  # points of a front edge
-_MIN_SLABS = 4  # coronal slabs with teeth on both sides, for the midline
-# Cell size of the height comparison of both arches, and the shared cells needed to prefer it over mean heights.
+_MIN_FRONT = 40  # smallest number of points on a front edge
+_MIN_SLABS = 4  # smallest number of coronal slabs with teeth on both sides that define a midline
+# Arches are compared by local heights in cells of this size; with fewer shared cells, by their mean heights.
 _CELL_MM, _MIN_CELLS = 4.0, 6
 
 
@@ -90,7 +90,7 @@ def _front_edge(crown: Array, side: float, within_mm: float) -> Array:
     Args:
         crown: Crown points, x from the midline, y up, z anterior [mm], shape (N, 3).
         side: 1 if the edge is the upper end of the crowns, -1 if the lower one.
-        within_mm: Largest height difference to the extreme point of the edge.
+        within_mm: Largest height difference from the outermost point of the edge.
     """
     reach = max(_MIDLINE_MM, float(np.sort(np.abs(crown[:, 0]))[min(_MIN_FRONT, len(crown) - 1)]))
     front = crown[np.abs(crown[:, 0]) <= reach]
@@ -100,7 +100,7 @@ def _front_edge(crown: Array, side: float, within_mm: float) -> Array:
 
 
 def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
-    """Rotate the lateral axis until the middle between the buccal outlines is a sagittal line.
+    """Rotate the lateral axis until the line midway between the buccal outlines is sagittal.
 
     Args:
         points: crown vertices [mm], shape (N, 3).
@@ -116,7 +116,7 @@ def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
         depth, middle = [], []
         for low, high in zip(bins[:-1], bins[1:], strict=True):
             slab = x[(z >= low) & (z < high)]
-            # a slab with teeth on one side only does not define the middle
+            # a slab with teeth on one side only has no midpoint
             if min(np.count_nonzero(slab > midline), np.count_nonzero(slab < midline)) >= 10:
                 depth.append(0.5 * (low + high))
                 middle.append(0.5 * (np.percentile(slab, 1.5) + np.percentile(slab, 98.5)))
@@ -137,7 +137,7 @@ def _thin(points: Array, count: int = 3000) -> Array:
 
 def _mirror_angle(flat: Array) -> float:
     """Return the angle of the axis about which a planar point set is most nearly symmetric, shape (N, 2) -> rad."""
-    # compare the radial outline, by angle, with its mirror image: robust to uneven sampling
+    # compare the outline, as radius over angle, with its mirror image: robust to uneven sampling
     flat = flat - 0.5 * (np.percentile(flat, 1, axis=0) + np.percentile(flat, 99, axis=0))
     bins = 360
     polar = np.arctan2(flat[:, 1], flat[:, 0])

@@ -1,4 +1,4 @@
-"""Pinhole cameras with OpenCV's radial-tangential distortion, and OpenCV coefficients for the lenses of other programs.
+"""Pinhole cameras with OpenCV's radial-tangential distortion, and the conversion of other lens models to it.
 
 Model: OpenCV "Camera Calibration and 3D Reconstruction": coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]).
 """
@@ -88,7 +88,7 @@ class Camera:
         return self._pixels(x)
 
     def scaled(self, size_px: tuple[int, int]) -> Camera:
-        """Return the camera of the image resized to a width and height [px] (pixel centres at integers)."""
+        """Return the camera for the image resized to a width and height [px] (pixel centres at integers)."""
         sx, sy = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
         K = self.K.copy()
         K[0] *= sx
@@ -99,7 +99,7 @@ class Camera:
         return replace(self, size_px=(int(size_px[0]), int(size_px[1])), K=K)
 
     def cropped(self, x0_px: int, y0_px: int, size_px: tuple[int, int]) -> Camera:
-        """Return the camera of a crop with width and height ``size_px`` and first pixel (x0_px, y0_px).
+        """Return the camera for a crop with width and height ``size_px`` and first pixel (x0_px, y0_px).
 
         Distortion stays exact, since it acts on normalised coordinates.
         """
@@ -145,9 +145,9 @@ def _paired(x: Array, y: Array) -> Array:
     return out
 
 
-_SAMPLES = 400  # radii of the fit
-_RADIUS_FACTOR = 1.1  # of the fitted image radius: the undistorted image may be larger than the recorded one
-_TOLERANCE_PX = 0.005  # largest error of a fit that keeps K
+_SAMPLES = 400  # number of radii at which the polynomial is sampled for the fit
+_RADIUS_FACTOR = 1.1  # factor on the fitted image radius: the undistorted image may be larger than the recorded one
+_TOLERANCE_PX = 0.005  # largest error of the coefficients up to which K is kept
 _ROUNDS, _MAX_DAMPING = 200, 1e12
 
 
@@ -159,7 +159,7 @@ def opencv_radial(K: Array, size_px: tuple[int, int], radial: Array) -> tuple[Ar
     Args:
         K: intrinsic matrix (3, 3) [px].
         size_px: width and height.
-        radial: a1 to a4, shape (4,).
+        radial: a1, a2, a3 and a4, shape (4,).
 
     Returns:
         The coefficients, shape (3,) or (6,), and their largest error [px].
@@ -183,8 +183,8 @@ def opencv_lens(K: Array, recorded_px: Array, ideal: Array) -> tuple[Array, Arra
     """Return K and OpenCV's eight coefficients, fitted to a lens given by distorted and undistorted points.
 
     K is kept if the coefficients alone fit the lens. Otherwise K is fitted too, which covers linear effects such as an
-    anamorphic squeeze; finally the camera rotation, which together with the principal point moves the centre of
-    distortion.
+    anamorphic squeeze. If that is not sufficient, so is the camera rotation, which together with the principal point
+    moves the centre of distortion.
 
     Args:
         K: Initial intrinsic matrix (3, 3) [px].
@@ -207,7 +207,7 @@ def opencv_lens(K: Array, recorded_px: Array, ideal: Array) -> tuple[Array, Arra
 
 
 def _least_squares(values: Array, free: npt.NDArray[np.intp], recorded_px: Array, ideal: Array) -> Array:
-    """Return the values with the free ones fitted by Levenberg-Marquardt with numeric derivatives."""
+    """Return the values, with those at the indices ``free`` fitted by Levenberg-Marquardt with numeric derivatives."""
     values, damping = values.copy(), 1e-3
     steps = np.where(np.arange(16) < 5, 1e-4 * values[0], 1e-6)
     residual = (_through(values, ideal) - recorded_px).ravel()

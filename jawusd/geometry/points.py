@@ -1,4 +1,4 @@
-"""Point sets and triangles: matching a moved copy, welding coincident points, intersecting rays."""
+"""Point sets and triangles: matching of a moved copy, welding of coincident points, ray intersection."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _PROBES = 60
 def match_points(source: Array, moved: Array, chosen: NDArray[np.int64], farthest: float) -> NDArray[np.int64] | None:
     """Return the points of a moved and scaled copy of a shape that correspond to chosen points of the shape.
 
-    The principal axes of both are aligned. Of the four remaining half turns the one that fits is used; if several fit,
-    as for symmetric shapes, the one that best preserves the order of the points.
+    The principal axes of both are aligned, which leaves four rotations by half turns. The one that fits is used; if
+    several fit, as for symmetric shapes, the one that best preserves the order of the points.
 
     Args:
         source: Points of the shape, shape (N, 3); duplicates count once.
         moved: Points of the copy, shape (M, 3): the same set, in any order, rotated, translated and scaled.
         chosen: Indices (n,) of points of the shape.
-        farthest: Largest distance between a point and its copy, in units of `source`.
+        farthest: Largest allowed distance between a point and its aligned copy, in units of `source`.
 
     Returns:
         Indices (n,) into `moved`; None if `moved` is not a copy of the shape.
@@ -69,7 +69,7 @@ def _nearest(wanted: Array, points: Array, farthest: float) -> NDArray[np.int64]
 
 
 def welded(points: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the distinct points and the index of each point, four times faster than `numpy.unique` of rows.
+    """Return the distinct points and the index of each point, four times as fast as `numpy.unique` over rows.
 
     Args:
         points: Finite points, shape (n, k).
@@ -98,8 +98,8 @@ def meet_triangles(origin: Array, direction: Array, corners: Array) -> tuple[Arr
 
     Returns:
         Barycentric coordinates u and v of the second and third corner, each shape (N,), and the distance along the
-        line in units of `direction`, shape (N,). The line meets a triangle if u, v >= 0 and u + v <= 1. All are 0 for
-        parallel triangles.
+        line in units of `direction`, shape (N,). The line meets a triangle if u, v >= 0 and u + v <= 1. For triangles
+        parallel to the line, all three are 0.
     """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     e1, e2, s = b - a, c - a, origin - a

@@ -36,7 +36,7 @@ def wxyz_from_matrix(R: ArrayLike) -> Array:
 def _multiples(R: Sequence[Sequence[N]] | Array) -> list[list[N]]:
     """Return 4 q q^T from rows of matrix entries, floats or arrays. Every row is a multiple of q.
 
-    The row with the largest diagonal entry loses no digits.
+    The row with the largest diagonal entry is free of cancellation.
     """
     a, b, c = R[0][0], R[1][1], R[2][2]
     x, y, z = R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]

@@ -46,8 +46,8 @@ def rigid_fits(source: ArrayLike, targets: ArrayLike) -> tuple[Array, Array]:
         targets: The points after each motion [mm], shape (F, N, 3), NaN if missing.
 
     Returns:
-        T (F, 4, 4), NaN with fewer than three points or collinear ones, and the rms distance (F,) [mm] of the present
-        points, NaN likewise.
+        T (F, 4, 4), and the rms distance (F,) [mm] over the points present; both NaN in frames with fewer than three
+        points or collinear ones.
 
     Raises:
         ValueError: wrong shapes.
@@ -74,7 +74,7 @@ def _on_a_line(points: Array) -> bool:
 
 
 def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:
-    """Return the world point (3,) [mm] seen at the given pixels.
+    """Return the world point (3,) [mm] that projects to the given pixels.
 
     A linear estimate (Hartley & Zisserman, Multiple View Geometry, section 12.2), refined by Gauss-Newton on
     the reprojection error.

@@ -1,4 +1,4 @@
-"""Rodrigues' formula in operators alone, for floats, arrays, tensors and graph values.
+"""Rodrigues' formula in arithmetic operators alone, for floats, arrays, tensors and graph values.
 
 With W the skew matrix of a rotation vector omega and x = |omega|^2, the rotation is ``I + a W + b W W`` and its left
 Jacobian ``I + b W + c W W``, where a = sin t / t, b = (1 - cos t) / t^2, c = (t - sin t) / t^3 and t = sqrt(x) (Sola,
@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from typing import Protocol, TypeVar
 
-SMALL_SQUARED_ANGLE = 1e-4  # [rad^2] below, closed forms lose digits and the series are exact to double precision
+SMALL_SQUARED_ANGLE = 1e-4  # [rad^2] below this, closed forms lose digits; the series are exact to double precision
 
 
 class Number(Protocol):
-    """The arithmetic that formulas need: with the same number type and with floats."""
+    """The arithmetic that formulas need, between two numbers of the type and between one and a float."""
 
     def __add__(self: N, other: N | float, /) -> N: ...
     def __radd__(self: N, other: float, /) -> N: ...

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry.so3 import hat, so3_exp, so3_left_jacobian, so3_left_jacobian_inverse, so3_log
 
-# Below this angle [rad] the coupling block uses its series: the closed form loses digits as a^-5.
+# Below this angle a [rad] the coupling block uses its series: the relative error of the closed form grows like a^-5.
 _COUPLING_SERIES_RAD = 0.3
 
 
@@ -162,7 +162,7 @@ def orthonormalise(T: ArrayLike) -> Array:
 def rigidity_defect(T: ArrayLike) -> Array:
     """Return the deviation of transforms (..., 4, 4) from rigidity, shape (...).
 
-    The largest absolute entry of R R^T - I and of the error of the bottom row; at least 2 for reflections.
+    It is the largest absolute entry of R R^T - I and of the error of the bottom row, and at least 2 for reflections.
     """
     T = np.asarray(T, dtype=np.float64)
     R = T[..., :3, :3]

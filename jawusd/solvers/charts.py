@@ -1,4 +1,4 @@
-"""Both kinds of models with derivatives, in the coordinates x (n, 3) [mm] of the search for the nearest pose.
+"""Both kinds of models with derivatives, in the chart coordinates x (n, 3) [mm] of the search for the nearest pose.
 
 As in `jawusd.evaluator.models`: for an anchored model x is the displacement u of the incisal point, for an additive one
 d itself; derivatives are spatial, S (n, 6, 3) with ``M(x + e) = exp(S e) M(x)``; twists are (omega [rad], v [mm]).
@@ -32,13 +32,13 @@ from jawusd.evaluator.schema import ADDITIVE, ANCHORED
 from jawusd.solvers.motion import OPERATIONS, MotionModule
 from jawusd.solvers.solution import applied, attached, capturing, finished, inverse
 
-_STEPS_CAPTURED = 7  # of the inverse gauge in a captured graph; 5 suffice for anatomical parameters
-_GAUGE_NUMBERS = 26  # count of numbers in `GaugeNumbers`
-_SERIES_SQUARED = 0.09  # [rad^2] below, derivatives of the angle coefficients use series
+_STEPS_CAPTURED = 7  # iterations of the inverse gauge in a captured graph; 5 suffice for anatomical parameters
+_GAUGE_NUMBERS = 26  # number of scalars in `GaugeNumbers`
+_SERIES_SQUARED = 0.09  # [rad^2] below this, derivatives of the angle coefficients use series
 
 
 def _glide(table: object, d2: Tensor, d3: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the glide table [mm] of a module at d2 (n,), d3 (n,) [mm], and its slopes; zeros for None."""
+    """Return the glide table [mm] of a module at d2 (n,), d3 (n,) [mm], and its derivatives; zeros for None."""
     if not isinstance(table, MotionModule):
         return torch.zeros_like(d2), torch.zeros_like(d2), torch.zeros_like(d2)
     a, a_2 = _curve(table, "glide2", d2[:, None])
@@ -47,7 +47,7 @@ def _glide(table: object, d2: Tensor, d3: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def _curve(module: MotionModule, name: str, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the points and slopes (n, k) of a module's curve at x (n, 1)."""
+    """Return the points and derivatives (n, k) of a module's curve at x (n, 1)."""
     parts = [module.get_buffer(f"{name}_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
     (start,), (c0,), (c1,), (c2,), (c3,) = OPERATIONS.lookup(x, module.get_buffer(f"{name}_knot"), parts)
     s = x - start
@@ -58,7 +58,7 @@ TENSORS: Elementary[Tensor] = Elementary(torch.sqrt, torch.exp, OPERATIONS.clip,
 
 
 class Chart(Protocol):
-    """Interface of a model to the search for the nearest pose."""
+    """Interface through which the search for the nearest pose uses a model."""
 
     def start(self, u: Tensor) -> Tensor:
         """Return starting points x (n, 3) for displacements u (n, 3) [mm] of the incisal point."""
@@ -70,7 +70,7 @@ class Chart(Protocol):
         """Return d (n, 3) [mm] of x, and dd/dx (n, 3, 3)."""
 
     def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
-        """Return what `decoded` found at x, with its first and second derivatives by x."""
+        """Return the d of `decoded` at x, with its first and second derivatives with respect to x."""
 
 
 class AnchoredMotion(MotionModule):
@@ -118,7 +118,7 @@ class AnchoredMotion(MotionModule):
         return d, inverse(torch.stack([torch.stack(row, dim=1) for row in rows], dim=1))
 
     def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
-        """Return d with its derivatives by u: a step of Newton's method adds the second ones."""
+        """Return d with its derivatives with respect to u: a step of Newton's method adds the second ones."""
         d = attached(d, by_x, x)
         u, _ = displacement(self._anchored_numbers().gauge, d[:, 0], d[:, 1], d[:, 2], TENSORS)
         error = torch.stack(u, dim=1) - x
@@ -182,7 +182,7 @@ class AdditiveMotion(MotionModule):
 
 
 def chart_of(kind: str, arrays: Mapping[str, Array]) -> AnchoredMotion | AdditiveMotion:
-    """Return the model of a kind."""
+    """Return the model, of the given kind, in its chart."""
     return AnchoredMotion(arrays) if kind == ANCHORED else AdditiveMotion(arrays)
 
 
@@ -219,7 +219,7 @@ def _rotations(omega: Tensor) -> tuple[Tensor, Tensor]:
 def _twist_derivative(twist: Tensor, by_x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return R, t and the spatial derivative of exp(twist) for twists (n, 6) with derivatives (n, 6, 3).
 
-    With the translation t = v + b w x v + c w x (w x v), a change of the twist rotates by s = J dw and shifts the
+    The translation is t = v + b w x v + c w x (w x v). A change of the twist adds the rotation s = J dw and shifts the
     origin by dt - s x t.
     """
     omega, v = twist[:, :3, None], twist[:, 3:, None]
@@ -242,7 +242,7 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _coefficient_slopes(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the derivatives by the squared angle x [rad^2] of b and c, see `jawusd.fast.rigid.coefficient_slopes`."""
+    """Return db/dx and dc/dx at squared angles x [rad^2], see `jawusd.fast.rigid.coefficient_slopes`."""
     small = x < _SERIES_SQUARED
     far = torch.where(small, torch.ones_like(x), x)
     series_b = -1 / 24 + x * (1 / 360 + x * (-1 / 13440 + x * (1 / 907200 - x / 95800320)))

@@ -11,20 +11,22 @@ from jawusd.evaluator.nearest import ITERATIONS, MAX_DAMPING, MIN_DAMPING, MIN_S
 from jawusd.solvers.charts import Chart
 from jawusd.solvers.solution import applied, attached, capturing, finished, inverse, solved
 
-# x (n, 3), targets (n, 3, m) -> residuals (n, 3 m) and their derivatives by x (n, 3 m, 3)
+# x (n, 3), targets (n, 3, m) -> residuals (n, 3 m) and their derivatives with respect to x (n, 3 m, 3)
 Residual = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 _STEPS_CAPTURED = 6
 _NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # off the model, Gauss-Newton converges slowly near the minimum
-_MIN_CURVATURE = 1e-9  # relative; keeps encodings differentiable where a parameter hardly moves the landmarks
+# added to the Hessian, relative to its diagonal; keeps encodings differentiable where a parameter hardly moves the
+# landmarks
+_MIN_CURVATURE = 1e-9
 
 
 def encoded(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the parameters whose motion moves vectors nearest to their targets.
+    """Return the parameters whose motion brings vectors closest to their targets.
 
-    First and second derivatives by the targets are exact, to the accuracy of the search. With its result x0, and the
-    inverse Hessian H and Jacobian J there as constants, ``x1 = x0 + H J^T (target - target0)`` is right to first order;
-    one step ``x2 = x1 - H grad(x1, target)`` makes it right to second order.
+    First and second derivatives with respect to the targets are exact, to the accuracy of the search. With its result
+    x0, and the inverse Hessian H and Jacobian J there as constants, ``x1 = x0 + H J^T (target - target0)`` is correct
+    to first order; one step ``x2 = x1 - H grad(x1, target)`` makes it correct to second order.
 
     Args:
         chart: The model.
@@ -74,7 +76,7 @@ def _nearest(chart: Chart, residual: Residual, target: Tensor, u: Tensor) -> tup
             break
         r_trial, J_trial = residual(x - step, target)
         g_trial = applied(J_trial.transpose(1, 2), r_trial)
-        # this near to the minimum, rounding hides differences of the residual: compare gradients
+        # this close to the minimum, changes of the residual are below rounding: compare gradients
         better = g_trial.square().sum(dim=1) <= g.square().sum(dim=1)
         x, r = torch.where(better[:, None], x - step, x), torch.where(better[:, None], r_trial, r)
         J, g = torch.where(better[:, None, None], J_trial, J), torch.where(better[:, None], g_trial, g)
@@ -103,7 +105,7 @@ def _descended(residual: Residual, x: Tensor, target: Tensor) -> tuple[Tensor, T
         r_trial, J_trial = residual(trial, target)
         cost_trial = r_trial.square().sum(dim=1)
         moving = (step.abs().amax(dim=1) > tolerance_mm) & (damping < MAX_DAMPING)
-        # the last step doubles the digits: accept it even if rounding hides the improvement
+        # the last step doubles the correct digits: accept it even if the improvement is below rounding
         taken = (cost_trial <= cost) | ~moving
         damping = torch.where(taken, (damping * 0.1).clamp(min=MIN_DAMPING), damping * 10.0)
         x, r = torch.where(taken[:, None], trial, x), torch.where(taken[:, None], r_trial, r)
@@ -114,7 +116,7 @@ def _descended(residual: Residual, x: Tensor, target: Tensor) -> tuple[Tensor, T
 
 
 def _curvature(residual: Residual, x: Tensor, target: Tensor) -> Tensor:
-    """Return the Hessian (n, 3, 3) by x of half the squared residual, by central differences of its exact gradient."""
+    """Return the Hessian (n, 3, 3) in x of half the squared residual, by central differences of its exact gradient."""
     h = 1e-4 if x.dtype == torch.float64 else 2e-2
     shifts = h * torch.eye(3, dtype=x.dtype, device=x.device)
     around = torch.cat([x[:, None] + shifts, x[:, None] - shifts], dim=1)

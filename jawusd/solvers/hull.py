@@ -38,7 +38,7 @@ _ROWS = 512  # rows compared with all candidates at once
 
 
 class Expansion(NamedTuple):
-    """The signed distance (n,) [mm] at points, its gradient (n, 3), and its Hessian (n, 3, 3) [1/mm] in two parts.
+    """The signed distance (n,) [mm], its gradient (n, 3), and its Hessian (n, 3, 3) [1/mm] in two parts.
 
     The part from the rounding is positive semidefinite; the bending of the supports along d1 may be indefinite.
     """
@@ -92,7 +92,7 @@ class Hull(Formula):
         return Expansion(distance, gradient, rounding, bending)
 
     def _sides(self, d: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the distance (n,) [mm], weight (n, k) and slope (n, k, 3) of the half-spaces, and d2 reach / d d1^2.
+        """Return the distance (n,) [mm], weights (n, k), gradients (n, k, 3) of the half-spaces, and d2 reach / d d1^2.
 
         In the order of `jawusd.evaluator.bounds`: the sides, then both ends.
         """
@@ -107,16 +107,16 @@ class Hull(Formula):
         return distance, torch.softmax(v, dim=1), slopes, reach_11
 
     def upper_margin(self, d: Tensor) -> Tensor:
-        """Return an upper bound (n,) [mm] of the margins in the section of d (n, 3).
+        """Return an upper bound (n,) [mm] on all margins in the section that contains d (n, 3).
 
-        Moving from d in any direction approaches some half-plane.
+        Moving from d in any direction approaches the edge of some half-plane.
         """
         offset = self.singles[3]
         (reach,) = curve("support", d[:, :1], self.tables(), OPERATIONS)
         return offset + (reach - d[:, 1:] @ self.directions.T).amax(dim=1)
 
     def nearest(self, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nearest points (n, 3) [mm] with margin >= 0, and their derivatives (n, 3, 3) by d (n, 3) [mm].
+        """Return the points (n, 3) [mm] with margin >= 0 nearest to d (n, 3), and their derivatives (n, 3, 3).
 
         On the bound, the derivative follows from the implicit function theorem on ``x - d + multiplier grad = 0,
         distance(x) = 0``.
@@ -145,7 +145,7 @@ class Hull(Formula):
         return x, torch.where(inside[:, None, None], identity, inverse(A) - across)
 
     def _starts(self, d: Tensor) -> Tensor:
-        """Return candidates (n, v, 3) [mm] in the valleys of the distance to d (n, 3), as in `JawRig.project`."""
+        """Return candidates (n, v, 3) [mm] at local minima of the distance to d (n, 3), as in `JawRig.project`."""
         if not capturing() and len(d) > _ROWS:
             return torch.cat([self._starts(rows) for rows in d.split(_ROWS)])
         squared = self.scan.square().sum(dim=2).flatten()
@@ -158,7 +158,7 @@ class Hull(Formula):
         return self.scan[slices, place.gather(1, slices)]
 
     def _descended(self, wanted: Tensor, start: Tensor) -> Tensor:
-        """Return the nearest valid points (n, 3) [mm] in the valleys around valid starts.
+        """Return the nearest valid points (n, 3) [mm] in the basins of valid starts.
 
         As in `jawusd.evaluator.solver`, every iterate is inside: the step of the quadratic model under the linearised
         bound is pulled back onto the surface, and accepted only if the distance does not grow.
@@ -212,7 +212,7 @@ class Hull(Formula):
         return self._pulled_inside(x)
 
     def _conditions(self, wanted: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Expansion]:
-        """Return the derivative (n, 3, 3) by x of ``x - wanted + multiplier gradient``, the multiplier and the hull."""
+        """Return the Jacobian (n, 3, 3) of ``x - wanted + multiplier gradient``, the multiplier and the hull at x."""
         at = self.expansion(x)
         squared = at.gradient.square().sum(dim=1).clamp(min=MIN_SLOPE)
         multiplier = ((wanted - x) * at.gradient).sum(dim=1) / squared
@@ -220,7 +220,7 @@ class Hull(Formula):
         return identity + multiplier[:, None, None] * (at.rounding + at.bending), multiplier, at
 
     def _pulled_inside(self, x: Tensor) -> Tensor:
-        # deep enough that rounding of the margin cannot move the point out again
+        # deep enough that a rounding error of the margin cannot put the point outside again
         depth_mm = INSIDE_MM if x.dtype == torch.float64 else 1e-5
         for _ in range(_PULLS_CAPTURED if capturing() else PULL_BACKS):
             distance, gradient = self.slope(x)

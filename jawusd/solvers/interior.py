@@ -18,8 +18,8 @@ from jawusd.solvers.motion import OPERATIONS, Formula
 from jawusd.solvers.solution import capturing, finished
 
 _STEPS, _STEPS_CAPTURED = 60, 12
-_SOFTNESS_MM = 1.0  # rounding used for the middle of a section: keeps the line of middles straight
-_CHECKED = 400  # openings at which the line of middles is checked
+_SOFTNESS_MM = 1.0  # rounding used to find the centre of a section: keeps the centre line straight
+_CHECKED = 400  # number of openings at which the centre line is checked
 _NEWTON_STEPS, _SMALLEST_SHARE, _STIFFNESS = 200, 1e-9, 1e-12
 _END_TOLERANCE_MM = 1e-13
 
@@ -27,9 +27,9 @@ _END_TOLERANCE_MM = 1e-13
 class Interior(Formula):
     """A map from vectors z (n, 3) onto the interior of a hull.
 
-    ``d1`` is a sigmoid of z1 onto the valid openings. With m the margin and c(d1) a line inside the volume,
+    ``d1`` is a sigmoid of z1 onto the valid openings. With m the margin and c(d1) a centre line inside the volume,
     ``(d2, d3) = c + (z2, z3) m(d1, d2, d3)``: sections are convex and m is concave in them, so along every ray from c
-    the ratio ``|(d2, d3) - c| / m`` rises from 0 to infinity, and each z has exactly one solution.
+    the ratio ``|(d2, d3) - c| / m`` increases from 0 to infinity, and there is exactly one solution for each z.
 
     Raises:
         EvaluatorError: no line from the smallest to the largest opening lies inside.
@@ -77,7 +77,7 @@ class Interior(Formula):
         return torch.where(margin > 0, z, torch.nan)
 
     def _on_line(self, d1: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the points (n, 3) [mm] of the line of middles at d1 (n, 1), and their derivatives."""
+        """Return the points (n, 3) [mm] of the centre line at d1 (n, 1), and their derivatives."""
         parts = [self.get_buffer(f"middle_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
         (start,), _, (c1,), (c2,), (c3,) = OPERATIONS.lookup(d1, self.get_buffer("middle_knot"), parts)
         s = d1 - start
@@ -92,9 +92,9 @@ class Interior(Formula):
 
 
 def _middles(bound: SliceHull) -> Array:
-    """Return points (k, 2) [mm] inside the sections at the knots, the deepest ones at the first and last knot.
+    """Return a point (2,) [mm] inside the section at each of k knots, at the first and last knot the deepest.
 
-    Beyond these two, sections change only by the rounding of the ends, which closes around the deepest point.
+    Beyond these two knots, sections only shrink by the rounding of the ends, towards the deepest point.
     """
     reach = bound.supports.values
     found = np.zeros((len(reach), 2))
@@ -135,7 +135,7 @@ def _deepest(normals: Array, reach: Array, softness_mm: float, y: Array) -> Arra
 
 
 def _ends(bound: SliceHull, line: HermiteCurve) -> tuple[float, float]:
-    """Return the openings [mm] between which the line of middles lies inside the bound."""
+    """Return the openings [mm] between which the centre line lies inside the bound."""
 
     def inside(d1: Array) -> Mask:
         return bound.signed_distance(np.column_stack([d1, line.value(d1)])) < 0

@@ -1,4 +1,4 @@
-"""A jaw rig as a torch module: poses, margins, clearances, encoding, and priors that other solvers can add."""
+"""A jaw rig as a torch module: poses, margins, clearances, encoding, and priors to add to other solvers."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Clearances(nn.Module):
 
 
 class TemporalPrior(nn.Module):
-    """A prior on motion: squared Mahalanobis lengths of velocity and acceleration of d, zero for a jaw at rest.
+    """A prior on motion: squared Mahalanobis norms of velocity and acceleration of d, zero for a jaw at rest.
 
     Both are modelled as normal with mean zero; the inverses of their covariances are buffers, float64.
 
@@ -78,7 +78,7 @@ class TemporalPrior(nn.Module):
     def forward(self, d: Tensor, fps: float) -> Tensor:
         """Return the prior (...) of d (..., F, 3) [mm] at a rate [1/s]; about 3 for motion like that of the take.
 
-        Half the sum of the mean squared Mahalanobis lengths of velocities and accelerations.
+        It is half the sum of the mean squared Mahalanobis norms of velocities and accelerations.
 
         Raises:
             ValueError: fewer than three frames.
@@ -106,7 +106,7 @@ class JawLayer(nn.Module):
     `encode`, `loss` and `residuals` have first and second derivatives, `project` and `inside` first ones only.
 
     All functions compute in the precision of the layer: autocast and TensorFloat-32 are off within them. A captured
-    graph multiplies with the precision that the program has set for matrices.
+    graph, however, uses the matrix multiplication precision that the surrounding program has set.
 
     ``layer.temporal(d, fps)`` is a prior on motion between frames, see `TemporalPrior`; None if the rig has no
     speeds.
@@ -170,8 +170,8 @@ class JawLayer(nn.Module):
     def clearance(self, d: Tensor, of: Meeting = "teeth") -> Tensor:
         """Return the clearance (...) [mm] of teeth or condyles at d (..., 3) [mm], as `JawRig.clearance` does.
 
-        Below 0 where they penetrate deeper than in the closed bite. Trilinear between samples, so the derivative is
-        discontinuous.
+        It is negative where they penetrate deeper than in the closed bite. It is trilinear between samples, so its
+        derivative is discontinuous.
 
         Raises:
             EvaluatorError: the rig has no such clearance.
@@ -185,7 +185,7 @@ class JawLayer(nn.Module):
     def project(self, d: Tensor) -> Tensor:
         """Return the nearest jaw parameters (..., 3) [mm] with margin >= 0 to d (..., 3) [mm], as `JawRig.project`.
 
-        Inside the bound, the derivative is the identity; outside, that of the nearest point on the bound.
+        The derivative is the identity inside the bound, and outside that of the nearest point on the bound.
         """
         rows = self._rows(d, (3,), "d")
         x, by_d = solved(self.bound.nearest, rows)
@@ -195,7 +195,7 @@ class JawLayer(nn.Module):
     def inside(self, z: Tensor) -> Tensor:
         """Return valid jaw parameters (..., 3) [mm] for any vectors z (..., 3): a smooth bijection.
 
-        z = 0 maps to the middle of the valid openings; the bound is at infinity. See `Interior`.
+        z = 0 maps to the middle of the valid openings, and the bound is approached at infinity. See `Interior`.
         """
         rows = self._rows(z, (3,), "z")
         d, by_z = solved(lambda z: self.interior.mapped(self.bound, z), rows)
@@ -210,7 +210,7 @@ class JawLayer(nn.Module):
     def encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nearest jaw parameters and their landmark distance, as `JawRig.encode`.
 
-        First and second derivatives by the pose are exact, from the implicit function theorem on
+        First and second derivatives with respect to the pose are exact, from the implicit function theorem on
         ``grad_d |pose(d) - T|^2 = 0``, including second derivatives of the model.
 
         Args:

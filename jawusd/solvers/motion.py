@@ -1,6 +1,7 @@
 """The model's formulas in torch: differentiable, in float32 or float64, on any device.
 
-A number is a column of a batch, shape (n, 1); a wide number, see `jawusd.evaluator.operations`, has shape (n, m).
+A number is a column of a batch, shape (n, 1); a number that is an array, see `jawusd.evaluator.operations`, has shape
+(n, m).
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ class TensorOperations:
 
     @staticmethod
     def split(row: Sequence[Tensor], width: int) -> Sequence[Tensor]:
-        """Return the columns (n, 1) of a wide number (n, width)."""
+        """Return the columns (n, 1) of a number that is an array (n, width)."""
         return row[0].split(1, dim=1)
 
 
@@ -170,7 +171,7 @@ def jaw_pose_from_axis_angle(
     Args:
         axis_angle: Rotation vectors of the jaw [rad], shape (..., 3).
         translation: Translation t of the jaw [model units], shape (..., 3); None for models that only rotate it.
-        joint: Jaw joint j of the face with the mouth closed [model units], shape (3,).
+        joint: Jaw joint j of the face model with the mouth closed [model units], shape (3,).
         T_skull_model: Rigid alignment of the model's frame with the skull (upper teeth scan) frame, in mm, (4, 4).
         T_rest: Pose of the closed bite, `JawRig.T_rest`, shape (4, 4).
         unit_mm: Length of a model unit; both models use metres.
@@ -179,7 +180,7 @@ def jaw_pose_from_axis_angle(
         T_skull_mandible [mm], shape (..., 4, 4).
 
     Raises:
-        TypeError: a number type coarser than float32.
+        TypeError: a dtype coarser than float32.
     """
     check_precision("axis_angle", axis_angle.dtype)
     batch = axis_angle.shape[:-1]

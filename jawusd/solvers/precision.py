@@ -1,6 +1,6 @@
-"""Number types of the torch functions: float32 or float64, whatever the program around them has switched on.
+"""Precision of the torch functions: float32 or float64, regardless of autocast and matrix multiplication settings.
 
-Poses are hundreds of millimetres from the origin: bfloat16 has steps of 1 mm there, TensorFloat-32 of 0.1 mm.
+Points are hundreds of millimetres from the origin, where bfloat16 resolves only 1 mm, and TensorFloat-32 0.1 mm.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _ALLOWED = (torch.float32, torch.float64)
 
 
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
-    """Run a function of tensors without autocast, and outside captured graphs without TensorFloat-32."""
+    """Decorate a function of tensors to run without autocast and, outside captured graphs, without TensorFloat-32."""
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **named: P.kwargs) -> R:
@@ -41,7 +41,7 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def check_precision(name: str, found: torch.dtype, own: torch.dtype | None = None) -> None:
-    """Check the number type of an argument, and that of the layer that it is passed to, if to any.
+    """Check the dtype of an argument, and that of the layer it is passed to, if any.
 
     Raises:
         TypeError: they differ, or are coarser than float32.

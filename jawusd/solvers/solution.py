@@ -1,7 +1,7 @@
-"""Iterative searches as differentiable functions: the search is opaque, its derivative is attached.
+"""Iterative searches as differentiable functions: autograd does not trace the search; its derivative is attached.
 
 A search takes rows (n, ...) and returns tensors whose first axis is n. In eager mode it may stop early, depending on
-values; while a graph is captured it makes a fixed number of steps. Derivatives come from the implicit function theorem,
+values; while a graph is captured it takes a fixed number of steps. Derivatives come from the implicit function theorem,
 see `attached`; there are no second derivatives.
 """
 
@@ -41,7 +41,7 @@ class _Search(torch.autograd.Function):
 
 
 def solved(search: Search, rows: Tensor) -> tuple[Tensor, ...]:
-    """Return the results of a search for rows (n, ...), as constants."""
+    """Return the results of a search for rows (n, ...), detached from the graph."""
     if capturing():
         return search(rows.detach())
     found: tuple[Tensor, ...] = _Search.apply(search, rows.detach())
@@ -59,7 +59,7 @@ def finished(moving: Tensor) -> bool:
 
 
 def attached(value: Tensor, jacobian: Tensor, by: Tensor) -> Tensor:
-    """Return a value (n, k) with a given derivative (n, k, m) by its argument (n, m)."""
+    """Return a value (n, k) with a given derivative (n, k, m) with respect to its argument (n, m)."""
     return value + applied(jacobian, by - by.detach())
 
 
