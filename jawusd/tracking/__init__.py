@@ -1,6 +1,6 @@
-"""Track the poses of both dental arches from masks or pictures of several cameras.
+"""Track the poses of both dental arches from masks or images of several cameras.
 
-Rooms, each importing only those before it: `contour`, `initialization`, `sequence` and `performance`, `region`.
+Subpackages, each importing only those before it: `contour`, `initialization`, `sequence` and `performance`, `region`.
 """
 
 from jawusd.tracking.config import TrackingConfig

@@ -1,4 +1,4 @@
-"""Settings of the tracker, each with its unit and reason. docs/explanation/constants.md says how they were chosen."""
+"""Settings of the tracker, with units and reasons; docs/explanation/constants.md explains how they were chosen."""
 
 from __future__ import annotations
 
@@ -20,54 +20,57 @@ class Mapper(Protocol):
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Settings of the tracker; px are pixels of the working picture unless stated otherwise."""
+    """Settings of the tracker; px are pixels of the working image unless stated otherwise."""
 
-    # Working resolution at the teeth [px/mm]: hand-drawn masks carry no more detail, and time grows with the area.
+    # Working resolution at the teeth [px/mm]: hand-drawn masks have no finer detail, and run time grows with the area.
     working_px_per_mm: float = 7.2
     # Spacing of contour samples [px]: mask noise is correlated over a longer distance.
     sample_step_px: float = 3.0
-    # Residual gate of each iteration [px]. Narrow at the end: wider gates reach lip and gum edges 0.5 mm away.
+    # Residual gate of each iteration [px]. Narrow at the end: wider gates also match lip and gum edges 0.5 mm away.
     wide_gates_px: tuple[float, ...] = (14.0, 10.0, 8.0, 6.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0)
-    # First gate when motion is easy to predict [px]; the wider ones are for fast motion and the fallback.
+    # First gate when motion is easy to predict [px]; wider gates are used for fast motion and as fallback.
     first_gate_px: float = 6.0
-    # Ratio of the first gate to the recent prediction error [-], since the next error may be larger.
+    # Ratio of the first gate to the recent prediction error [-]: above 1, since the next error may be larger.
     gate_per_miss: float = 1.5
-    # Limits of the last gates [px], which adapt to the spread of the residuals: 2 px for good hand-drawn masks.
+    # Smallest and largest final gate [px]. The gate adapts to the spread of the residuals: 2 px for good hand-drawn
+    # masks.
     final_gate_px: tuple[float, float] = (1.2, 4.0)
     # Residual beyond which a sample adds nothing to the score [px]; the same for all poses, so scores are comparable.
     score_gate_px: float = 2.5
     # Tukey gate in standard deviations: 95 % efficiency for normal noise (Huber & Ronchetti 2009).
     gate_sigmas: float = 4.685
-    # Weight of samples deep inside the mask while gates are wide [-]: pulls a model outwards that lies too far inside.
+    # Weight of contour samples deep inside the mask while gates are wide [-]: moves a model outwards if it is too far
+    # in.
     pull: float = 0.3
-    # Gate [px] up to which that pull is off: near the solution it would favour gum over teeth.
+    # Gate [px] up to which that weight is zero: near the solution it would favour gum over teeth.
     pull_above_px: float = 4.0
-    # Least cosine between contour and mask normals at a matched edge [-]: lips cross the contour at larger angles.
+    # Minimum cosine between contour and mask normals at a matched edge [-]: lips cross the contour at larger angles.
     normal_cosine: float = 0.7
-    # How much nearer a crown may be one pixel inside its own contour [mm]: curvature of a cusp, not a second tooth.
+    # Largest decrease in depth from a contour point to the pixel inside it [mm]: a cusp curves by less, another tooth
+    # is nearer by more.
     depth_tolerance_mm: float = 1.5
     # Depth difference from which one arch hides the other [mm]: above the error of the poses.
     overlap_tolerance_mm: float = 0.4
     # Update below which iterations stop [mm at the crowns]: a tenth of the attainable accuracy.
     converged_mm: float = 0.004
-    # Update below which the intermediate gates are skipped [mm at the crowns]: they serve larger steps.
+    # Update below which the intermediate gates are skipped [mm at the crowns]: only larger steps need them.
     settled_mm: float = 0.0
-    # Last update up to which its residuals are reused for the final pose [mm at the crowns]; 0 recomputes them.
+    # Size of the last update up to which residuals are not recomputed at the final pose [mm at the crowns].
     judged_mm: float = 0.0
-    # Motion after which a scan is drawn again [px]: occlusion is accurate to this distance.
+    # Motion after which a scan is rendered again [px]: occlusion is accurate to this distance.
     redraw_px: float = 1.0
-    # Parallax between near and far parts of a scan above which it is drawn again instead of warped [px]: at 4 px,
+    # Parallax between near and far parts of a scan above which it is rendered again instead of warped [px]: at 4 px,
     # corrections of knocked cameras become biased.
     parallax_px: float = 2.0
     # Standard deviation of an arch about its prediction [mm]: a weak prior for motions that masks do not constrain.
     prediction_mm: float = 0.5
-    # Outline variance times correlation length assumed by that prior [px^3]: 0.4 px over 18 px, as drawn.
+    # Outline variance times correlation length assumed by that prior [px^3]: 0.4 px over 18 px, as in drawn masks.
     typical_noise_px3: float = 3.0
     # Correlation length of outline errors along the contour [px], until it is measured on the take.
     correlation_px: float = 18.0
-    # The same for outlines whose residuals do not reveal it; None uses the measured value.
+    # Correlation length [px] if residuals cannot reveal it; None uses the measured value.
     known_correlation_px: float | None = None
-    # Side of the tiles over which errors are summed to measure it [px]: estimates change little from 20 to 45.
+    # Side of the tiles over which errors are summed to measure that length [px]: estimates change little from 20 to 45.
     tile_px: int = 30
     # Ratio of true to measured correlation length [-]: the fit absorbs part of the error, and the Tukey weight loses
     # efficiency.
@@ -76,19 +79,20 @@ class TrackingConfig:
     history_frames: int = 31
     # History of good frames for scores [frames]: shorter than closing lips take, longer than losing a pose takes.
     score_frames: int = 7
-    # Share of the recent median score below which an arch is suspect [-]: lips seldom hide so much in a few frames.
+    # Fraction of the recent median score below which an arch is suspect [-]: closing lips seldom hide so much in a few
+    # frames.
     suspect_score: float = 0.6
-    # Share of the score below which even closing lips cannot explain it [-].
+    # Fraction of that median below which closing lips cannot be the cause [-].
     alarming_score: float = 0.3
     # Multiple of the recent median residual spread above which an arch is suspect [-].
     suspect_residual: float = 1.4
-    # Uncovered share of a mask above the recent median from which an arch, or a mask, is suspect [-].
+    # Excess of a mask's uncovered fraction over its recent median from which the mask or its arch is suspect [-].
     suspect_coverage: float = 0.04
     # Multiple of the arch's recent median residual above which the mask of one view is suspect [-].
     uneven_residual: float = 1.6
-    # Share of its recent median score below which a mask shows something other than the arch [-].
+    # Fraction of its recent median score below which a mask shows something other than the arch [-].
     dead_score: float = 0.03
-    # Penalty of an uncovered mask pixel, in px of contour [1/px]: rejects wrong minima where few edges are visible.
+    # Penalty per uncovered mask pixel, in px of contour [1/px]: rejects wrong local minima where few edges are visible.
     uncovered_price: float = 0.5
     # Gain in the objective of the other masks, relative to their score, that shows an excluded mask to be wrong [-].
     conflict_gain: float = 0.15
@@ -96,19 +100,19 @@ class TrackingConfig:
     recovery_gain: float = 0.05
     # Offsets of the multi-start search [mm, rad]: prediction errors of a fast chewing stroke, and after an occlusion.
     search_rings: tuple[tuple[float, float], ...] = ((2.0, 0.05), (4.0, 0.12))
-    # Gates of the short trial of every start [px], and number of starts that are refined fully.
+    # Gates of the short trial alignment from every start [px], and number of starts that are refined fully.
     trial_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4
     # Matched contour length below which an arch is lost [px]: 8 mm of tooth edge.
     least_matched_px: float = 60.0
     # Multiple of the suspect residual above which an arch is lost [-]; with a low score, the suspect limit suffices.
     lost_residual: float = 1.3
-    # Uncovered share of a mask above which its arch is lost [-]: good poses leave about 0.01.
+    # Uncovered fraction of a mask above which its arch is lost [-]: good poses leave about 0.01.
     lost_coverage: float = 0.12
     # Position uncertainty of the crowns above which an arch is lost [mm].
     lost_sigma_mm: float = 0.5
-    # Least matched share of the visible contour in the first frame [-]: correct poses reach 0.15 with nearly closed
-    # lips, and 0.07 with scans without gum. Wrong poses above it fail by their uncovered masks.
+    # Minimum matched fraction of the visible contour in the first frame [-]: correct poses reach 0.15 with nearly
+    # closed lips, and 0.07 with scans without gum. Wrong poses above it are rejected because masks stay uncovered.
     first_share: float = 0.05
     # Delay between cameras [frames] and mask bias [px] above which all frames are aligned again with both corrected:
     # below, they matter less than the noise of single frames.
@@ -118,7 +122,7 @@ class TrackingConfig:
     late_frames: float = 0.6
     # Maximum rounds of realignment [-]: each leaves a tenth of the delay.
     refine_rounds: int = 2
-    # The same while a camera still has a delay: matches converge slowly then.
+    # Maximum rounds while a camera still has a delay: matches converge slowly then.
     late_rounds: int = 4
     # Contour shift by wrong camera poses above which they are corrected [px]: smaller shifts are annotator bias.
     refine_shift_px: float = 0.15
@@ -126,7 +130,7 @@ class TrackingConfig:
     refine_turn_rad: float = 0.0035
     refine_move_mm: float = 0.5
     # Frames on which these corrections are iterated before all frames are aligned again [-], maximum iterations, and
-    # the share of the limits above below which iteration stops.
+    # the fraction of the preceding limits below which iteration stops.
     settle_frames: int = 40
     settle_rounds: int = 6
     settled_share: float = 0.2
@@ -139,7 +143,7 @@ class TrackingConfig:
         return rest[-1:] if moved_mm < self.settled_mm else rest
 
     def with_gates_scaled(self, factor: float) -> TrackingConfig:
-        """Return settings with all gates multiplied by a factor, for pictures with more pixels per mm."""
+        """Return settings with all gates multiplied by a factor, for images with more pixels per mm."""
         return replace(
             self,
             wide_gates_px=tuple(factor * gate for gate in self.wide_gates_px),
@@ -154,7 +158,7 @@ class TrackingConfig:
         return tuple(g for g in self.wide_gates_px if g <= max(reach_px, self.first_gate_px))
 
 
-#: For takes of several cameras: scans are drawn half as often. Searches with a single camera need the default.
+#: For takes of several cameras: scans are rendered half as often. Searches with a single camera need the default.
 FOR_TAKES = TrackingConfig(redraw_px=2.0)
 
 #: For masks made by jawusd. They vary more between frames than drawn ones, and get rougher as lips close, so the limits

@@ -32,7 +32,7 @@ _EDGE = 127.5  # mask value at the outline: half of a pixel belongs to the teeth
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _sample(mask: NDArray[np.uint8], x: float, y: float) -> float:
-    """Interpolate a uint8 picture bilinearly; 0 outside."""
+    """Interpolate a uint8 image bilinearly; 0 outside."""
     if x < 0 or y < 0 or x >= mask.shape[1] - 1 or y >= mask.shape[0] - 1:
         return 0.0
     i = int(x)
@@ -57,7 +57,7 @@ def _at(picture: NDArray[np.float32], x: float, y: float) -> float:
 def _nearest_edge(mask: NDArray[np.uint8], x: float, y: float, nx: float, ny: float, reach: float) -> float:
     """Return the signed distance [px] along the normal to the nearest edge where the mask ends.
 
-    NaN if there is none within reach; positive infinity if the whole reach lies inside the mask.
+    NaN if there is none within reach; positive infinity if the mask extends over the whole reach.
     """
     start = _sample(mask, x, y)
     outer = inner = start
@@ -98,9 +98,9 @@ def search_edges(
         other_inverse_depth: rendered inverse depth of the other arch's scan [1/mm], 0 = empty, shape (h, w).
         reach_px: search distance in both directions.
         tolerance_mm: depth difference from which one arch hides the other.
-        cos_limit: least cosine between the sample's normal and the mask's normal at the edge.
+        cos_limit: minimum cosine between the sample's normal and the mask's normal at the edge.
         out: receives the distances, positive outwards, shape (n,). NaN if the sample is hidden, or no edge of its own
-            object is near; +inf if the whole reach lies inside the mask.
+            object is near; +inf if the mask extends over the whole reach.
     """
     for s in range(len(samples)):
         sample = samples[s]
@@ -125,7 +125,7 @@ def search_edges(
 
 @numba.njit(nogil=True, cache=True)
 def _slope(sample: Array, pose: Array, matrix: Array, centre: Array, jacobian: Array) -> None:
-    """Write the motion of a sample along its normal [px] per unit of a left twist about a world point."""
+    """Write the derivative of a sample's normal displacement [px] with respect to a left twist about a world point."""
     a = pose[0, 0] * sample[X] + pose[0, 1] * sample[Y] + pose[0, 2] * sample[Z] + pose[0, 3]
     b = pose[1, 0] * sample[X] + pose[1, 1] * sample[Y] + pose[1, 2] * sample[Z] + pose[1, 3]
     c = pose[2, 0] * sample[X] + pose[2, 1] * sample[Y] + pose[2, 2] * sample[Z] + pose[2, 3]
@@ -160,7 +160,7 @@ def accumulate(
 ) -> tuple[float, float, float, float]:
     """Add the Tukey-weighted normal equations of one arch in one view.
 
-    The residual d of a sample shrinks by n . du when the sample moves by du in the picture; du follows from a left
+    The residual d of a sample shrinks by n . du when the sample moves by du in the image; du follows from a left
     twist (omega, v) of the arch about `centre` (Drummond & Cipolla 2002 use the same point-to-edge distances).
 
     Args:
@@ -262,16 +262,16 @@ def scatter_of_tiles(
     shape: tuple[int, int],
     tile_px: int,
 ) -> tuple[Array, Array]:
-    """Return the sum over picture tiles of s s^T, shape (6, 6); s is the sum of w J d over the samples in the tile.
+    """Return the sum over image tiles of s s^T, shape (6, 6); s is the sum of w J d over the samples in the tile.
 
-    The second result uses the gum share in place of d: the effect of a gum line drawn one pixel off in one place.
+    The second result uses the gum fraction in place of d: the effect of a gum line drawn one pixel off within one tile.
 
     Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The
     ratio to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).
 
     Args:
         samples, distances, gate_px, pose, matrix, centre: as for `accumulate`.
-        shape: (h, w) of the picture.
+        shape: (h, w) of the image.
         tile_px: side of the square tiles, longer than the correlation length.
     """
     across = shape[1] // tile_px + 1

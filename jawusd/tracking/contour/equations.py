@@ -36,10 +36,10 @@ def twist_between(start: Array, end: Array, centre: Array) -> Array:
 
 
 class OutlineSums(NamedTuple):
-    """Sums over matched contour samples per arch and view; w weight, d distance to the mask edge [px], J slope.
+    """Sums over matched contour samples per arch and view: weight w, distance d to the mask edge [px], derivative J.
 
     The habits of the annotator shift the outline by h . (edge px, gum px, gum mm), with the last three columns h of a
-    sample: at free edges, at the gum line in the picture, and at the gum line along the crown surface.
+    sample: at free edges, at the gum line in the image, and at the gum line along the crown surface.
 
     Attributes:
         precision: sum w J^T J, shape (2, C, 6, 6).
@@ -145,7 +145,7 @@ class ResidualTerm(Protocol):
 
 
 class SilhouetteTerm:
-    """Pulls the silhouettes of the crowns to the edges of their masks."""
+    """Penalises distances of crown silhouettes from the edges of their masks."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the sums over the matched silhouette samples of all views."""
@@ -153,7 +153,7 @@ class SilhouetteTerm:
 
 
 class GingivalMarginTerm:
-    """Pulls the crown-gum lines to the edges of their masks."""
+    """Penalises distances of crown-gum lines from the edges of their masks."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the sums over the matched samples of the gingival margin of all views."""

@@ -129,7 +129,7 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
 
 
 class _Store:
-    """An append-only file of packed records; replaced records stay, because other mappings may share them."""
+    """An append-only file of packed records; replaced ones remain in it, because other mappings may refer to them."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115  # open as long as this object exists

@@ -73,12 +73,12 @@ def uncovered_px(
 
 
 def coverage_error(uncovered: Array, total: Array) -> Array:
-    """Return the uncovered share of every mask from the results of `uncovered_px`, NaN without a mask."""
+    """Return the uncovered fraction of every mask from the results of `uncovered_px`, NaN without a mask."""
     return np.where(total > 0, uncovered / np.maximum(total, 1), np.nan)
 
 
 def arch_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], uncovered_price: float) -> Array:
-    """Return the matched share of each arch's visible contour, less the penalty for uncovered mask, shape (2,) [-].
+    """Return the matched fraction of each arch's visible contour, less the penalty for uncovered mask, shape (2,) [-].
 
     The median over the views, so that one wrong mask of three is ignored; -inf where nothing is visible.
     `uncovered_price` is the penalty of an uncovered pixel in px of contour [1/px].

@@ -1,4 +1,4 @@
-"""Pictures and contours of both scans as the cameras see them, redrawn only after they have moved."""
+"""Renderings and contours of both scans in every camera, redrawn only after the scans have moved."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
-_AROUND_PX = 24  # margin drawn around the window, since the window follows the masks
+_AROUND_PX = 24  # margin rendered around the window, since the window follows the masks
 _LARGEST_ZOOM = 1.02  # change of scale up to which a drawing is warped
-_MOST_KEPT = 64  # drawings; every camera correction adds new ones
+_MOST_KEPT = 64  # drawings in the cache; every camera correction adds new ones
 
 _Kept = tuple[Array, int]
 
@@ -41,7 +41,7 @@ class Contour:
 
 
 class Drawing:
-    """A scan drawn for one camera, which is warped to show small motions.
+    """A rendering of a scan for one camera, which is warped for small motions.
 
     Visibility and outline of a scan depend only on the position of the eye in scan coordinates.
     """
@@ -64,7 +64,7 @@ class Drawing:
         self._contours: dict[Contour, _Kept] = {}
         self._probes = scan.probes[:: max(1, len(scan.probes) // 24)]
         drawn_at = np.column_stack([projected(self._matrix, self._probes), np.ones(len(self._probes))])
-        self._least_squares = np.linalg.pinv(drawn_at)  # of affine maps from here, shape (3, n)
+        self._least_squares = np.linalg.pinv(drawn_at)  # fits affine maps from the drawn points, shape (3, n)
 
     def shows(self, matrix: Array, eye: Array, shape: tuple[int, int], parallax_px: float) -> bool:
         """Return whether this drawing can be warped to another pose.
@@ -91,13 +91,13 @@ class Drawing:
         return bool((corners > -1.0).all() and (corners < np.array(self._labels.shape[::-1])).all())
 
     def to_drawn(self, matrix: Array) -> Array:
-        """Return the affine map from pixels at another pose to those of the drawing, shape (2, 3)."""
+        """Return the affine map from pixels at another pose to pixels of the drawing, shape (2, 3)."""
         *linear, shift = self._least_squares @ projected(matrix, self._probes)
         back = np.linalg.inv(np.transpose(linear))
         return np.column_stack([back, -back @ shift])
 
     def show(self, matrix: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32]) -> float:
-        """Write the drawing warped to a pose; return the rotation of the scan in the picture [rad].
+        """Write the drawing warped to a pose; return the rotation of the scan in the image [rad].
 
         Args:
             matrix: as for the constructor.
@@ -138,7 +138,7 @@ class Drawing:
 
 
 class Drawings:
-    """A cache of the last drawing of every arch in every camera."""
+    """A cache with the last drawing of every arch for every camera."""
 
     def __init__(self, scans: Sequence[Scan], parallax_px: float) -> None:
         """Start empty; `parallax_px` as for `Drawing.shows`."""
@@ -148,7 +148,7 @@ class Drawings:
     def of(
         self, arch: int, view: int, camera: Array, T_world_scan: Array, matrix: Array, shape: tuple[int, int]
     ) -> Drawing:
-        """Return a drawing that can show an arch in a pose.
+        """Return a drawing that can be warped to a pose of an arch.
 
         Thread-safe for different arches or views.
 
@@ -209,7 +209,7 @@ def _shifted(matrix: Array, px: float) -> Array:
 
 
 def _px_per_mm(matrix: Array, point: Array) -> float:
-    """Return the scale of the picture at a point (3,) of the scan [px/mm], of square pixels."""
+    """Return the image scale at a point (3,) of the scan [px/mm], assuming square pixels."""
     axis = matrix[2, :3] / np.linalg.norm(matrix[2, :3])
     across = matrix[0, :3] - (matrix[0, :3] @ axis) * axis
     return float(np.linalg.norm(across) / (matrix[2, :3] @ point + matrix[2, 3]))
@@ -221,21 +221,21 @@ def projected(matrix: Array, points: Array) -> Array:
     return np.asarray(h[:, :2] / h[:, 2:])
 
 
-# Points of a unit ball whose projections reveal motion.
+# Points of the unit sphere whose projections are compared to measure motion.
 _CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
 
 
 class Rendering:
-    """Pictures and contours of both scans in every view of one instant, redrawn only after they have moved.
+    """Renderings and contours of both scans in every view of one instant, redrawn only after the scans have moved.
 
-    In between, the points of a contour move with the scan. The error is of second order: a turned outline runs through
-    other points.
+    In between, the points of a contour move with the scan. The error is of second order: the contour of a rotated scan
+    runs through other points.
     """
 
     def __init__(
         self, views: Sequence[View], contours: Sequence[Contour], drawings: Drawings, redraw_px: float, map: Mapper
     ) -> None:
-        """Start without pictures.
+        """Start without drawings.
 
         Args:
             views: of the instant.
@@ -291,6 +291,6 @@ class Rendering:
         T_world_scan = view.T_delay[r] @ pose
         matrix = view.matrix @ T_world_scan
         drawing = self._drawings.of(r, c, view.eye, T_world_scan, matrix, labels.shape)
-        drawing.find_samples(self._contours[r])  # here, because threads run this for several views in parallel
+        drawing.find_samples(self._contours[r])  # sampled here, because threads run this for several views in parallel
         at = projected(view.matrix @ pose, self._corners[r])
         self._shown[r, c] = (at, drawing, drawing.show(matrix, labels, depth))

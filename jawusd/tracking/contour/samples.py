@@ -12,21 +12,22 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.tracking.contour.scan import CROWN, GUM, Faces, Scan
 
-# Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the picture, represented contour
-# length [px], inverse depth [1/mm]; then the effect of annotator habits on the outline along the normal: share of free
-# edge and of gum line [-], and pixels per mm by which the gum line is moved along the crown surface.
+# Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the image, represented contour
+# length [px], inverse depth [1/mm]; then the effect of annotator habits on the outline along the normal: fraction of
+# free edge and of gum line [-], and pixels per mm by which the gum line is moved along the crown surface.
 X, Y, Z, U, V, NX, NY, LENGTH, INVERSE_DEPTH, EDGE_SHARE, GUM_SHARE, GUM_SLOPE = range(12)
 COLUMNS = 12
 HABITS = slice(EDGE_SHARE, COLUMNS)  # an outline shifts by samples[:, HABITS] @ (edge px, gum px, gum mm)
 
-# Distance from visible gum at which an outline starts to count as gum line, and counts fully [mm]: brushes half a
-# millimetre wide blur the two.
+# Distance from visible gum at which an outline starts to count as gum line, and counts fully [mm]: painted labels blur
+# the boundary, since brushes are half a millimetre wide.
 _GUM_FAR_MM, _GUM_NEAR_MM = 1.0, 0.55
 # For scans without gum: cosine to the gum direction at which an outline starts to count as gum line, and counts fully
-# [-]. Only the biting edges surely are not, since papillae hide the sides of crowns.
+# [-]. Only biting edges are certainly no gum line, since papillae hide the sides of crowns.
 _LEAST_FACING, _FULL_FACING = -0.6, -0.2
-# Two samples belong to the same outline within this distance [px] and with at least this cosine between normals. The
-# inner one is dropped if the other lies farther out by the offset [px] plus the slope times their distance along it.
+# Two samples are on the same outline if they lie within `_BESIDE_PX` and the cosine between their normals is at least
+# `_SAME_WAY`. The inner one is dropped if the other is farther out by `_OUTSIDE_PX` plus `_OUTSIDE_SLOPE` times their
+# distance along the outline.
 _BESIDE_PX, _OUTSIDE_PX, _OUTSIDE_SLOPE, _SAME_WAY = 1.5, 0.05, 0.35, 0.3
 
 
@@ -40,9 +41,10 @@ def contour_samples(
     depth_tolerance_mm: float,
     towards_gum: Array | None = None,
 ) -> tuple[Array, int]:
-    """Return the contour points at which the picture changes from crown to anything else, shape (n, COLUMNS).
+    """Return the contour points at which the label changes from crown to anything else, shape (n, COLUMNS).
 
-    Silhouette samples come first, then those of the gingival margin; the second result is the number of the first.
+    Silhouette samples come first, then those of the gingival margin; the second result is the number of silhouette
+    samples.
 
     Args:
         matrix: projection from scan coordinates [mm] to homogeneous px of the region, shape (3, 4).
@@ -50,7 +52,7 @@ def contour_samples(
         labels: visible label of every pixel of the region: CROWN, GUM or 0, shape (h, w).
         inverse_depth: inverse depth [1/mm], shape (h, w).
         step_px: largest distance between samples.
-        depth_tolerance_mm: how much nearer the surface just inside the contour may be before it hides the contour.
+        depth_tolerance_mm: how much nearer the surface just inside the contour may be without hiding the contour.
         towards_gum: unit vector in scan coordinates, shape (3,), for scans without gum: outlines facing this direction
             are gum line.
     """
@@ -90,7 +92,7 @@ def _samples(
 
 @numba.njit(nogil=True, cache=True)
 def _px_per_mm(matrix: Array, point: Array) -> float:
-    """Return the scale of the picture at a point (3,) of the scan [px/mm]."""
+    """Return the image scale at a point (3,) of the scan [px/mm]."""
     depth = matrix[2, 0] * point[0] + matrix[2, 1] * point[1] + matrix[2, 2] * point[2] + matrix[2, 3]
     x = matrix[0, 1] * matrix[2, 2] - matrix[0, 2] * matrix[2, 1]
     y = matrix[0, 2] * matrix[2, 0] - matrix[0, 0] * matrix[2, 2]
@@ -100,7 +102,7 @@ def _px_per_mm(matrix: Array, point: Array) -> float:
 
 @numba.njit(nogil=True, cache=True)
 def _in_picture(matrix: Array, direction: Array) -> Array:
-    """Return the components of a scan direction (3,) to the right and down in the picture, shape (2,)."""
+    """Return the image components, right and down, of a direction (3,) in scan coordinates, shape (2,)."""
     away = matrix[2, :3] / np.sqrt((matrix[2, :3] ** 2).sum())
     out = np.empty(2)
     for k in range(2):
@@ -216,7 +218,7 @@ def _visible(
     px_per_mm: float,
     facing_gum: Array,
 ) -> Array:
-    """Keep samples with their own surface visible on the inner side and no crown outside; classify edge and gum."""
+    """Keep samples whose own surface is visible inside and no crown outside; classify edge and gum line."""
     out = np.empty_like(samples)
     height, width = labels.shape
     shows_gum = facing_gum[0] == 0.0 and facing_gum[1] == 0.0
@@ -248,7 +250,7 @@ def _visible(
 
 @numba.njit(nogil=True, cache=True)
 def _outermost(samples: Array, shape: tuple[int, int]) -> Array:
-    """Drop samples that lie inside the outline by less than the pixel that `_visible` resolves.
+    """Drop samples that lie inside the outline by less than a pixel, the resolution of `_visible`.
 
     At a rounded edge with small or noisy faces, several silhouette lines can lie within a pixel. Only the outermost is
     the outline; the others would bias it inwards by 0.03 to 0.05 px.
@@ -271,7 +273,7 @@ def _outermost(samples: Array, shape: tuple[int, int]) -> Array:
 
 @numba.njit(nogil=True, cache=True)
 def _has_one_outside(samples: Array, s: int, last: NDArray[np.int32], before: NDArray[np.int32]) -> bool:
-    """Return whether another sample of the same outline lies outside of sample s."""
+    """Return whether another sample of the same outline lies farther out than sample s."""
     u, v, nx, ny = samples[s, U], samples[s, V], samples[s, NX], samples[s, NY]
     j, i = int(v / _BESIDE_PX) + 1, int(u / _BESIDE_PX) + 1
     for row in range(j - 1, j + 2):
@@ -289,7 +291,7 @@ def _has_one_outside(samples: Array, s: int, last: NDArray[np.int32], before: ND
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _nearer(seen: float, own: float, tolerance_mm: float) -> bool:
-    """Return whether the seen inverse depth is in front of another one by more than the tolerance."""
+    """Return whether the rendered surface is nearer than a sample by more than the tolerance, from inverse depths."""
     return seen * (1.0 - tolerance_mm * own) > own
 
 

@@ -26,11 +26,11 @@ ARCHES = (0, 1)
 ARCH_NAMES = ("upper", "lower")
 CROWN, GUM = 1, 2  # labels of a drawn scan; 0 is empty
 
-_PROBES = 300  # vertices: enough for a mean over the crowns to one per cent
-# Crown faces above which most steps use a decimated scan, and crown faces of that: the loss of accuracy is below
-# 0.002 mm, and time is proportional to the faces.
+_PROBES = 300  # vertices: enough for means over the crowns that are accurate to one per cent
+# Crown faces above which most steps use a decimated scan, and crown faces of the decimated scan: the loss of accuracy
+# is below 0.002 mm, and time is proportional to the faces.
 _DENSE_FACES, _THIN_FACES = 60_000, 20_000
-_GUM_SHARE = 0.02  # gum faces per crown face below which they are leftovers of removed gum
+_GUM_SHARE = 0.02  # gum faces per crown face below which they are remnants of removed gum
 _FEWEST_CROWN_FACES = 100  # fewer have no contour in several directions
 
 
@@ -50,8 +50,8 @@ class Scan:
     probes: Array  # vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
     centre: Array  # centroid of the crown vertices [mm], shape (3,)
     radius_mm: float  # largest distance of a crown vertex from the centre
-    # whether labels or paint separate crown from gum; otherwise the whole scan counts as crown. Painted crowns are
-    # wound outwards, so back faces need not be drawn
+    # whether labels or paint separate crown from gum; otherwise the whole scan counts as crown. Painted crowns have
+    # outward normals, so back faces are culled
     painted: bool
     # the same arch with fewer faces, for all but the last steps; None if this one has few enough
     thin: Scan | None = None
@@ -62,23 +62,23 @@ class Scan:
         return len(self.gum_faces) > _GUM_SHARE * len(self.crown_faces)
 
     def crown_vertices(self, limit: int | None = None) -> Array:
-        """Return the vertices of the crowns [mm], about `limit` of them at most, shape (N, 3)."""
+        """Return all or about `limit` vertices of the crowns [mm], shape (N, 3)."""
         points = self.vertices[np.unique(self.crown_faces)]
         return points if limit is None else points[:: max(1, len(points) // limit)]
 
     def silhouette(self, matrix: Array, shape: tuple[int, int], left: int = 0, top: int = 0) -> NDArray[np.uint64]:
-        """Return the pixels covered by the crowns in a picture of (h, w), as packed bits.
+        """Return the pixels covered by the crowns in an image of (h, w), as packed bits.
 
         Args:
             matrix: projection from scan coordinates [mm] to homogeneous px, shape (3, 4).
-            left, top: pixel coordinates of the picture's first column and row.
+            left, top: pixel coordinates of the image's first column and row.
         """
         bits = np.zeros((shape[0], words_for(shape[1])), np.uint64)
         draw_silhouette(self._projected(matrix), self.crown_faces, left, top, shape[1], self.painted, bits)
         return bits
 
     def draw(self, matrix: Array, depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> None:
-        """Draw inverse depth [1/mm] and labels into zeroed pictures (h, w); `matrix` as for `silhouette`."""
+        """Draw inverse depth [1/mm] and labels into zeroed images (h, w); `matrix` as for `silhouette`."""
         points = self._projected(matrix)
         draw_depth_labels(points, self.crown_faces, 0, 0, self.painted, depth, labels, CROWN)
         draw_depth_labels(points, self.gum_faces, 0, 0, False, depth, labels, GUM)

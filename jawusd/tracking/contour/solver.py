@@ -32,7 +32,7 @@ from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
 _ROUGH_FACES = 6_000  # crown faces of an arch in short trials: a third of a decimated scan
-_DENSE_STEPS = 2  # with all faces of a dense scan, after the decimated one has converged
+_DENSE_STEPS = 2  # steps with all faces of a dense scan, after the decimated one has converged
 
 # Samples, number of silhouette samples, distances to the mask edge, visible contour length [px].
 _Match = tuple[Array, int, Array, float]
@@ -61,7 +61,7 @@ class ContourSolver:
         towards_gum = _towards_gum(self.scans)
         self.contours = tuple(Contour(scan, *limits, way) for scan, way in zip(self.scans, towards_gum, strict=True))
         thin = [scan.thin or scan for scan in self.scans]
-        #: The same for decimated scans; None if no scan is dense.
+        #: A solver of the decimated scans; None if no scan is dense.
         self.thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
         self._executor = executor
         #: Cache of the last drawings.
@@ -76,7 +76,7 @@ class ContourSolver:
     def exact(self) -> ContourSolver:
         """Return a solver of the same scans that never warps drawings.
 
-        Searches need it: they rank poses by uncovered pixels in small pictures, and jump between poses.
+        Searches need it: they rank poses by uncovered pixels in small images, and jump between poses.
         """
         return ContourSolver(self.scans, replace(self.config, parallax_px=0.0), self._executor)
 
@@ -105,7 +105,7 @@ class ContourSolver:
 
         Args:
             poses: start T_world_upper, T_world_lower, shape (2, 4, 4).
-            views: one picture per camera.
+            views: one per camera.
             gates_px: residual gate of every iteration; if empty, the given poses are only evaluated.
             use: masks to use, shape (2, C); default: all present ones.
             terms: further constraints on the poses.
@@ -147,7 +147,7 @@ class ContourSolver:
             for r in ARCHES:
                 poses[r] = motion_about(state.centres[r], step[r]) @ poses[r]
             left = self.config.gates_after(left, self._motion_mm(step))
-        if iterations:  # otherwise rounding errors accumulate, as predictions multiply poses frame after frame
+        if iterations:  # without this, rounding errors accumulate, as predictions multiply poses frame after frame
             poses = orthonormalise(poses)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
@@ -167,11 +167,11 @@ class ContourSolver:
 
         Args:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            views, use: one picture per camera, and the masks to use, shape (2, C).
+            views, use: one view per camera, and the masks to use, shape (2, C).
             gate: residual beyond which a sample has no weight [px].
             rendering: of these views, shared by all steps at an instant.
             final: also compute the sums for the covariance.
-            matched: receives the samples behind the sums.
+            matched: receives the samples that were summed.
         """
         config = self.config
         rendering.update(poses)

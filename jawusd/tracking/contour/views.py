@@ -27,7 +27,7 @@ _CHUNK = 48  # instants buffered when iterating backwards: about 20 MB
 
 
 class EdgeSearch(Protocol):
-    """Finds the picture edges that contour samples should lie on."""
+    """Finds the image edges that contour samples should lie on."""
 
     def search(
         self, samples: Array, count: int, arch: int, drawn: Drawn, limits: tuple[float, float, float]
@@ -38,14 +38,14 @@ class EdgeSearch(Protocol):
 
         Args:
             samples: shape (n, COLUMNS); the first `count` are silhouette.
-            limits: reach [px], depth tolerance [mm], least cosine; as in `search_edges`.
+            limits: reach [px], depth tolerance [mm], minimum cosine; as in `search_edges`.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Both arches as drawn in a picture."""
+    """Both arches as drawn in an image."""
 
     own: NDArray[np.uint8]  # labels of the arch alone: CROWN, GUM or 0, shape (h, w)
     other: NDArray[np.uint8]  # the same of the other arch
@@ -56,14 +56,14 @@ class Drawn:
 class View:
     """The masks of one camera at one instant, undistorted, at working resolution."""
 
-    matrix: Array  # world [mm] to homogeneous px of this picture, shape (3, 4)
+    matrix: Array  # world [mm] to homogeneous px of this image, shape (3, 4)
     eye: Array  # camera centre in the world [mm], shape (3,)
     # of the upper and the lower arch, uint8, 255 = teeth, shape (2, h, w); zeros without a mask
     masks: NDArray[np.uint8]
     present: Mask  # whether each of the two masks exists, shape (2,)
     # world motion of the arches from the reference instant to this camera's own, shape (2, 4, 4)
     T_delay: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
-    # mask bias beyond the teeth at free edges [px], at the gum line [px], along the gum [mm], shape (2, 3)
+    # outward mask bias at free edges [px], at the gum line [px], along the gum [mm], shape (2, 3)
     habits: Array = field(default_factory=lambda: np.zeros((2, 3)))
     # finds outlines by colour if there are no masks
     edges: EdgeSearch | None = None
@@ -92,7 +92,7 @@ class MaskViews:
             sources, cameras: all cameras of the capture; the calibrated ones by name.
             offsets: reference frame minus own frame number of every camera.
             centre_world: position of the teeth at the start [mm], shape (3,).
-            working_px_per_mm: resolution at the teeth; pictures are never enlarged.
+            working_px_per_mm: resolution at the teeth; images are never enlarged.
             fewest: required number of cameras with masks.
 
         Raises:
@@ -212,7 +212,7 @@ def masked_sources(
 
 
 def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple[int, int]:
-    """Return the picture size that shows a point at a given resolution, at most the recorded size.
+    """Return the image size at which a point is imaged at a given resolution, at most the recorded size.
 
     Raises:
         TrackingError: the point lies behind the camera.

@@ -19,7 +19,7 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.magnification import magnified, measure_magnification
 
-# Least `arch_fit` of a first frame [-]: between wrong poses, and correct ones with most of the lower teeth hidden.
+# Minimum `arch_fit` of a first frame [-]: between wrong poses, and correct ones with most of the lower teeth hidden.
 _LEAST_FIT = 0.03
 # The same for a fit without one camera, which must be unambiguous; see `start_causes.CLEAR_FIT`.
 _CLEAR_FIT = 0.3

@@ -18,7 +18,7 @@ from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
 _BESIDE = 2  # surveyed frames on either side that are redundant
-_WIDTH_PX = 320  # of the surveyed pictures: mask centres are accurate to a tenth of a millimetre
+_WIDTH_PX = 320  # of the surveyed images: mask centres are accurate to a tenth of a millimetre
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +56,11 @@ class MaskSurvey:
     """Centres and areas of the masks of some frames."""
 
     frames: NDArray[np.int64]  # reference camera frames, shape (F,)
-    # mean position (x, y) of every mask in its undistorted survey picture [px], NaN without a mask, shape (F, 2, C, 2);
+    # mean position (x, y) of every mask in its undistorted survey image [px], NaN without a mask, shape (F, 2, C, 2);
     # rows are upper, lower
     middles: Array
     areas_px: Array  # area of every mask, shape (F, 2, C); 0 without a mask
-    matrices: Array  # world [mm] to homogeneous px of the survey pictures, shape (C, 3, 4)
+    matrices: Array  # world [mm] to homogeneous px of the survey images, shape (C, 3, 4)
     eyes: Array  # camera centres in the world [mm], shape (C, 3)
     fewest: int = FEWEST_CAMERAS  # cameras that must show both arches
 

@@ -1,6 +1,6 @@
 """Magnification of the masks relative to calibration and scans: wrong focal lengths, lenses and scan sizes.
 
-Poses cannot compensate for a picture that is magnified about its principal point: over a take, distances between
+Poses cannot compensate for an image that is magnified about its principal point: over a take, distances between
 projected contours and mask edges then grow with the distance from that point. Magnification and its change with the
 radius are estimated per camera, with poses, camera motions and outline biases eliminated.
 """
@@ -38,7 +38,7 @@ class Magnification:
     """Magnification of the teeth in each camera relative to what is expected.
 
     Attributes:
-        scale, sigma_scale: relative, shape (C,): 0.05 for pictures 5 % larger than expected.
+        scale, sigma_scale: relative, shape (C,): 0.05 for images 5 % larger than expected.
         bend, sigma_bend: change of `scale` from the optical axis to a radius of 25 mm at the teeth, shape (C,).
         bias_px, sigma_bias_px: mask bias beyond the teeth at working resolution, per arch, shape (C, 2).
         turn_rad, move_mm: rotation and motion of each camera relative to the mean of all, shape (C,).

@@ -23,8 +23,8 @@ _THROUGH_MM = 2.0  # vertical overlap of arches that passed through one another;
 _SLAB_MM = 3.0
 _FEWEST = 50  # surface samples required on a side of an arch
 _ASIDE_MM = 6.0  # nearer to the midline, left and right belong to the same tooth
-_OPEN = 0.08  # least directed area over area of an open surface
-# Least gum area relative to the crowns, and distance below them, from which gum shows the orientation of a scan.
+_OPEN = 0.08  # minimum directed area over area of an open surface
+# Minimum gum area relative to the crowns, and distance below them, from which gum shows the orientation of a scan.
 _GUM_SHARE, _GUM_BELOW_MM = 0.3, 2.0
 
 
@@ -35,10 +35,10 @@ class Occlusion:
     gap_mm: float  # smallest distance between the crowns, 0 if they touch
     side_gaps_mm: tuple[float, float]  # the same left and right of the midline, negative if crowns overlap
     depth_mm: float  # largest overlap of the crowns
-    deep_share: float  # share of the opposed crown surface that overlaps by more than 1 mm
-    through: float  # share of the common area in the bite plane on which lower crowns end 2 mm above upper ones
-    same: float  # share of the surfaces that coincide
-    opposite: float  # share of the arch with fewer teeth that has crowns of the other arch over or under it
+    deep_share: float  # fraction of the opposed crown surface that overlaps by more than 1 mm
+    through: float  # fraction of the common area in the bite plane on which lower crowns end 2 mm above upper ones
+    same: float  # fraction of the surfaces that coincide
+    opposite: float  # fraction of the arch with fewer teeth that has crowns of the other arch over or under it
     aside_mm: float  # distance between the centres of the arches along the bite plane
     turn_rad: float  # angle in the bite plane between the forward directions of both arches
     turned_over: tuple[bool | None, bool | None]  # upper, lower: gum between crowns and other arch; None: no gum
@@ -117,7 +117,7 @@ def _signed_distances(these: CrownSurface, others: CrownSurface) -> Array:
 
 
 def _through(upper: Array, lower: Array) -> float:
-    """Return the share of the common area in the bite plane where lower crowns end far above upper ones.
+    """Return the fraction of the common area in the bite plane where lower crowns end far above upper ones.
 
     Args:
         upper, lower: crown points (left, up, front) [mm], shapes (N, 3) and (M, 3).

@@ -19,7 +19,7 @@ from jawusd.geometry import Camera, rigid_fit, se3_exp, transform_points, triang
 from jawusd.tracking.initialization.bootstrap import picked_size
 
 _SIZE_SHARE = 0.02  # deviation from 1 of the scan size by the picks, from which the size may be a mistake
-# Prior standard deviations of a camera's errors: shift over the picture width, relative focal length. And of a click
+# Prior standard deviations of a camera's errors: shift over the image width, relative focal length. And of a click
 # [mm].
 _SHIFT, _FOCAL, _CLICK_MM = 0.05, 0.1, 0.3
 _MOST_ZOOM = np.log(2.0)  # limit of the logarithm of the focal length factor: random clicks would make it overflow
@@ -28,7 +28,7 @@ _STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # scale of the pose unknowns, 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Everything that places the scans in the pictures, as given or with a mistake undone.
+    """Everything that places the scans in the images, as given or with a mistake undone.
 
     Attributes:
         picks: on the upper and lower arch.
@@ -157,7 +157,7 @@ def _with_views(given: Setting, renamed: Callable[[list[str]], list[str]]) -> tu
 
 
 def _wrong_lenses(given: Setting) -> Iterator[Mistake]:
-    """Yield cameras whose pictures may be shifted or scaled relative to their calibration."""
+    """Yield cameras whose images may be shifted or scaled relative to their calibration."""
     for name, camera in given.cameras.items():
         for zooms in (False, True):
             fitted = fitted_camera(given.picks, given.vertices, given.cameras, name, zooms)

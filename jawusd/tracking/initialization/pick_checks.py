@@ -23,13 +23,13 @@ from jawusd.tracking.initialization.bootstrap import TOLERANCE_MM, picks_miss_mm
 from jawusd.tracking.initialization.pick_causes import Mistake, Setting, possible_mistakes
 
 _CLOSE_MM = 1.0  # mask pixels this near to a projected crown point count as covered
-_ON = 0.85  # share of a camera's masks on the scans from which the masks count as correctly placed
-# Misfit of the given inputs above which mistakes are tested; exceeded by 1 of 60 valid persons.
+_ON = 0.85  # fraction of a camera's masks on the scans from which the masks count as correctly placed
+# Misfit of the given inputs above which mistakes are tested; exceeded by 1 of 60 valid subjects.
 _SUSPECT_MISFIT = 1.7
-# Share of the given misfit that may remain for a mistake to be believed. The second holds for mistakes that tracking
+# Fraction of the given misfit that may remain for a mistake to be believed. The second holds for mistakes that tracking
 # corrects, which are only warnings, if rejected picks then fit.
 _PROOF, _PROOF_BY_PICKS = 0.5, 0.75
-_OFF, _MISS_MM = 0.05, 0.3  # share of masks off the scans, and rms pick error [mm], that add the same misfit
+_OFF, _MISS_MM = 0.05, 0.3  # fraction of masks off the scans, and rms pick error [mm], that add the same misfit
 _UNSEEN = 0.25  # assumed share off the scans of a camera without masks at this instant: it may show something else
 _SURE = 1.0  # misfit below which an exchange is accepted without testing mistakes of single cameras
 _ALIKE = 0.15  # extra misfit up to which other mistakes are reported besides the most likely one
@@ -83,7 +83,7 @@ class _Evidence:
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     wrong: Mapping[str, list[int]]  # numbers of the rejected picks, by arch
     miss_mm: float  # rms error of the picks, clipped at the rejection limit
-    on: Mapping[str, float]  # share of each camera's masks that lies on the scans; cameras without masks are missing
+    on: Mapping[str, float]  # fraction of each camera's masks that lies on the scans; cameras without masks are missing
     unseen: int  # number of cameras without masks at this instant
 
     @property
@@ -127,7 +127,7 @@ def _evidence(setting: Setting, seen: Sequence[Seen], masked: Sequence[str]) -> 
 
 
 def _covered(setting: Setting, poses: Sequence[Array], seen: Sequence[Seen], masked: Sequence[str]) -> dict[str, float]:
-    """Return the share of each camera's masks that lies on the scans, for its best candidate of the time offsets."""
+    """Return the fraction of each camera's masks that lies on the scans, for its best candidate of the time offsets."""
     on = {}
     for name in masked:
         camera = setting.cameras[name]

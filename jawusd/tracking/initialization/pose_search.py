@@ -1,6 +1,6 @@
 """Brute-force search for the pose of one arch: orientations one by one, all translations at once.
 
-For one orientation, a small translation mostly shifts the picture of the arch. How well it fits its mask at every
+For one orientation, a small translation mostly shifts the image of the arch. How well it fits its mask at every
 shift is a correlation, which the fast Fourier transform computes for all shifts together. The objective of a
 translation is the sum over the cameras.
 """
@@ -77,7 +77,7 @@ def coarse_scan(mesh: Mesh, name: str) -> Scan:
 
 
 class ShiftCorrelation:
-    """Correlates the drawn arch with its mask in one picture, for all shifts at once."""
+    """Correlates the drawn arch with its mask in one image, for all shifts at once."""
 
     def __init__(self, view: View, arch: int, px_per_mm: float, shifts: Array, at: Array) -> None:
         """Prepare the correlation for world translations `shifts` (N, 3) of a world point `at` (3,) [mm]."""
@@ -149,10 +149,10 @@ def search_arch(
 
 
 def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> Array:
-    """Return the picture whose correlation with the drawn crowns is their objective, up to a constant [px].
+    """Return the image whose correlation with the drawn crowns is their objective, up to a constant [px].
 
     The objective is the length of outline on the mask's outline, less a penalty for uncovered mask pixels. The first is
-    the correlation of the blurred gradients of both pictures, normalised to 1 per pixel of a straight edge. Moving both
+    the correlation of the blurred gradients of both images, normalised to 1 per pixel of a straight edge. Moving both
     derivatives to the mask turns it into -div(w grad m), with w = 0 where the outline belongs to the other arch.
     """
     sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # blur of both outlines combined
@@ -195,7 +195,7 @@ def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], us
     H, g, sight = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for view in (view for view, used in zip(views, use[arch], strict=True) if used):
         height, width = view.masks.shape[1:]
-        # Three times the picture size, since the teeth may be outside the picture.
+        # Three times the image size, since the teeth may be outside the image.
         bits = scan.silhouette(view.matrix @ view.T_delay[arch] @ pose, (3 * height, 3 * width), -width, -height)
         crowns, mask = unpack_bits(bits, 3 * width), view.masks[arch] > 127
         depth = view.matrix[2] @ centre

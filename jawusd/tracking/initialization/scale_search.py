@@ -1,6 +1,6 @@
 """A search for the world scale at which masks and scans agree best.
 
-Pictures of a calibration board do not reveal the size of its squares. A wrong size scales the whole world, and no pose
+Images of a calibration board do not reveal the size of its squares. A wrong size scales the whole world, and no pose
 of the teeth fits their masks in several views until the distances between cameras are corrected.
 """
 

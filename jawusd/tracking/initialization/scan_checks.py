@@ -14,9 +14,9 @@ from jawusd.geometry import anatomical_frame
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusion
 
-# The limits lie outside all valid bites measured (docs/explanation/constants.md).
-# Impossible bites: distance of the arches, share that passed through, share of coinciding surface, least opposed share,
-# rotation about the bite normal, range of widths.
+# The limits lie outside all valid bites measured (docs/explanation/constants.md). Impossible bites: distance of the
+# arches, share that passed through, fraction of coinciding surface, minimum opposed share, rotation about the bite
+# normal, range of widths.
 _APART_MM = 4.0
 _THROUGH_SHARE = 0.5
 _SAME_SHARE = 0.5

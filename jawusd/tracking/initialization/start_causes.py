@@ -18,10 +18,10 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_search import StartSearch
 
-# Share of the uncovered mask that may remain for an exchange to be believed.
+# Fraction of the uncovered mask that may remain for an exchange to be believed.
 _PROOF = 0.5
-# Uncovered share of a camera's masks from which an exchange is looked for: good poses leave 0.01, and exchanged masks
-# of similar cameras as little as 0.1.
+# Uncovered fraction of a camera's masks from which an exchange is looked for: good poses leave 0.01, and exchanged
+# masks of similar cameras as little as 0.1.
 _ODD_SHARE = 0.05
 
 
@@ -101,7 +101,7 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
 
 
 def _uncovered_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
-    """Return the uncovered share of each camera's masks, NaN without masks, shape (C,)."""
+    """Return the uncovered fraction of each camera's masks, NaN without masks, shape (C,)."""
     with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm / 2) as masks:
         uncovered, total = uncovered_px(solver.scans, poses, masks.at(frame))
     return coverage_error(uncovered.sum(0), total.sum(0))
@@ -119,7 +119,7 @@ def _with_masks(sources: Sequence[CameraSource], masks: dict[int, Masks]) -> tup
 
 
 def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
-    """Return whether masks would be assigned to a camera with another picture size."""
+    """Return whether masks would be assigned to a camera with another image size."""
     size = {_masks(source).upper: footage.cameras[source.name].size_px for source in footage.sources}
     size |= {_masks(source).lower: footage.cameras[source.name].size_px for source in footage.sources}
     return any(size[_masks(source).upper] != footage.cameras[source.name].size_px for source in sources)
@@ -127,10 +127,10 @@ def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
 
 #: Clear fit [-]: correct poses exceed it unless lips are nearly closed; wrong poses stay below 0.1 in one arch.
 CLEAR_FIT = 0.3
-#: Least acceptable fit with a mistake undone [-]: wrong poses do not reach it.
+#: Minimum acceptable fit with a mistake undone [-]: wrong poses do not reach it.
 EXPLAINS = 0.1
 _MOST_CAMERAS = 4  # up to which exchanges are tried; each costs a search
-#: Maximum pictures searched [-], separately for the start and for mistakes; each takes 2 to 3 s of CPU time.
+#: Maximum images searched [-], separately for the start and for mistakes; each takes 2 to 3 s of CPU time.
 #: It covers all mistakes of four cameras, and of eight without exchanges. Work is counted instead of time, so that
 #: messages do not depend on the machine.
 MOST_PICTURES = 120

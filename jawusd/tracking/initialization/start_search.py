@@ -193,7 +193,7 @@ class StartSearch:
     def _objective(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> Array:
         """Return the matched contour less the penalty for uncovered mask per arch [px], shape (2,)."""
         uncovered, _ = uncovered_px(solver.scans, solution.poses, views)
-        # The penalty is per area, and coarse pictures have larger pixels.
+        # The penalty is per area, and coarse images have larger pixels.
         price = self._config.uncovered_price
         if solver is self._coarse_solver:
             price *= self._config.working_px_per_mm / _PX_PER_MM

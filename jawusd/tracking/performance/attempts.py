@@ -18,7 +18,8 @@ from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
 from jawusd.tracking.performance.views import Growth
 
-#: Largest standard deviations of head and jaw, after many frames without visible teeth [rad, mm, mm].
+#: Upper bounds on the standard deviations of head and jaw, reached after many frames without visible teeth [rad, mm,
+#: mm].
 LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
 # Matched contour below which an arch is not accepted [px]: 2 mm of tooth edge. Tracking without a rig requires more.
 _LEAST_MATCHED_PX = 15.0
@@ -32,11 +33,11 @@ class FrameFit:
     Attributes:
         pose: measured or extrapolated pose of head and jaw.
         solution: matched outlines at the pose, None without any mask.
-        use: masks that count, shape (2, C): those present, of arches that were found.
+        use: masks that are used, shape (2, C): those present, of arches that were found.
         present: available masks, shape (2, C).
-        uncovered: share of every mask not covered by the scan, NaN without a mask, shape (2, C).
-        growth: derivatives of the outlines by unknown focal lengths.
-        doubtful: less of the contour fits than usual, so the pose may be wrong.
+        uncovered: fraction of every mask not covered by the scan, NaN without a mask, shape (2, C).
+        growth: derivatives of the outlines with respect to unknown focal lengths.
+        doubtful: whether less of the contour fits than usual, so that the pose may be wrong.
     """
 
     pose: Pose
@@ -69,12 +70,12 @@ class Trial:
     mask_px: Array
 
     def objective(self, price: float) -> float:
-        """Return the score that ranks attempts: matched contour minus the price of uncovered mask [px]."""
+        """Return the score that ranks attempts: matched contour minus the penalty for uncovered mask [px]."""
         return float((score_px(self.solution) - price * self.uncovered_px)[self.use].sum())
 
     @property
     def uncovered(self) -> Array:
-        """Return the uncovered share of every mask, NaN without one."""
+        """Return the uncovered fraction of every mask, NaN without one."""
         return np.where(self.mask_px > 0, self.uncovered_px / np.maximum(self.mask_px, 1), np.nan)
 
 
@@ -88,12 +89,12 @@ class Instant:
 
 
 class Attempts:
-    """Aligns instants, and accepts results by the usual residual of the take."""
+    """Aligns instants, and accepts or rejects results by comparison with the usual residual of the take."""
 
     def __init__(self, instants: InstantSolver, outline_weight: Array, usual_px: Array | None = None) -> None:
-        """Start, if given, with a known usual residual per arch, shape (2,).
+        """Start with a known usual residual per arch, shape (2,), if given.
 
-        The outline weight is that of `InstantSolver.align`.
+        `outline_weight` is as for `InstantSolver.align`.
         """
         self.instants, self.config, self._weight = instants, instants.config, outline_weight
         self._residuals: deque[Array] = deque(maxlen=self.config.history_frames)
@@ -137,7 +138,7 @@ class Attempts:
         return np.asarray(trial.use.any(1) & (rough | uncovered | few))
 
     def judged(self, trial: Trial, instant: Instant) -> FrameFit:
-        """Return the attempt as a fit, without the arches that do not fit."""
+        """Return the attempt as a frame fit, without arches that do not match their masks."""
         use = trial.use & ~self.bad(trial)[:, None]
         return FrameFit(trial.pose, trial.solution, use, instant.present, trial.uncovered)
 

@@ -1,4 +1,4 @@
-"""The unknowns of a frame, head pose and jaw parameters, and the derivatives of both arches by them.
+"""The unknowns of a frame, head pose and jaw parameters, and the derivatives of both arches with respect to them.
 
 The head moves by twists in its own axes about the centre of the upper crowns, the pivot; the jaw parameters
 follow. A frame has nine unknowns: omega [rad], v [mm], d1, d2, d3 [mm].
@@ -40,7 +40,7 @@ class Coordinates:
     """Conversion of head poses and jaw parameters to poses of both arches, with derivatives.
 
     Attributes:
-        jaw: the person's rig.
+        jaw: the subject's rig.
         pivot: point of the upper scan the head turns about [mm], shape (3,).
     """
 
@@ -59,7 +59,7 @@ class Coordinates:
         return Pose(arches[0].copy(), self.jaw.encode(se3_inverse(arches[0]) @ arches[1])[0])
 
     def slopes(self, pose: Pose) -> tuple[Array, Array]:
-        """Return the derivatives of both arches' left world twists about their centres by the unknowns, (6, 9) each.
+        """Return d(left world twist about the arch's centre) / d(unknowns) for both arches, shape (6, 9) each.
 
         The centres are those of the crowns, as in `Solution.centres`.
         """
@@ -83,7 +83,7 @@ class Coordinates:
         return orthonormalise(head @ self._from_pivot @ se3_exp(twist) @ self._to_pivot)
 
     def head_steps(self, before: Array, after: Array) -> Array:
-        """Return the twists that take heads (..., 4, 4) to others, (..., 6), in the first's axes at the pivot."""
+        """Return the twists (..., 6) between two head poses (..., 4, 4), about the pivot in the axes of `before`."""
         return se3_log(self._to_pivot @ se3_inverse(before) @ after @ self._from_pivot)
 
     def step(self, before: Pose, after: Pose) -> Array:

@@ -18,7 +18,7 @@ from jawusd.tracking.performance.instant import Expected
 from jawusd.tracking.performance.motion import STEADY, Prediction
 
 _KEPT_JAWS = 12  # jaw parameters remembered as starts after a loss
-_APART_MM = 3.0  # least distance of the lower incisal point between them, within the solver's basin of convergence
+_APART_MM = 3.0  # minimum distance of the lower incisal point between them, within the solver's basin of convergence
 _FINALISTS = 3
 
 
@@ -62,7 +62,7 @@ class ForwardPass:
         return attempts.judged(alone, instant)
 
     def _other_starts(self, expected: Expected, instant: Instant) -> list[Pose]:
-        """Return further starts: the prediction, the last pose, and known jaws with the head moved to its masks."""
+        """Return further starts: the prediction, the last pose, and earlier jaw poses with the head moved to its masks."""
         jaws = [expected.pose.d, *(self._jaws if self._motion.blind.any() else ())]
         arch = 0 if instant.present[0].any() else 1
         scan, shifted = self._attempts.instants.solver.scans[arch], []

@@ -15,8 +15,8 @@ from jawusd.tracking.contour.solver import ContourSolver, Matched
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
 
-# Softness of the rig's bound [mm]. The bound is only as wide as the take the rig was made from, and with a hard bound,
-# a jaw that exceeds it would be lost.
+# Standard deviation of the rig's soft bound [mm]. The bound comes from the take that the rig was fitted to; a hard
+# bound would lose jaws that move beyond it.
 BOUND_MM = 1.0
 _QUICK_FACES, _QUICK_REDRAW_PX = 6_000, 2.0
 
@@ -26,7 +26,7 @@ class Expected:
     """Prior of head and jaw at an instant."""
 
     pose: Pose
-    precision: Array  # of the step away from there, shape (9,)
+    precision: Array  # of the step from the expected pose, shape (9,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class InstantSolver:
         return matrix, right
 
     def _motion_mm(self, step: Array) -> float:
-        """Return an estimate of how far crowns move in a step [mm]."""
+        """Return an estimate of the distance by which a step moves the crowns [mm]."""
         turn = float(np.linalg.norm(step[HEAD][:3])) * self.solver.scans[0].radius_mm
         return turn + float(np.linalg.norm(step[HEAD][3:])) + float(np.linalg.norm(step[JAW]))
 
@@ -119,7 +119,7 @@ def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
 
 
 def quick(solver: ContourSolver) -> ContourSolver:
-    """Return a solver with decimated scans and rarer redraws, for the many steps of the first pass."""
+    """Return a solver with decimated scans that redraws them less often, for the many steps of the first pass."""
     scans = [thinned(replace(scan.thin or scan, thin=None), _QUICK_FACES) for scan in solver.scans]
     return ContourSolver(scans, replace(solver.config, redraw_px=_QUICK_REDRAW_PX))
 

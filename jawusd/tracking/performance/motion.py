@@ -16,7 +16,7 @@ from jawusd.tracking.performance.instant import Expected
 # Standard deviations of a prediction [rad, mm, mm], as for fast chewing at 24 frames per second. They only regularise
 # directions that the images do not determine; the smoother uses measured variances.
 _MISS = np.r_[[0.01] * 3, [0.7] * 3, [0.7] * 3]
-#: Factors on the head's standard deviations for a head that hardly moves relative to the cameras, and for a known head.
+#: Factors on the standard deviations of a head that hardly moves relative to the cameras, and of a known head pose.
 STEADY, KNOWN = 0.05, 1e-4
 _DAMPING = 0.8  # of the velocity per frame
 
@@ -28,7 +28,7 @@ _LEAST_JAW = np.full(3, 0.02**2)
 _FEWEST_BENDS = 20  # second differences needed for an estimate
 _USUAL_JAW = np.array([0.3, 0.2, 0.1]) ** 2  # default: exercises at 24 frames per second [mm]
 _USUAL_HEAD = np.r_[[1e-3] * 3, [0.1] * 3] ** 2
-_OUTLIERS = 99.0  # percentile of the second differences above which they span gaps
+_OUTLIERS = 99.0  # percentile of the second differences above which they are assumed to span gaps
 # Variance of the second and fourth differences of white noise relative to its own.
 _NOISE_BEND, _NOISE_FOURTH = 6.0, 70.0
 
@@ -52,7 +52,7 @@ class Prediction:
         self.blind = np.where(found, 0, 1)
 
     def expected(self, frames: float = 1.0) -> Expected:
-        """Return the prediction some frames ahead; its variance grows while teeth are out of sight."""
+        """Return the prediction some frames ahead; its variance grows while teeth are not visible."""
         self._frames = frames
         sigma = frames * self._miss * np.sqrt(1.0 + np.r_[[self.blind[0]] * 6, [self.blind.max()] * 3])
         reach = _DAMPING * (1.0 - _DAMPING**frames) / (1.0 - _DAMPING)
@@ -83,7 +83,7 @@ def head_bends(coordinates: Coordinates, poses: Sequence[Pose]) -> tuple[Array, 
 
 
 def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask, fps: float) -> Motion:
-    """Return the variances of a take's motion, or if too little is seen, those of the take the rig was made from.
+    """Return the variances of a take's motion, or those of the take the rig was fitted to if too few frames are good.
 
     Args:
         poses: of consecutive frames.

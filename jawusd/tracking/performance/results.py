@@ -31,7 +31,7 @@ def performance_of(
     """Return the performance of a take.
 
     Args:
-        jaw: the person's rig.
+        jaw: the subject's rig.
         pivot: point of the upper scan the head turns about [mm], shape (3,).
         frames: of the reference camera, in the order of the fits.
         smoothed: the take after the second pass.
@@ -74,13 +74,14 @@ def performance_of(
 def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     """Return the poses of both arches with their covariances.
 
-    Every frame has final poses; arches out of sight count as lost and have no raw poses. The standard deviations of the
-    landmarks include the uncertainty of the rig.
+    Every frame has final poses; arches that are not visible count as lost and have no raw poses. The standard
+    deviations of the landmarks include the uncertainty of the rig.
     """
     p = performance
     head, relative = p.T_world_upper, jaw.pose(p.d)
     lower = head @ relative
-    # Derivatives of left twists by the nine unknowns: of the head in the world, of the mandible in the skull frame.
+    # Derivatives of left twists with respect to the nine unknowns: of the head in the world, of the mandible in the
+    # skull frame.
     turn = se3_adjoint(head @ make_transform(np.eye(3), p.pivot))
     by_d = se3_left_jacobian(jaw.twist(p.d)) @ jaw.jacobian(p.d)
     of_upper, of_lower = np.zeros((2, len(p.frames), 6, 9))
@@ -136,7 +137,7 @@ def _spread(slope: Array, covariance: Array) -> Array:
 
 
 def _of_rig(jaw: JawRig, relative: Array) -> Array:
-    """Return the covariance of T_upper_lower that gives each landmark the rig's uncertainty, shape (F, 6, 6)."""
+    """Return the covariance of T_upper_lower that reproduces the rig's landmark uncertainties, shape (F, 6, 6)."""
     variance = rig_sigma_mm(jaw) ** 2
     out = np.zeros((len(relative), 6, 6))
     if not variance.all():

@@ -69,7 +69,7 @@ def solve_performance(
     """Solve head pose and jaw parameters of every frame of a shot.
 
     Args:
-        jaw: the person's rig.
+        jaw: the subject's rig.
         scans: upper and lower teeth, prepared.
         shot: views, frames and start.
         config: settings of the tracker.
@@ -175,14 +175,14 @@ def solve_capture(
     """Solve the performance of a capture.
 
     Args:
-        capture: masks, frame range and optional picks; without picks, the start is searched.
+        capture: masks, frame range and optional picks; without picks, the start pose is searched for.
         cameras: calibrated; world lengths in mm.
         offsets: reference frame minus own frame number, per camera name.
         upper, lower: teeth scans in one frame, the same as in the rig [mm].
-        jaw: the person's rig.
+        jaw: the subject's rig.
         config: settings of the tracker.
         fixed_head: the cameras are head-mounted, so the head pose is constant.
-        free_focal: estimate the focal lengths; those of the calibration are guesses.
+        free_focal: estimate the focal lengths, starting from those of the calibration.
         threads: number of threads of the start search; the result does not depend on it.
         progress: called after each frame with the number of frames done and the total.
 

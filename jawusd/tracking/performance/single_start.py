@@ -1,8 +1,8 @@
 """The start of a solve with one camera: a search for head and jaw in its masks.
 
 In a single view, distance follows from apparent size and perspective only, and lips hide an unknown part of the teeth.
-The search therefore tries all distances at which the masks could be the teeth, with all orientations, and then the jaw
-poses for the most promising heads.
+The search therefore tries all distances at which teeth could fill the masks, with all orientations, and then jaw poses
+for the most promising head poses.
 """
 
 from __future__ import annotations
@@ -51,11 +51,12 @@ _GRID = Grid(
     reach_mm=(9.0, 7.5, 0.1),
 )
 _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
-# Heads kept, jaws tried with each, pairs aligned in a few steps, pairs aligned fully, and at the working resolution.
+# Number of head poses kept, jaw poses tried with each, pairs aligned in a few steps, pairs aligned fully, and pairs
+# aligned at the working resolution.
 _HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 240, 32, 160, 24, 5
-# Price of a pixel of crown outside the mask, in px of contour. It is low, as lips may hide crowns.
+# Penalty per crown pixel outside the mask, in px of contour. It is low, as lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
-_DISTINCT_MM = 3.0  # least mean distance of the teeth between heads that are kept
+_DISTINCT_MM = 3.0  # minimum mean distance of the teeth between head poses that are kept
 # Fit of the worse arch above which a start is accepted at once, and below which it is rejected [-]; see
 # `start_causes.CLEAR_FIT` for several cameras.
 _CLEAR_FIT, _LEAST_FIT = 0.3, 0.1
@@ -82,7 +83,7 @@ class SingleStart:
         Args:
             meshes: upper and lower teeth scans in one frame [mm].
             solver: solver with the same scans, prepared.
-            jaw: the person's rig.
+            jaw: the subject's rig.
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
             map_: map function that may run orientations in parallel.
         """
@@ -149,9 +150,9 @@ class SingleStart:
         return None if best is None else FoundPose(frame, best[1].pose, best[0])
 
     def _searched(self, views: Sequence[View], places: Array) -> list[Pose]:
-        """Return the most promising heads, each with its most promising jaw.
+        """Return the most promising head poses, each with its most promising jaw pose.
 
-        The upper arch alone hardly constrains the distance, so heads are ranked by a few steps with both arches.
+        The upper arch alone hardly constrains the distance, so heads are ranked after a few steps with both arches.
         """
         found: list[Candidate] = []
         for pair in places:
@@ -185,7 +186,7 @@ class SingleStart:
         return kept
 
     def _with_jaws(self, views: Sequence[View], head: Candidate) -> list[tuple[float, Pose]]:
-        """Return the two most promising jaws for a head, with the objective of both arches."""
+        """Return the two most promising jaw poses for a head pose, with the objective of both arches."""
         place = transform_point(head.pose, self._coarse[1].centre)
         correlation = ShiftCorrelation(views[0], 1, _PX_PER_MM, _SHIFTS @ head.pose[:3, :3].T, place)
         poses = head.pose @ self._jaw.pose(self._jaws)
@@ -194,7 +195,7 @@ class SingleStart:
         return [(head.objective + scores[k], Pose(head.pose, self._jaws[k])) for k in np.argsort(scores)[::-1][:2]]
 
     def _outside_price(self, arch: int, pose: Array, view: View) -> float:
-        """Return the price of crowns outside the mask; otherwise, teeth close to the camera would cover any mask."""
+        """Return the penalty for crowns outside the mask; otherwise, teeth close to the camera would cover any mask."""
         bits = self._coarse[arch].silhouette(view.matrix @ pose, view.masks.shape[1:])
         return _OUTSIDE_PRICE * max(int(count_bits(bits)) - int((view.masks[arch] > 127).sum()), 0)
 
@@ -221,7 +222,7 @@ def _descending(entry: tuple[float, Pose]) -> float:
 
 
 def spread_out(jaw: JawRig, count: int) -> Array:
-    """Return captured jaw parameters by farthest-point sampling, including the bite, shape (at most count, 3) [mm]."""
+    """Choose captured jaw parameters, including the bite, by farthest-point sampling, shape (at most count, 3) [mm]."""
     d = np.vstack([np.zeros(3), jaw.captured_d])
     tips = transform_points(jaw.pose(d), jaw.landmarks[:1])[:, 0]
     chosen, distance = [0], np.linalg.norm(tips - tips[0], axis=1)
@@ -233,12 +234,12 @@ def spread_out(jaw: JawRig, count: int) -> Array:
 
 
 def _places(view: View) -> Array:
-    """Return the centres of both masks in space for every candidate width of the teeth [mm], shape (W, 2, 3)."""
+    """Return the 3-D centres of both masks for every candidate width of the teeth [mm], shape (W, 2, 3)."""
     middles, columns = np.ones((2, 3)), np.flatnonzero((view.masks > 127).any((0, 1)))
     for r, mask in enumerate(view.masks):
         rows, across = np.nonzero(mask > 127)
         middles[r, :2] = across.mean(), rows.mean()
-    # With the third row of the camera matrix of unit length, the factor of a ray is its depth.
+    # If the third row of the camera matrix has unit length, the scale factor of a ray is its depth.
     matrix = view.matrix / np.linalg.norm(view.matrix[2, :3])
     rays = np.linalg.solve(matrix[:, :3], middles.T).T
     focal_px = float(np.linalg.norm(np.cross(matrix[0, :3], matrix[2, :3])))

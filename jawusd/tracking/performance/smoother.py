@@ -24,7 +24,7 @@ from jawusd.tracking.performance.views import Views, growth_of
 _ROUNDS = 2
 _FOCAL_ROUNDS = 6  # with unknown focal lengths, which couple strongly with the distance of the head
 #: Ratio of true to computed variance of a frame's unknowns [-]: the equations ignore that outline errors persist over
-#: frames and that the rig deviates from the person.
+#: frames and that the rig deviates from the subject's anatomy.
 WIDER = 1.5**2
 # Standard deviations of smoothed poses in frames where an arch was missed [rad, mm, mm].
 _NEARBY = np.r_[[0.05] * 3, [3.0] * 3, [3.0] * 3]
@@ -114,7 +114,7 @@ class Smoother:
                 done(round_ * len(fits) + k + 1, total)
             weight = 1.0 / outline_variance(fits, config, self._length_px)
         sigma = np.zeros(self._cameras)
-        # Without the bound, which is an inequality and would make the covariance too small.
+        # Without the bound: as an inequality, it would make the covariance too small.
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, bounded=False))
         if self._unknowns.free_focal:
             sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
@@ -161,7 +161,7 @@ class Smoother:
         return replace(fit, solution=solution, growth=growth)
 
     def _found_again(self, fits: list[FrameFit], weight: Array) -> list[FrameFit]:
-        """Retry, from smoothed poses, the arches with masks that were not found."""
+        """Retry, from smoothed poses, arches that have masks but were not found."""
         if self._views is None:
             return fits
         attempts = Attempts(self._instants, weight, usual_residual_px(fits))

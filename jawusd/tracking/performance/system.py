@@ -17,7 +17,7 @@ class TakeCovariance(NamedTuple):
 
     Attributes:
         own: of each frame's unknowns, conditional on those of the take, shape (N, L, L).
-        response: derivative of each frame's unknowns by those of the take, shape (N, L, G).
+        response: derivative of each frame's unknowns with respect to those of the take, shape (N, L, G).
         shared: of the unknowns of the take, shape (G, G).
     """
 

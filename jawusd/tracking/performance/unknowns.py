@@ -1,7 +1,7 @@
 """The unknowns shared by all frames of a take, and the equations of a frame in all unknowns.
 
-Shared are the offsets of masks from free edges and gum lines, equal in all cameras; the head pose if it is fixed; and
-unknown focal lengths.
+The shared unknowns are the offsets of masks from free edges and gum lines, equal in all cameras; the head pose if it is
+fixed; and unknown focal lengths.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinate
 from jawusd.tracking.performance.instant import bound_equations
 from jawusd.tracking.performance.views import PRIOR_LOG_FOCAL, with_focal
 
-_HABITS = 3  # of an arch, as in `OutlineSums`
+_HABITS = 3  # number per arch, as in `OutlineSums`
 
 
 @dataclass(frozen=True)

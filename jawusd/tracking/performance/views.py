@@ -65,7 +65,7 @@ class KeptViews:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Sums over matched samples per arch and view, as `OutlineSums`; g is a sample's derivative by log focal [px].
+    """Sums like those of `OutlineSums`, with a sample's derivative g with respect to log focal length [px].
 
     Attributes:
         twist: sum w J g, shape (2, C, 6).
@@ -97,7 +97,7 @@ def growth_of(matched: Sequence[Matched], poses: Array, centres: Array, views: S
 
 
 def _slopes(samples: Array, pose: Array, matrix: Array, centre: Array) -> Array:
-    """Return the derivatives (n, 6) of samples along their normals [px] by a left twist about a world point."""
+    """Return derivatives (n, 6) of normal displacements [px] with respect to a left twist about a world point."""
     points = transform_points(pose, samples[:, X : Z + 1])
     depth = points @ matrix[2, :3] + matrix[2, 3]
     across = matrix[:2, :3] - samples[:, [U, V], None] * matrix[2, :3]

@@ -17,7 +17,7 @@ from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V, pixel_o
 from jawusd.tracking.contour.scan import CROWN
 
 _MOST_STEPS = 10  # to either side of a sample
-_LEAST_CLEAR = 0.15  # share of `clear_ratio` below which an edge is rejected
+_LEAST_CLEAR = 0.15  # fraction of `clear_ratio` below which an edge is rejected
 _LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2  # range of compensated motion blur; gamma of the images
 _SMOOTH_PX = 1.0  # half the width over which slopes are measured
 _PER_CODE = 8  # linearisation table entries per 8-bit step

@@ -27,7 +27,7 @@ _USUAL_MM = np.array(
     ]
 )
 _ODD = np.array([False, True, False, False, False, True, True, False, False, False])  # terms odd in x
-# Standard deviations of a person's coefficients to the side, up and forwards [mm], the factor for products, and the
+# Standard deviations of a subject's coefficients to the side, up and forwards [mm], the factor for products, and the
 # standard deviation of the constant, an error of the scans' bite.
 _SPREAD_MM, _PRODUCTS, _CONSTANT_MM = (0.4, 1.5, 1.5), 0.5, 1.0
 # Residuals of condyles about a jaw's own polynomials, standard deviations to the side, up and forwards [mm].

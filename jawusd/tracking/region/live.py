@@ -1,4 +1,4 @@
-"""Live tracking of head and jaw of a known person."""
+"""Live tracking of head and jaw of a known subject."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class LiveTake:
         """Prepare the scans.
 
         Args:
-            jaw: the person's rig.
+            jaw: the subject's rig.
             scans: upper and lower teeth, prepared.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
             cameras: in image order.
@@ -60,7 +60,7 @@ class LiveTake:
         self._tracker: RigTracker | None = None
 
     def begin(self, cut: Cut, near: Pose) -> float:
-        """Learn the colours of an instant near a pose; return the matched share of the visible contour, 0 .. 1."""
+        """Learn the colours of an instant near a pose; return the matched fraction of the visible contour, 0 .. 1."""
         colours = LearnedColours(self._scans, self._cameras, self._axes)
         self._tracker = RigTracker(self._instants, colours, head=self._head, effort=FAST)
         solution = self._tracker.begin(cut, near).solution

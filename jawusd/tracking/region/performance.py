@@ -80,7 +80,7 @@ class PictureTake:
         """Prepare the scans.
 
         Args:
-            jaw: the person's rig.
+            jaw: the subject's rig.
             scans: upper and lower teeth, prepared.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
             shot: images and frames.
@@ -101,7 +101,7 @@ class PictureTake:
         )
 
     def begun(self, frame: int, near: Pose) -> tuple[Pose, float]:
-        """Return the pose in a frame near a guess, and the matched share of the visible contour, 0 .. 1.
+        """Return the pose in a frame near a guess, and the matched fraction of the visible contour, 0 .. 1.
 
         Raises:
             CaptureError: an image cannot be decoded.

@@ -87,7 +87,7 @@ class ArchStart:
 
 
 class PictureStart:
-    """Search for head and jaw of a person with a known rig in a frame of one or more cameras.
+    """Search for head and jaw of a subject with a known rig in a frame of one or more cameras.
 
     Attributes:
         findings: findings about the scans.

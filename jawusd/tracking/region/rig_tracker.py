@@ -1,4 +1,4 @@
-"""Tracker of head and jaw of a person with a known rig by colour, with recovery after losses."""
+"""Tracker of head and jaw of a subject with a known rig by colour, with recovery after losses."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ _FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of
 # arch is not accepted again. `Effort` overrides the first two as long as no frames are dropped.
 _DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
 _UNSURE_FRAMES = 3.0  # frames since the last step after which an arch counts as lost
-_USUAL_FRAMES = 15  # window of the usual matched share
+_USUAL_FRAMES = 15  # window of the usual matched fraction
 _LEAST_USUAL = 0.7  # lower bound of the usual share, relative to the first frame
 _JAWS = 96  # jaw poses that a search ranks by colour
 
 
 class RigTracker:
-    """Frame-by-frame tracker of head and jaw of a known person.
+    """Frame-by-frame tracker of head and jaw of a known subject.
 
     Attributes:
         expected: prior of the last step.
@@ -149,7 +149,7 @@ class RigTracker:
     ) -> tuple[Aligned, _InstantImages]:
         """Align from the prediction; if that may have failed, from other starts, then by search in larger crops.
 
-        Results of a search are accepted only if the matched share reaches `least`, shape (2,).
+        Results of a search are accepted only if the matched fraction reaches `least`, shape (2,).
         """
         effort, usual = self._effort, self._usual_share()
         in_turn, far = effort.in_turn and self._failed > effort.searches, frames > _STEADY_FRAMES

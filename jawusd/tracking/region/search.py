@@ -237,5 +237,5 @@ def _upper_alone(views: Sequence[View]) -> Mask:
 
 
 def fitting_share(solution: Solution) -> Array:
-    """Return the matched share of the visible contour, per arch, shape (2,)."""
+    """Return the matched fraction of the visible contour, per arch, shape (2,)."""
     return np.asarray(score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0), np.float64)

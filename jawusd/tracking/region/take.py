@@ -30,11 +30,11 @@ from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings, mirror_findings
 from jawusd.tracking.sequence.time_checks import time_findings
 
-_LEAST_SHARE = 0.3  # matched share of the contour, relative to the best camera, below which a camera is reported
+_LEAST_SHARE = 0.3  # matched fraction of the contour, relative to the best camera, below which a camera is reported
 # Standard deviation of the lower teeth beyond which a frame is uninformative [mm], and the shares of such frames above
 # which a take is doubtful, and unusable.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
-_MOST = 0.6  # share of frames; a run of good frames this long suggests trimming the ends of the take
+_MOST = 0.6  # fraction of frames; a run of good frames this long suggests trimming the ends of the take
 
 #: Prior on the offsets of colour borders from the teeth's edges: up to half a pixel inside, as teeth darken towards
 #: them; gum-line offsets are learned while tracking.
@@ -45,7 +45,7 @@ FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)
 def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list[Finding]:
     """Return a warning for each camera whose images fit the teeth far worse than those of the others.
 
-    Kind: "camera_rarely_used", with the matched share of the visible contour.
+    Kind: "camera_rarely_used", with the matched fraction of the visible contour.
     """
     shares = []
     for solution in solutions:

@@ -25,7 +25,7 @@ _FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of
 # again, and an arch is given up. The usual share is the median over the last frames, but at least `_LEAST_USUAL` of
 # that of the first frame, so that slowly closing lips do not become usual.
 _DOUBTED, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = 0.8, 0.6, 0.5, 0.25, 0.7
-_USUAL_FRAMES = 15  # window of the usual matched share
+_USUAL_FRAMES = 15  # window of the usual matched fraction
 _EAGER, _OFTEN = 6, 4
 _RESTING = 4  # frames without wide gates after these have failed, since lips stay closed for a while
 _WIDE_MM = 40.0  # largest expected opening of a jaw that was out of sight
@@ -40,7 +40,7 @@ class RegionPose:
     covariance: Array  # of their left twists about the world origin, NaN for arches not found, shape (2, 6, 6)
     objective_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
     solution: Solution | None = None  # the alignment; None for poses read from a file
-    usual: Array = field(default_factory=lambda: np.ones(2))  # matched share relative to the usual one, shape (2,)
+    usual: Array = field(default_factory=lambda: np.ones(2))  # matched fraction relative to the usual one, shape (2,)
     least: Array = field(default_factory=lambda: np.zeros(2))  # threshold on it for an arch to be found, shape (2,)
 
 
@@ -92,7 +92,7 @@ class RegionTracker:
 
     @property
     def first_fit(self) -> float:
-        """Matched share of the visible contour in the first frame, of the worse arch, 0 .. 1."""
+        """Matched fraction of the visible contour in the first frame, of the worse arch, 0 .. 1."""
         return float(self._first_share.min())
 
     def follow(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:
@@ -173,7 +173,7 @@ class _DirectionTracker:
         return solution, searched
 
     def _least(self) -> Array:
-        """Return the share of the usual matched contour below which an arch is not found, shape (2,)."""
+        """Return the fraction of the usual matched contour below which an arch is not found, shape (2,)."""
         return np.where(self._found, _LOST, _AGAIN)
 
     def _taken(self, instant: _Instant, rough: Solution, searched: bool, usual: Array, seen: bool) -> RegionPose:

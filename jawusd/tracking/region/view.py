@@ -21,10 +21,10 @@ from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
 
 _AHEAD_PX = 2.0  # distance outside a crown's silhouette at which gum is tested for
 
-_SHUTTER = 0.5  # assumed exposure as a share of the frame time, typical of film
+_SHUTTER = 0.5  # assumed exposure as a fraction of the frame time, typical of film
 # Motion during the exposure at which the weight of a border is halved [px]: the variance of an edge grows with the
-# square of its blur. Applied in the final alignment only, since earlier ones decide by the matched share of the contour
-# whether teeth are lost.
+# square of its blur. Applied in the final alignment only, since earlier ones decide by the matched fraction of the
+# contour whether teeth are lost.
 _BLURRED_PX = 10.0
 _LEARNED_PX = (2, 7)  # range of distances from borders in which colours are learned
 # Estimate of the gum-line offset: minimum weight of a border [-], largest distance [px], minimum number of samples.
@@ -73,7 +73,7 @@ def measure_blur(samples: Array, before: Array, shutter: float, out: Array) -> N
     Args:
         samples: shape (n, COLUMNS).
         before: projection of the arch to this image in the previous frame, shape (3, 4).
-        shutter: exposure as a share of the frame time [-].
+        shutter: exposure as a fraction of the frame time [-].
         out: result, shape (n,).
     """
     for s in range(len(samples)):

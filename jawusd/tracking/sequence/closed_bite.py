@@ -1,10 +1,10 @@
 """Frames with the teeth together: the registration error of the scans, and the constant error of a take.
 
-The scans are exported in occlusion, so a closed bite shows T_upper_lower = identity up to three errors: the scans'
-registration, outlines drawn with the same bias in every frame, and the noise of single frames. Each has a known
-spread, so linear least squares divides the measured deviation among them. Most registrations are accurate to some
-hundredths of a millimetre, but outliers are large: they follow a Student distribution, fitted by reweighting (Lange,
-Little & Taylor 1989).
+The scans are exported in occlusion, so T_upper_lower is the identity in a closed bite, up to three errors: the scans'
+registration, outlines drawn with the same bias in every frame, and the noise of single frames. Each has a known spread,
+so linear least squares divides the measured deviation among them. Most registrations are accurate to some hundredths of
+a millimetre, but outliers are large: registration errors follow a Student distribution, which is fitted by reweighting
+(Lange, Little & Taylor 1989).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class RestFrames:
 
     Attributes:
         frames: frame numbers.
-        named: whether the capture names one of them.
+        named: whether the capture specifies one of them.
         point, lower: centre of the teeth, and of the lower crowns, in scan coordinates [mm], shape (3,).
         apply: whether to correct the position of the lower scan.
     """
@@ -92,18 +92,19 @@ def _moved_mm(one: Array, other: Array, probes: Array) -> float:
     return float(np.linalg.norm(gap, axis=1).mean())
 
 
-# Standard deviation of the closed bite about that of the scans, from registration and bite force [mm]; and radius that
-# converts it into a rotation [mm].
+# Standard deviation of the closed bite relative to the occlusion of the scans, due to registration and bite force [mm];
+# and lever arm that converts it to a rotation [mm].
 _BITE_MM = 0.03
 _ARCH_MM = 25.0
 _DEGREES_OF_FREEDOM = 4.0  # of the Student distribution: about one registration in a hundred is off by ten sigmas
-#: Share of the outline error variance, besides annotator habits, that is constant over a take [-]: with more, the noise
-#: of few closed frames would shift the whole take.
+#: Fraction of the outline error variance that is constant over a take, in addition to annotator habits [-]: if it were
+#: larger, noise in a few closed frames would shift the whole take.
 STEADY = 0.3
 _FEWEST_FRAMES = 2
-# Neighbouring frames have nearly the same outline error: independent measurements added per frame, and their limit [-].
+# Effective independent measurements added per closed frame, and their maximum in all [-]: neighbouring frames have
+# nearly the same outline error.
 _NEW_PER_FRAME, _MOST_FRAMES = 0.25, 3.0
-_USUAL_FRAMES = 2000  # about this many, evenly spread, are enough for the usual error of a long take
+_USUAL_FRAMES = 2000  # evenly spread frames from which the median error of a long take is computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +129,7 @@ class ClosedBite:
     remaining: Array
 
     def correct(self, poses: Array, registered: bool) -> Array:
-        """Return poses (F, 2, 4, 4) without their constant error; if registered, of a lower scan moved by `motion`."""
+        """Return poses (F, 2, 4, 4) without constant errors; if `registered`, for the lower scan moved by `motion`."""
         out = poses @ se3_inverse(self.steady_motions(False))
         if registered:
             out[:, 1] = out[:, 1] @ se3_inverse(self.motion())
@@ -142,7 +143,7 @@ class ClosedBite:
         return motions
 
     def motion(self) -> Array:
-        """Return the registration as a motion in scan coordinates, shape (4, 4)."""
+        """Return the registration correction as a rigid motion in scan coordinates, shape (4, 4)."""
         return np.asarray(translation(self.point) @ se3_exp(self.registration) @ translation(-self.point), np.float64)
 
     def report(self, rest: RestFrames) -> Registration:
@@ -164,7 +165,8 @@ class ClosedBite:
         """Return the covariances of left twists about the world origin after the correction, shape (F, 6, 6).
 
         Args:
-            covariance, steady: total covariance before, and its part that is constant over the take, shapes (F, 6, 6).
+            covariance, steady: total covariance before the correction, and the part of it that is constant over the
+                take, shapes (F, 6, 6).
             T_world_scan: poses in whose axes the error is constant, shape (F, 4, 4).
             which: 0 upper arch, 1 lower arch, 2 lower relative to upper (`T_world_scan` is identity then).
         """
@@ -185,8 +187,8 @@ def steady_part(outline: Array, habits: Array) -> Array:
     """Return the part of pose covariances that is constant over a take, of any shape.
 
     Args:
-        outline: covariance by the outline errors of single frames.
-        habits: covariance by annotator habits, of the same shape.
+        outline: covariance due to the outline errors of single frames.
+        habits: covariance due to annotator habits, of the same shape.
     """
     return np.asarray(STEADY * outline + habits, np.float64)
 
@@ -293,7 +295,7 @@ def observe_bite(
     extrinsics: Extrinsics,
     variance_px3: Array,
 ) -> None:
-    """Add the observation to a take that the teeth are together: habits that separate them are unlikely.
+    """Add to a take the observation that the teeth are together: habits that separate them are unlikely.
 
     `variance_px3` is outline variance times correlation length per arch [px^3], shape (2,).
     """

@@ -14,7 +14,7 @@ from jawusd.tracking.contour.scan import ARCHES
 
 
 def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:
-    """Return the motion of both arches from the reference instant to that of each camera, shape (C, 2, 4, 4)."""
+    """Return the motion of both arches from the reference instant to each camera's own, shape (C, 2, 4, 4)."""
     out = np.tile(np.eye(4), (len(delays), 2, 1, 1))
     for arch in ARCHES:
         motion = _motion_twists(records, frame, arch)
@@ -28,8 +28,9 @@ def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array)
 def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
     """Return the twist per frame about the arch's centre and its change per frame, shapes (6,): a parabola in time.
 
-    Fitted through both neighbours, at ends through two on one side, since a jaw starts and stops within a frame or two.
-    Across a gap the motion is uniform. None without tracked frames nearby.
+    The parabola passes through both neighbours, or through two on one side if the other is not tracked. More frames
+    would smooth too much, since a jaw starts and stops within a frame or two. Across a gap the motion is uniform. None
+    without tracked frames nearby.
     """
 
     def step(frames: int) -> Array:

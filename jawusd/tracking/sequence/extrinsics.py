@@ -18,8 +18,8 @@ from jawusd.tracking.contour.views import View
 class Extrinsics:
     """Corrections of camera poses.
 
-    Camera c sees the world moved by exp(twists[c]) about the pivot, which multiplies T_cam_world from the right. A
-    motion common to all cameras is a motion of the world, so the twists sum to zero.
+    For camera c, the world is moved by exp(twists[c]) about the pivot; this motion multiplies T_cam_world from the
+    right. A motion common to all cameras is a motion of the world, so the twists sum to zero.
     """
 
     T_cam_world: Array  # the calibrated poses, shape (C, 4, 4)
@@ -29,12 +29,12 @@ class Extrinsics:
 
     @classmethod
     def calibrated(cls, cameras: Sequence[Camera], pivot: Array) -> Extrinsics:
-        """Return zero corrections of the calibrated cameras."""
+        """Return zero corrections for the calibrated cameras."""
         nothing = np.zeros((len(cameras), 6))
         return cls(np.stack([c.T_cam_world for c in cameras]), np.asarray(pivot, float), nothing, nothing)
 
     def motions(self) -> Array:
-        """Return the motion of the world seen by each camera, shape (C, 4, 4)."""
+        """Return the apparent motion of the world in each camera, shape (C, 4, 4)."""
         return motion_about(self.pivot, self.twists)
 
     def then(self, twists: Array, sigma: Array) -> Extrinsics:
@@ -47,7 +47,7 @@ class Extrinsics:
         return self.T_cam_world @ self.motions()
 
     def correct(self, views: Sequence[View]) -> list[View]:
-        """Return the views as the corrected cameras see them."""
+        """Return the views with the projections of the corrected cameras."""
         moved = self.motions()
         return [
             replace(view, matrix=view.matrix @ M, eye=se3_inverse(M)[:3, :3] @ view.eye + se3_inverse(M)[:3, 3])

@@ -33,7 +33,7 @@ _FEWEST_MASKS = 2  # with one view, depth depends on the size of the outline, wh
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A solution with its uncovered mask pixels; arrays per arch and view, shape (2, C)."""
+    """A solution and the number of uncovered mask pixels; arrays per arch and view, shape (2, C)."""
 
     solution: Solution
     uncovered: Array
@@ -66,7 +66,7 @@ class FrameTracker:
         self._solver = solver
         self._config = config
         self.history = history
-        self.searched = False  # whether the last instant was searched from many starts
+        self.searched = False  # whether the multi-start search ran on the last instant
 
     def track(
         self,
@@ -135,11 +135,11 @@ class FrameTracker:
         return _Trial(solution, *uncovered_px(solver.scans, solution.poses, views, solver.map), use)
 
     def _suspect(self, trial: _Trial) -> Mask:
-        """Return which arches look worse than in recent frames, shape (2,)."""
+        """Return which arches fit worse than in recent frames, shape (2,)."""
         return self._failing(trial, self._config.suspect_score)
 
     def _alarming(self, trial: _Trial) -> Mask:
-        """Return which arches look worse than closing lips can explain, shape (2,)."""
+        """Return which arches fit worse than closing lips can explain, shape (2,)."""
         return self._failing(trial, self._config.alarming_score)
 
     def _failing(self, trial: _Trial, share: float) -> Mask:
@@ -162,13 +162,13 @@ class FrameTracker:
         return trial.use & (trial.coverage - self.history.usual_coverage() > self._config.suspect_coverage)
 
     def _spoiled(self, trial: _Trial, fewest: int) -> Mask:
-        """Return wrong masks: the scan does not fit them, but at least `fewest` others of the arch, shape (2, C)."""
+        """Return the masks that the scan does not fit while it fits at least `fewest` others, shape (2, C)."""
         dead = trial.use & (score_px(trial.solution) < self._config.dead_score * self.history.usual_score())
-        uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # sufficient to lose the arch
+        uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # enough for the arch to count as lost
         wrong = self._badly_covered(trial) | uncovered | dead
         for r in ARCHES:
             if (trial.use[r] & ~wrong[r]).sum() < fewest:
-                wrong[r] = False  # more likely the pose is wrong than so many masks
+                wrong[r] = False  # the pose is more likely to be wrong than so many masks
         return wrong
 
     def _losses(self, trial: _Trial) -> tuple[Loss, Loss]:

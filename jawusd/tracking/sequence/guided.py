@@ -50,7 +50,7 @@ class GuidedTracker:
         Args:
             upper, lower: teeth scans in one frame, in occlusion [mm].
             see: makes the masks; masks made around a wrong pose tend to confirm it.
-            rounds: number of alternations between masks and poses on a frame.
+            rounds: number of times that masks and poses are updated in turn on a frame.
 
         Raises:
             TrackingError: a scan cannot be tracked.
@@ -98,19 +98,19 @@ class GuidedTracker:
     def follow(
         self, frames: range, guide: Mapping[int, Array], past: Sequence[FrameSummary]
     ) -> Iterator[tuple[int, FrameRecord]]:
-        """Yield frames with their records; lost arches keep the poses of the guide.
+        """Yield frames with their records; lost arches get the poses of the guide.
 
         Args:
-            frames: in either direction, starting next to a known frame.
+            frames: in either direction, starting next to a frame in `past`.
             guide: T_world_upper and T_world_lower by frame, as found by colour, shape (2, 4, 4).
-            past: the frames before, from the first aligned one to the neighbour of these.
+            past: the frames tracked before, from the first aligned one to the neighbour of `frames`.
         """
         history = History(self._config.history_frames, self._config.score_frames)
         for before in past:
             history.add_summary(before)
         tracker = FrameTracker(self._solver, self._config, history)
         for frame in frames:
-            self._solver.forget_drawings()  # resumed runs equal uninterrupted ones
+            self._solver.forget_drawings()  # so that resumed runs give the same poses as uninterrupted ones
             start = guide[frame]
             record = tracker.track([start], self._see(frame, start, 0), None)
             for turn in range(1, self._rounds):

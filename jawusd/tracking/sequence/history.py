@@ -13,10 +13,10 @@ from jawusd.geometry import orthonormalise, se3_inverse, transform_points
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.scan import ARCHES
 
-_KEPT_POSES = 16  # earlier poses kept, enough to cover the range of a jaw
+_KEPT_POSES = 16  # earlier poses kept, enough to cover the range of motion of a jaw
 _APART_MM = 2.0  # poses closer than this converge to the same minimum
-# Failed multi-start searches allowed in a take, and frames that allow one more: at up to five seconds each, all of them
-# together take no longer than tracking.
+# Failed multi-start searches allowed in any take, and number of frames for which one more is allowed: at up to five
+# seconds each, all of them together take no longer than tracking.
 _FRUITLESS, _FRAMES_PER_FRUITLESS = 8, 32
 _RECENT = 8  # frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
 
@@ -67,7 +67,7 @@ class MotionPredictor:
                 if not self._lost_for[r]:
                     gap = transform_points(expected[r], self._points[r]) - transform_points(poses[r], self._points[r])
                     self._misses.append(float(np.linalg.norm(gap, axis=1).max()))
-                # After a loss the last pose is a guess, so it gives no velocity.
+                # After a loss the last pose is a guess, from which no velocity can be computed.
                 self._step[r] = None if self._lost_for[r] else poses[r] @ se3_inverse(self._last[r])
             else:
                 self._step[r] = None
@@ -97,13 +97,13 @@ class MotionPredictor:
     def search_is_due(self) -> bool:
         """Return whether a multi-start search is due: always at first, then less and less often while it fails.
 
-        Frames without masks do not count, so teeth that reappear are searched at once.
+        Frames without masks do not count, so the search runs as soon as the teeth reappear.
         """
         failures = int(self._failures.max())
         return failures & (failures - 1) == 0 or failures % 16 == 0
 
     def pose_history(self) -> list[Array]:
-        """Return earlier poses as starts for the next frame, relative to the current head."""
+        """Return earlier poses as starts for the next frame, relative to the current head pose."""
         head = self.predict()[0]
         return [np.stack([p[0], head @ se3_inverse(p[0]) @ p[1]]) for p in self._seen]
 
@@ -163,7 +163,7 @@ class History:
     """
 
     def __init__(self, length: int, score_length: int) -> None:
-        """Start empty; keep at most `length` frames, scores of at most `score_length`."""
+        """Start empty; keep at most `length` frames, but scores of at most `score_length`."""
         self._scores: deque[Array] = deque(maxlen=score_length)
         self._residuals: deque[Array] = deque(maxlen=length)
         self._coverages: deque[Array] = deque(maxlen=length)

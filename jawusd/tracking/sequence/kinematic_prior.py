@@ -1,4 +1,4 @@
-"""The person's jaw model as a prior on the pose of the lower arch relative to the upper one."""
+"""The subject's jaw model as a prior on the pose of the lower arch relative to the upper one."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from jawusd.geometry import (
 )
 from jawusd.tracking.contour.equations import NormalEquations, Solution
 
-_NORMAL_DIRECTIONS = 3  # six degrees of freedom less the three of the model
+_NORMAL_DIRECTIONS = 3  # six degrees of freedom minus the three of the model
 
 
 @dataclass(frozen=True, eq=False)
 class KinematicPrior:
-    """A prior that pulls relative poses towards a jaw model, and leaves motion along the model free.
+    """A prior that penalises the distance of relative poses from a jaw model, but not motion along the model.
 
     The deviation of a pose from the model, the left twist xi with T_upper_lower = exp(xi) pose(d), costs
-    xi^T P xi after the best change of d: P = 3 / s^2 (M - M J (J^T M J)^-1 J^T M) with the landmark metric M
+    xi^T P xi after minimisation over d: P = 3 / s^2 (M - M J (J^T M J)^-1 J^T M) with the landmark metric M
     (xi^T M xi = mean squared displacement), the model's Jacobian J, and the rms distance s of captured poses from the
     model, spread over three directions. This is the prior of Zoss et al. 2018 (an empirical rig), with its width
     estimated from the capture.
     """
 
-    jaw: JawRig  # the person's model
+    jaw: JawRig  # the subject's model
     spread_mm: float  # rms landmark distance s of good tracked poses from the model [mm]
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
@@ -69,16 +69,16 @@ class KinematicPrior:
 
 
 _FEWEST = 15  # poses needed to estimate the spread about the model
-_ROUNDS = 3  # the model is nearly linear over pose errors
+_ROUNDS = 3  # linearisations: the model is nearly linear over the range of pose errors
 
 
 def weigh_with_model(tracks: Tracks, jaw: JawRig) -> Tracks:
     """Return tracks with final relative poses that are most likely under their covariance and the model.
 
-    For tracks from colours, whose errors extend over whole teeth: the model improves molars and condyles, and keeps the
-    incisal point. The result is the mean of two Gaussians, relinearised `_ROUNDS` times, with `KinematicPrior` of the
-    rms distance of raw poses from the model. Upper teeth, raw poses, covariances and sigmas stay as measured. The meta
-    data store the width of the prior as `prior_spread_mm`.
+    For tracks from colours, whose errors extend over whole teeth: the model improves molars and condyles and hardly
+    changes the incisal point. The result is the mean of two Gaussians, relinearised `_ROUNDS` times; the spread of the
+    `KinematicPrior` is the rms distance of raw poses from the model. Upper teeth, raw poses, covariances and sigmas
+    remain as measured. The meta data store the width of the prior as `prior_spread_mm`.
 
     Args:
         tracks: from colours, without a model.

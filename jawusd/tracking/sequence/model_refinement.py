@@ -1,4 +1,4 @@
-"""The second pass: frames that are uncertain from masks alone, tracked again with the person's jaw model."""
+"""The second pass: frames that are uncertain from masks alone, tracked again with the subject's jaw model."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _FEWEST_GOOD = 15  # good frames needed to use the model as a prior
 
 
 def hard_frames(tracks: Tracks) -> Mask:
-    """Return the frames to refine with the model: lost, recovered, without a camera, or uncertain; shape (F,)."""
+    """Return the frames to refine with the model: lost, recovered, missing a camera, or uncertain; shape (F,)."""
     sigma = tracks.sigma_mm.max(1)
     return (tracks.status != TRACKED).any(1) | ~(sigma <= _HARD_MM)
 
@@ -58,8 +58,8 @@ def refine_tracks(
 ) -> Tracks:
     """Track the hard frames again with the fitted model as a prior on the relative pose.
 
-    Changes final poses, `prior_aided`, and the uncertainties of lost frames. Raw poses stay, so that no model is fitted
-    to or scored on poses influenced by its prior.
+    Changes final poses, `prior_aided`, and the uncertainties of lost frames. Raw poses are unchanged, so that no model
+    is fitted to or scored on poses influenced by its prior.
 
     Args:
         tracks: the first pass.
@@ -157,8 +157,8 @@ def _variances(tracks: Tracks) -> Array:
 def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
     """Return start poses of every frame, T_world_upper and T_world_lower, shape (F, 2, 4, 4).
 
-    A lost arch is placed by the other one and the model, interpolated between neighbouring frames. If both are lost,
-    the head is interpolated linearly.
+    A lost arch is placed from the other one with the jaw parameters interpolated between measured frames. If both are
+    lost, the head is interpolated linearly.
     """
     frames = tracks.frames.astype(np.float64)
     d = jaw.interpolate(frames[measured], jaw.encode(tracks.raw_T_upper_lower[measured], inside=True)[0], frames)

@@ -22,7 +22,7 @@ class Nuisances:
 
     Attributes:
         delays: camera c shows the instant of frame + delays[c], in frames; 0 for the first camera, shape (C,).
-        habits: mask bias beyond the teeth, per arch and camera, shape (2, C, 3): at free edges and at the gum line [px
+        habits: outward mask bias, per arch and camera, shape (2, C, 3): at free edges and at the gum line [px
             at working resolution], and along the gum surface [mm]; see `OutlineSums`.
         shift_px: the resulting mean shift of edges and gum line, shape (2, C, 2).
         sigma_delays, sigma_habits, sigma_shift_px: their standard deviations.
@@ -48,7 +48,7 @@ class Nuisances:
         return replace(more, delays=self.delays + more.delays, habits=self.habits + more.habits, shift_px=shift)
 
     def matters(self, config: TrackingConfig) -> bool:
-        """Return whether anything exceeds its limit; delays and camera poses must be significant as well.
+        """Return whether any estimate exceeds its limit; delays and camera poses must be significant as well.
 
         Habits have a prior, so even an insignificant estimate is the most likely value.
         """
@@ -60,7 +60,7 @@ class Nuisances:
         return bool((np.abs(self.delays) > np.maximum(config.refine_delay_frames, 4 * self.sigma_delays)).any())
 
     def settled(self, config: TrackingConfig) -> bool:
-        """Return whether all are too small for another iteration."""
+        """Return whether all estimates are too small to need another iteration."""
         late = np.abs(self.delays).max() / config.refine_delay_frames
         wide = np.abs(self.shift_px).max() / config.refine_bias_px
         return max(late, wide, self.contour_px / config.refine_shift_px) < config.settled_share
@@ -71,7 +71,7 @@ class Nuisances:
         return bool(clear and self.contour_px > config.refine_shift_px)
 
 
-# Prior standard deviation of delays, since cameras are synchronised to whole frames.
+# Prior standard deviation of the delays left after cameras are synchronised to whole frames.
 _PRIOR_DELAY_FRAMES = 0.5
 
 
@@ -80,10 +80,11 @@ class AnnotatorPrior:
     """Prior standard deviations of mask biases.
 
     Attributes:
-        edge_px, gum_px, gum_mm: of edges and gum line together, of the gum line relative to edges, and along the
+        edge_px, gum_px, gum_mm: bias of edges and gum line together, of the gum line relative to edges, and along the
             surface.
-        arch_px, arch_mm, camera_px: of differences between arches and between cameras.
-        frames: effective number of independent frames in a take [-], since all frames show the same lips and teeth.
+        arch_px, arch_mm, camera_px: differences between arches and between cameras.
+        frames: effective number of independent frames in a take [-]: few, since all frames show the same lips and
+            teeth.
     """
 
     edge_px: float
@@ -95,7 +96,7 @@ class AnnotatorPrior:
     frames: float
 
 
-#: For a person who draws masks.
+#: For an annotator who draws masks.
 DRAWN = AnnotatorPrior(edge_px=0.5, gum_px=0.4, gum_mm=0.1, arch_px=0.15, arch_mm=0.05, camera_px=0.1, frames=1.5)
 
 #: The same for scans without gum. Outlines at the neck of a tooth are then classified by their direction, with some
@@ -170,7 +171,7 @@ class TakeEquations:
         self._layout = _Layout(len(extrinsics.twists), annotator)
         size, C = self._layout.size, self._layout.cameras
         self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
-        self._gum = np.zeros((2, C, 2))  # sums of weights and slopes of the gum line
+        self._gum = np.zeros((2, C, 2))  # gum line: sums of weights, and of weighted shifts per mm along the surface
         self._frames = 0
         self._seen_S, self._seen_r = np.zeros((size, size)), np.zeros(size)
         for frame in sorted(records if frames is None else frames):
@@ -210,7 +211,7 @@ class TakeEquations:
         S[:first_twist, :first_twist] += np.diag(redundancy[:first_twist] / layout.prior_sigma() ** 2)
         for c, precision in enumerate(self._extrinsics.precision(config.refine_turn_rad, config.refine_move_mm)):
             S[layout.twist(c), layout.twist(c)] += precision
-        # A delay common to all cameras is part of the motion.
+        # A delay common to all cameras cannot be distinguished from the motion.
         keep = np.arange(1, size if cameras_move else first_twist)
         covariance = np.zeros((size, size))
         covariance[np.ix_(keep, keep)] = np.linalg.inv(S[np.ix_(keep, keep)])

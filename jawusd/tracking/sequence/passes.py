@@ -81,7 +81,7 @@ class Passes:
     def track_back_to(self, start: int) -> None:
         """Track to the first frame from a well-seen one, and past it until both directions agree.
 
-        The first frame was aligned without knowing the usual fit of this take, and its neighbours followed it.
+        The first frame was aligned without knowing the usual fit of this take, and its neighbours were tracked from it.
         """
         seen = nearest_well_seen(self.records, start)
         if seen is None or seen == start:
@@ -162,11 +162,12 @@ def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
     return [(a, b) for a, b in runs]
 
 
-# Least score and largest residual of a well-seen frame, relative to the medians of the take. They only determine where
-# tracking back to the first frame begins.
+# Minimum score and largest residual of a well-seen frame, relative to the medians of the take. They only determine
+# where tracking back to the first frame begins.
 _LEAST_SCORE, _MOST_RESIDUAL = 0.8, 1.2
-# Share of the visible contour and residual, relative to the medians of the take, beyond which both together mean that
-# lip edges were matched instead of teeth; and frames needed for the medians. False-alarm rate: at most 1.4 %.
+# Matched fraction of the visible contour, and residual, both relative to the medians of the take: an arch beyond both
+# limits was matched with lip edges instead of teeth. Last, the number of frames needed for the medians. False-alarm
+# rate: at most 1.4 %.
 _POOR_SHARE, _POOR_RESIDUAL, _TELLING_FRAMES = 0.5, 1.6, 6
 
 

@@ -38,7 +38,7 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, interpolation_covariance, pose_response
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
-#: Refines all measured poses by further knowledge. Arguments and results: poses (F, 2, 4, 4), NaN where lost, the
+#: Refines all measured poses with further knowledge. Arguments and results: poses (F, 2, 4, 4), NaN where lost, the
 #: covariances of their left twists about the world origin (F, 2, 6, 6), and that of T_upper_lower about the skull
 #: origin (F, 6, 6).
 Fusion = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
@@ -111,7 +111,7 @@ def assemble(
 
 
 def _columns(records: Mapping[int, FrameRecord], frames: NDArray[np.int64]) -> list[Array]:
-    """Return the values of `_figures` as one array each over all frames."""
+    """Return each value of `_figures` as one array over all frames."""
     rows = (_figures(records[frame]) for frame in frames.tolist())
     first = next(rows)
     columns = [np.empty((len(frames), *value.shape)) for value in first]
@@ -122,7 +122,7 @@ def _columns(records: Mapping[int, FrameRecord], frames: NDArray[np.int64]) -> l
 
 
 def _figures(record: FrameRecord) -> tuple[Array | Mask | NDArray[np.int8], ...]:
-    """Return the values of a frame that tracks store; the third are reason, value and limit of each loss."""
+    """Return the values of a frame that tracks store; the third has reason, value and limit of each loss."""
     solution, losses = record.solution, np.array(record.losses, np.float64)
     quality = (residual_px(solution), matched_px(solution))
     return (solution.poses, record.status, losses, solution.centres, record.coverage, record.used, *quality)

@@ -25,7 +25,7 @@ from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance
 
 # Frames on either side over which process noise is estimated: a third of a second at 24 fps.
 _WINDOW = 4
-# Least acceleration variance, relative to that of independent noise: outline errors that neighbouring frames share
+# Minimum acceleration variance, relative to that of independent noise: outline errors that neighbouring frames share
 # cancel in second differences.
 _FLOOR = 0.5
 _SHORTEST = 5  # frames needed to estimate process noise

@@ -39,9 +39,9 @@ from jawusd.tracking.sequence.take_checks import (
 from jawusd.tracking.sequence.time_checks import frame_shifts, time_findings
 
 _SETTLED_REST = 6  # closed-bite frames among those on which nuisance parameters are iterated
-# If these are found, camera poses are not corrected, since that would hide them.
+# If these errors are found, camera poses are not corrected, since corrected poses would hide them.
 _SHOWN_AS_MOTION = ("focal_length", "scan_size", "lens_distortion", "scans_mirrored")
-_CHECKED_FRAMES = 8  # tested for wrong lenses and sizes: takes half a second
+_CHECKED_FRAMES = 8  # tested for wrong lenses and scan sizes, which takes half a second
 
 
 def track_capture(
@@ -59,7 +59,7 @@ def track_capture(
     """Track both arches through a capture.
 
     Args:
-        capture: provides masks, frame range and bootstrap picks; without picks, the teeth are searched.
+        capture: provides masks, frame range and bootstrap picks; without picks, the first pose is searched for.
         cameras: calibrated; world lengths in mm.
         offsets: reference frame minus own frame number, per camera name.
         upper, lower: teeth scans in one frame, in occlusion [mm].
@@ -68,7 +68,7 @@ def track_capture(
         progress: called once per frame with the number of frames done, and their total.
 
     Raises:
-        TrackingError: only one camera, exchanged masks or scans, or no frame on which the teeth can be aligned.
+        TrackingError: only one camera, swapped masks or scans, or no frame on which the teeth can be aligned.
         CaptureError: a mask cannot be read.
     """
     config = config or FOR_TAKES
@@ -159,7 +159,7 @@ class _Take(Passes):
     def _late_cameras(self, equations: TakeEquations, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
         """Correct delays of about a frame first; None without such delays.
 
-        A camera with such a delay also looks moved, and its masks look wrong where the jaw is fast.
+        A camera with such a delay also seems to have moved, and its masks seem wrong where the jaw is fast.
         """
         c = self._config
         found = equations.solve(c, False)
@@ -258,7 +258,7 @@ def _corrected_views(
 
 
 def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]:
-    """Return starts for aligning a frame again: its poses, after interpolated ones if an arch is lost."""
+    """Return starts for aligning a frame again: its poses, preceded by interpolated ones if an arch is lost."""
     own = records[frame].solution.poses
     lost = np.flatnonzero(records[frame].status == LOST)
     even = own.copy()

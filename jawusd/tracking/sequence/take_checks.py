@@ -25,13 +25,13 @@ from jawusd.tracking.sequence.history import SearchBudget
 
 @dataclass(frozen=True)
 class LensLimits:
-    """Limits of a magnification beyond which there is a warning.
+    """Limits of the magnification of cameras, beyond which a warning is given.
 
     Attributes:
         scale, common: of one camera relative to the others, and of all cameras [-].
         bend: change of magnification over 25 mm at the teeth [-].
         bias_px: outline bias of a camera relative to the others [px].
-        clear: least significance of `scale` and `common` [standard deviations].
+        clear: minimum significance of `scale` and `common` [standard deviations].
         knock: motion of a camera relative to the others [standard deviations].
     """
 
@@ -45,17 +45,17 @@ class LensLimits:
 
 #: For drawn masks. Sigmas of magnifications allow for cameras that moved along their axis.
 OF_MASKS = LensLimits(0.02, 0.015, 0.002, 1.2, 3.0, 8.0)
-#: For colours, whose sigmas are wide. Lens distortion cannot be detected with them.
+#: For tracking by colour, whose sigmas are larger, and which cannot detect lens distortion.
 OF_COLOURS = LensLimits(0.03, 0.015, np.inf, np.inf, 1.6, np.inf)
 # Magnification change of an uncalibrated lens with k1 = -0.4 at a distance of 130 mm [-]: larger changes are errors of
 # the masks of side teeth.
 _MOST_BEND = 0.015
 # Motion of a camera since its calibration that causes a warning after its correction.
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
-_KNOCKED_MORE = 1.5  # least ratio of its motion to that of any other camera
-_TELLING_CAMERAS = 3  # if two cameras differ, either may be wrong
-# Matched share of the visible contour, and residual, each relative to the other scan: both together reveal another
-# person's scan. And frames needed for that. False-alarm rate: at most 14 %.
+_KNOCKED_MORE = 1.5  # minimum ratio of the motion of a knocked camera to that of any other
+_TELLING_CAMERAS = 3  # cameras needed to tell which is wrong: of two that differ, it may be either
+# Matched fraction of the visible contour, and residual, each relative to the other scan: a scan beyond both limits
+# belongs to another subject. Last, the number of frames needed for the decision. False-alarm rate: at most 14 %.
 _FITS_LESS, _FITS_ROUGHER, _TELLING_FRAMES = 0.35, 1.5, 3
 _CLEARLY = 4.0  # standard deviations
 
@@ -256,13 +256,13 @@ def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) 
     ]
 
 
-_HALF = 0.5  # share of a camera's masks that must be used: below, it mostly contradicts the others
+_HALF = 0.5  # fraction of a camera's masks that must be used; below it, the camera mostly contradicts the others
 
 
 def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -> list[Finding]:
     """Return a warning for each camera whose masks were never or rarely used.
 
-    Kinds: "camera_not_used", with the number of frames that have masks; "camera_rarely_used", with the used share.
+    Kinds: "camera_not_used", with the number of frames that have masks; "camera_rarely_used", with the used fraction.
     """
     frames = sorted(records)
     present = np.array([np.isfinite(records[frame].coverage) for frame in frames])  # (F, 2, C)
@@ -298,7 +298,7 @@ def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -
     return out
 
 
-_FRAMES = 4  # aligned twice: takes a second or two
+_FRAMES = 4  # aligned with the scans and with their mirror images, which takes a second or two
 # Ratio of the contour matched by the mirror images to that matched by the scans: at most 0.98 for correct scans.
 _LEAST_RATIO = 1.15
 

@@ -1,8 +1,9 @@
 """Synchronisation errors found in a tracked take: late cameras, and dropped or repeated frames.
 
 Delays below a frame are estimated by linear equations (`TakeEquations`). A whole frame is too much for these where the
-jaw moves fast, because masks of the wrong instant are rejected or pull the jaw. With masks, neighbouring frames of each
-camera are therefore compared with the pose that the other cameras see. Without masks, a step of the delay is fitted.
+jaw moves fast, because masks of the wrong instant are rejected or bias the jaw pose. With masks, neighbouring frames of
+each camera are therefore compared with the pose estimated from the other cameras. Without masks, a step of the delay is
+fitted.
 """
 
 from __future__ import annotations
@@ -29,13 +30,14 @@ from jawusd.tracking.sequence.results import outline_variance
 SHIFTS = (-1, 0, 1)  # frames
 _CHECKED_FRAMES = 18  # of a take, at a tenth of a second each
 _FEWEST = 3  # conclusive frames needed on either side of a step, since two masks in a row may be wrong
-# Least margin by which a shift must fit better than others, as a share of the visible contour, and its clipping limit.
+# Minimum margin by which a shift must fit better than others, and value to which margins are clipped, as fractions of
+# the visible contour.
 _LEAST_LEAD, _MOST_LEAD = 0.1, 0.5
-# Least fit of the masks of the correct instant [-]: below, something other than the instant is wrong. False-alarm rate:
-# at most 4 %.
+# Minimum fit of the masks of the correct instant [-]: below it, something other than the instant is wrong. False-alarm
+# rate: at most 4 %.
 _LEAST_FIT = -0.1
-# Least margin over the best fit of the other cameras, if all fit worse, as when the jaw was lost after a dropped frame
-# [-].
+# Minimum margin over the best fit of the other cameras, required instead if these fit even worse, as when the jaw was
+# lost after a dropped frame [-].
 _BETTER_FIT = 0.15
 
 
@@ -55,7 +57,7 @@ class Shift(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FrameShifts:
-    """Fit of each camera's masks of neighbouring frames to the poses seen by the other cameras.
+    """Fit of each camera's masks of neighbouring frames to the poses estimated from the other cameras.
 
     Attributes:
         frames: the frames checked, shape (F,).
@@ -69,7 +71,8 @@ class FrameShifts:
     def clearest(self) -> Shift | None:
         """Return the most significant shift; None if all cameras show the correct instant.
 
-        The shift of one camera biases the poses that others are compared with, so these seem to shift as well.
+        The shift of one camera biases the poses that the other cameras are compared with, so they seem to be shifted as
+        well.
         """
         found = [shift for c in range(self.fit.shape[1]) for shift in self._shifts_of(c)]
         return max(found, key=lambda entry: entry[0])[1] if found else None
@@ -85,7 +88,7 @@ class FrameShifts:
         return rows, np.clip(leads[rows], -_MOST_LEAD, _MOST_LEAD)
 
     def _others_at_best(self, c: int, rows: NDArray[np.int_]) -> Array:
-        """Return the fit of the other cameras' masks at the best shift of each, inf if none is seen, shape (n,)."""
+        """Return the fit of the other cameras' masks at the best shift of each, inf if none has a mask, shape (n,)."""
         others = np.delete(self.fit[rows], c, axis=1).max(2)
         usual = np.full(len(rows), np.inf)
         seen = np.isfinite(others).any(1)
@@ -93,7 +96,7 @@ class FrameShifts:
         return usual
 
     def _shifts_of(self, c: int) -> Iterator[tuple[float, Shift]]:
-        """Yield possible shifts of a camera, each with its evidence first."""
+        """Yield the evidence for each possible shift of a camera, and the shift."""
         rows, leads = self._conclusive(c)
         above = self.fit[rows, c] - np.minimum(_LEAST_FIT, self._others_at_best(c, rows) + _BETTER_FIT)[:, None]
         for k, shift in enumerate(SHIFTS):
@@ -113,7 +116,7 @@ def _leads(fit: Array) -> Array:
 
 
 def _agree(leads: Array, above: Array | None = None) -> bool:
-    """Return whether a shift leads in enough frames, and in most, with a sufficient fit there."""
+    """Return whether a shift leads in enough frames and in the majority, and fits well enough where it leads."""
     leading = leads > _LEAST_LEAD
     clear = leading.sum() >= _FEWEST and np.median(leads) > _LEAST_LEAD
     return bool(clear and (above is None or np.median(above[leading]) > 0.0))
@@ -196,8 +199,8 @@ def _fast_frames(records: Mapping[int, FrameRecord]) -> list[int]:
     return [inner[max(part, key=lambda i: moved[i])] for part in parts]
 
 
-_PRIOR_FRAMES = 1.0  # standard deviation of a step
-_LEAST_FRAMES = 2  # on either side of it
+_PRIOR_FRAMES = 1.0  # prior standard deviation of a step of the delay
+_LEAST_FRAMES = 2  # frames required on either side of a step
 
 
 @dataclass(frozen=True)
@@ -225,7 +228,8 @@ def delay_steps(
         return []
     cameras = len(extrinsics.twists)
     S, right = TakeEquations(records, variance_px3, extrinsics, []).normal_equations()
-    # The parts of the delays per frame, then summed in place from each frame on: tens of megabytes for long takes.
+    # Terms of the delay of each frame, then cumulated in place from each frame to the last: tens of megabytes for long
+    # takes.
     after_S = np.empty((len(frames), len(right), cameras))
     after_r = np.empty((len(frames), cameras))
     for k, frame in enumerate(frames):
@@ -315,7 +319,8 @@ def _step_of_delay(
 ) -> list[Finding]:
     """Return a warning if the delay of a camera changes within the take."""
     steps = delay_steps(records, outline_variance(records, config), extrinsics, whole_frames(records))
-    # Poses partly follow the camera, so the others seem to step the other way; the most significant step is its own.
+    # Poses partly follow the camera whose delay steps, so the others seem to step the opposite way; the most
+    # significant step is its own.
     clearest = max(range(len(steps)), key=lambda c: abs(steps[c].step) / steps[c].sigma, default=None)
     if clearest is None:
         return []
