@@ -62,7 +62,7 @@ class ForwardPass:
         return attempts.judged(alone, instant)
 
     def _other_starts(self, expected: Expected, instant: Instant) -> list[Pose]:
-        """Return further starts: the prediction, the last pose, and earlier jaw poses with the head moved to its masks."""
+        """Return further starts: the prediction, last pose, and earlier jaw poses with the head moved to its masks."""
         jaws = [expected.pose.d, *(self._jaws if self._motion.blind.any() else ())]
         arch = 0 if instant.present[0].any() else 1
         scan, shifted = self._attempts.instants.solver.scans[arch], []
