@@ -16,7 +16,7 @@
       ClusterError         exit 11  the workers of a cluster cannot be used
       ResourceError        exit 12  out of memory or processor time, or a library crashed
 
-A message states where (file, frame, camera), what was found, what is allowed with its unit, and what to do.
+A message states the place (file, frame, camera), what was found, what is allowed with its unit, and what to do.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Run the program in a child process with resource limits, and report crashes of native libraries as one message.
+"""Run the command in a child process with resource limits, and report crashes of native libraries as one message.
 
 OpenUSD, FFmpeg, OpenCV and other libraries may crash or exhaust memory on a damaged file. The parent only waits for the
 child, and forwards signals and the exit code.
@@ -23,15 +23,15 @@ from jawusd.base.errors import ResourceError
 try:
     import resource
 except ImportError:  # on Windows, which has no such limits
-    resource = None  # type: ignore[assignment]  # a module elsewhere
+    resource = None  # type: ignore[assignment]  # a module on other systems
 
 #: Environment variable: how much memory [GB] a command may use; 0 for no limit.
 SETTING = "JAWUSD_MEMORY_GB"
 
-_FRACTION, _MIN_GB = 0.75, 4.0  # fraction of the machine's memory; lower bound, which ordinary builds stay below
-_MIN_SPACE_GB = 1.5  # OpenUSD's libraries take 1.3 GB of address space
+_FRACTION, _MIN_GB = 0.75, 4.0  # default limit, as fraction of the memory, and its minimum, enough for usual builds
+_MIN_SPACE_GB = 1.5  # least address space that is accepted; OpenUSD's libraries take 1.3 GB
 _CHILD = "_JAWUSD_CHILD"  # environment variable that marks the child where processes cannot fork
-_SI_KERNEL = 0x80  # from Linux's siginfo.h: sent by a terminal, to the child as well
+_SI_KERNEL = 0x80  # si_code in Linux's siginfo.h: sent by the terminal, which signals the child as well
 _PR_SET_PDEATHSIG = 1  # from Linux's prctl.h
 _PASSED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGTSTP", "SIGCONT")
 _KEYS = ("SIGINT", "SIGQUIT", "SIGTSTP")
@@ -59,7 +59,7 @@ def run_in_child() -> None:
     passed = {getattr(signal, name) for name in _PASSED}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {*passed, signal.SIGCHLD})
     parent = os.getpid()
-    gc.freeze()  # a collection would copy the pages that parent and child share
+    gc.freeze()  # a garbage collection would copy the pages that parent and child share
     child = os.fork()
     if child:
         _exit_like(_wait(child, passed))
@@ -96,7 +96,7 @@ def machine_memory() -> int:
 
 
 def _check_address_space() -> None:
-    """Refuse too little address space for OpenUSD's libraries, which would be reported as damaged files later."""
+    """Check that OpenUSD's libraries fit into the address space; otherwise valid files would be reported as damaged."""
     space = -1 if resource is None else resource.getrlimit(resource.RLIMIT_AS)[0]  # -1: no limit
     if 0 <= space < _MIN_SPACE_GB * 1e9:
         found = (
@@ -244,7 +244,7 @@ def _run_in_subprocess() -> NoReturn:
     """Run the program in a second Python process and exit with its status, where processes cannot fork."""
     import subprocess
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the console sends it to both
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the console interrupts both processes
     line = [sys.executable, "-m", "jawusd", *sys.argv[1:]]
     code = subprocess.run(line, env={**os.environ, _CHILD: "1"}, check=False).returncode
     if code < 0 or code >= 0xC0000000:  # Windows exit codes of uncaught exceptions
@@ -253,13 +253,13 @@ def _run_in_subprocess() -> NoReturn:
 
 
 _M_MMAP_THRESHOLD = -3  # of glibc's malloc.h
-_LARGE_BYTES = 8_000_000  # mapping costs time: a threshold of 1 MB slows a report by a tenth
+_LARGE_BYTES = 8_000_000  # mapping costs time: with a threshold of 1 MB, a report takes 10 % longer
 
 
 def map_large_arrays() -> None:
     """Make glibc return arrays of more than 8 MB to the system as soon as they are freed.
 
-    By default, glibc raises its threshold to the size of the largest block freed so far. The setting holds for the
+    By default, glibc raises its threshold to the size of the largest block freed so far. The setting applies to the
     whole process; libraries should not call this.
     """
     if sys.platform == "linux":
@@ -273,7 +273,7 @@ def map_large_arrays() -> None:
 def trim_memory() -> None:
     """Return freed memory to the system with glibc; other C libraries do so on their own.
 
-    glibc keeps free blocks below any block in use: about 100 MB after each stage of a build.
+    glibc does not return free blocks below one in use: about 100 MB after each stage of a build.
     """
     if sys.platform == "linux":
         import ctypes

@@ -1,4 +1,4 @@
-"""Which paths may be used: regular files as inputs, names that OpenUSD can open, and allowed folders for stages."""
+"""Checks of input paths: regular files, names that OpenUSD can open, and folders that stages may reference."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jawusd.base.errors import FormatError, JawusdError
 from jawusd.base.guard import note_input
 
 _LFS = b"version https://git-lfs"
-#: Environment variable with folders that are allowed in every run, separated as in PATH.
+#: Environment variable: folders that are allowed in every run, separated as in PATH.
 SETTING = "JAWUSD_ALLOW"
 
 _given: ContextVar[tuple[Path, ...]] = ContextVar("allowed_folders", default=())
@@ -38,7 +38,7 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
 
 
 def why_unreadable(path: str | os.PathLike[str]) -> tuple[str, str] | None:
-    """Return why a file cannot be read, and what to do, if it is empty or a Git LFS pointer; otherwise None."""
+    """Return message and hint for a file that is empty or a Git LFS pointer; None for other files."""
     with open(path, "rb") as file:
         head = file.read(len(_LFS))
     if not head:
@@ -71,7 +71,7 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
 
 
 def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
-    """Allow stages to reference files in folders and their subfolders; replaces earlier calls, not the setting."""
+    """Let stages reference files in folders and subfolders, besides those of the setting; replaces earlier calls."""
     _given.set(tuple(Path(folder).resolve() for folder in folders))
 
 

@@ -24,11 +24,11 @@ TWIST_ORDER = ["omega", "v"]
 NamedArrays = dict[str, Array]  # of any dtype; `take` checks the arrays that are used
 JsonObject = dict[str, object]
 
-# Ten times the size of 20,000 frames; guards against zip bombs.
+# Ten times the largest array of a take of 20,000 frames; guards against zip bombs.
 _MAX_ARRAY_BYTES = 512 << 20
-#: Exceptions of zipfile and numpy for damaged members, besides OSError: decoder errors, unsupported methods and
-# passwords (RuntimeError), headers that declare too much data (MemoryError) or nest too deeply, and errors of Python's
-# tokenizer, with which numpy parses headers that are not Python literals.
+#: Exceptions of zipfile and numpy for damaged members, besides OSError: decoder errors, unsupported compression methods
+#: and encryption (RuntimeError), headers that declare too much data (MemoryError) or nest too deeply, and errors of
+#: Python's tokenizer, which numpy uses for headers that are not Python literals.
 DAMAGED = (
     ValueError, EOFError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError,
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError, SyntaxError,

@@ -1,4 +1,4 @@
-"""Read text and tables of any encoding and locale, as written by editors, spreadsheets and other programs.
+"""Read text and tables in any encoding and locale, as written by editors, spreadsheets and other programs.
 
 All readers share these rules:
 
@@ -112,7 +112,7 @@ class TextTable:
 
 
 def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool = False) -> TextTable:
-    """Read a table of text whose first row names the columns.
+    """Read a text table whose first row names the columns.
 
     Args:
         path: the file.
@@ -188,7 +188,7 @@ def _is_filled(row: Sequence[str]) -> bool:
 
 
 def _separator(text: str, comment: str) -> str:
-    """Return the separator, found from the first line that any separator splits and the line after it."""
+    """Return the separator, determined from the first line that any separator splits, and the line after it."""
     lines = (line for line in io.StringIO(text) if line.strip() and not line.lstrip().startswith(comment))
     first = next((line for line in lines if any(sign in line for sign in SEPARATORS)), "")
     second = next(lines, "")
@@ -203,7 +203,7 @@ def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str],
 
     Args:
         cells: rows of equal length.
-        named: returns the name of a cell for messages, given row and column.
+        named: callback that returns the name of a cell for messages, given row and column.
         path: the file, for messages.
 
     Raises:

@@ -1,7 +1,8 @@
 """Cameras of COLMAP: text models (https://colmap.github.io/format.html), read and written.
 
-`cameras.txt` holds lenses, `images.txt` two lines per image: rotation (w, x, y, z) and translation, world to camera,
-and the image's points, which may be omitted. The centre of the top-left pixel is at (0.5, 0.5), OpenCV's at (0, 0).
+`cameras.txt` contains the intrinsics, `images.txt` two lines per image: rotation (w, x, y, z) and translation, world to
+camera; and the image's points, which may be omitted. The centre of the top-left pixel is at (0.5, 0.5); in OpenCV it is
+at (0, 0).
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, wxyz_from_matrix
 
 _FILES = ("cameras.txt", "images.txt")
-# Focal parameters of each model (f: shared by x and y), and number of OpenCV distortion terms after the centre.
+# Focal length parameters of each camera model (f: shared by x and y), and number of OpenCV's distortion coefficients
+# that follow the principal point.
 _MODELS = {
     "SIMPLE_PINHOLE": ("f", 0),
     "PINHOLE": ("fxfy", 0),
@@ -158,7 +160,7 @@ def save_colmap(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
     """Write cameras as a COLMAP text model in mm, with one image `NAME.png` each and an empty `points3D.txt`.
 
     Raises:
-        CalibrationError: a camera has pixel skew, which COLMAP's models lack.
+        CalibrationError: a camera has pixel skew, which COLMAP's camera models lack.
         OutputError: a file cannot be written.
     """
     lenses = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6"]
@@ -168,7 +170,7 @@ def save_colmap(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
         if abs(skew) > _LARGEST_SKEW * fx:
             raise CalibrationError(f"camera {camera.name} has pixel skew, which COLMAP does not support.")
         lens = np.pad(camera.distortion, (0, 8 - camera.distortion.size))
-        values = np.concatenate([[fx, fy, cx + 0.5, cy + 0.5], lens])  # COLMAP's origin is the pixel corner
+        values = np.concatenate([[fx, fy, cx + 0.5, cy + 0.5], lens])  # COLMAP's origin is the corner of the first pixel
         shown = " ".join(repr(float(value)) for value in values)
         lenses.append(f"{number} FULL_OPENCV {camera.size_px[0]} {camera.size_px[1]} {shown}")
         T = camera.T_cam_world

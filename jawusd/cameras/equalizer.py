@@ -1,11 +1,11 @@
-"""Cameras of 3DEqualizer: its Nuke export (.nk), with the lenses beside it (`lens_3de`).
+"""Cameras of 3DEqualizer: its Nuke export (.nk), with lens files beside it (see `equalizer_lens`).
 
 Poses, focal length and film back come from the `Camera` nodes of "Export Project, Nuke" (see a studio's version of that
 script: NyanNyanGringo/match-move-exporter on GitHub): camera axes x right, y up, z backward; `rotate` in
 degrees, z applied first, then x, then y (`rot_order ZXY`); `translate` in the units of the project, mostly cm; `focal`,
 `haperture` and `vaperture` in mm; `win_translate` is -2 times the lens centre offset over the film back. A parent
-`Axis` holds the scene transform and scale. The optical axis meets the film back at its centre plus that offset, x
-right, y up; the film back spans the outer edges of the pixels. The image size is not in the file.
+`Axis` has the scene transform and scale. The optical axis meets the film back at its centre plus that offset, x right,
+y up; the film back spans the outer edges of the pixels. The image size is not in the file.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 def load_3de(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
     """Read the cameras of 3DEqualizer's Nuke export, sorted by name, with lenses beside it, in the project's unit.
 
-    A camera uses the lens of the same name (of the node, the file, or within it), or the only lens. Without lenses, it
-    is a pinhole camera, for undistorted footage.
+    A camera uses the lens of the same name (of its node, of its file, or stated in the file), or the only lens.
+    Without lenses, cameras are pinholes, for undistorted footage.
 
     Args:
         path: the script or its folder.

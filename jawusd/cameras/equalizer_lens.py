@@ -7,8 +7,8 @@ as knobs.
 
 The models (Science-D-Visions, "The Standard Models for Lens Distortion in 3DE4", and its Lens Distortion Plugin Kit)
 map recorded to undistorted points, in coordinates from the lens centre, y up, over half the film back diagonal. OpenCV
-maps in the other direction: its coefficients are fitted to the model over the image, and residuals above 0.05 px are
-rejected. Only "OpenCV Radial Degree 6, Decentered Degree 2" uses OpenCV's own coefficients.
+maps in the other direction: its coefficients are fitted to the model over the image, and lenses with residuals above
+0.05 px are rejected. Only "OpenCV Radial Degree 6, Decentered Degree 2" uses OpenCV's own coefficients.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _STATIC = ("0", "DISTORTION_STATIC")
 _FOV = {"xa": 0.0, "xb": 1.0, "ya": 0.0, "yb": 1.0}
 _LARGEST_ERROR_PX = 0.05
 _MM_PER_CM = 10.0
-_GRID, _BEYOND = 33, 0.03  # fitting points per side of the image, and margin around it [fraction of the side]
+_GRID, _BEYOND = 33, 0.03  # fitting points per side of the image, and margin around it as a fraction of the side
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class FoundLens:
-    """A lens that was found and can be read."""
+    """A lens in a file, with the function that reads it."""
 
     name: str
     path: Path
@@ -110,7 +110,7 @@ def find_lenses(folder: Path, scripts: Mapping[Path, list[NukeNode]]) -> list[Fo
 
 
 def _node_lens(path: Path, node: NukeNode, name: str) -> Lens:
-    """Return the lens of an LD node, whose class and knob names are the model's with underscores."""
+    """Return the lens of an LD node; its class and knobs are named after the model and its parameters, with underscores."""
     models = {_nuke_name(model): model for model in _PARAMETERS}
     model = models.get(node.kind.removeprefix("LD").lstrip("_"))
     if model is None:

@@ -63,10 +63,10 @@ def load_cameras_file(
     """Read cameras from any supported calibration, in file order; lengths in mm, OpenCV axes and pixels.
 
     Args:
-        path: TOML of aniposelib, Pose2Sim or Caliscope, a COLMAP text model (its folder or one of its files),
-            nerfstudio's transforms.json, Metashape XML, RealityScan CSV or (a folder of) XMP, OpenCV YAML, XML or JSON,
-            or 3DEqualizer's Nuke script (or its folder).
-        unit_mm: length of the file's unit.
+        path: TOML of aniposelib, Pose2Sim or Caliscope; a COLMAP text model (its folder or one of its files);
+            nerfstudio's transforms.json; Metashape XML; RealityScan CSV, or (a folder of) XMP; OpenCV YAML, XML or
+                JSON; or 3DEqualizer's Nuke script (or its folder).
+        unit_mm: the file's unit of length [mm].
         sizes: (width, height) [px] of the images by camera, for formats without them; see `lacks_sizes`.
 
     Raises:
@@ -87,5 +87,5 @@ def calibration_files(path: Path) -> list[Path]:
 
 
 def lacks_sizes(path: Path) -> bool:
-    """Tell whether a calibration's format lacks the image size."""
+    """Tell whether a calibration's format lacks the image sizes."""
     return _format_of(path).lacks_sizes

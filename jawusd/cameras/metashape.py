@@ -94,12 +94,12 @@ def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
     if not focal > 0 or min(size) < 1:
         raise CalibrationError(f"sensor {label} has no focal length or no resolution.", path=path)
     wide = value("fx", focal + value("b1"))
-    # Before version 1.0, cx and cy were relative to the corner, and there were fx and fy.
+    # Before version 1.0, cx and cy were relative to the image corner, and focal lengths were fx and fy.
     old = "fx" in values
     cx = value("cx") + (0.0 if old else size[0] / 2) - _HALF_PX
     cy = value("cy") + (0.0 if old else size[1] / 2) - _HALF_PX
     K = np.array([[wide, value("b2"), cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    for key in ("p3", "p4"):  # fitted by older versions
+    for key in ("p3", "p4"):  # tangential coefficients of older versions
         if value(key):
             raise CalibrationError(
                 f"sensor {label} has {key} = {value(key):g}, allowed is 0.", path=path, hint=UNDISTORT

@@ -1,8 +1,8 @@
 """Read the nodes of a Nuke script, with their knobs and connections.
 
 A script is a list of nodes: `Class {`, one knob per line, `}`. A node pops its inputs from a stack (one unless `inputs`
-is given) and pushes itself; `set` and `push` name nodes and push them again. Knobs with default values are omitted. An
-animated knob is a curve, `{curve x1001 0.5 x1002 0.6}`: frames have the prefix x.
+is given) and pushes itself; `set` and `push` name nodes and push them again. Knobs with default values are omitted. The
+value of an animated knob is a curve, `{curve x1001 0.5 x1002 0.6}`: frame numbers have the prefix x.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jawusd.formats.text import read_text
 SAME = 1e-3  # tolerance for equality: relative for lengths, [rad] for rotations
 
 _MOST_BYTES = 64 << 20
-_MOST_LEVELS = 4  # nesting of braces in a knob
+_MOST_LEVELS = 4  # deepest nesting of braces in a knob
 _START = re.compile(r"^\s*(?P<kind>\w+)\s*\{\s*$")
 _KNOB = re.compile(r"^\s*(?P<name>\w+)(?:\s+(?P<value>.*))?$", re.DOTALL)
 _BRACE = re.compile(r"(?<!\\)[{}]")
@@ -162,5 +162,5 @@ def _unwrapped(items: list[object]) -> list[object]:
 
 
 def _is_sign(word: str) -> bool:
-    """Tell whether a word of a curve is not a value: the keyword, a frame, an interpolation type, or a slope."""
+    """Tell whether a word of a curve is not a value but the keyword, a frame, an interpolation type, or a slope."""
     return word == "curve" or bool(re.fullmatch(r"[A-Za-z]|[a-z]-?[\d.]+(?:e[-+]?\d+)?", word))

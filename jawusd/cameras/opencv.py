@@ -2,8 +2,9 @@
 
 `cv::FileStorage` (https://docs.opencv.org/4.x/d4/da4/group__core__xml.html), with matrices as written by OpenCV's
 samples, ROS `camera_info` and EasyMocap: camera_matrix, cameraMatrix, K or M with distortion coefficients, and R (3 x 3
-or Rodrigues vector) and T, world to camera. Names may have the camera as suffix, `K_left`, `R_left`; with M1, D1, M2,
-D2, R, T, the first camera is the world. Pixels and axes are OpenCV's. Other values are ignored.
+or Rodrigues vector) and T, world to camera. Names may have the camera as suffix, `K_left`, `R_left`. For a stereo pair,
+M1, D1, M2, D2, R and T, the world frame is that of the first camera. Pixels and axes are OpenCV's. Other values are
+ignored.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp
 
 _MOST_BYTES = 16 << 20
 _YAML = (".yml", ".yaml")
-_BEGINNING = 4096  # bytes searched for OpenCV's marks in XML and JSON
+_BEGINNING = 4096  # leading bytes searched for OpenCV's markers in XML and JSON
 _MATRIX = re.compile(
     r"^\s*(?P<name>[\w.-]+)\s*:\s*(?:!!opencv-matrix)?\s*\n\s*rows\s*:\s*(?P<rows>\d+)\s*\n\s*cols\s*:\s*(?P<cols>\d+)"
     r"\s*\n(?:\s*dt\s*:\s*\S+\s*\n)?\s*data\s*:\s*\[(?P<data>[^\]]*)\]",
@@ -43,7 +44,7 @@ _MOST_PX = 1e6
 
 
 def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read cameras from OpenCV's storage: one file per camera, named after it, or files that hold several.
+    """Read cameras from OpenCV's storage: one file per camera, named after it, or files with several cameras.
 
     Args:
         paths: the files; values of a camera are merged over all files. If any camera has a pose, those without one are
@@ -147,7 +148,7 @@ def _values(path: Path) -> Iterator[tuple[str, tuple[int, ...], list[str]]]:
 
 
 def _is_opencv(path: Path) -> int:
-    """Return 1 for YAML, 2 for XML and JSON with OpenCV's marks, 0 for others."""
+    """Return 1 for YAML, 2 for XML and JSON with OpenCV's markers, 0 for other files."""
     suffix = path.suffix.lower()
     if suffix in _YAML or suffix not in (".xml", ".json") or not path.is_file():
         return int(suffix in _YAML)

@@ -1,4 +1,4 @@
-"""Shared by the camera readers: the format registry entry, names, sizes, lens models, XML, numbers."""
+"""Helpers of the camera readers: the format registry entry, names, sizes, lens models, XML, numbers."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ Size = tuple[int, int]
 MOST_BYTES = 64 << 20
 UNDISTORT = "Undistort the footage first, or calibrate with OpenCV's standard model."
 _LARGEST_DEFECT = 1e-3
-# Tolerances between images of a static camera: rotation [rad], and position relative to its distance.
+# Tolerances between the poses of a static camera in its images: rotation [rad], and position relative to its distance
+# from the origin.
 _MOVED_RAD, _MOVED_SHARE = 1e-3, 1e-3
-_LARGEST_ERROR_PX = 0.05  # of a converted lens model
+_LARGEST_ERROR_PX = 0.05  # of a lens model converted to OpenCV's
 _MODEL_KEYS = ("distortion_model", "distortion_type", "lens_model", "camera_model", "model_type", "projection_model")
 _FLAG_KEYS = ("fisheye", "fisheye_model", "is_fisheye", "use_fisheye", "xi")  # xi: omnidirectional
 # Names of OpenCV's radial-tangential model with up to eight coefficients, in ROS, Kalibr, camodocal and others.
@@ -100,7 +101,7 @@ def known_size(path: Path, name: str, sizes: Mapping[str, Size]) -> Size:
 
 
 def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> None:
-    """Check that the lens model in a file, under the keys of common programs, is OpenCV's standard model.
+    """Check that a file's lens model, if stated under a key of a common program, is OpenCV's standard model.
 
     Raises:
         CalibrationError: it is another model.
@@ -120,7 +121,7 @@ def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> No
 
 
 def numbers(path: Path, text: str, count: int, what: str) -> Array:
-    """Return the numbers of a text, shape (count,).
+    """Return a text of `count` numbers as an array, shape (count,).
 
     Raises:
         CalibrationError: the text has other content.
@@ -142,7 +143,7 @@ def parsed_xml(path: Path) -> ElementTree.Element:
         FormatError: it cannot be read.
     """
     text = read_text(path, MOST_BYTES)
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can reference other files and expand without bound
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can refer to other files and expand without limit
         raise CalibrationError("declares a document type, which is not allowed.", path=path)
     try:
         return ElementTree.fromstring(text)
@@ -164,7 +165,7 @@ def world_to_camera(path: Path, name: str, rotation: Array, centre: Array) -> Ar
 
 
 def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tangential: tuple[float, float]) -> Array:
-    """Return OpenCV's coefficients of a lens with four radial terms and OpenCV's (p1, p2).
+    """Return OpenCV's coefficients for a lens with four radial coefficients and OpenCV's (p1, p2).
 
     Raises:
         CalibrationError: the approximation error is above 0.05 px.
@@ -182,7 +183,7 @@ def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tan
 
 
 def corner_matrix(path: Path, where: str, fx: float, fy: float, cx: float, cy: float) -> Array:
-    """Return K (3, 3) from values in coordinates where the centre of the first pixel is at (0.5, 0.5).
+    """Return K (3, 3) from intrinsics for which the centre of the first pixel is at (0.5, 0.5).
 
     Raises:
         CalibrationError: a focal length is not positive.

@@ -3,8 +3,8 @@
 XMP, `IMAGE.xmp` ("Camera Geometry in RealityScan", dev.epicgames.com, and "RealityCapture XMP Camera Math",
 support.capturingreality.com): Rotation (row-major) maps world to camera axes, x right, y down, z forward; Position is
 the camera's centre. FocalLength35mm refers to 36 mm along the longer side; PrincipalPointU and V are relative to the
-image centre, in units of that side. Distortion "brown3" and "brown4" (t2: with tangential terms) equals OpenCV's in
-coordinates over the focal length: k1 k2 k3 k4 t1 t2, where t1, t2 are OpenCV's p1, p2. The image size is not in the
+image centre, in units of that side. Distortion models "brown3" and "brown4" ("t2": with tangential terms) equal
+OpenCV's in normalised coordinates: k1 k2 k3 k4 t1 t2, where t1, t2 are OpenCV's p1, p2. The image size is not in the
 file.
 
 CSV ("Internal/External camera parameters"; columns are found by name): x, y, alt is the camera's centre; the camera's
@@ -48,7 +48,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read the XMP files of a folder as cameras named after the files, in their unit.
+    """Read the XMP files of a folder as cameras named after the files, in the files' unit.
 
     Args:
         folder: the folder of the files.

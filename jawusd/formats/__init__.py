@@ -1,1 +1,4 @@
-"""The files of jawusd: one dataclass with reader and writer per file; numpy, pydantic and the standard library."""
+"""The file formats of jawusd: per format one dataclass with reader and writer.
+
+May import only base, numpy, pydantic and the standard library.
+"""

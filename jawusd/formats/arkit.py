@@ -1,4 +1,4 @@
-"""Face captures of ARKit, as Live Link Face exports them, and a person's mapping from their weights to d.
+"""Face captures of ARKit, as exported by Live Link Face, and a subject's mapping from blend shape weights to d.
 
 A capture is a CSV table of blend shape weights with time codes:
 
@@ -6,10 +6,10 @@ A capture is a CSV table of blend shape weights with time codes:
     14:03:52:28.207,61,...,0.01,0,0.02,0.31,...
 
 A time code is HH:MM:SS:FF.fff. FF counts at the rate of the time code, which may differ from the sample rate: devices
-that record 60 samples per second with a 30 fps code write `.50`, or write every code twice. At 29.97 and 59.94 frames
-per second the code may skip the first two or four numbers of every minute that is not a multiple of ten ("drop frame",
-SMPTE ST 12-1). A semicolon before the frames, or skipped numbers, mark this. Column names are case-insensitive, other
-columns are ignored. A row whose count is 0 shows no face.
+that record 60 samples per second with a 30 fps time code write a fraction of `.50`, or every time code twice. At 29.97
+and 59.94 frames per second it may skip the first two or four frame numbers of every minute that is not a multiple of
+ten ("drop frame", SMPTE ST 12-1), marked by a semicolon before the frames or by the skipped numbers themselves. Column
+names are case-insensitive, other columns are ignored. In a row whose count is 0 no face was detected.
 
 The mapping is a JSON file, format jawusd-arkit/1.
 """
@@ -41,10 +41,10 @@ _RATES = (24, 25, 30, 48, 50, 60, 100, 120)
 _NTSC_SLACK = 0.006
 _DAY_S = 86_400
 _FEWEST_REPEATED = 3  # distinct time codes needed to detect repetition
-_FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # rows in the median second, over the requested rate
-_MOST_STEPS_OFF = 2.0  # deviation of the step across seconds from the step within seconds [steps]
-# ARKit gives 0 to 1. A personal neutral face or gains exceed this slightly; percent and standardised weights exceed it
-# by far.
+_FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # allowed rows of the median second, over the requested rate
+_MOST_STEPS_OFF = 2.0  # largest deviation of the step across seconds from the step within seconds [steps]
+# ARKit's weights are 0 to 1. With a calibrated neutral face or gains they exceed this slightly; percentages and
+# standardised weights exceed it by far.
 _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
 _MAX_MAPPING_BYTES = 1 << 20
@@ -65,7 +65,7 @@ class FaceCapture:
 
 
 def shares_of(weights: Array) -> Array:
-    """Return weights (F, 4) as fractions of opening, reach to the left and reach forward, shape (F, 3)."""
+    """Return weights (F, 4) as fractions of full opening, reach to the left and reach forward, shape (F, 3)."""
     opening, left, right, forward = weights.T
     return np.stack([opening, left - right, forward], axis=1)
 
@@ -157,8 +157,8 @@ def _seconds_and_frame(code: str, named: str, path: Path) -> tuple[int, float]:
 def _spread(codes: Array) -> Array:
     """Return the frame within the second of every row; rows that repeat a time code are spread evenly.
 
-    This applies if most codes are repeated. A code with fewer rows than usual has lost its first rows if it is the
-    first code, otherwise its last rows.
+    Rows are spread only if most time codes are repeated. Of a time code with fewer rows than usual, the last rows are
+    assumed to be missing, or the first rows if it begins the recording.
 
     Args:
         codes: seconds and frames within the second, shape (F, 2).
@@ -177,15 +177,15 @@ def _spread(codes: Array) -> Array:
 def _numbers_per_second(
     seconds: NDArray[np.int64], inside: Array, fps: float | None, table: TextTable, column: int
 ) -> int:
-    """Return how many frames the time codes count per second: the standard rate that best fits across seconds."""
+    """Return the rate of the time codes: the standard rate that best fits the steps across seconds."""
     top = int(np.argmax(inside))
     highest = math.floor(inside[top])
     given = 0 if fps is None else math.ceil(fps - _NTSC_SLACK)
     same = np.diff(seconds) == 0
     step = float(np.median(np.diff(inside)[same])) if same.any() else 1.0
-    at_rate = round(given * step, 3)  # code rate if the samples come at the given rate
+    at_rate = round(given * step, 3)  # rate of the time codes if the samples have the given rate
     rates = [rate for rate in sorted({*_RATES, given, at_rate}) if rate > highest and rate % 1 == 0]
-    # Not at the start of a minute, where numbers may be dropped.
+    # Not at the start of a minute, where frame numbers may be dropped.
     turns = np.flatnonzero((np.diff(seconds) == 1) & (seconds[1:] % 60 != 0))
     # The first and last seconds are incomplete.
     rows_of_whole = np.unique(seconds, return_counts=True)[1][1:-1]
@@ -225,13 +225,13 @@ def _is_of_ntsc(rate: float) -> bool:
 
 
 def _dropped(seconds: NDArray[np.int64], inside: Array, number: int, marked: bool) -> int:
-    """Return how many numbers the time codes drop at the start of a minute, 0 without drop-frame counting."""
+    """Return how many frame numbers the time codes skip at the start of a minute, 0 without drop-frame counting."""
     if number not in (30, 60):
         return 0
     count = number // 15
     if marked:
         return count
-    # Unmarked drop-frame codes skip these numbers from the end of one minute to the start of the next.
+    # Drop-frame time codes without the semicolon are recognised by the numbers they skip between two minutes.
     first = (seconds % 60 == 0) & (seconds // 60 % 10 != 0)
     stepped = first[1:] & (np.floor(inside[1:]) == count) & (np.floor(inside[:-1]) == number - 1)
     stepped &= np.diff(seconds) == 1
@@ -254,11 +254,11 @@ def _frames(
 
 
 class ArkitMapping(BaseModel):
-    """A person's mapping from jaw weights to d; groups of four are JawOpen, JawLeft, JawRight, JawForward.
+    """A subject's mapping from jaw weights to d; arrays of four are JawOpen, JawLeft, JawRight, JawForward.
 
     d = rest_mm + (gain_mm + u_open * opened_gain_mm) @ u, where u is the deviation of each weight from its neutral
-    value, reduced by the dead zone (0 inside it), and u_open that of JawOpen. Gains of other directions are cross-talk.
-    Opened gains model that lateral and forward reach change as the jaw opens.
+    value, reduced by the dead zone (0 inside it), and u_open that of JawOpen. Gains of weights for other directions
+    model cross-talk; opened gains model the change of lateral and forward reach as the jaw opens.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 # Prefix of unfinished files and folders, by which leftovers of killed runs are found and deleted.
 _UNFINISHED = ".jawusd-tmp-"
 _LONGEST_SUFFIX = 16  # bytes; keeps temporary names within the length limit
-#: Hint where a file or folder cannot be written.
+#: Hint for files and folders that cannot be written.
 ELSEWHERE = "Choose a folder where you have write access."
-# Errors of file systems without fsync or modes.
+# Errors of file systems that lack fsync or file modes.
 _UNSUPPORTED = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM)
 
 
 def destination(path: str | os.PathLike[str]) -> Path:
-    """Return the file that an output is written to: the path itself, or the target of a link within its folder.
+    """Return the file that an output is written to: the path itself or, for a link within its folder, its target.
 
     Raises:
         OutputError: a folder, a disk, a socket, a link out of its folder, or an invalid name.
@@ -44,7 +44,7 @@ def destination(path: str | os.PathLike[str]) -> Path:
                 hint = "Delete the link, or name the file itself."
                 raise OutputError(f"is a link out of its folder, to {target}.", path=path, hint=hint)
         found = _mode(target)
-    except (OSError, ValueError) as error:  # a name that is too long, links in a circle, a null byte
+    except (OSError, ValueError) as error:  # a name that is too long, circular links, a null byte
         raise OutputError(f"cannot write here: {getattr(error, 'strerror', error)}.", path=path) from error
     if found is not None and not stat.S_ISREG(found):
         what = "a folder" if stat.S_ISDIR(found) else "neither a file nor a pipe"
@@ -191,7 +191,7 @@ def _umask() -> int:
 
 
 def _sync_folder(folder: Path) -> None:
-    # Without this a power cut may lose the rename on some file systems; Windows cannot open folders.
+    # Without fsync of the folder, some file systems lose the rename in a power failure. Windows cannot open folders.
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

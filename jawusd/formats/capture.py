@@ -18,15 +18,15 @@ from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
 
 FAMILY, VERSION = "jawusd-capture", 1
-_MOST_PICKS = 200  # per arch; the number of triples to sample from grows with the cube
+_MOST_PICKS = 200  # per arch; the number of triples of picks grows with the cube
 
 
 class Sync(Strict):
     """How the cameras are synchronised.
 
-    `flash` uses light flashes or, if a clip shows none, the sound; `audio` uses only the sound. `timecode` compares the
-    time codes of the clips, `numbers` the frame numbers of image sequences. `offsets` gives an integer per camera:
-    frame k of the camera shows the same instant as frame k + offset of the reference camera.
+    `flash` uses light flashes or, if a clip has none, the sound; `audio` uses only the sound. `timecode` compares the
+    time codes of the clips, `numbers` the frame numbers of image sequences. `offsets` sets one integer per camera:
+    frame k of the camera was recorded at the same instant as frame k + offset of the reference camera.
     """
 
     method: Annotated[
@@ -205,11 +205,11 @@ class Capture(Strict):
         return self.sync.reference or self.cameras[0].name
 
 
-_MOST_LOOKED_AT = 4096  # bytes checked for null bytes
+_MOST_LOOKED_AT = 4096  # leading bytes searched for null bytes
 
 
 def _refuse_other_files(path: Path) -> None:
-    """Refuse a path that cannot be a capture.toml, with advice.
+    """Reject a path that cannot be a capture.toml, with a hint.
 
     Raises:
         FormatError: it is missing, or not text.

@@ -26,7 +26,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
         OutputError: the picks have changed, have a form that cannot be replaced safely, or the file cannot be written.
             The file is then unchanged.
     """
-    path = Path(path).resolve()  # keeps a link a link
+    path = Path(path).resolve()  # replaces the target of a link, not the link
     check_input(path)
     try:
         data = path.read_bytes()
@@ -58,7 +58,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
 
 
 def with_bootstrap(text: str, picks: Bootstrap) -> str:
-    """Return the text of a capture.toml with new picks; comments among the old ones are kept.
+    """Return the text of a capture.toml with new picks; comments among the old picks are kept.
 
     Raises:
         ValueError: the old picks are not written as tables.
@@ -83,7 +83,7 @@ def _lines(picks: Bootstrap) -> list[str]:
     lines = [f"frame = {picks.frame}"]
     for arch, picked in (("upper", picks.upper), ("lower", picks.lower)):
         for pick in picked:
-            # Camera names hold no character that TOML would escape.
+            # Camera names contain no characters that TOML escapes.
             views = (f'{{ camera = "{view.camera}", x = {view.x:.2f}, y = {view.y:.2f} }}' for view in pick.views)
             lines += ["", f"[[{_TABLE}.{arch}]]", f"vertex = {pick.vertex}", f"views = [{', '.join(views)}]"]
     return lines
@@ -117,7 +117,7 @@ def _statements(text: str) -> Iterator[list[str]]:
 
 
 def _comments(lines: list[str], last: bool) -> list[str]:
-    """Return the comments of a block; a value with a trailing comment becomes a comment as a whole."""
+    """Return the comments of a block; a line with a value and a trailing comment is commented out."""
     among = lines[: len(lines) - len(_after(lines))] if last else lines
     # Values of picks contain no #, so a # starts a comment.
     return [line.strip() if line.lstrip().startswith("#") else f"# {line.strip()}" for line in among if "#" in line]

@@ -1,4 +1,4 @@
-"""The keys of a capture.toml: their reference, and validation errors that name table, key, value and what is allowed.
+"""The keys of a capture.toml: their reference, and validation errors that name table, key, value and allowed values.
 
 Both are derived from the pydantic models that read the file.
 """
@@ -17,7 +17,7 @@ from typing import Annotated, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-_CLOSE = 0.6  # least difflib ratio of a suggested key; "mask" and "masks" have 0.89
+_CLOSE = 0.6  # least difflib ratio of a key that is suggested for a misspelt one; "mask" and "masks" have 0.89
 _ALLOWED_SHOWN = 300  # characters
 
 Location = tuple[int | str, ...]
@@ -62,7 +62,7 @@ class KeyEntry:
     table: str  # as written in the file: "", "[scans]", "[[camera]]"
     name: str
     kind: str  # "text", "number", "path", ...
-    default: str  # "" if required, "none" if omitting it has a meaning of its own
+    default: str  # "" for required keys, "none" if the key may be omitted without a default taking its place
     key: Key
 
 
@@ -172,7 +172,7 @@ def reference_lines(listed: list[KeyEntry], width: int = 100) -> list[str]:
 def problems_of(
     error: ValidationError, model: type[BaseModel], data: Mapping[str, object]
 ) -> list[tuple[str, str | None]]:
-    """Return the problems, each as a sentence that names table and key, and a hint or None.
+    """Return the problems, each as a sentence that names table and key, with a hint or None.
 
     Args:
         error: raised when `model` validated `data`, the content of the file.
@@ -184,13 +184,13 @@ def problems_of(
     for problem in sorted(found, key=lambda problem: not _is_unknown(problem["type"])):
         location, kind = problem["loc"], problem["type"]
         if kind == "too_short" and location in deeper:
-            continue  # the entries themselves are reported
+            continue  # the errors of its entries are reported
         if _is_unknown(kind):
             out.append(_unknown_key(str(location[-1]), location[:-1], model, place(location[:-1], data)))
         elif kind == "missing" and any(
             table == location[:-1] and _meant(key, [str(location[-1])]) for table, key in unknown
         ):
-            continue  # missing only because it is misspelt, which is reported
+            continue  # misspelt, which is reported as an unknown key
         else:
             out.append(_wrong_value(problem, location, model, data))
     return out

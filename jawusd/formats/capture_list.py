@@ -65,7 +65,7 @@ def _listed(line: str, folder: Path, path: Path, number: int) -> ListedCapture:
     except (csv.Error, ValueError) as error:
         raise FormatError(f"line {number} is not CSV ({error}).", path=path) from error
     cells = [cell.strip() for cell in cells]
-    while len(cells) > 1 and not cells[-1]:  # blank columns of a spreadsheet
+    while len(cells) > 1 and not cells[-1]:  # blank columns appended by spreadsheets
         cells.pop()
     if len(cells) > 2 or not cells[0] or "\0" in cells[0]:
         raise FormatError(f"line {number} must be a path, or a path, a comma and a name.", path=path)

@@ -12,7 +12,7 @@ from jawusd.formats.clips import ClipSource
 
 
 class Strict(BaseModel):
-    """Base of all tables: immutable, unknown keys are errors."""
+    """Base class of all tables: immutable, and unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, populate_by_name=True)
 
@@ -42,7 +42,8 @@ class Masks(Strict):
     """The teeth masks of one camera: a PNG pattern with %06d, or a video.
 
     A mask is white on black, or the alpha channel of an image. Instead of `upper` and `lower`, `labels` may name one
-    pattern or lossless video in which gray value `upper_value` is upper teeth, `lower_value` lower teeth, 0 neither.
+    pattern or lossless video in which the gray value `upper_value` labels upper teeth, `lower_value` lower teeth, and
+    0 neither.
     """
 
     upper: Annotated[
@@ -87,14 +88,14 @@ class Masks(Strict):
 
     @property
     def labels(self) -> tuple[int, int] | None:
-        """Return the gray values of upper and lower teeth in label images, None if each arch has its own file."""
+        """Return the gray values of upper and lower teeth in label images; None if each arch has its own file."""
         if self.upper_value is None or self.lower_value is None:
             return None
         return self.upper_value, self.lower_value
 
     @property
     def exchanged(self) -> Masks:
-        """Return the masks with upper and lower swapped."""
+        """Return the masks with upper and lower teeth swapped."""
         return Masks(upper=self.lower, lower=self.upper, upper_value=self.lower_value, lower_value=self.upper_value)
 
 
@@ -165,7 +166,7 @@ class CameraSource(Strict):
 
 
 class Boards(Strict):
-    """The calibration board and its clips; counts are inner corners.
+    """The calibration board and its clips; columns and rows count inner corners.
 
     `videos` lists one video or image sequence (`%04d`) per camera, in camera order; images with the same number count
     as simultaneous. A ChArUco board also needs OpenCV's name of its dictionary, and its marker size.

@@ -17,9 +17,9 @@ from jawusd.formats.file_names import is_pattern, wrong_kind
 
 M = TypeVar("M", bound=BaseModel)
 _MOVE = "Move the file into that folder, or allow it with --allow-outside."
-_SHOWN = 3  # suggested names
+_SHOWN = 3  # most names suggested
 _DRIVE = re.compile(r"[A-Za-z]:[\\/]")  # prefix of a Windows path
-_NO_NAME = re.compile(r"[\x00-\x1f]")  # from TOML escapes, such as \t in videos\take.mp4
+_NO_NAME = re.compile(r"[\x00-\x1f]")  # control characters from TOML escapes, such as \t in videos\take.mp4
 _RELATIVE = "Write it relative to the capture's folder, with slashes, such as video/left.mp4."
 
 
@@ -31,7 +31,7 @@ def resolve_paths(
     Args:
         model: read from a file.
         source: that file; paths are relative to its folder.
-        data: its contents, for the names of tables.
+        data: the file's contents, for the names of tables in messages.
         allow_outside: allow paths outside the folder.
 
     Raises:
@@ -84,7 +84,7 @@ def _problem(value: Path, full: Path, folder: Path, allow_outside: bool) -> tupl
     """Return the problem with a path and a hint, None if it is fine."""
     if os.name != "nt" and _DRIVE.match(str(value)):
         return "is a Windows path, which does not exist on this system.", _RELATIVE
-    # Resolve links too: a link inside the folder may lead out of it.
+    # Resolve links too: a link inside the folder may point outside.
     anchor = full.parent if is_pattern(full) else full
     inside, exists = anchor.resolve().is_relative_to(folder), anchor.exists()
     if not allow_outside and not inside:
@@ -109,7 +109,7 @@ def _misnamed(location: Location, full: Path) -> tuple[str, str | None] | None:
 def _named_twice(
     location: Location, full: Path, named: dict[tuple[str, Path], Location], data: Mapping[str, object]
 ) -> tuple[str, str | None] | None:
-    """Return the problem with a scan, clip or mask that another key uses too; record it otherwise."""
+    """Return the problem with a scan, clip or mask that another key names too; otherwise record its use."""
     group = next((str(part) for part in location if part in ("scans", "masks", "video", "videos")), "")
     other = named.setdefault((group, full), location)
     # One label file may hold both arches of a camera.
@@ -119,7 +119,7 @@ def _named_twice(
 
 
 def _link_out(place: Path, folder: Path) -> str | None:
-    """Return a link in a folder of images or labels that leads outside the capture's folder, or None."""
+    """Return a link in a folder of images or labels that points outside the capture's folder, or None."""
     if not place.is_dir():
         return None
     with os.scandir(place) as entries:

@@ -1,8 +1,8 @@
 """Clips of a capture: where they are and how they are read, their brightness over time, and their time codes.
 
-Time code, SMPTE ST 12-1, counts frames since midnight. Numbers after "HH:MM:SS:" count the frames of a second. At
-29.97, 59.94 and 119.88 frames per second the count may skip the first two, four or eight numbers of every minute that
-is not a multiple of ten ("drop frame", written with ";" or "." before the frames), so that it follows the clock.
+Time code, SMPTE ST 12-1, counts frames since midnight; the digits after "HH:MM:SS:" number the frames within a second.
+At 29.97, 59.94 and 119.88 frames per second it may skip the first two, four or eight frame numbers of every minute that
+is not a multiple of ten ("drop frame", written with ";" or "." before the frames), to stay in step with the clock.
 
 Rates of time code tracks are read from QuickTime and MP4 files, as FFmpeg does not report them: Apple, "QuickTime File
 Format Specification", atoms and timecode sample description.
@@ -29,14 +29,14 @@ from jawusd.base.errors import CaptureError
 _CODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.,])(\d{2,3})")
 _HOURS_PER_DAY = 24
 _PATH = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
-_HEAD, _LONG_HEAD = 8, 16  # bytes of an atom's size and type; the latter for atoms above 4 GB
+_HEAD, _LONG_HEAD = 8, 16  # bytes of an atom's header (size and type), and of the header of atoms above 4 GB
 _TO_ENTRIES = 8  # bytes of a table's version, flags and count
-_MOST_ATOMS = 100_000  # bounds the search in damaged files
+_MOST_ATOMS = 100_000  # limits the search in damaged files
 
 
 @dataclass(frozen=True)
 class ClipSource:
-    """A video or image sequence, with properties that the files may lack.
+    """A video or image sequence, with properties that may be missing from the files.
 
     Attributes:
         path: the file, or a pattern as in `formats.file_names`.
@@ -65,9 +65,9 @@ class LightCurve:
     """Brightness of one clip over time."""
 
     times_s: Array  # presentation time of every image after the first one [s], shape (n,)
-    frames: NDArray[np.int64]  # its frame on the clip's even grid, shape (n,)
-    brightness: Array  # its mean brightness, 0 .. 255, shape (n,)
-    # times at which the light suddenly went off, and on [frames], shapes (a,), (b,)
+    frames: NDArray[np.int64]  # frame of each image on the clip's regular grid, shape (n,)
+    brightness: Array  # mean brightness of each image, 0 .. 255, shape (n,)
+    # times of abrupt darkening and brightening [frames], shapes (a,), (b,)
     off_frames: Array
     on_frames: Array
 
@@ -118,7 +118,7 @@ def timecode_rates(path: str | os.PathLike[str]) -> list[Fraction]:
 
 
 def _atoms(file: BinaryIO, start: int, stop: int, path: tuple[bytes, ...]) -> Iterator[int]:
-    """Yield the content positions of the atoms at a path of types."""
+    """Yield the content offsets of the atoms at a path of atom types."""
     for _ in range(_MOST_ATOMS):
         file.seek(start)
         head = file.read(_LONG_HEAD)

@@ -1,4 +1,4 @@
-"""Results of the paper's experiments on one take, as drawn in figures and written to a table."""
+"""Results of the paper's experiments on one take, for figures and a table."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ class Coverage:
     slices_d1: Array  # openings [mm], shape (K,)
     # lowest and highest valid d2 and d3 [mm] of the slice hull on the habitual path, shape (2, K, 2)
     slices: Array
-    # points (d1, d2) and (d1, d3) [mm] inside the slice hull far from every captured pose, each (G, 2)
+    # points (d1, d2) and (d1, d3) [mm] inside the slice hull but far from all captured poses, each (G, 2)
     gaps: tuple[Array, Array]
-    sentences: tuple[str, ...]  # what to record next
+    sentences: tuple[str, ...]  # which movements to record next
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +80,12 @@ class Experiments:
     condyle_paths: tuple[CondylePath, ...]  # one per model
     distances: tuple[Distances, ...]  # everything measured, in the order of the table
     coverage: Coverage  # captured part of the envelope
-    # number of frames each model excluded; models that could not be fitted, and why; experiments not requested
+    # remarks: number of frames that each model excluded, models that could not be fitted, experiments not requested
     notes: tuple[str, ...]
     parameter_paths: tuple[ParameterPath, ...] = ()  # of the linear and the default model, for each parameter
 
     def of(self, experiment: str) -> list[Distances]:
-        """Return the distances of one experiment."""
+        """Return the sets of distances of one experiment."""
         return [found for found in self.distances if found.experiment == experiment]
 
     def table(self) -> list[dict[str, str | int | float]]:

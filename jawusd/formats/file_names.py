@@ -1,7 +1,7 @@
-"""File names: the kind that a suffix states, and numbered files such as image sequences.
+"""File names: file types by suffix, and numbered files such as image sequences.
 
-A pattern stands in the last part of a path: `%06d` or `%d` as in printf, `####` with one sign per digit, or a glob with
-`*` or `?`, where the last digits of the name are the number. Subfolders are not searched.
+The last part of a path may be a pattern: `%06d` or `%d` as in printf, `####` with one # per digit, or a glob with `*`
+or `?`, for which the last digits of a file name are its number. Subfolders are not searched.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mxf", ".mts", ".mpg
 PICTURES = (".png", ".tif", ".tiff", ".exr", ".dpx", ".jpg", ".jpeg")
 MESHES = (".ply", ".stl", ".obj", ".dcm")
 
-# Suffixes that keys of a capture.toml cannot have, by group of keys.
+# Suffixes of the wrong file types for a key of capture.toml, by group of keys.
 _WRONG = {
     "scans": (("a video", VIDEOS), ("a picture", PICTURES)),
     "footage": (("a mesh", MESHES), ("a calibration", (".toml", ".json", ".xml", ".csv", ".yml", ".yaml"))),
@@ -44,7 +44,7 @@ def is_pattern(path: Path) -> bool:
     """Tell whether a path is a pattern of numbered files rather than one file."""
     try:
         return any(sign in path.name for sign in "%#*?") and not path.is_file()
-    except (OSError, ValueError):  # too long, a null byte; the reader reports it
+    except (OSError, ValueError):  # too long, or a null byte; reported by the reader
         return False
 
 
@@ -140,7 +140,7 @@ def _offer(folder: Path) -> str:
 
 
 def wrong_kind(key: str, path: PurePath) -> str | None:
-    """Return why a file has the wrong type for a key of capture.toml, and what is needed; None if it fits.
+    """Return why the type of a file is wrong for a key of capture.toml, and what is needed; None if it is right.
 
     Args:
         key: the key, such as `upper_teeth`, `video`, `calibration`.

@@ -1,4 +1,4 @@
-"""Findings of checks and estimates, in one form for the terminal, JSON, tracks and reports."""
+"""Findings of checks and estimates: one class for the terminal, JSON, tracks and reports."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Finding:
 
     kind: str  # stable identifier for programs, such as "scans_apart"
     severity: Severity
-    message: str  # one sentence without the place: what was found and what is allowed, with units
+    message: str  # one sentence, without the place: what was found and what is allowed, with units
     value: float | None = None  # the measured value, in the unit given in the message
     limit: float | None = None  # what is allowed, in the same unit
     path: str | None = None

@@ -20,7 +20,7 @@ from jawusd.base.arrays import Array
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.geometry.quaternion import continuous_wxyz
 
-_MM = 1e-3  # in metres
+_MM = 1e-3  # a millimetre in metres
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _Values = NDArray[np.float32] | NDArray[np.uint16] | NDArray[np.uint32]
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -29,7 +29,7 @@ _VERTICES, _INDICES = 34962, 34963  # targets of buffer views
 
 @dataclass(frozen=True)
 class Material:
-    """A material, used where a surface has no vertex colours."""
+    """A material; its colour is multiplied by vertex colours, if there are any."""
 
     color: tuple[float, float, float]  # linear red, green, blue, 0 .. 1
     roughness: float

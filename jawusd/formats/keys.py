@@ -15,7 +15,7 @@ from jawusd.base.tables import read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_model
 
-#: Largest length, an hour at 60 frames per second, since every frame is written; and largest frame number.
+#: Most frames, an hour at 60 frames per second, since every frame is baked; and largest frame number.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
 _MAX_BYTES = 64 << 20
 #: Largest parameter [mm]: larger values overflow when projected into the bound.

@@ -32,7 +32,7 @@ READ = (
     "Supported are C3D, TSV of Qualisys Track Manager (3D), TRC, CSV of Vicon Nexus (Trajectories), ArtiSynth probes, "
     "and plain rows of numbers."
 )
-#: Suffixes of marker and motion files that are not supported.
+#: Suffixes of unsupported marker and motion files, with their types.
 _NOT_READ = {
     ".mat": "a MATLAB file",
     ".qtm": "a project file of Qualisys Track Manager",
@@ -47,7 +47,7 @@ _NOT_READ = {
 _LENGTHS = ("mm", "cm", "m")
 _MAX_BYTES = 1 << 28
 _MOST_FRAMES = 10_000_000
-_OUT_OF_SIGHT = 1e20  # coordinates from here on mark a hidden marker
+_OUT_OF_SIGHT = 1e20  # coordinates of this magnitude or more mean a hidden marker
 _INTERPOLATIONS = ("step", "linear", "parabolic", "cubic", "cubicstep", "quadraticstep", "sphericallinear")
 _LEADING_ZERO = re.compile(r"[+-]?0\d+")
 
@@ -136,7 +136,7 @@ def _read_table(path: Path) -> MarkerTable:
 
 def _plain(rows: _Rows, separator: str, path: Path) -> Array:
     """Return the positions in plain numbers or an ArtiSynth probe, shape (F, N, 3)."""
-    if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # spaces as well as separators
+    if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # spaces within cells
         rows = [(line, separator.join(row).split()) for line, row in rows]
     probe = len(rows) > 1 and rows[1][1][0].strip().lower() in _INTERPOLATIONS
     if probe:
@@ -194,7 +194,7 @@ def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
     data = [(line, row) for line, row in rows if _is_number_or_blank(row[0])]
     header = next((row for _, row in rows if row[0].strip().lower() == "frame"), [])
     first = [cell.strip().lower() in ("frame", "time") for cell in header[:2]].count(True)
-    if not header:  # two extra numbers are frame and time
+    if not header:  # two extra columns are frame and time
         filled = max((k + 1 for _, row in data for k, cell in enumerate(row) if cell.strip()), default=0)
         first = max(filled - 3 * count, 0)
     points = _positions(data, first, 3 * count, path)
@@ -250,7 +250,7 @@ def _read_vicon(rows: _Rows, path: Path) -> MarkerTable:
 
 
 def _with_gaps(data: _Rows, points: Array, path: Path) -> Array:
-    """Return positions with NaN frames for numbers missing in the first column."""
+    """Return positions with rows of NaN for frame numbers missing in the first column."""
     numbers = to_numbers([row[:1] for _, row in data], lambda i, _: f"line {data[i][0]}, frame", path)[:, 0]
     steps = np.diff(numbers)
     if (steps < 1).any() or (numbers % 1 != 0).any():
@@ -308,7 +308,7 @@ def length_unit(unit: str, path: Path) -> str | None:
 
 
 def _probe_size(row: list[str], path: Path) -> int:
-    """Return how many numbers a frame of an ArtiSynth probe has."""
+    """Return the number of values per frame of an ArtiSynth probe."""
     try:
         return int(row[1])
     except (IndexError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""A triangle mesh as the layers exchange it, its crown faces, and the colours of contacts between teeth."""
+"""The triangle mesh used by all layers, its crown faces, and the colours of contacts between teeth."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from jawusd.base.arrays import Array, Mask
 
 GUM, TOOTH, BOUNDARY, BASE = 0, 1, 2, 3
 
-# Excess of red or green over the other channels (of 255) that marks a label: painted labels have more (pure red 255),
-# gum in photographic textures, such as (200, 110, 110), less.
+# Least excess of red or green over the other channels (of 255) in a painted label: pure red has 255, gum in
+# photographic textures, such as (200, 110, 110), less than this.
 _PAINT_CONTRAST = 100
-_FEWEST_PAINTED = 0.01  # fraction of vertices; fewer are not a labelling
+_FEWEST_PAINTED = 0.01  # fraction of vertices below which a scan does not count as painted
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Mesh:
     vertices: Array  # positions [mm], shape (V, 3), float64
     faces: NDArray[np.int32]  # vertex indices, counter-clockwise seen from outside, shape (F, 3), int32
     colors: NDArray[np.uint8] | None = None  # red, green, blue per vertex, shape (V, 3), uint8, or None
-    # labels of a teeth scan other than painted ones: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,), uint8
+    # labels of a teeth scan that are not painted: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,), uint8
     labels: NDArray[np.uint8] | None = None
     # texture coordinates of face corners, u to the right, v upwards, shape (F, 3, 2), float64, or None
     uv: Array | None = None
@@ -89,7 +89,7 @@ def natural_colors(mesh: Mesh) -> NDArray[np.uint8] | None:
 def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
     """Return GUM, TOOTH or BOUNDARY per vertex of a teeth scan, shape (V,); tooth labels are > 0.
 
-    Uses the mesh's labels, with its base as gum, or painted labels; without either, everything is tooth.
+    Uses the mesh's labels, with the base as gum, or painted labels; without either, every vertex is TOOTH.
     """
     if mesh.labels is not None:
         return np.where(mesh.labels == BASE, GUM, mesh.labels).astype(np.uint8)
@@ -107,7 +107,7 @@ class Mark(NamedTuple):
 
     color: tuple[int, int, int]  # red, green, blue, 0 to 255
     meaning: str
-    apart_mm: float  # used where surfaces are closer than this; negative: deeper than in the closed bite
+    apart_mm: float  # largest distance with this colour; negative: penetration beyond that of the closed bite
 
 
 DEEP = Mark((120, 40, 200), "deeper than in the closed bite", -0.15)

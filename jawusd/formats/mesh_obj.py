@@ -1,7 +1,7 @@
 """Wavefront OBJ: vertices, texture coordinates and faces ("Object Files (.obj)", Alias|Wavefront, 1995).
 
-Negative indices count back from the line that uses them. Vertices may have a colour after their coordinates, 0 to 1
-(MeshLab, Blender) or 0 to 255. Materials, normals, groups, lines and curves are ignored.
+Negative indices count backwards from the last vertex before the face. Vertices may have a colour after their
+coordinates, 0 to 1 (MeshLab, Blender) or 0 to 255. Materials, normals, groups, lines and curves are ignored.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from jawusd.formats.mesh_data import (
 _MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
 _COUNTED = re.compile(r"^#\s*Faces:\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE)  # written by MeshLab above the faces
-# OBJ has no counts. A file without a final line end, and with this fraction of unused vertices, counts as truncated.
+# OBJ does not declare counts. A file is truncated if its last line does not end and at least this fraction of vertices
+# is unused.
 _LEAST_LOOSE = 0.1
 
 
@@ -133,7 +134,7 @@ def _uv(path: Path, rows: list[list[str]], texture: Indices | None, placed: Indi
 
 
 def _check_whole(path: Path, text: str, polygons: int, vertices: Array, faces: Indices) -> None:
-    """Raise if a file is truncated within its faces."""
+    """Raise an error if a file is truncated within its faces."""
     declared = _COUNTED.findall(text)
     if len(declared) == 1 and int(declared[0]) > polygons:
         raise cut_off(path, polygons, int(declared[0]), "faces")

@@ -170,7 +170,7 @@ def _plural(element: _Element) -> str:
 
 
 def _numbers(text: bytes) -> tuple[Array, str | None]:
-    """Return the numbers of a text up to the first invalid word, and that word unless it is the last."""
+    """Return the numbers of a text up to the first invalid word, and that word unless it ends the text."""
     words = text.split()
     try:
         return np.fromiter(map(float, words), np.float64, len(words)), None
@@ -187,7 +187,7 @@ def _numbers(text: bytes) -> tuple[Array, str | None]:
 
 
 def _check_columns(path: Path, text: bytes, rows: int, used: int) -> None:
-    """Raise if the lines of a text hold more numbers than the header declares; extra lines are ignored."""
+    """Raise an error if lines of a text file have more numbers than the header declares; extra lines are ignored."""
     lines = [line for line in text.splitlines() if line.strip()][:rows]
     held = sum(len(line.split()) for line in lines)
     if len(lines) == rows and held != used:
@@ -199,7 +199,7 @@ class _Reader:
 
     def __init__(self, path: Path, element: _Element, order: str) -> None:
         self._path, self._element = path, element
-        # numbers of text files are stored as doubles
+        # numbers of text files are read as doubles
         self._values = [(order + one.value if order else "<f8") for one in element.properties]
         self._lengths = [one.length and (order + one.length if order else "<f8") for one in element.properties]
 
@@ -261,7 +261,7 @@ class _Reader:
         return np.array(starts, np.int64), np.array(counts, np.int64).reshape(rows, -1)
 
     def _table(self, groups: list[tuple[Indices, NDArray[np.void]]], counts: Indices) -> _Table:
-        """Return the table of rows that were read in groups, each with its row indices."""
+        """Return the table from rows that were read in groups; each group comes with its row indices."""
         columns: dict[str, Array] = {}
         lists: dict[str, tuple[Indices, Array]] = {}
         for k, one in enumerate(self._element.properties):

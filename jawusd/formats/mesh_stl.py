@@ -17,7 +17,7 @@ from jawusd.formats.mesh_data import COPY_AGAIN, MOST_TRIANGLES, MeshData, check
 
 _HEADER = 84
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_LENGTHS = (1e-6, 1e5)  # range of plausible coordinates, to detect triangles beyond the declared count
+_LENGTHS = (1e-6, 1e5)  # range of plausible magnitudes of coordinates, to detect triangles beyond the declared count
 _SOLID = re.compile(rb"\n[ \t]*(end)?solid\b[^\n]*")
 _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 
@@ -30,7 +30,7 @@ def read_stl(path: Path) -> MeshData:
     """
     data = read_mesh_bytes(path)
     begins_as_text = data[:512].removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() == b"solid"
-    # The highest byte of a binary count is zero; text has no zero bytes. Binary headers may also start with "solid".
+    # Binary headers may also start with "solid"; but a plausible count contains a zero byte, and text does not.
     corners = _text(path, data) if begins_as_text and 0 not in data[80:_HEADER] else _binary(path, data)
     return MeshData(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
@@ -67,7 +67,7 @@ def _are_triangles(corners: Array) -> np.typing.NDArray[np.bool_]:
 def _text(path: Path, data: bytes) -> Array:
     data = (b"\n" + data.removeprefix(b"\xef\xbb\xbf")).lower().replace(b"\r", b"\n")
     ends = [bool(word) for word in _SOLID.findall(data)]
-    body = _SOLID.sub(b"", data)  # names may hold any words
+    body = _SOLID.sub(b"", data)  # names may contain keywords
     whole = body.count(b"endfacet")
     facets = body.count(b"facet") - whole
     check_count(path, facets, "triangles")

@@ -37,7 +37,7 @@ class JawModel:
 
     @property
     def notes(self) -> ModelMeta:
-        """Those values of `meta` that have a schema."""
+        """The values of `meta` that have a schema."""
         return cast(ModelMeta, self.meta)
 
 

@@ -20,7 +20,7 @@ _STRICT = ConfigDict(strict=True, extra="ignore")
 
 
 class CameraCorrections(TypedDict, total=False):
-    """Camera poses as refined on a take; tables by camera name."""
+    """Corrections of the camera poses, estimated on a take; tables by camera name."""
 
     corrected: bool
     pivot_mm: list[float]
@@ -34,8 +34,8 @@ class CameraCorrections(TypedDict, total=False):
 class Registration(TypedDict, total=False):
     """Registration of the lower scan to the closed bite found in the take, in skull (scan) axes.
 
-    `T` (4, 4) maps the lower scan as given to its corrected position; shift and turn describe the same motion about the
-    centre of the lower crowns.
+    `T` (4, 4) maps the lower scan from its given to its corrected position; shift and turn describe the same motion,
+    about the centre of the lower crowns.
     """
 
     frames: Required[list[int]]  # frames with the teeth together
@@ -51,7 +51,7 @@ class Registration(TypedDict, total=False):
 class TakeNotes(TypedDict, total=False):
     """Estimates for the whole take, stored in tracks and printed in summaries; pairs are (upper, lower)."""
 
-    outline_bias_px: dict[str, list[float]]  # by camera: offset of the masks' outlines at free edges
+    outline_bias_px: dict[str, list[float]]  # by camera: bias of the mask outlines at free edges
     gum_bias_px: dict[str, list[float]]  # by camera: the same at the gum line
     gum_line_mm: list[float]  # offset of the drawn gum line from the scans', along the surface towards the gum
     registration: Registration  # of the lower scan, from frames with the teeth together
@@ -71,20 +71,20 @@ class TracksMeta(TakeNotes, total=False):
     outline_bias_sigma_px: dict[str, list[float]]
     gum_bias_sigma_px: dict[str, list[float]]
     gum_line_sigma_mm: list[float]
-    steady_error: list[list[list[float]]]  # of both arches S (4, 4): the masks showed T_world_arch @ S
+    steady_error: list[list[list[float]]]  # per arch S (4, 4): the poses T_world_arch @ S fit the masks
     extrinsics: CameraCorrections
-    focal: dict[str, list[float]]  # by camera: focal length over the calibrated one, and its standard deviation
+    focal: dict[str, list[float]]  # by camera: estimated over calibrated focal length, and its standard deviation
     start: dict[str, object]  # how and on which frame tracking was initialised
     painted: list[bool]
     solver: str
     backend: str
     evaluations_per_row_and_frame: float
     fps: float  # frames per second of a performance
-    tolerance_mm: float  # distance outside the bound that the rig allows for a performance
+    tolerance_mm: float  # largest distance outside the bound at which the rig accepts poses of a performance
 
 
 class ModelWarning(TypedDict):
-    """A movement or quality that the take lacks for a good model."""
+    """A movement that the take lacks, or a quality that is too low, for a good model."""
 
     code: str
     message: str

@@ -1,4 +1,4 @@
-"""A solved performance: head and jaw of a known person per frame, its CSV table, and its arrays in `tracks.npz`."""
+"""A solved performance: head and jaw of a known subject per frame, its CSV table, and its arrays in `tracks.npz`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STATE_WORDS: dict[SolveState, str] = {
     SolveState.CARRIED: "hidden: interpolated from neighbouring frames",
     SolveState.LOST: "lost: no pose fits the pictures",
 }
-#: RGB of an arch in images, by state; the colours also differ in brightness.
+#: RGB of an arch in overlays, by state; the colours also differ in brightness.
 STATE_COLOURS: dict[SolveState, tuple[int, int, int]] = {
     SolveState.SOLVED: (0, 190, 120),
     SolveState.CARRIED: (255, 225, 0),
@@ -56,7 +56,7 @@ class Performance:
         pivot: point of the upper scan [mm], shape (3,).
         state: `SolveState`, shape (F,).
         found: arches whose outlines were used, (upper, lower), shape (F, 2).
-        use: masks, or cameras, that were used, shape (F, 2, C).
+        use: masks that were used, or cameras if there are no masks, shape (F, 2, C).
         uncovered: fraction of each mask not covered by the scan, shape (F, 2, C); NaN without a mask.
         residual_px, matched_px: standard deviation of outline residuals, and length of matched contour, shape (F, 2).
         margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).
@@ -138,7 +138,7 @@ class SolvedJaw:
 
 
 def take_solved(arrays: NamedArrays, count: int, path: str | os.PathLike[str]) -> SolvedJaw | None:
-    """Return the performance arrays of a tracks file with `count` frames; None if it has none.
+    """Return the performance arrays of a tracks file with `count` frames; None if the file has none.
 
     Raises:
         FormatError: an array is missing, has the wrong shape, is not finite, or has an unknown state.

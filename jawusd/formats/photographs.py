@@ -15,7 +15,7 @@ FORMAT = "jawusd-photos/1"
 
 @dataclass(frozen=True, eq=False)
 class AlignedPhoto:
-    """Pose and lens of one photograph, in pixels of the image as stored (mirrored if it is)."""
+    """Pose and lens of one photograph, in pixels of the image as stored, mirrored or not."""
 
     name: str
     size_px: tuple[int, int]
@@ -27,10 +27,10 @@ class AlignedPhoto:
     outline_rms_px: float  # rms distance of drawn points from the outlines, in px of an image 1440 px wide
     outline_median_px: float
     free_rms_px: float  # the same without gum lines
-    # mean squared distance in position and direction, relative to half a millimetre, at most 1, of the worse arch
+    # worse arch's mean squared distance in position and direction, relative to half a millimetre; each at most 1
     misfit: float
-    other_hand: float  # misfit with the opposite mirroring over `misfit`, at the initial pose [-]
-    T_upper_lower_alone: Array  # the bite from this photograph alone, shape (4, 4)
+    other_hand: float  # misfit with the opposite handedness over that with this one, at the initial pose [-]
+    T_upper_lower_alone: Array  # the bite estimated from this photograph alone, shape (4, 4)
     alone_off_mm: float  # distance of that bite from the common one at the lower incisor
 
     def as_json(self) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""Data of the reports of a build and of a solved performance, before rating and drawing."""
+"""Data for the reports of a build and of a solved performance, before rating and drawing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jawusd.formats.tracks import Tracks
 
 @dataclass(frozen=True)
 class Origin:
-    """Provenance of a build; empty where not recorded."""
+    """Provenance of a build; strings are empty if not recorded."""
 
     finished: str  # date and time
     command: str  # the command line; "" if called from Python
@@ -56,7 +56,7 @@ class ReplayPart:
 
     name: str  # display name
     kind: str  # "bone", "tooth" or "gum": how it is coloured
-    moves: bool  # it belongs to the mandible
+    moves: bool  # moves with the mandible
     mesh: Mesh  # decimated, anatomical frame, at the closed bite [mm]
 
 

@@ -19,7 +19,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 _MOST_TOML_BYTES = 4 << 20
 _SHOWN = 80  # characters of a line in messages
-# Dotted parts of a key: tomllib takes quadratic time, hours for a file of 200 kB.
+# Most parts of a dotted key: tomllib takes quadratic time, hours for a file of 200 kB.
 _MOST_DOTS = 64
 _NAME = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_NAME}[ \t]*+\.[ \t]*+){{{_MOST_DOTS}}}", re.ASCII)
@@ -84,7 +84,7 @@ def parse_json(text: str, path: Path) -> object:
 
 
 def parse_model(text: str, path: Path, model: type[Model], hint: str | None = None) -> Model:
-    """Parse a JSON text read from a file into a model; field descriptions are used in messages.
+    """Parse a JSON text read from a file into a pydantic model; field descriptions are used in messages.
 
     Raises:
         FormatError: it is not JSON, or a value is missing or wrong.

@@ -21,7 +21,7 @@ from jawusd.formats.performance import SolvedJaw, take_solved
 from jawusd.geometry import LANDMARKS, rigidity_defect
 
 FAMILY, VERSION = "jawusd-tracks", 1
-_APART_S = 0.5  # least distance of chosen frames; neighbours show the same problem
+_APART_S = 0.5  # least time between chosen frames; adjacent frames have the same problem
 
 
 class TrackStatus(IntEnum):
@@ -30,7 +30,7 @@ class TrackStatus(IntEnum):
     LOST = 0
     TRACKED = 1
     RECOVERED = 2  # after a loss
-    PARTIAL = 3  # without one of the cameras
+    PARTIAL = 3  # tracked without one of the cameras
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -43,13 +43,13 @@ _WHOLE = ("frames", "status", "prior_aided", "masks_used", "lost_reason")
 
 
 class LostReason(IntEnum):
-    """Values of `Tracks.lost_reason`: the failed check by which the tracker lost an arch, and its measure."""
+    """Values of `Tracks.lost_reason`: the check that failed when an arch was lost, and the checked quantity."""
 
     NONE = 0  # not lost, or not recorded
     FEW_MASKS = 1  # number of masks used
     LITTLE_CONTOUR = 2  # matched contour [px]
     ROUGH_FIT = 3  # standard deviation of the residuals [px]
-    LOW_SCORE = 4  # matched contour over its recent median, with residuals also above theirs [-]
+    LOW_SCORE = 4  # matched contour over its recent median, if residuals are also above their recent median [-]
     UNCOVERED_MASK = 5  # largest fraction of a mask not covered by the scan [-]
     UNCERTAIN = 6  # standard deviation of the crowns' position [mm]
 
@@ -77,7 +77,7 @@ class Tracks:
     """Tracked poses of a take; NaN where an arch was not tracked.
 
     Poses without prefix are final. `raw_` poses are from the first pass, without smoothing or kinematic prior; models
-    are fitted to and evaluated on them.
+    are fitted to them and evaluated on them.
 
     Attributes:
         frames: frame numbers of the reference camera, shape (F,).
@@ -207,7 +207,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         UnitsError: other units or twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
-    limit = meta.pop("margin_limit_mm", None)  # older files store the smallest margin, a negative value
+    limit = meta.pop("margin_limit_mm", None)  # in older files: the smallest allowed margin, a negative value
     if isinstance(limit, float):
         meta["tolerance_mm"] = -limit
     check_notes(meta, TracksMeta, path)
@@ -221,7 +221,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         # Lost frames are NaN, so only integer arrays must be finite.
         name: take(arrays, name, shape, path, finite=name in _WHOLE)
         for name, shape in _shapes(count, len(names)).items()
-        if not name.startswith("lost_") or "lost_reason" in arrays  # older files have none of the three
+        if not name.startswith("lost_") or "lost_reason" in arrays  # files of older versions lack all three
     }
     if not np.isin(values.get("lost_reason", 0), list(LostReason)).all():
         raise FormatError('"lost_reason" has an unknown reason.', path=path)

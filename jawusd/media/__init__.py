@@ -1,4 +1,4 @@
 """Read and write the images of a capture: clips by presentation time, masks, overlays, videos.
 
-The only room that may import PyAV; imports `meshes` only to draw overlays.
+The only package that may import PyAV; imports `meshes` only to draw overlays.
 """

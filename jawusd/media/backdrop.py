@@ -1,4 +1,4 @@
-"""Background of drawn scans: a camera's footage, or its masks if there is none."""
+"""Background behind drawn scans: a camera's footage, or its masks if there is none."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _UPPER, _LOWER, _NEITHER = 150, 105, 25
 
 
 class Backdrop:
-    """Images of one camera by frames of the reference camera; thread-safe.
+    """Images of one camera, by frame of the reference camera; thread-safe.
 
     Attributes:
         size_px: (width, height) of the images.
@@ -26,7 +26,7 @@ class Backdrop:
     """
 
     def __init__(self, source: CameraSource, offset: int) -> None:
-        """Open the footage or masks; frame k shows the same instant as frame k + offset of the reference camera.
+        """Open the footage or masks; frame k was recorded at the same instant as frame k + offset of the reference camera.
 
         Raises:
             CaptureError: it has neither video nor masks, or they cannot be decoded.

@@ -27,7 +27,7 @@ INTERLACED_HINT = (
 class VideoFrame:
     """One decoded image."""
 
-    index: int  # number in order of presentation, the first is 0
+    index: int  # index in presentation order, from 0
     time_s: float  # presentation time after the first image [s]
     image: NDArray[np.uint8]  # (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, 0..255, read-only
 
@@ -41,7 +41,7 @@ class Clip(ABC):
         times_s: presentation times after the first image [s], shape (count,), increasing.
         timeline: maps frames to images.
         keys: indices of key frames, shape (n,).
-        start_s: presentation time of the first image in the file, on the same clock as its sound [s].
+        start_s: presentation time of the file's first image, on the same clock as its sound [s].
         fps: average images per second.
         rotation_deg: counter-clockwise rotation stored in the file: 0, 90, 180 or 270. It is applied to every image.
         size_px: (width, height) after rotation.
@@ -50,8 +50,8 @@ class Clip(ABC):
         timecode_fps: frames per second of the time code; None if unknown.
         is_interlaced: whether a decoded image was marked as interlaced.
         has_alpha: whether the images have an alpha channel.
-        is_gray: whether they are stored as one channel.
-        is_rgb: whether they are stored as RGB.
+        is_gray: whether the images are stored as one channel.
+        is_rgb: whether the images are stored as RGB.
     """
 
     path: Path
@@ -80,7 +80,7 @@ class Clip(ABC):
         region: tuple[int, int, int, int] | None = None,
         threads: int = 0,
     ) -> Iterator[VideoFrame]:
-        """Return an iterator over the images first, first + 1, .. last - 1.
+        """Return an iterator over the images first, first + 1, ..., last - 1.
 
         Gray is the luma at full range (black 0, white 255); for gray and full-range files it is the decoder's own
         buffer, without a copy.
@@ -108,7 +108,7 @@ class Clip(ABC):
     def pictures(
         self, wanted: Sequence[int | None], *, colour: Colour = "gray", threads: int = 0
     ) -> Iterator[NDArray[np.uint8] | None]:
-        """Yield an image for each of increasing indices and None for None, decoding every image at most once.
+        """Yield the image at each index, and None for None; every image is decoded at most once.
 
         Args:
             wanted: indices of images, increasing, or None.

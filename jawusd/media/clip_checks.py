@@ -15,26 +15,26 @@ from jawusd.formats.finding import Finding
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT, Clip
 from jawusd.media.picture_sequence import PictureSequence
 
-# Drift between cameras over a take that is ignored [frames].
+# Largest drift between cameras over a take that is not reported [frames].
 _DRIFT_FRAMES = 0.5
 # Relative tolerance of frame rates: accepts rounding to three digits and 23.976 for 24, but not 25 [1].
 _RATE_TOLERANCE = 0.005
 _DECODED_PX = 1.5e9  # pixels decoded per clip: 700 images of full HD, a few seconds
-_ENDS_S = 4.0  # duration that `sync` reads first
+_ENDS_S = 4.0  # duration at either end that `sync` reads first
 _PART = 48  # images
-_SPARSE = 4  # every 4th pixel in both directions
+_SPARSE = 4  # subsampling: every 4th pixel in both directions
 _LISTED = 5
-# Thresholds for repeated images, relative to the usual change: a percentile over a window of images.
-# Chosen on `tests/benchmarks/frozen.py`, which measures false alarms in still and noisy scenes.
+# Thresholds for repeated images, relative to the usual change: a percentile over a window of images. Chosen with
+# `tests/benchmarks/frozen.py`, which measures false positives in static and noisy scenes.
 _MOST, _AROUND = 75, 48
 _FEWEST = 12  # images needed to estimate the usual change
 _LEAST_CHANGE = 0.1  # of 255 levels
-_SAME, _ALIKE = 0.05, 0.03  # for long runs, and for one or two images, which resemble a reversal of motion
+_SAME, _ALIKE = 0.05, 0.03  # for long runs; for one or two images, which a reversal of motion resembles
 _SHORT, _SOME, _LONG = 2, 5, 12  # images
 _STOPS, _FARTHER = (0.5, 4.0), 1.25
-_FAR_BELOW = 0.2  # of the 25th percentile
+_FAR_BELOW = 0.2  # of the 25th percentile of changes
 _REGULAR = 0.15  # of the images
-_MISSING_SHARE = 0.01  # fraction of frames without an image that is accepted at a constant rate
+_MISSING_SHARE = 0.01  # fraction of frames that may lack an image at a constant rate
 
 
 def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
@@ -77,7 +77,7 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
 
 
 def _parts(video: Clip) -> list[tuple[int, int]]:
-    """Return the ranges of images to decode: all, or both ends, used for synchronisation, and parts between."""
+    """Return the ranges of images to decode: all; of long clips both ends, which are used for synchronisation, and some parts between."""
     most = int(_DECODED_PX / (video.size_px[0] * video.size_px[1]))
     if video.count <= most:
         return [(0, video.count)]
@@ -99,9 +99,9 @@ def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
 def repeated_runs(changes: Array) -> list[tuple[int, int]]:
     """Return the first and last image of runs that repeat the image before them.
 
-    Encoders also repeat images of static scenes, but there changes fade out and in. In a freeze they stop and resume
-    abruptly, and after one or two repeated images the change is larger than usual. A light switched off causes a
-    larger change before the run. Scenes without a usual change are not judged.
+    Encoders also repeat images of static scenes, but there the changes fade out and in. In a freeze they stop and
+    resume abruptly, and after one or two repeated images the next change is larger than usual. If a light was switched
+    off, the change before the run is the larger one. Scenes without a usual change are skipped.
 
     Args:
         changes: of `picture_changes`, shape (n,).
@@ -116,7 +116,7 @@ def repeated_runs(changes: Array) -> list[tuple[int, int]]:
     short = [
         run for run in runs if run[1] - run[0] < _SHORT and known[run[0] : run[1] + 1].max() <= _ALIKE * usual[run[0]]
     ]
-    regular = len(short) > _REGULAR * len(known)  # such as after frame rate conversion
+    regular = len(short) > _REGULAR * len(known)  # images repeated regularly, as by frame rate conversion
     found = [run for run in runs if (run in short and regular) or _stands_out(known, *run)]
     return [(first + 1, last + 1) for first, last in found]
 
@@ -125,11 +125,11 @@ def _stands_out(changes: Array, first: int, last: int) -> bool:
     """Tell whether changes stop and resume abruptly around a run."""
     outside = np.concatenate([changes[max(0, first - _AROUND) : first], changes[last + 1 : last + 1 + _AROUND]])
     if first == 0 or len(outside) < _FEWEST:
-        return False  # many takes begin at rest
+        return False  # many takes begin without motion
     little, usual = np.percentile(outside, (100 - _MOST, _MOST))
     before = changes[max(0, first - 2) : first].max()
     length, most = last - first + 1, changes[first : last + 1].max()
-    # If even the quietest images change, by noise or motion, encoders do not repeat images.
+    # If even the most static images change, by noise or motion, repeated images do not come from the encoder.
     restless = length >= _SOME and little > _LEAST_CHANGE and most <= _FAR_BELOW * little
     least = _STOPS[0] * (little if restless else usual)
     if usual <= _LEAST_CHANGE or not least <= before <= _STOPS[1] * usual:

@@ -1,4 +1,4 @@
-"""Open media files: containers limited to one self-contained file, decodable codecs, and sound as one channel."""
+"""Open media files: self-contained containers only, decodable codecs, and sound as one channel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jawusd.base.errors import CaptureError
 from jawusd.base.inputs import check_input
 
-#: Most pixels of an image, four times 8K: a few bytes can declare one that fills the memory.
+#: Most pixels of an image, four times 8K: a header of a few bytes can declare one that exhausts memory.
 MOST_PX = 1 << 27
 #: Self-contained formats. FFmpeg also follows playlists (HLS, DASH, concat, SDP), which refer to other files and URLs.
 FORMATS = (
@@ -30,8 +30,8 @@ PICTURES = (
 )  # fmt: skip
 
 
-# Decoders for which strict error detection, including checksums, is enabled. Not all: the TIFF decoder then rejects
-# valid files, and others gain nothing.
+# Options of strict error detection, including checksums. Not enabled for all decoders: the TIFF decoder would reject
+# valid files, and others do not detect more.
 _STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
 _STRICT_CODECS = ("hevc", "mjpeg", "png")
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
@@ -43,7 +43,7 @@ def open_container(
 ) -> av.container.InputContainer:
     """Open a video or sound file, or a file of the given formats.
 
-    Decoders raise errors for damage or mark images as corrupt, and reject images of more than `most_px` pixels.
+    Decoders raise errors for damaged images or mark them as corrupt, and reject images of more than `most_px` pixels.
 
     Raises:
         av.FFmpegError: it has another format, or refers to other files.
@@ -53,7 +53,7 @@ def open_container(
     options = {"format_whitelist": ",".join(formats), "protocol_whitelist": "file"}
     container = av.open(
         os.fspath(path), metadata_errors="replace", options=options | limit
-    )  # this also decodes some images
+    )  # this also decodes a few images
     for stream in container.streams.video:
         if stream.codec_context is not None:  # None for unknown codecs
             strict = _STRICT if stream.codec_context.name in _STRICT_CODECS else {}
@@ -64,13 +64,13 @@ def open_container(
 def slices_are_whole(packet: bytes) -> bool:
     """Verify the slice checksums of an FFV1 image; false also if there are none.
 
-    FFmpeg silently replaces damaged slices by those of the previous image. RFC 9043, 4.9: a slice ends with its size
+    FFmpeg silently replaces damaged slices with those of the previous image. RFC 9043, 4.9: a slice ends with its size
     (3 bytes), a status (1) and a CRC (4; polynomial 0x04C11DB7, highest bit first, initial value 0).
     """
     end = len(packet)
     while end >= 8:
         size = int.from_bytes(packet[end - 8 : end - 5], "big") + 8
-        # zlib uses the lowest bit first, and inverts.
+        # zlib processes the lowest bit first, and inverts the result.
         if size > end or zlib.crc32(packet[end - size : end].translate(_REVERSED), 0xFFFFFFFF) != 0xFFFFFFFF:
             return False
         end -= size
@@ -78,7 +78,7 @@ def slices_are_whole(packet: bytes) -> bool:
 
 
 def decodable() -> dict[str, bool]:
-    """Return whether common codecs can be decoded, by ffmpeg's name."""
+    """Return which common codecs can be decoded, by ffmpeg's name."""
     return {name: _has(name) for name in _NAMES}
 
 

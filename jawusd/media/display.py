@@ -47,7 +47,7 @@ def to_display(stored: Stored, largest: int, space: str | None, config: Path | N
         return _by_config(values if fractions else values / np.float32(largest), space, config)
     if stored.dtype == np.float32:
         return _curve(np.asarray(stored, np.float32), space)
-    # Two bytes have 65536 values: a lookup table is fastest.
+    # 16-bit types have 65536 values: a lookup table is fastest.
     codes = stored.view(np.uint16) if stored.dtype == np.float16 else stored
     return _table(stored.dtype.name, largest, space)[codes]
 
@@ -75,7 +75,7 @@ def _curve(values: NDArray[np.float32], space: str) -> NDArray[np.uint8]:
 
 
 class _Processor(Protocol):
-    """The part of OpenColorIO that is used; it has no stubs."""
+    """The interface of OpenColorIO that is used here, for type checkers: its package lacks stubs."""
 
     def applyRGB(self, pixels: NDArray[np.float32]) -> None: ...
 

@@ -18,7 +18,7 @@ from jawusd.media.picture_sequence import PictureSequence
 from jawusd.media.video import Video
 
 _AHEAD = 24  # images up to which decoding forward is faster than seeking
-_BACK = 8  # images decoded at once when stepping backwards
+_BACK = 8  # images decoded together when stepping backwards
 _KEPT_BYTES = 128 << 20
 
 

@@ -19,8 +19,8 @@ _TILE_PX = (520, 400)
 _MARGIN = 0.92  # fraction of a tile that the scan fills
 _FAR_MM = 1000.0  # camera distance, far enough for near-orthographic views
 _LEAST_LIGHT = 0.35
-# Rows: right, up and towards the camera in (left, up, front) axes of the subject. The biting side of the upper arch is
-# seen from below, of the lower one from above, with the front teeth at the top.
+# Rows: the image's right, its up, and the direction towards the camera, in (left, up, front) axes of the subject. The
+# biting side is that of the upper arch seen from below, and of the lower arch seen from above; front teeth at the top.
 _SIDES = {
     "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "left": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
@@ -80,7 +80,7 @@ def _view(points: Array, faces: NDArray[np.int32], labels: NDArray[np.uint8]) ->
 
 
 def face_labels(labels: NDArray[np.uint8], faces: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Return the label of every face, shape (F,): crown if two corners are, otherwise that of gum or base corners."""
+    """Return the label of every face, shape (F,): crown if at least two corners are crown, otherwise gum or base."""
     corner = labels[faces]
     tooth = (corner == TOOTH) | (corner > TOOTH) & (corner < BASE)
     rest = np.where((corner == BASE).sum(axis=1) >= 2, BASE, GUM)

@@ -1,4 +1,4 @@
-"""The clock of live images; tests replace it."""
+"""The clock of live images; replaced in tests."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from jawusd.media.pixels import ColourPicture, DecodedPicture
 from jawusd.media.video import Video
 
 _WAIT_S = 0.1
-_KEPT = 8  # buffered images, more than can be waiting for processing
+_KEPT = 8  # size of the buffer, larger than the number of images that can wait for processing
 # PyAV's input format for local devices, by address prefix.
 _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
 
@@ -38,9 +38,9 @@ class LiveSource:
         """Prepare to read from an address.
 
         Args:
-            where: a file, a network address (rtsp://, http://, ...), or a device (/dev/video0 on Linux).
-            size_px: width and height that the camera was calibrated for.
-            early_s: time by which a file starts before the other sources [s].
+            where: a file, a URL (rtsp://, http://, ...), or a device (/dev/video0 on Linux).
+            size_px: width and height for which the camera was calibrated.
+            early_s: time by which the recording in a file begins before those of the other sources [s].
         """
         self.where, self._size_px, self._early_s = where, size_px, early_s
         self._kept: deque[LivePicture] = deque(maxlen=_KEPT)
@@ -51,7 +51,7 @@ class LiveSource:
         self.ended = False
 
     def open(self, from_s: float = 0.0) -> None:
-        """Open the source in its thread; files start at a time from the beginning of the recordings [s]; see `play`."""
+        """Open the source in its thread; files are read from `from_s` [s] after the beginning of the recordings; see `play`."""
         self._heard_s = live_clock.now_s()
         threading.Thread(target=self._read, args=(from_s,), daemon=True).start()
 

@@ -21,7 +21,7 @@ from jawusd.media.pixels import Colour
 LabelValues = tuple[int, int]
 
 _NUMBER = re.compile(r"%(0(\d+))?d")
-_FEW = 6  # label values listed in messages
+_FEW = 6  # most label values listed in messages
 
 
 class PngMasks:
