@@ -170,7 +170,7 @@ def save_colmap(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
         if abs(skew) > _LARGEST_SKEW * fx:
             raise CalibrationError(f"camera {camera.name} has pixel skew, which COLMAP does not support.")
         lens = np.pad(camera.distortion, (0, 8 - camera.distortion.size))
-        values = np.concatenate([[fx, fy, cx + 0.5, cy + 0.5], lens])  # COLMAP's origin is the corner of the first pixel
+        values = np.concatenate([[fx, fy, cx + 0.5, cy + 0.5], lens])  # COLMAP's origin is the corner of a pixel
         shown = " ".join(repr(float(value)) for value in values)
         lenses.append(f"{number} FULL_OPENCV {camera.size_px[0]} {camera.size_px[1]} {shown}")
         T = camera.T_cam_world

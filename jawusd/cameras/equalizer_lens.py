@@ -110,7 +110,7 @@ def find_lenses(folder: Path, scripts: Mapping[Path, list[NukeNode]]) -> list[Fo
 
 
 def _node_lens(path: Path, node: NukeNode, name: str) -> Lens:
-    """Return the lens of an LD node; its class and knobs are named after the model and its parameters, with underscores."""
+    """Return the lens of an LD node, whose class and knobs are named like the model and its parameters."""
     models = {_nuke_name(model): model for model in _PARAMETERS}
     model = models.get(node.kind.removeprefix("LD").lstrip("_"))
     if model is None:

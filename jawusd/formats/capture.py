@@ -26,7 +26,7 @@ class Sync(Strict):
 
     `flash` uses light flashes or, if a clip has none, the sound; `audio` uses only the sound. `timecode` compares the
     time codes of the clips, `numbers` the frame numbers of image sequences. `offsets` sets one integer per camera:
-    frame k of the camera was recorded at the same instant as frame k + offset of the reference camera.
+    frame k of the camera is simultaneous with frame k + offset of the reference camera.
     """
 
     method: Annotated[

@@ -26,7 +26,7 @@ class Backdrop:
     """
 
     def __init__(self, source: CameraSource, offset: int) -> None:
-        """Open the footage or masks; frame k was recorded at the same instant as frame k + offset of the reference camera.
+        """Open the footage or masks; frame k is simultaneous with frame k + offset of the reference camera.
 
         Raises:
             CaptureError: it has neither video nor masks, or they cannot be decoded.

@@ -21,7 +21,7 @@ _DRIFT_FRAMES = 0.5
 _RATE_TOLERANCE = 0.005
 _DECODED_PX = 1.5e9  # pixels decoded per clip: 700 images of full HD, a few seconds
 _ENDS_S = 4.0  # duration at either end that `sync` reads first
-_PART = 48  # images
+_PART = 48  # images per decoded part
 _SPARSE = 4  # subsampling: every 4th pixel in both directions
 _LISTED = 5
 # Thresholds for repeated images, relative to the usual change: a percentile over a window of images. Chosen with
@@ -77,7 +77,7 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
 
 
 def _parts(video: Clip) -> list[tuple[int, int]]:
-    """Return the ranges of images to decode: all; of long clips both ends, which are used for synchronisation, and some parts between."""
+    """Return the ranges of images to decode: all, or for long clips both ends, which `sync` uses, and parts between."""
     most = int(_DECODED_PX / (video.size_px[0] * video.size_px[1]))
     if video.count <= most:
         return [(0, video.count)]

@@ -51,7 +51,7 @@ class LiveSource:
         self.ended = False
 
     def open(self, from_s: float = 0.0) -> None:
-        """Open the source in its thread; files are read from `from_s` [s] after the beginning of the recordings; see `play`."""
+        """Open the source in its thread; files start `from_s` [s] after the beginning of the recordings; see `play`."""
         self._heard_s = live_clock.now_s()
         threading.Thread(target=self._read, args=(from_s,), daemon=True).start()
 

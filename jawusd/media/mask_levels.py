@@ -1,4 +1,4 @@
-"""How images become masks: which channel and values mean background and teeth, found once per take from content."""
+"""Conversion of images to masks: the channel and values of background and teeth, found once per take from content."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as stored in files
 # Largest fraction of intermediate values in a mask. Blurred edges reach 0.2 in small masks; photographs have 0.39 or
 # more.
 MOST_GRAY = 0.2
-MOST_SOFT = 0.35  # largest usual fraction of intermediate values outside the background, as after a blur of 8 px
-_FAINT = 0.25  # of the contrast: smaller values are noise; an image with nothing above it shows no teeth
-_DEAD_ZONE = 0.06  # of the contrast: deviation from the levels by lossy coding
+MOST_SOFT = 0.35  # the same outside the background, for a typical image of a source, as after a blur of 8 px
+_FAINT = 0.25  # of the contrast: smaller values are noise; an image without larger ones has no teeth
+_DEAD_ZONE = 0.06  # of the contrast: deviation from the levels that is attributed to lossy coding
 _NEAR = 24  # of 255: closer values belong to one level, after blur or lossy coding
 _FLAT = 10  # of 255: pixels that differ less from their neighbours are inside a region, not on its edge
 _ALIKE = 0.15  # of the contrast: largest difference of levels between images of one source
-_MOST_THIRD = 0.25  # area of a third level over the smaller of the other two; soft edges are not flat
+_MOST_THIRD = 0.25  # largest area of a third level over the smaller of the other two; soft edges have no flat area
 _SHARP = (
-    0.8  # fraction of a level's area within one step of its value; labels reach it, smooth parts of photographs do not
+    0.8  # least fraction of a level's area within 1 of its value; labels reach it, smooth parts of photographs do not
 )
 
 
@@ -46,7 +46,7 @@ class MaskLevels:
     deep: bool = False  # 16 bit per channel
     lossy: bool = False  # lossy coding has left noise around the levels
     ambiguous: bool = False  # whether border and area disagree about which level is the background
-    # fraction of pixels outside the background that are between the levels
+    # of the pixels outside the background, the fraction between the levels
     soft: float = field(default=0.0, compare=False)
 
     @property
@@ -62,7 +62,7 @@ class MaskLevels:
         return self.teeth < self.background
 
     def coverage(self, image: RawImage) -> tuple[MaskImage | None, str]:
-        """Return the mask of an image, 0 .. 255 with the outline at half, or None; and why the image is rejected.
+        """Return the mask of an image, 0 .. 255 with the outline at half, or None; and the reason if it is rejected.
 
         The reason, phrased to follow the image's name, is empty for masks and empty images. The mask may be the
         input array itself.
@@ -92,7 +92,7 @@ class MaskLevels:
         return mask, ""
 
     def _around_teeth(self, plane: RawImage) -> Slices:
-        """Return the bounding box of everything but background in a channel; at least one pixel."""
+        """Return the bounding box of all that is not background in a channel, at least one pixel."""
 
         def seen(part: RawImage, axis: int) -> list[int]:
             most = part.min(axis) if self.inverted else part.max(axis)
@@ -106,7 +106,7 @@ class MaskLevels:
         return band, slice(columns[0], columns[-1] + 1, 1)
 
     def _shares(self, part: RawImage) -> MaskImage:
-        """Return the coverage of pixels of a channel, 0 .. 255."""
+        """Return the coverage of the pixels of a channel, 0 .. 255."""
         if part.dtype != np.uint8:
             return self._table[part]
         return cast(MaskImage, part if self._as_stored else cv2.LUT(part, self._table))
@@ -158,10 +158,10 @@ def border_share(image: MaskImage, above: float) -> float:
 
 
 class NotMasks(Exception):
-    """Images are not masks, for a `reason`, with a `hint`; `index` is the image that shows it, if there is one."""
+    """Images are not masks, for a `reason`, with a `hint`; `index` is the offending image, if it is a single one."""
 
     def __init__(self, index: int | None, reason: str, hint: str) -> None:
-        """Store the index of the image among those given, None for all of them."""
+        """Store the index among the given images, None if all of them are concerned."""
         super().__init__(reason)
         self.index, self.reason, self.hint = index, reason, hint
 
@@ -172,12 +172,12 @@ class _Levels:
 
     low: float
     high: float
-    light: float  # fraction of the image closer to the high level
-    light_border: float  # the same along its border
+    light: float  # fraction of the image that is closer to the high level
+    light_border: float  # the same along the image's border
     gray: float  # fraction of the image at neither level
-    soft: float  # fraction at neither level of everything not dark, if teeth are light
-    soft_dark: float  # fraction at neither level of everything not light, if teeth are dark
-    third: float | None  # a third level of large area
+    soft: float  # of all that is not dark, the fraction at neither level: the softness if teeth are light
+    soft_dark: float  # of all that is not light, the fraction at neither level: the softness if teeth are dark
+    third: float | None  # a third level of large area, if any
 
     @property
     def contrast(self) -> float:
@@ -195,15 +195,15 @@ class _Looked:
 
 
 def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], Iterable[RawImage]]) -> MaskLevels | None:
-    """Return the meaning of a source's values, None if all its images are empty.
+    """Return the meaning of a source's pixel values, None if all its images are empty.
 
-    The two levels are those of most images. The background is the darker one, unless the lighter one has most of the
-    area and of the border, since teeth are inside the image.
+    The two levels are those that most images have. The background is the darker one, unless the lighter one has most of
+    the area and of the border, since teeth are inside the image.
 
     Args:
         pictures: samples from the whole take.
         lossy: whether coding is lossy.
-        more: returns all other images, used if the samples are empty.
+        more: returns all other images; called if the samples are empty.
 
     Raises:
         NotMasks: most non-empty images are not masks, or have more than two levels.
@@ -225,7 +225,7 @@ def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], It
 
 
 def _shown(looked: Sequence[_Looked]) -> list[_Looked]:
-    """Return the images with content; some programs write opaque photographs for frames without a mask."""
+    """Return the images with a mask; some programs write opaque photographs for frames without one."""
     if any("alpha" in one.planes for one in looked):
         return [one for one in looked if "alpha" in one.planes]
     return [one for one in looked if one.planes and not (one.opaque and one.planes["brightest"].gray > MOST_GRAY)]
@@ -328,7 +328,7 @@ def _levels(plane: RawImage) -> _Levels | None:
 
 
 def _peak(counts: Array) -> tuple[int, float, Array]:
-    """Return the most frequent of 256 values, the count of it and its neighbours, and the counts without them."""
+    """Return the most frequent of 256 values, the count of it and its neighbours, and the histogram without them."""
     at = int(counts.argmax())
     near = slice(max(at - _NEAR, 0), at + _NEAR + 1)
     rest = counts.copy()

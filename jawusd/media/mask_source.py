@@ -1,4 +1,4 @@
-"""The meaning of values in mask files and mask videos, cached per file version."""
+"""The meaning of pixel values in mask files and mask videos, cached per file version."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from jawusd.media.video import Video
 
 _SAMPLED = 10  # sampled images per take
 _FEWEST_OF_VIDEO = 4
-_NEUTRAL = 12  # of 255: colour left in gray by lossy coding
+_NEUTRAL = 12  # of 255: largest difference of channels in gray after lossy coding
 
 
 @dataclass(frozen=True)
 class SourceLevels:
     """The meaning of one source's values.
 
-    `levels` is None if all its images are empty. `palette_numbers`: read palette indices, as all colours are equal.
-    `sizes_px` are the (width, height) of sampled files, one file per size.
+    `levels` is None if all images are empty. `palette_numbers`: use palette indices, because all palette colours are
+    equal. `sizes_px` are the (width, height) of the sampled files, with one file of each size.
     """
 
     levels: MaskLevels | None
@@ -47,7 +47,7 @@ def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | Non
     try:
         return _png_levels_of_version(tuple(sample), versions, others, is_other)
     finally:
-        others.files = []  # the cache keeps this object, and takes have tens of thousands of files
+        others.files = []  # the cache keeps this object alive, and takes have tens of thousands of files
 
 
 def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
@@ -66,7 +66,7 @@ def mask_video(path: Path) -> Video:
         CaptureError: as `Video`.
     """
     if not path.is_file():
-        return Video(path)  # which reports the error
+        return Video(path)  # raises the error
     found = path.stat()
     return _video_of_version(path, found.st_mtime_ns, found.st_size)
 
@@ -78,7 +78,7 @@ def _video_of_version(path: Path, changed_ns: int, size: int) -> Video:
 
 
 class _Others:
-    """Files besides a sample. Instances of equal length compare equal, so that the cache does not compare files."""
+    """All files that are not sampled. Instances of equal length are equal, so that the cache does not compare files."""
 
     def __init__(self, files: list[Path]) -> None:
         self.files, self._count = files, len(files)
@@ -114,7 +114,7 @@ def _png_levels_of_version(
                 try:
                     image = load_png(path)
                 except CaptureError:
-                    continue  # reported when the frame is read
+                    continue  # the error is raised when the frame is read
                 if is_other is None or not is_other(image):
                     read.append(path)
                     sizes.setdefault((image.shape[1], image.shape[0]), path)
@@ -127,7 +127,7 @@ def _png_levels_of_version(
             where = read[error.index] if error.index is not None else sample[0].parent
             raise CaptureError(error.reason, path=where, hint=error.hint) from error
         if not read:
-            return SourceLevels(MaskLevels())  # all files are unreadable; reported when frames are read
+            return SourceLevels(MaskLevels())  # all files are unreadable; the error is raised when a frame is read
         if found is not None:
             return SourceLevels(found, palette_numbers, tuple((path, size) for size, path in sizes.items()))
     return SourceLevels(None, sizes_px=tuple((path, size) for size, path in sizes.items()))
@@ -138,7 +138,7 @@ def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels,
     """Find the levels of a video and the format to decode; the modification time identifies its version."""
     video = mask_video(path)
     colour: Colour = "gray" if video.is_gray else "rgba" if video.has_alpha else "rgb"
-    # Key frames are cheap to decode; some may be empty, as the first often is.
+    # Key frames are cheap to decode. Several are used, because some are empty, often the first.
     sample = [int(video.keys[k]) for k in _spread(len(video.keys), _SAMPLED)]
     if len(sample) < _FEWEST_OF_VIDEO:
         sample = sorted({*sample, *_spread(video.count, _FEWEST_OF_VIDEO)})
@@ -163,7 +163,7 @@ def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels,
         where = "" if error.index is None else f"picture {numbers[error.index]}: "
         raise CaptureError(where + error.reason, path=path, hint=error.hint) from error
     if lossy and neutral[0]:
-        colour = "gray"  # its own luma, at full resolution
+        colour = "gray"  # the video's luma, at full resolution
     return SourceLevels(found), colour
 
 

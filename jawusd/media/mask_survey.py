@@ -1,4 +1,4 @@
-"""What the masks of a capture contain, measured on a few frames in seconds, without tracking."""
+"""Quick checks of the masks of a capture on a few frames, without tracking."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from jawusd.media.masks import MaskReader, open_masks
 
 ARCHES = ("upper", "lower")
 _LISTED = 5
-_SPREAD = 9  # sampled frames per clip
-_POINTS = 500  # sampled pixels per mask
+_SPREAD = 9  # frames sampled per clip
+_POINTS = 500  # pixels sampled per mask
 _HALF = 128
 
 
@@ -61,7 +61,7 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
 
 
 def odd_pictures(source: CameraSource, arch: str, odd: Sequence[str]) -> list[Finding]:
-    """Return findings about images that are inconsistent with the others, see `MaskReader.odd`."""
+    """Return findings about mask images that are inconsistent with the others, see `MaskReader.odd`."""
     if not odd:
         return []
     more = f"; and {len(odd) - _LISTED} more" if len(odd) > _LISTED else ""
@@ -138,8 +138,8 @@ class MaskSamples:
     counts: tuple[int, int]  # number of frames of the mask sources, upper and lower
     first_last: tuple[
         tuple[int, int] | None, tuple[int, int] | None
-    ]  # first and last frame with a mask of each arch, None if there is none
-    read: Callable[[int, int], MaskImage | None]  # arch, frame: the mask
+    ]  # first and last frame with a mask, per arch, None if there is none
+    read: Callable[[int, int], MaskImage | None]  # returns the mask of (arch, frame)
 
     @property
     def first_frame(self) -> int | None:
@@ -186,7 +186,7 @@ def _first_last(reader: MaskReader) -> tuple[int, int] | None:
 
 
 def _boundary(reader: MaskReader, shown: int, empty: int) -> int:
-    """Return the masked frame next to the empty ones, by bisection."""
+    """Return the frame with a mask that is adjacent to the empty frames, by bisection."""
     while abs(shown - empty) > 1:
         middle = (shown + empty) // 2
         if _shows(reader, middle):

@@ -21,7 +21,7 @@ from jawusd.media.mask_levels import MaskImage, MaskLevels
 from jawusd.media.timeline import Timeline
 from jawusd.media.video import Video
 
-_LOOKED_AT = 10  # sampled images of labels
+_LOOKED_AT = 10  # label images sampled
 _AHEAD = 4  # buffered images: 8 MB of full HD per reader
 
 
@@ -51,9 +51,9 @@ class MaskReader:
         """Find the masks, and the meaning of their values from samples of the whole take.
 
         Args:
-            path: a PNG pattern with one `%d` or `%06d` (the number of the image in the camera's video), or a video
-                with one image per image, or per frame, of the camera's video.
-            timeline: timeline of the camera's video; without one, PNG files are numbered by frames.
+            path: a PNG pattern with one `%d` or `%06d` (the index of the image in the camera's video), or a video with
+                one image per image, or per frame, of the camera's video.
+            timeline: timeline of the camera's video; without one, PNG files are numbered by frame.
             labels: for label images, the gray values of the requested and the other arch.
             prepare: applied to each mask in the background thread, such as `WorkingView.mask`.
 
@@ -78,7 +78,7 @@ class MaskReader:
         self._ahead: _Ahead | None = None
 
     def read(self, frame: int) -> MaskImage | None:
-        """Return the prepared mask (h, w) of a frame of the camera: 255 = tooth, 0 = background, soft edges between.
+        """Return the prepared mask (h, w) of a frame of the camera: 255 = tooth, 0 = background, intermediate at edges.
 
         None if the frame is not segmented: outside the video, without an image, or black.
 
@@ -114,7 +114,7 @@ class MaskReader:
 
     @property
     def odd(self) -> list[str]:
-        """Return the rejected images read so far, with reasons; they count as not segmented."""
+        """Return the images rejected so far, with reasons; they count as not segmented."""
         return [self._source.odd[number] for number in sorted(self._source.odd)]
 
     def read_some(self, first: int, stop: int) -> list[MaskImage | None]:
@@ -171,7 +171,7 @@ class MaskReader:
 
 
 def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> Timeline | None:
-    """Return the timeline that maps frames to file numbers; None if they are equal."""
+    """Return the timeline that maps frames to file numbers; None if both are equal."""
     if video is None or not (video.missing or video.is_numbered):
         return None
     if video.is_numbered:
@@ -203,7 +203,7 @@ def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks) -> Calla
 def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -> Timeline:
     """Return the timeline that maps the camera's frames to images of a mask video."""
     if video is None or source.timeline.count == video.count != len(video.numbers) != source.count:
-        return source.timeline  # converted from variable to constant rate
+        return source.timeline  # the masks were made from footage converted to a constant rate
     if source.count != len(video.numbers):
         frames = f" in {video.count} frames" if video.missing else ""
         raise CaptureError(

@@ -28,7 +28,7 @@ UPPER_COLOUR: Colour = (255, 170, 0)
 LOWER_COLOUR: Colour = (0, 200, 255)
 _LINE_PX = 2
 CAPTION_PX = 22
-#: Background where a camera has no image.
+#: Gray of a tile whose camera has no image.
 EMPTY_GRAY = 60
 _MARGIN = 0.25  # margin around the teeth in a tile [fraction of their extent]
 
@@ -37,7 +37,7 @@ _MARGIN = 0.25  # margin around the teeth in a tile [fraction of their extent]
 class PlacedScan:
     """A teeth scan at its tracked pose."""
 
-    mesh: Mesh  # the scan [mm]; its gum occludes but is not drawn
+    mesh: Mesh  # the scan [mm]; its gum is not drawn, but occludes
     T_world_scan: Array  # its pose, shape (4, 4); NaN omits the scan
     colour: Colour
 
@@ -66,7 +66,7 @@ def draw_overlay(
 
 
 def arch_colours(tracks: Tracks, row: int) -> tuple[Colour, Colour]:
-    """Return the colours of upper and lower arch in the frame at a row; by state in a solved performance."""
+    """Return the colours of upper and lower arch in a row of tracks; of a solved performance, by its state."""
     if tracks.solved is None:
         return UPPER_COLOUR, LOWER_COLOUR
     whole = SolveState(int(tracks.solved.state[row]))
@@ -76,7 +76,7 @@ def arch_colours(tracks: Tracks, row: int) -> tuple[Colour, Colour]:
 
 
 def placed_scans(tracks: Tracks, row: int, meshes: Sequence[Mesh]) -> list[PlacedScan]:
-    """Return the upper and the lower scan at the poses of the frame at a row."""
+    """Return the upper and the lower scan, posed as in a row of tracks."""
     poses = tracks.T_world_upper[row], tracks.T_world_lower[row]
     return [PlacedScan(*one) for one in zip(meshes, poses, arch_colours(tracks, row), strict=True)]
 
@@ -93,11 +93,11 @@ def tracking_sheet(
 ) -> NDArray[np.uint8]:
     """Return one RGB image with a row per frame and a column per camera, cropped to the teeth and captioned.
 
-    A tile is gray without an image, and has no tint where the jaw was lost.
+    A tile is gray if the camera has no image, and has no tint if the jaw was lost.
 
     Args:
         frames: frames of the reference camera, all of them in tracks.
-        backdrops: images by camera.
+        backdrops: image sources by camera.
 
     Raises:
         ValueError: a frame is not in tracks.
@@ -151,7 +151,7 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
 
 
 def _points(camera: Camera, scan: PlacedScan) -> NDArray[np.float32]:
-    """Return recorded pixels and depth per vertex; triangles are small enough to ignore distortion within them."""
+    """Return the distorted pixel and the depth of each vertex; distortion within a triangle is negligible."""
     world = transform_points(scan.T_world_scan, scan.mesh.vertices)
     return np.column_stack([camera.project(world), camera.depth(world)]).astype(np.float32)
 

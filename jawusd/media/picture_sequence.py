@@ -21,7 +21,7 @@ from jawusd.media.timeline import Timeline
 
 #: Frame rate if neither the capture nor the files have one.
 _USUAL_RATE = 24.0
-_FASTEST_COUNT = 30.0  # of time codes in headers [frames per second]
+_FASTEST_COUNT = 30.0  # highest rate of time codes in headers [frames per second]
 _AHEAD = 2  # images decoded ahead
 
 
@@ -30,7 +30,7 @@ class PictureSequence(Clip):
 
     Attributes:
         numbers: numbers of the files, increasing, shape (count,).
-        is_fractional: whether pixels are floating-point light, as in EXR.
+        is_fractional: whether pixels are floating-point linear light, as in EXR.
     """
 
     def __init__(self, source: ClipSource) -> None:
@@ -51,7 +51,8 @@ class PictureSequence(Clip):
         self.keys = np.arange(self.count)
         self.start_s, self.rotation_deg = 0.0, 0
         self.timecode = header.timecode
-        # Headers can count 39 frames per second; at higher rates several images share a number (SMPTE ST 12-3).
+        # The header field has room for frame numbers below 40; at higher rates several images have the same (SMPTE ST
+        # 12-3).
         self.timecode_fps = self.fps / math.ceil(self.fps / _FASTEST_COUNT - 0.01)
         self.pixel_aspect = header.pixel_aspect
         self._space = source.colour_space or header.colour_space
@@ -77,7 +78,7 @@ class PictureSequence(Clip):
         return found
 
     def light(self, index: int) -> NDArray[np.float32]:
-        """Return a floating-point image as light, (h, w, 3) RGB float32.
+        """Return a floating-point image as linear light, (h, w, 3) RGB float32.
 
         Raises:
             CaptureError: as `stored`.

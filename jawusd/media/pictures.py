@@ -28,11 +28,11 @@ RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 _PNG = b"\x89PNG\r\n\x1a\n"
 _HINT = "Export the pictures again, as PNG, TIFF, EXR, DPX or JPEG."
 _MOST_HEADER_BYTES = 1 << 16
-#: Largest image, 8K [px]: small files can declare images that exhaust memory, at up to 28 bytes per pixel.
+#: Largest image, 8K [px]: small files can declare images that exhaust memory; decoding takes up to 28 bytes per pixel.
 MOST_STORED_PX = 36_000_000
 _EXR, _DPX = b"\x76\x2f\x31\x01", (b"SDPX", b"XPDS")
-_QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # orientations of Exif
-_DPX_LOG = (1, 3)  # transfer characteristics of printing density and of logarithm, SMPTE ST 268-1 table 5A
+_QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # Exif orientations: quarter turns, mirrored ones
+_DPX_LOG = (1, 3)  # transfer characteristics "printing density" and "logarithmic", SMPTE ST 268-1 table 5A
 
 
 def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
@@ -50,7 +50,7 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
 
 
 def _pixels(path: Path) -> int:
-    """Return the number of pixels in the file's header, 0 if unknown."""
+    """Return the number of pixels according to the file's header, 0 if unknown."""
     with open(path, "rb") as file:
         head = file.read(24)
     if head.startswith(_PNG):  # fast path for PNG
@@ -62,7 +62,7 @@ def _pixels(path: Path) -> int:
                 return image.width * image.height
     except Image.DecompressionBombError:
         return MOST_PX + 1
-    except Exception:  # unknown to Pillow; OpenCV has its own limit
+    except Exception:  # unknown to Pillow; OpenCV enforces its own limit
         return 0
 
 
@@ -165,7 +165,7 @@ def _fractions(frame: av.VideoFrame) -> NDArray[np.float16] | NDArray[np.float32
     count = len(frame.planes)
     pixels = np.empty((frame.height, frame.width, min(count, 3)), kind.newbyteorder("="))
     order = (0,) if count == 1 else (1, 2, 0)  # ffmpeg's planar order is green, blue, red
-    for plane, channel in zip(frame.planes, order):  # a fourth is alpha
+    for plane, channel in zip(frame.planes, order):  # a fourth plane is alpha
         rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
         pixels[..., channel] = np.ascontiguousarray(rows[: frame.height, : frame.width * kind.itemsize]).view(kind)
     return pixels[..., 0] if count == 1 else pixels
@@ -189,7 +189,7 @@ def read_header(path: Path) -> PictureHeader:
         if head[:4] in _DPX:
             return _dpx(head)
     except (struct.error, IndexError, ValueError):
-        pass  # the decoder reports damage
+        pass  # damage is reported by the decoder
     return PictureHeader()
 
 
@@ -226,7 +226,7 @@ def _dpx(head: bytes) -> PictureHeader:
 
 
 def _timecode(code: int, bits_of_drop: bool = True) -> str:
-    """Return SMPTE ST 12-1 time code from packed decimals: hours, minutes, seconds, frames, highest byte first."""
+    """Return an SMPTE ST 12-1 time code from BCD: hours, minutes, seconds, frames, highest byte first."""
     tens = (0x3, 0x7, 0x7, 0x3)
     parts = [(code >> shift) & 0xFF for shift in (24, 16, 8, 0)]
     hours, minutes, seconds, frame = (10 * (part >> 4 & mask) + (part & 0xF) for part, mask in zip(parts, tens))

@@ -29,12 +29,12 @@ _BYTE_BITS = 8
 # interpolate.
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 _AROUND_PX = 8  # margin around a region, for chroma interpolation
-_STEP_PX = 32  # alignment of its sides
-_ANY_TIME = Fraction(1, 1000)  # filters need a time base
+_STEP_PX = 32  # alignment of the region's sides
+_ANY_TIME = Fraction(1, 1000)  # arbitrary, but filters need a time base
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 _PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
 _PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
-# Little-endian planar formats of more than 8 bits; p010 and similar use the highest bits.
+# Little-endian planar formats of more than 8 bits; p010 and similar store values in the highest bits.
 _DEEP = re.compile(r"(yuva?4\d\dp|p0)(10|12|14|16)le")
 
 
@@ -49,7 +49,7 @@ def turn_deg(frame: av.VideoFrame) -> int:
     """
     try:
         stored = frame.side_data.get("DISPLAYMATRIX")
-    except ValueError:  # with side data unknown to PyAV, such as Exif, only the rotation is available
+    except ValueError:  # PyAV does not know other side data, such as Exif; only the rotation is available
         return frame.rotation % 360
     if stored is None:
         return 0
@@ -57,7 +57,7 @@ def turn_deg(frame: av.VideoFrame) -> int:
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     if not lengths.all():
         return 0  # a zero matrix means no rotation
-    rows /= lengths  # ignore the scale, as players do
+    rows /= lengths  # drop the scale, as players do
     for quarters in range(4):
         if np.allclose(rows, np.linalg.matrix_power(_QUARTER_TURN, quarters), atol=1e-3):
             return 90 * quarters
@@ -150,7 +150,7 @@ def _widened(part: slice[int, int, int], limit: int) -> tuple[int, int]:
 
 
 def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices]:
-    """Return a crop around a window of a stored image, and the window in it; the whole if not much larger."""
+    """Return a crop of a stored image around a window, and the window in the crop; the whole if not much larger."""
     rows, columns = window
     (top, bottom), (left, right) = (_widened(*sides) for sides in zip(window, (frame.height, frame.width)))
     height, width = bottom - top, right - left
@@ -176,7 +176,7 @@ def deep_rgb(frame: av.VideoFrame) -> tuple[NDArray[np.uint16], int]:
         return stored, 65535
     bits = max(part.bits for part in frame.format.components)
     full = frame.color_range == _FULL_RANGE or len(frame.format.components) == 1
-    # ffmpeg shifts bits: white ends in zeros.
+    # ffmpeg shifts values to 16 bits, so the low bits of white are 0.
     return stored, ((1 << bits) - 1) << (16 - bits) if full else 255 << 8
 
 
@@ -184,7 +184,7 @@ def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np
     name = frame.format.name
     deep = _DEEP.fullmatch(name)
     if deep is not None:
-        # ffmpeg's conversion to gray mixes in colour: up to 11 levels of 255.
+        # ffmpeg's conversion to gray mixes in chroma: errors of up to 11 levels of 255.
         plane = frame.planes[0]
         stored = np.frombuffer(memoryview(plane), "<u2").reshape(-1, plane.line_size // 2)
         luma = np.rot90(stored[: frame.height, : frame.width], rotation_deg // 90)[window]

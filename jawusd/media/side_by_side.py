@@ -34,17 +34,17 @@ from jawusd.media.overlay import (
 Part = tuple[int, int, int, int]
 
 _MOST_IN_ROW = 3
-_MOST_FRAMES, _MOST_POINTS = 200, 300  # sampled per take and per scan to locate the teeth
-_STRAYS_PERCENT = 1.0  # frames whose teeth may leave the crop, at each side
+_MOST_FRAMES, _MOST_POINTS = 200, 300  # frames per take and vertices per scan that are sampled to locate the teeth
+_STRAYS_PERCENT = 1.0  # percentage of frames whose teeth may leave the crop, at each side
 _ROOM = 0.25  # margin around the teeth [fraction of their extent]
 _LEAST_PX = 32
 _SHOW_PARTLY_S = 0.3  # time after which partial results are shown
 _WHITE: Colour = (240, 240, 240)
-_WIDE_PX = 1200  # narrower bars use one line per piece of text
+_WIDE_PX = 1200  # narrower status bars use one line per piece of text
 _LINE_PX, _LEFT_PX, _GAP_PX, _SWATCH_PX = 26, 10, 34, 14
 _FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.55
 
-Piece = tuple[str, Colour, bool]  # text, its colour, and whether to draw white text after a swatch of the colour
+Piece = tuple[str, Colour, bool]  # text, colour, and whether the text is white and follows a swatch of the colour
 
 
 class CameraWall:
@@ -62,11 +62,11 @@ class CameraWall:
         scans: Sequence[Mesh],
         tile_px: tuple[int, int],
     ) -> None:
-        """Crop the images of cameras to the teeth over a take; without tracks, show them whole.
+        """Crop the images to the region of the teeth over a take; without tracks, show them whole.
 
         Args:
             cameras: calibrated cameras; others are shown without scans.
-            backdrops: images by camera.
+            backdrops: image sources by camera.
             scans: teeth scans of the tracks, upper and lower [mm].
             tile_px: (width, height) of each camera's image.
         """
@@ -93,7 +93,7 @@ class CameraWall:
         Args:
             scans: scans to draw.
             fill: opacity of the crowns.
-            partly: called with partial images while cameras are decoded, if that takes long.
+            partly: called with incomplete images while cameras are being decoded, if that takes long.
 
         Raises:
             CaptureError: a camera's image cannot be decoded.
@@ -195,7 +195,7 @@ class StatusBar:
             self._legend = [(STATE_WORDS[state], colour, True) for state, colour in STATE_COLOURS.items()]
 
     def draw(self, row: int) -> NDArray[np.uint8]:
-        """Return the bar of the frame at a row of the tracks, (h, w, 3) RGB; h is the same for all."""
+        """Return the bar for a row of the tracks, (h, w, 3) RGB; h is the same for all rows."""
         lines: list[list[Piece]] = [self._said(row), self._legend]
         if self._width_px < _WIDE_PX:
             lines = [[piece] for line in lines for piece in line]

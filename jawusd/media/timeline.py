@@ -11,7 +11,7 @@ from jawusd.base.arrays import Array
 class Timeline:
     """The images of a video on a regular grid of frames, by presentation time.
 
-    Frame k is the image shown k nominal frame durations after the first one. At a constant rate that is image k; at
+    Frame k is the image displayed k nominal frame durations after the first one. At a constant rate that is image k; at
     a variable rate some frames have no image.
 
     Attributes:
@@ -21,7 +21,7 @@ class Timeline:
     """
 
     def __init__(self, times_s: Array, fps: float) -> None:
-        """Fit the grid to presentation times (n,) [s]; the file's average rate is used for one or two images."""
+        """Fit the grid to presentation times (n,) [s]; for one or two images, use the file's average rate."""
         self._set(*_grid(times_s, fps), np.arange(len(times_s)))
 
     @classmethod
@@ -62,9 +62,9 @@ def _grid(times_s: Array, fps: float) -> tuple[NDArray[np.int64], float]:
     steps = np.diff(times_s)
     if len(steps) < 2 or not (median := float(np.median(steps))) > 0:
         return np.arange(len(times_s)), fps
-    # Use adjacent frames: gaps bias the mean, and rounded time stamps the median.
+    # Mean over adjacent frames only: gaps bias the mean, and rounded time stamps the median.
     period = float(steps[(steps > 0.5 * median) & (steps < 1.5 * median)].mean())
-    last = 16  # the first estimate has an error of a few per mille by jitter; refine it on growing intervals
+    last = 16  # jitter gives the first estimate an error of a few per mille; refine it on growing intervals
     while True:
         stretch = times_s[:last]
         numbers = np.round(stretch / period)

@@ -26,10 +26,10 @@ from jawusd.media.timeline import Timeline
 
 _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
 _CUT_OFF = "Copy it again from the camera; repair an interrupted recording first."
-# WebM stores alpha in a second stream, which only these decoders read; flagged in the metadata.
+# WebM stores alpha in a second stream, as flagged in the metadata; only these decoders read it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
-# Decoders that report damage with any number of threads. Those with error concealment (H.264, MPEG-4) mark an image
-# only after threads have returned it: with eight threads, a third of the damage in H.264 was missed.
+# Decoders that report damage with any number of threads. Decoders with error concealment (H.264, MPEG-4) mark an image
+# as damaged only after threads have returned it: with eight threads, a third of the damage in H.264 was missed.
 _THREADED = ("hevc", "prores", "ffv1")
 _PROGRESSIVE = (0, 1)  # FFmpeg's field order: unknown, or progressive
 
@@ -43,11 +43,11 @@ class Video(Clip):
         colour_space: str | None = None,
         colour_config: Path | None = None,
     ) -> None:
-        """Read the table of frames and the first image.
+        """Read the table of images and decode the first one.
 
         Args:
             path: the file.
-            colour_space, colour_config: of its images, if they are not display-referred; see `display`.
+            colour_space, colour_config: colour space of the images if they are not display-referred; see `display`.
 
         Raises:
             CaptureError: the file is missing, empty, truncated, not a video, or has no presentation times.
@@ -64,7 +64,7 @@ class Video(Clip):
             stream = container.streams.video[0]
             announced = stream.frames
             self._time_base = float(stream.time_base or 1)
-            self._has_checksums = False  # of the slices of each image
+            self._has_checksums = False  # whether the slices of each image have checksums
             self._pts, self._seek_dts, self._key_before, stored = self._packet_table(container, stream)
             self.fps = float(stream.average_rate or 0)
             stored_aspect = stream.sample_aspect_ratio
@@ -100,7 +100,7 @@ class Video(Clip):
         self.is_gray = not self.is_rgb and len(stored_as.components) == 1
 
     def colour_pictures(self, wanted: Sequence[int | None], *, threads: int = 0) -> Iterator[ColourPicture | None]:
-        """Yield as `Clip.colour_pictures`."""
+        """Yield images as `Clip.colour_pictures` does."""
         if self._space is not None:
             yield from super().colour_pictures(wanted, threads=threads)
             return
@@ -118,7 +118,7 @@ class Video(Clip):
     def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
         for index, frame in self._decode(first, last, threads, alpha=colour == "rgba"):
             image = self._image(frame, colour, window)
-            image.flags.writeable = False  # the gray buffer may be a decoder reference
+            image.flags.writeable = False  # the gray buffer may be a reference image of the decoder
             yield VideoFrame(index, float(self.times_s[index]), image)
 
     def _image(self, frame: av.VideoFrame, colour: Colour, window: Slices) -> NDArray[np.uint8]:
@@ -173,7 +173,7 @@ class Video(Clip):
                     dts.append(packet.pts if packet.dts is None else packet.dts)
                     key.append(packet.is_keyframe)
         except av.FFmpegError:
-            # Truncated file: use the images before the break; `announced` tells whether more were declared.
+            # Truncated file: use the images before the truncation; `announced` tells whether more were declared.
             pass
         order = np.argsort(pts, kind="stable")
         times = np.array(pts, np.int64)[order]
@@ -213,8 +213,9 @@ class Video(Clip):
     def _seek(self, container: av.container.InputContainer, stream: av.VideoStream, index: int) -> None:
         """Seek to the last key frame shown no later than an image, or to an earlier one.
 
-        Containers seek by presentation or decoding time of a key frame; if the former leads past the image, the
-        latter does not. MP4 uses presentation time; decoding time would start one key frame too early.
+        Containers seek by presentation or by decoding time of key frames. If seeking by the former leads past the
+        image, the latter is used. MP4 seeks by presentation time; a decoding time would lead to one key frame too
+        early.
         """
         for time in (self._pts[self._key_before[index]], self._seek_dts[index]):
             container.seek(int(time), stream=stream, backward=True)
@@ -226,10 +227,10 @@ class Video(Clip):
     def _decoded(
         self, container: av.container.InputContainer, stream: av.VideoStream, alpha: bool, first: int, broken: set[int]
     ) -> Iterator[av.VideoFrame]:
-        """Yield decoded images from here on; before a time stamp, decode only reference images.
+        """Yield decoded images from the current position on; before a time stamp, decode only reference images.
 
-        Time stamps of packets that are damaged by container flags or checksums are added to a set, together with those
-        up to the next key frame.
+        Time stamps of packets that are damaged according to container flags or checksums are added to a set, and so are
+        all others up to the next key frame.
         """
         if not (alpha and self._alpha_decoder):
             damaged = False

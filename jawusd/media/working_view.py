@@ -14,7 +14,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry.camera import Camera
 from jawusd.media.pixels import ColourPicture, DecodedPicture, Slices
 
-_NODE_PX = 16  # spacing of map samples used to locate a region
+_NODE_PX = 16  # spacing of the map's nodes that are searched for a region
 
 
 _Pixel = TypeVar("_Pixel", np.uint8, np.float32)
@@ -45,9 +45,9 @@ def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[
 class WorkingView:
     """Undistortion and downscaling of the images of one camera; thread-safe.
 
-    A working pixel is the mean of n x n bilinear samples of the recorded image, n = the reduction rounded up, at the
-    undistorted positions of an n times larger working image. This equals undistortion at full size followed by area
-    averaging, with one interpolation and only where needed.
+    A working pixel is the mean of n x n bilinear samples of the recorded image, at the distorted positions of the
+    pixels of an n times larger working image; n is the downscaling factor, rounded up. This equals undistortion at
+    full size followed by area averaging, but interpolates once, and only where needed.
 
     Attributes:
         camera: the pinhole camera of the working images.
@@ -79,7 +79,7 @@ class WorkingView:
     def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the coverage of each working pixel, 255 = full, (h, w), from a recorded mask (H, W).
 
-        Only the surroundings of non-black pixels are processed.
+        Only regions around non-black pixels are processed.
 
         Raises:
             ValueError: the mask does not have the size of the recorded images.
@@ -103,7 +103,7 @@ class WorkingView:
         return self._averaged(image, (slice(0, height), slice(0, width)))
 
     def light(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return undistorted light of recorded light (H, W, 3), at full size; 0 where nothing was recorded.
+        """Return a recorded linear-light image (H, W, 3) undistorted at full size; 0 where nothing was recorded.
 
         Raises:
             ValueError: the image does not have the recorded size, or the view is smaller.
@@ -136,14 +136,14 @@ class WorkingView:
         return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _window(self, mask: NDArray[np.uint8]) -> Slices | None:
-        """Return the working pixels that can see a non-black pixel of the mask, or None."""
+        """Return the working pixels that may sample a non-black pixel of the mask, or None."""
         rows = np.flatnonzero(mask.max(axis=1))
         if rows.size == 0:
             return None
         cols = np.flatnonzero(mask[rows[0] : rows[-1] + 1].max(axis=0))
         reach, (x, y) = np.float32(self._reach_px), self._nodes
-        # There is at least one node beyond each side of the box within reach, so the ring of cells around those nodes
-        # contains the box.
+        # On each side of the box, at least one node lies beyond it but within reach, so the cells around those nodes
+        # contain the box.
         across: Mask = (x >= cols[0] - reach) & (x <= cols[-1] + reach)
         inside: Mask = across & (y >= rows[0] - reach) & (y <= rows[-1] + reach)
         spans = []

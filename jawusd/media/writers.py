@@ -98,9 +98,9 @@ class VideoWriter:
 
 
 class PlateWriter:
-    """Writer of the undistorted images of one camera at full size, as JPEG, or EXR for light.
+    """Writer of the undistorted images of one camera at full size: as JPEG, or as EXR for linear light.
 
-    A plate has the intrinsics K and size of the recorded image, so that the same pinhole camera applies; corners that
+    A plate has the intrinsics K and size of the recorded image, so that the same pinhole camera applies; regions that
     were not recorded are black.
     """
 
@@ -118,7 +118,7 @@ class PlateWriter:
         write_bytes_atomic(path, cv2.imencode(".jpg", plate, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
 
     def write_light(self, path: str | os.PathLike[str], image: NDArray[np.float32]) -> None:
-        """Undistort and write light (h, w, 3) RGB as EXR of half floats, ZIP compressed.
+        """Undistort linear light (h, w, 3) RGB and write it as EXR of half floats, ZIP compressed.
 
         Raises:
             OutputError: the file cannot be written.

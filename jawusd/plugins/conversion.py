@@ -39,7 +39,7 @@ def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps:
     if not path.is_file():
         raise FormatError("there is no such file.", path=path)
     command = [*_blender(path), "--", str(path.resolve()), str(target), repr(frame_rate(path) or fps)]
-    # plugins of this process do not fit Blender's own OpenUSD
+    # this process's plugins are incompatible with Blender's OpenUSD
     environment = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, env=environment, check=False)

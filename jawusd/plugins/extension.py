@@ -14,7 +14,7 @@ from jawusd.plugins.vendoring import vendored_files
 _HERE = Path(__file__).parent
 _READER = "jawusd_reader.py"
 _SCRIPTS = ("jawusd_recipes.py",)
-# a fixed time, so that the zip is reproducible
+# fixed, so that the zip is reproducible
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 
@@ -35,7 +35,7 @@ def build_extension(out: Path) -> Path:
 
 
 def copy_scripts(folder: Path) -> list[Path]:
-    """Write the reader and the scripts that use it to a folder, created if missing, and return their paths.
+    """Write the reader and the scripts that use it to a folder, which is created if missing; return their paths.
 
     Raises:
         OSError: A file cannot be written.
@@ -49,7 +49,7 @@ def copy_scripts(folder: Path) -> list[Path]:
 def packed_reader() -> str:
     """Return the source of the reader as one file that needs only the standard library.
 
-    Its imports of jawusd are replaced by the modules themselves.
+    Imports from jawusd are replaced by the contents of the imported modules.
 
     Raises:
         ValueError: A module cannot be packed, because of an unsupported import, or a name defined in two modules.

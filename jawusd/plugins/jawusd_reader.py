@@ -1,7 +1,7 @@
-"""Read and evaluate jaw rigs in any Python: one file, no dependencies, not even jawusd.
+"""Read and evaluate jaw rigs in any Python: one file without dependencies, not even jawusd.
 
 `python -m jawusd.plugins FOLDER` writes that file; put it next to your script. `model.npz` needs only Python 3.9. USD
-needs the `pxr` modules that Blender, Maya, Houdini and Unreal include.
+files need the `pxr` modules, which Blender, Maya, Houdini and Unreal include.
 
     import jawusd_reader
     rig = jawusd_reader.load("actor/actor.usda")
@@ -43,7 +43,7 @@ LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forw
 
 _NOT_NEEDED = ("codes", "polygon_", "residual_limit_mm", "tolerance_mm")
 _SEARCH_STEPS = 60
-_SLICES = 48  # openings at which searches for the nearest d start
+_SLICES = 48  # openings from which the nearest valid d is searched
 _CODES = {
     "f2": "e", "f4": "f", "f8": "d", "b1": "?", "i1": "b", "i2": "h", "i4": "i", "i8": "q",
     "u1": "B", "u2": "H", "u4": "I", "u8": "Q",
@@ -200,14 +200,14 @@ def _by_rows(values: Sequence[float], shape: Sequence[int]) -> Sequence[float]:
 
 
 class Rig:
-    """One person's jaw.
+    """The jaw of one subject.
 
     Attributes:
         kind: "anchored" or "additive".
         arrays: The model's arrays by name, each a flat list, row by row.
         d_range: ((min, max), (min, max), (min, max)) of d1, d2, d3 [mm].
-        formula: The model's motion in the anatomical frame.
-        matrices: T_skull_anatomical, and T_anatomical_mandible of the closed bite, as rows.
+        formula: Evaluates the model's motion in the anatomical frame.
+        matrices: T_skull_anatomical, and T_anatomical_mandible in the closed bite, row by row.
     """
 
     def __init__(self, kind: str, arrays: dict[str, list[float]]) -> None:
@@ -219,7 +219,7 @@ class Rig:
         self.matrices = (_rigid_inverse(A), _product(A, rows(arrays["T_rest"], 4)))
         self.formula, self._bound = MODELS[kind](arrays), BoundFormula(arrays)
         first_mm, last_mm, softness_mm, offset_mm = self._bound.numbers
-        beyond = offset_mm - softness_mm  # approximate extent of the rounded ends
+        beyond = offset_mm - softness_mm  # approximate extent of the rounded ends of the bound
         self._spacing_mm = (last_mm - first_mm + 2.0 * beyond) / _SLICES
         self._openings = [first_mm - beyond + (i + 0.5) * self._spacing_mm for i in range(_SLICES)]
 
@@ -244,9 +244,9 @@ class Rig:
         return self.margin(d1, d2, d3) >= -ON_BOUND_MM
 
     def project(self, d1: float, d2: float, d3: float) -> Triple[float]:
-        """Return the nearest jaw parameters [mm] inside the bound, d itself if it is inside, NaN if it is not finite.
+        """Return the nearest jaw parameters [mm] inside the bound: d itself if it is inside, NaN if it is not finite.
 
-        The search starts at every opening that may lead to a nearer point than the nearest so far.
+        A search starts from every opening that may lead to a point nearer than the best so far.
 
         Raises:
             ReaderError: The bound is empty.
@@ -274,7 +274,7 @@ class Rig:
     def ranges(self, d1: float, d2: float = 0.0, d3: float = 0.0) -> tuple[Pair, Pair]:
         """Return the valid (min, max) of d2 at this d3, and of d3 at this d2 [mm]; (nan, nan) if there is none.
 
-        The bound ends some tenths of a mm inside the range of d1; between, the last valid opening is used.
+        The bound ends some tenths of a mm before the limits of d1; beyond, the last valid opening is used.
         """
         d1 = self._nearest_opening(d1, d2, d3)
         along_d2 = _chord(lambda x: self.margin(d1, x, d3), *self.d_range[1])
@@ -328,7 +328,7 @@ def decompose(T: Rows) -> tuple[Triple[float], tuple[float, float, float, float]
         (c - g, b + d, 1 - a + e - i, f + h),
         (d - b, c + g, f + h, 1 - a - e + i),
     )
-    # the row with the largest diagonal entry is the most accurate
+    # the candidate with the largest component is the most accurate
     q = candidates[max(range(4), key=lambda k: candidates[k][k])]
     length = math.copysign(math.sqrt(sum(v * v for v in q)), q[0] if q[0] != 0 else 1.0)
     return (x, y, z), (q[0] / length, q[1] / length, q[2] / length, q[3] / length)

@@ -1,6 +1,6 @@
 """Drive a mandible with a jaw rig in Maya, Houdini or Unreal: short recipes on top of `jawusd_reader.py`.
 
-Put both files on the Python path of the program. `model.npz` is read without `pxr`.
+Put both files on the Python path of the program. `model.npz` can be read without `pxr`.
 
     import jawusd_reader, jawusd_recipes as recipes
     rig = jawusd_reader.load("actor/model.npz")              # or actor.usda, if the program includes pxr
@@ -16,11 +16,11 @@ Put both files on the Python path of the program. `model.npz` is read without `p
     # Unreal: the mandible's binding in a level sequence, and keys of d1, d2, d3 by frame
     recipes.unreal_keys(rig, binding, {0: (0, 0, 0), 24: (20, 0, 0)})
 
-Every whole frame gets a key, with linear interpolation between: between sparse keys the jaw would be millimetres off
-its path. Parameters outside the bound are moved to the nearest valid ones, with a warning. `measured=True` keeps
-them, for captured takes of the person. Angles are continuous from frame to frame.
+Every whole frame gets a key, with linear interpolation between them: with sparse keys the jaw would leave its path by
+millimetres. Parameters outside the bound are replaced by the nearest valid ones, with a warning. `measured=True` keeps
+them, for captured takes of the subject. Angles are continuous from frame to frame.
 
-The mandible's own transform is replaced by T_skull_mandible, below a parent at the skull's pose. Lengths are in
+The mandible's transform is replaced by T_skull_mandible; its parent must have the pose of the skull. Lengths are in
 millimetres; if the parent does not scale them, set `scale`, 0.1 for centimetres.
 """
 
@@ -97,7 +97,7 @@ def nearest_turn(
 
 
 def row_matrix(T: Rows, scale: float = 1.0) -> list[float]:
-    """Return the 16 numbers of a pose for programs with row vectors, Maya and Houdini: transposed, lengths scaled."""
+    """Return a pose as 16 numbers for programs with row vectors, Maya and Houdini: transposed, lengths scaled."""
     rows = [[T[i][j] for i in range(3)] + [0.0] for j in range(3)]
     return [x for row in [*rows, [scale * T[i][3] for i in range(3)] + [1.0]] for x in row]
 
@@ -105,7 +105,7 @@ def row_matrix(T: Rows, scale: float = 1.0) -> list[float]:
 def unreal_pose(T: Rows, scale: float = 0.1) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return location and quaternion (x, y, z, w) of a pose in Unreal's left-handed axes with Z up.
 
-    Its USD importer swaps y and z, a reflection S. R becomes S R S, whose rotation axis is swapped and negated.
+    Unreal's USD importer swaps y and z, a reflection S. R becomes S R S: its rotation axis is swapped and negated.
     """
     (x, y, z), (qw, qx, qy, qz) = jawusd_reader.decompose(T)
     return (scale * x, scale * z, scale * y), (-qx, -qz, -qy, qw)

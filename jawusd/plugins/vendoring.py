@@ -13,7 +13,7 @@ _VERSION = re.compile(r"^__version__ = .*$", re.MULTILINE)
 
 
 def vendored_files(stubs: Iterable[Path]) -> dict[str, str]:
-    """Return the files to add to a package, by their path in it.
+    """Return the contents of the files to add to a package, by path in the package.
 
     Args:
         stubs: `.pyi` files that import the required names, each in the form `from jawusd.x import y as y`.
@@ -60,7 +60,7 @@ def _imported(tree: ast.Module) -> Iterator[str]:
 
 
 def _relative(module: str, source: str) -> str:
-    """Return the source of a module with relative imports in place of those of jawusd."""
+    """Return the source of a module with imports of jawusd made relative."""
     parts = module.split(".")[1:]
     dots = "." * (len(parts) + (_file(module).name == "__init__.py"))
     return _OURS.sub(lambda found: f"{found[1]}from {dots}{found[2][1:]} import", source)

@@ -18,7 +18,8 @@ SETTINGS = {
     "WM_OT_collada_export": {},
 }
 _CHANNELS = ("location", "rotation_quaternion")
-# FBX export applies an action to every object that has all its channels. A property unique to the mandible prevents it.
+# FBX export assigns an action to every object that has all its channels; a property that only the mandible has prevents
+# this.
 _OWN = "jawusd_own"
 _LINEAR = 1  # the interpolation of a key, as Blender stores it
 

@@ -1,4 +1,4 @@
-"""Handles at chin or incisor: dragging one moves the sliders by inverse kinematics, inside the bound."""
+"""Handles at chin or incisor: dragging a handle moves the sliders by inverse kinematics, inside the bound."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def follow(handle: bpy.types.Object) -> bool:
 
 @bpy.app.handlers.persistent
 def _dragged(_: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Follow dragged handles, and move the handles of jaws that were moved."""
+    """Move sliders after dragged handles, and handles after jaws that were moved otherwise."""
     moved = {update.id.original for update in depsgraph.updates if isinstance(update.id, bpy.types.Object)}
     for handle in handles():
         if handle in moved and not jaw.curves(handle):

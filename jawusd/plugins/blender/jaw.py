@@ -18,20 +18,20 @@ from . import vendored
 if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
-PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # from prim paths to the objects and data created from them
+PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # prim paths to the objects and data-blocks created from them
 
 SOURCE, KEEP, FPS = "jawusd_source", "keep_valid", "jawusd_fps"
 _STORE, _ACTOR, _FIXED = "jawusd_rig", "jawusd_actor", "jawusd_fixed"
 _FUNCTION, _OLD_FUNCTION = "jawusd_offset", "jawusd_channel"
-# Failing drivers, as without the add-on or with scripts disabled, evaluate to 0. The mandible's own transform is
-# therefore its rest pose, and the drivers set offsets from it that are 0 at rest: the delta location, and x, y, z of
-# the delta rotation, whose w is constant.
+# Drivers evaluate to 0 when they fail, as without the add-on or with scripts disabled. The mandible's transform is
+# therefore its rest pose, and the drivers set offsets that are 0 at rest: the delta location, and x, y, z of the delta
+# rotation, whose w is constant.
 _CHANNELS = (*(("delta_location", i) for i in range(3)), *(("delta_rotation_quaternion", i) for i in (1, 2, 3)))
 # Large, because Blender 5.0 snaps driven values within 1e-4 of 0 or 1, which for a unit quaternion is up to 0.02 mm at
 # the chin. Quaternions are normalised before use.
 _QUATERNION_W = 1024.0
 
-_rigs: dict[str, vendored.JawRig] = {}  # by the text that is stored in the actor
+_rigs: dict[str, vendored.JawRig] = {}  # cache, by the text stored in the actor
 _poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
 
 
@@ -131,12 +131,12 @@ def parameters(actor: bpy.types.Object) -> tuple[float, float, float]:
 
 
 def shown(actor: bpy.types.Object, d: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the displayed parameters [mm]: d, moved inside the bound if the actor has "Keep valid" on."""
+    """Return the displayed parameters [mm]: d, projected into the bound if the actor's "Keep valid" is on."""
     return _kept(rig_of(actor), d) if actor.get(KEEP) else d
 
 
 def _kept(rig: vendored.JawRig, d: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return parameters [mm] moved inside the bound."""
+    """Return parameters [mm] projected into the bound."""
     if rig.is_inside(d):
         return d
     d1, d2, d3 = rig.keep_inside([0.0], [d]).d[0].tolist()
@@ -152,7 +152,7 @@ def _text_of(rig: vendored.JawRig) -> str:
 
 
 def _source_of(prim: Usd.Prim) -> str:
-    """Return the file that defines a rig, usually `actor.usda`, even if a stage references it."""
+    """Return the file that defines a rig, usually `actor.usda`, even if the stage only references it."""
     for spec in prim.GetPrimStack():
         if spec.HasInfo("apiSchemas") and spec.layer.realPath:
             return str(spec.layer.realPath).split("[")[0]
@@ -187,7 +187,7 @@ def _add_sliders(actor: bpy.types.Object, rig: vendored.JawRig, values: list[flo
 
 
 def _set_limits(actor: bpy.types.Object, rig: vendored.JawRig) -> None:
-    """Set the slider range. Blender clamps keyed values to the hard limits, which are therefore far beyond it."""
+    """Set the range of the sliders. Blender clamps keyed values to the hard range, which is therefore far wider."""
     for name, label, (low, high) in zip(vendored.PARAMETERS, vendored.LABELS, rig.d_range.tolist()):
         slack = high - low
         ui = actor.id_properties_ui(name)
@@ -195,7 +195,7 @@ def _set_limits(actor: bpy.types.Object, rig: vendored.JawRig) -> None:
 
 
 def drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
-    """Drive the mandible by d1, d2, d3 of the actor, instead of the cached motion of the file or keys."""
+    """Drive the mandible by d1, d2, d3 of the actor, replacing its keys or the file's cached motion."""
     for constraint in list(mandible.constraints):
         if constraint.type == "TRANSFORM_CACHE":
             mandible.constraints.remove(constraint)
@@ -268,11 +268,11 @@ def curve_lists(found: bpy.types.Object) -> list[bpy.types.bpy_prop_collection[b
 
 
 def _offset(mandible: bpy.types.Object, d1: float, d2: float, d3: float, keep: float, channel: int) -> float:
-    """Return a channel of the mandible's offset from its rest pose [mm]: the driver function. The actor is scaled."""
+    """Return a channel of the mandible's offset from its rest pose, in the actor's units [mm]: the driver function."""
     actor = mandible[_ACTOR]
     key = (actor[_STORE], d1, d2, d3, bool(keep))
     if key not in _poses:
-        _poses.clear()  # the six channels of a pose are evaluated in sequence
+        _poses.clear()  # keep only the latest pose: its six channels are evaluated in succession
         rig = rig_of(actor)
         T, rest = rig.pose(_kept(rig, (d1, d2, d3)) if keep else (d1, d2, d3)), rig.pose((0.0, 0.0, 0.0))
         w, *turn = vendored.wxyz_from_matrix(T[:3, :3] @ rest[:3, :3].T).tolist()
@@ -289,7 +289,7 @@ def _install(*_: object) -> None:
         if _drivers(mandible, (_OLD_FUNCTION,)):
             with contextlib.suppress(vendored.JawusdError):  # the panel shows the error
                 drive(mandible, mandible[_ACTOR])
-        # Blender marks drivers with a missing function as broken; setting the expression makes it retry
+        # Blender disables drivers whose function is missing; setting the expression makes it retry
         for curve in _drivers(mandible, (_FUNCTION,)):
             curve.driver.expression = str(curve.driver.expression)
 

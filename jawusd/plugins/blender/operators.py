@@ -95,7 +95,7 @@ class JAWUSD_OT_export(bpy.types.Operator, ExportHelper):
 
 
 class JAW_OT_bake_to_keys(bpy.types.Operator):
-    """Operator of the bake button, and for scripts: `bpy.ops.jaw.bake_to_keys()`."""
+    """Operator of the bake button; in scripts: `bpy.ops.jaw.bake_to_keys()`."""
 
     bl_idname = "jaw.bake_to_keys"
     bl_label = "Bake to Keys"
@@ -143,7 +143,7 @@ class JAW_OT_use_sliders(bpy.types.Operator):
     __annotations__ = {"actor": bpy.props.StringProperty()}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Drive the mandible again."""
+        """Reconnect the mandible to the sliders."""
         mandible = jaw.mandible_of(_actor(self))
         bake.remove_baked_keys(mandible)
         jaw.drive(mandible, _actor(self))

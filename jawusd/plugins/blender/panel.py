@@ -58,7 +58,7 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
 
 
 class JAW_PT_export(bpy.types.Panel):
-    """Warning about what an export loses, next to its settings in the file browser."""
+    """Warning about motion that an export loses, next to the export settings in the file browser."""
 
     bl_label = "Jaw"
     bl_space_type = "FILE_BROWSER"
@@ -82,7 +82,7 @@ class JAW_PT_export(bpy.types.Panel):
 
 
 def _readout(rig: vendored.JawRig, d: tuple[float, float, float]) -> list[tuple[str, str]]:
-    """Return lines with icons that show how far parameters d [mm] are inside or outside the bound."""
+    """Return lines with icons that state how far parameters d [mm] are inside or outside the bound."""
     inside, distance = bool(rig.is_inside(d)), abs(float(rig.margin(d)))
     word = "inside" if inside else "OUTSIDE"
     lines = [(f"{word} the bound by {distance:.1f} mm", "INFO" if inside else "ERROR")]

@@ -49,7 +49,7 @@ def _show(camera: bpy.types.Camera, pattern: str, last: int) -> None:
     image.source = "SEQUENCE"
     background = camera.background_images.new()
     background.image, background.alpha, background.display_depth = image, 1.0, "BACK"
-    # the number in a plate's name is its time code, which is the scene's frame
+    # the number in a plate's file name is its USD time code, which equals the scene's frame
     user = background.image_user
     user.frame_start, user.frame_offset, user.frame_duration = 1, 0, max(last, 1)
     camera.show_background_images = True
