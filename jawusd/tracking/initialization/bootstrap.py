@@ -24,15 +24,15 @@ from jawusd.geometry import (
 from jawusd.tracking.contour.equations import motion_about
 
 _FEWEST = 3
-# Distance between projected vertex and pixel from which a pick is rejected [mm at the teeth]: three times the error of
-# a careless click (5 px where a pixel is 0.07 mm).
+# Distance between projected vertex and picked pixel above which a pick is rejected [mm at the teeth]: three times the
+# error of a careless click (5 px where a pixel is 0.07 mm).
 TOLERANCE_MM = 1.1
 _CLICK_MM = TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
-_GAP_MM = 0.8  # allowed distance between the lines of sight of a careless pick
-# Deviation from 1 of the scan size by the picks, from which it may explain contradictions: clicks 0.4 mm off on picks
-# 40 mm apart cause 0.01.
+_GAP_MM = 0.8  # largest distance between the lines of sight of a careless pick
+# Deviation from 1 of the scan size estimated from the picks, above which a wrong size may explain contradictions:
+# clicks 0.4 mm off on picks 40 mm apart cause 0.01.
 _SIZE_SHARE = 0.03
-_MOST_TRIPLES = 500  # more start triples do not improve the consensus
+_MOST_TRIPLES = 500  # number of triples tried: more do not improve the consensus
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,8 @@ def pose_from_picks(
 ) -> tuple[Array, list[int]]:
     """Return T_world_scan from the picks, shape (4, 4), and the numbers of rejected picks.
 
-    Numbers start at 1. `vertices` are those of the scan file [mm], shape (V, 3); `arch` is its name in messages.
+    Pick numbers start at 1. `vertices` are those of the scan file [mm], shape (V, 3); `arch` is the name of the scan in
+    messages.
 
     Raises:
         TrackingError: too few picks, an invalid pick, or picks that contradict one another.
@@ -125,7 +126,7 @@ def _wrong_sight(
     places: Array,
     sightings: Sequence[_Sighting],
 ) -> str | None:
-    """Describe an exchange of cameras that explains the contradictions, or lines of sight that do not meet; else None.
+    """Describe swapped cameras that explain the contradictions, or lines of sight that do not meet; otherwise None.
 
     `places` are the triangulated picks, world coordinates [mm], shape (P, 3).
     """
@@ -143,7 +144,7 @@ def _wrong_sight(
         pose = rigid_fit(points, meets)
         if all(_miss_mm(s, pose) < TOLERANCE_MM for s in seen):
             return f"cameras {a} and {b} are exchanged, in the picks or in the calibration"
-    # Lines of sight of neighbouring cameras meet even for different points at the same height.
+    # Lines of sight of neighbouring cameras may meet even if different points at the same height were picked.
     gaps = [_miss_mm(replace(s, point=place), np.eye(4)) for s, place in zip(sightings, places, strict=True)]
     if float(np.median(gaps)) < _GAP_MM:
         return None
@@ -165,10 +166,10 @@ def picked_sigma_mm(
     pose: Array,
     probes: Array,
 ) -> float:
-    """Return the rms position uncertainty of the crowns caused by careless clicks [mm].
+    """Return the rms position uncertainty of the crowns for careless clicks [mm].
 
-    `picks` are those behind the pose T_world_scan, shape (4, 4); `probes` are points spread over the crowns, scan
-    coordinates [mm], shape (N, 3).
+    `picks` are those from which the pose T_world_scan, shape (4, 4), was computed; `probes` are points spread over the
+    crowns, scan coordinates [mm], shape (N, 3).
     """
     H = np.zeros((6, 6))
     for k, pick in enumerate(picks, start=1):
@@ -192,7 +193,7 @@ def picks_miss_mm(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, 
 def picked_size(
     picks: Sequence[Sequence[Pick]], vertices: Sequence[Array], cameras: Mapping[str, Camera]
 ) -> tuple[float, float]:
-    """Return the ratio of the scans' size to the size by the picks [-], and its standard deviation for careless clicks.
+    """Return the ratio of the scans' size to that of the triangulated picks, and its sigma for careless clicks [-].
 
     `picks` and `vertices` are those of the upper and the lower scan.
 
@@ -239,7 +240,7 @@ def _sighting(number: int, pick: Pick, vertices: Array, cameras: Mapping[str, Ca
 
 
 def _residuals_px(s: _Sighting, pose: Array) -> tuple[Array, Array, Array]:
-    """Return projection minus pixel (C, 2), depths (C,) and the derivative by the world point (C, 2, 3)."""
+    """Return projection minus pixel (C, 2), depths (C,) and derivatives with respect to the world point (C, 2, 3)."""
     h = s.matrices @ np.append(transform_point(pose, s.point), 1.0)
     projected = h[:, :2] / h[:, 2:]
     slope = (s.matrices[:, :2, :3] - projected[:, :, None] * s.matrices[:, 2:, :3]) / h[:, 2, None, None]

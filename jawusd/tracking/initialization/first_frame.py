@@ -19,15 +19,15 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.magnification import magnified, measure_magnification
 
-# Minimum `arch_fit` of a first frame [-]: between wrong poses, and correct ones with most of the lower teeth hidden.
+# Minimum `arch_fit` of a first frame [-]: above wrong poses, below correct ones with most of the lower teeth hidden.
 _LEAST_FIT = 0.03
-# The same for a fit without one camera, which must be unambiguous; see `start_causes.CLEAR_FIT`.
+# Minimum fit without one of the cameras, which must be unambiguous; see `start_causes.CLEAR_FIT`.
 _CLEAR_FIT = 0.3
-# Magnification [-] of a camera from which it explains a failed start, and deviation of a camera from the others from
-# which it is corrected; number of estimates, since contours far from their masks are not matched at first.
+# Magnification of a camera above which it explains a failed start [-]; deviation of a camera from the others above
+# which it is corrected [-]; and number of iterations, since contours far from their masks are not matched at first.
 _LEAST_SCALE, _OWN_SCALE, _SIZE_ROUNDS = 0.02, 0.015, 3
 _SIZE_HINT = "Check the scans' scale, the board's square size, and that each calibration is for the lens and zoom used."
-_FEWEST_MASKS = 2  # per arch: one view does not determine the depth
+_FEWEST_MASKS = 2  # required per arch: one view does not determine the depth
 
 
 def first_record(
@@ -40,7 +40,7 @@ def first_record(
 ) -> FrameRecord:
     """Align the first frame from its views, starting from given T_world_upper and T_world_lower, shape (2, 4, 4).
 
-    With `explain`, which takes longer, the error names a wrong focal length if that is the cause.
+    With `explain`, which takes longer, the error message states a wrong focal length if that is the cause.
 
     Raises:
         TrackingError: too few masks on this frame, or the alignment failed.
@@ -90,7 +90,7 @@ def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views:
         poses = np.where(better[:, None, None], wide.poses, best.poses)
         best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
-    for _ in range(2):  # exclude uncovered masks, and include excluded ones again that are now covered
+    for _ in range(2):  # exclude uncovered masks, and include those again that are now covered
         kept = _without_spoiled(whole, coverage, config.lost_coverage)
         if (kept == use).all():
             break

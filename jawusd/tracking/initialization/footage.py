@@ -1,4 +1,4 @@
-"""Mask files before tracking: position and size of the masks, and the frames that show them best."""
+"""Survey of mask files before tracking: position and size of the masks, and the frames in which they are largest."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
-_BESIDE = 2  # surveyed frames on either side that are redundant
-_WIDTH_PX = 320  # of the surveyed images: mask centres are accurate to a tenth of a millimetre
+_BESIDE = 2  # surveyed frames on either side of a chosen one that are redundant
+_WIDTH_PX = 320  # width of the surveyed images: enough for mask centres accurate to a tenth of a millimetre
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +35,11 @@ class Footage:
     fewest: int = FEWEST_CAMERAS  # cameras that must show both arches
 
     def survey(self, frames: tuple[int, int] | None, count: int) -> MaskSurvey:
-        """Measure the masks of evenly spaced frames, of the whole footage by default."""
+        """Measure the masks of `count` evenly spaced frames, by default from the whole footage."""
         return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count, self.fewest)
 
     def views(self, centre: Array, px_per_mm: float) -> MaskViews:
-        """Open the masks at a resolution at the teeth, which are near a world point (3,) [mm]."""
+        """Open the masks at a given resolution at the teeth, which are near a world point `centre` (3,) [mm]."""
         return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm, self.fewest)
 
     def has_masks(self, frame: int) -> bool:

@@ -20,9 +20,9 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z, 
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import Drawn, View
 
-# Search distance for contours [px]: an error of 5 % in focal length moves molars by 9 px at 7 px/mm.
+# Search distance about contours [px]: an error of 5 % in focal length moves molars by 9 px at 7 px/mm.
 _REACH_PX = 16.0
-# Distance from the optical axis at which distortion is stated [mm]: the outermost visible teeth.
+# Distance from the optical axis at which distortion is reported [mm]: that of the outermost visible teeth.
 _RADIUS_MM = 25.0
 # Prior standard deviations: magnification and distortion [-], rotation [rad] and motion [mm] of a camera per axis,
 # outline bias [px].
@@ -35,12 +35,13 @@ _LEAST_SPREAD_PX = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Magnification:
-    """Magnification of the teeth in each camera relative to what is expected.
+    """Magnification of the teeth in each camera relative to that expected from calibration and scans.
 
     Attributes:
-        scale, sigma_scale: relative, shape (C,): 0.05 for images 5 % larger than expected.
+        scale, sigma_scale: relative error of the magnification, shape (C,): 0.05 if teeth appear 5 % larger than
+            expected.
         bend, sigma_bend: change of `scale` from the optical axis to a radius of 25 mm at the teeth, shape (C,).
-        bias_px, sigma_bias_px: mask bias beyond the teeth at working resolution, per arch, shape (C, 2).
+        bias_px, sigma_bias_px: outward mask bias at working resolution, per arch, shape (C, 2).
         turn_rad, move_mm: rotation and motion of each camera relative to the mean of all, shape (C,).
         motion_clear: length of that motion in standard deviations (Mahalanobis), shape (C,).
         spread_px: robust standard deviation of the residuals.
@@ -69,13 +70,13 @@ Instant = tuple[Array, Sequence[View], Mask]
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Linearised distances of one arch in one frame: d = J x + C theta, x the pose, theta the shared unknowns."""
+    """Linearised distances of one arch in one frame: d = J x + C theta with pose x and shared unknowns theta."""
 
     distance: Array  # shape (n,)
     length: Array  # contour length [px], shape (n,)
-    pose: Array  # derivatives by the twist of the arch, shape (n, 6)
+    pose: Array  # derivatives with respect to the twist of the arch, shape (n, 6)
     camera: Array  # camera of each row, shape (n,)
-    shared: Array  # derivatives by the unknowns of its camera, shape (n, _UNKNOWNS)
+    shared: Array  # derivatives with respect to the unknowns of its camera, shape (n, _UNKNOWNS)
 
 
 def measure_magnification(
@@ -100,7 +101,7 @@ def measure_magnification(
 def _rows(
     scans: Sequence[Scan], r: int, c: int, poses: Array, view: View, pivot: Array, config: TrackingConfig
 ) -> _Rows | None:
-    """Match the contour of an arch in one view over a large distance; None if nothing matches."""
+    """Match the contour of an arch in one view with a large search distance; None if nothing matches."""
     scan, pose = scans[r], view.T_delay[r] @ poses[r]
     samples, distance = _matched(scans, r, view, poses, config)
     if not len(samples):
@@ -136,7 +137,7 @@ def _matched(scans: Sequence[Scan], r: int, view: View, poses: Array, config: Tr
     """Return the contour samples of an arch with an edge in reach (n, COLUMNS), and their distances (n,) [px]."""
     labels = np.zeros((2, *view.masks.shape[1:]), np.uint8)
     depth = np.zeros(labels.shape, np.float32)
-    drawn = [r] if view.edges is None else ARCHES  # masks separate the arches already
+    drawn = [r] if view.edges is None else ARCHES  # masks already separate the arches
     for arch in drawn:
         scans[arch].draw(view.matrix @ view.T_delay[arch] @ poses[arch], depth[arch], labels[arch])
     pose = view.T_delay[r] @ poses[r]

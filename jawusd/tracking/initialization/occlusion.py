@@ -13,38 +13,39 @@ from jawusd.geometry import bite_normal
 from jawusd.tracking.contour.scan import Scan
 
 _SAMPLES = 8000  # surface samples per arch: one per half millimetre
-_SHARE = 0.002  # of the crown surface ignored as outliers, such as spikes of the mesh
-_DEEPEST_MM = 5.0  # larger depths inside a crown are impossible: such points lie beyond an open border
+_SHARE = 0.002  # fraction of the crown surface ignored as outliers, such as spikes of the mesh
+_DEEPEST_MM = 5.0  # largest depth inside a crown: deeper points lie beyond an open border
 _DEEP_MM = 1.0
 _SAME_MM = 0.05
-_BESIDE_MM = 4.0  # half of a molar: crowns nearer than this in the bite plane oppose one another
+_BESIDE_MM = 4.0  # distance in the bite plane up to which crowns oppose one another: half of a molar
 _CELL_MM = 1.0
 _THROUGH_MM = 2.0  # vertical overlap of arches that passed through one another; cusps overlap less
 _SLAB_MM = 3.0
 _FEWEST = 50  # surface samples required on a side of an arch
-_ASIDE_MM = 6.0  # nearer to the midline, left and right belong to the same tooth
-_OPEN = 0.08  # minimum directed area over area of an open surface
-# Minimum gum area relative to the crowns, and distance below them, from which gum shows the orientation of a scan.
+_ASIDE_MM = 6.0  # minimum distance of left and right from the midline: nearer, they belong to the same tooth
+_OPEN = 0.08  # minimum ratio of directed area to area for a surface to count as open
+# Minimum area of the gum relative to the crowns, and minimum distance below them, for the gum to indicate the
+# orientation of a scan.
 _GUM_SHARE, _GUM_BELOW_MM = 0.3, 2.0
 
 
 @dataclass(frozen=True)
 class Occlusion:
-    """How two arches meet; lengths in mm, NaN if they cannot be measured."""
+    """How two arches meet; lengths in mm, NaN if not measurable."""
 
     gap_mm: float  # smallest distance between the crowns, 0 if they touch
-    side_gaps_mm: tuple[float, float]  # the same left and right of the midline, negative if crowns overlap
+    side_gaps_mm: tuple[float, float]  # gaps left and right of the midline, negative if crowns overlap
     depth_mm: float  # largest overlap of the crowns
     deep_share: float  # fraction of the opposed crown surface that overlaps by more than 1 mm
     through: float  # fraction of the common area in the bite plane on which lower crowns end 2 mm above upper ones
     same: float  # fraction of the surfaces that coincide
-    opposite: float  # fraction of the arch with fewer teeth that has crowns of the other arch over or under it
+    opposite: float  # fraction of the arch with fewer teeth that has crowns of the other arch above or below it
     aside_mm: float  # distance between the centres of the arches along the bite plane
     turn_rad: float  # angle in the bite plane between the forward directions of both arches
-    turned_over: tuple[bool | None, bool | None]  # upper, lower: gum between crowns and other arch; None: no gum
-    opens_towards: tuple[bool, bool]  # upper, lower: the open side of the crowns faces the other arch
+    turned_over: tuple[bool | None, bool | None]  # whether gum lies between crowns and other arch
+    opens_towards: tuple[bool, bool]  # whether the open side of the crowns faces the other arch
     midlines_mm: float  # lateral distance of the midlines, where both arches have teeth left and right
-    width_ratio: float  # width of the upper arch over that of the lower one at equal depth
+    width_ratio: float  # ratio of the widths of upper and lower arch, measured at equal depth
     widths_mm: tuple[float, float]  # largest width of each arch
     lower_ahead_mm: float  # distance of the lower front teeth in front of the upper ones
 
@@ -97,7 +98,7 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
 
 
 def crown_surface(scan: Scan) -> CrownSurface:
-    """Return about `_SAMPLES` crown faces at most as surface samples."""
+    """Return surface samples: all crown faces, or about `_SAMPLES` of them."""
     border = np.zeros(len(scan.crown_faces), bool)
     border[scan.edges[scan.edges[:, 3] < 0, 2]] = True
     chosen = slice(None, None, max(1, len(scan.crown_faces) // _SAMPLES))
@@ -111,7 +112,7 @@ def _signed_distances(these: CrownSurface, others: CrownSurface) -> Array:
     """Return the distance of each sample to the other arch, negative inside [mm], shape (N,)."""
     distance, nearest = cKDTree(others.points).query(these.points)
     behind = np.einsum("ij,ij->i", these.points - others.points[nearest], others.normals[nearest])
-    # Behind the surface, and not just beyond its border.
+    # Points behind the surface, and not just beyond its border.
     inside = (behind < -0.7 * distance) & (distance < _DEEPEST_MM) & ~others.border[nearest]
     return np.where(inside, -distance, distance)
 
@@ -139,7 +140,7 @@ def _weighted_quantile(values: Array, weights: Array, share: float) -> float:
 
 
 def _beside(these: Array, others: Array) -> Array:
-    """Return whether the other arch has a point over or under each point, shape (N,)."""
+    """Return whether the other arch has a point above or below each point, shape (N,)."""
     return cKDTree(others[:, [0, 2]]).query(these[:, [0, 2]])[0] < _BESIDE_MM
 
 

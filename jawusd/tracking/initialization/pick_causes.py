@@ -1,6 +1,6 @@
 """Mistakes in scans, calibration, masks or picks that can make picks and masks contradict one another.
 
-Each mistake carries the inputs with that mistake undone, so that `pick_checks` can test whether they agree.
+Each mistake comes with the inputs after undoing it, so that `pick_checks` can test whether these agree.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from jawusd.formats.capture import Pick
 from jawusd.geometry import Camera, rigid_fit, se3_exp, transform_points, triangulate
 from jawusd.tracking.initialization.bootstrap import picked_size
 
-_SIZE_SHARE = 0.02  # deviation from 1 of the scan size by the picks, from which the size may be a mistake
-# Prior standard deviations of a camera's errors: shift over the image width, relative focal length. And of a click
-# [mm].
+_SIZE_SHARE = 0.02  # deviation from 1 of the scan size estimated from the picks, above which the size may be a mistake
+# Prior standard deviations of a camera's errors: shift as a fraction of the image width, and relative focal length; and
+# standard deviation of a click [mm].
 _SHIFT, _FOCAL, _CLICK_MM = 0.05, 0.1, 0.3
-_MOST_ZOOM = np.log(2.0)  # limit of the logarithm of the focal length factor: random clicks would make it overflow
-_STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # scale of the pose unknowns, about their usual error [rad, mm]
+_MOST_ZOOM = np.log(2.0)  # limit of the log focal length factor, without which random clicks would make it overflow
+_STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # scale of the pose unknowns: about their usual error [rad, mm]
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Everything that places the scans in the images, as given or with a mistake undone.
+    """All inputs that determine where the scans project to, as given or with a mistake undone.
 
     Attributes:
-        picks: on the upper and lower arch.
+        picks: those on the upper and on the lower arch.
         vertices: of both scans, as the picks index them [mm].
         crowns: some points of both scans' crowns [mm].
         cameras: by name.
         sources: the camera whose masks are used for each camera; by default its own.
-        exchanged: cameras in which the masks of the two arches are exchanged.
+        exchanged: cameras in which the masks of the two arches are swapped.
     """
 
     picks: tuple[Sequence[Pick], Sequence[Pick]]
@@ -55,7 +55,7 @@ class Mistake:
     message: str
     hint: str
     setting: Setting
-    correctable: bool = False  # tracking estimates it, provided that the picks agree with one another
+    correctable: bool = False  # whether tracking estimates it, provided that the picks agree with one another
     camera: str | None = None
 
 
@@ -83,7 +83,7 @@ def possible_mistakes(given: Setting) -> Iterator[Mistake]:
 
 
 def _exchanged_scans(given: Setting) -> Iterator[Mistake]:
-    """Yield the exchange of the two scans, if all picked vertices exist after it."""
+    """Yield the swap of the two scans, if all picked vertices exist after it."""
     vertices = given.vertices[::-1]
     if all(pick.vertex < len(own) for own, picks in zip(vertices, given.picks, strict=True) for pick in picks):
         yield Mistake(
@@ -95,7 +95,7 @@ def _exchanged_scans(given: Setting) -> Iterator[Mistake]:
 
 
 def _exchanges(given: Setting) -> Iterator[Mistake]:
-    """Yield exchanges of calibrations, of cameras in the picks, and of masks."""
+    """Yield swaps of calibrations, of cameras in the picks, and of masks."""
     yield Mistake(
         "picks_views_exchanged",
         "the two cameras of the picks are exchanged",
@@ -199,8 +199,8 @@ def fitted_camera(
 ) -> Camera | None:
     """Return a camera with the principal point, or focal length, that fits the picks best.
 
-    None if no pick is seen by that camera, or the picks of an arch lie on a line. `picks` and `vertices` are those of
-    the upper and the lower scan. The poses of the scans are fitted as well.
+    None if no pick has a pixel in that camera, or the picks of an arch lie on a line. `picks` and `vertices` are those
+    of the upper and the lower scan. The poses of the scans are fitted as well.
     """
     if all(view.camera != name for own in picks for pick in own for view in pick.views):
         return None
@@ -219,7 +219,7 @@ def fitted_camera(
     sights = [_sights(own, points) for own, points in zip(picks, vertices, strict=True)]
 
     def residuals(x: Array) -> Array:
-        """Return pick errors over that of a click, and the change of the camera over its prior deviation."""
+        """Return pick errors over that of a click, and the change of the camera over its prior standard deviation."""
         table = {**cameras, name: changed(x)}
         out = [x[:2]]
         for k, (start, seen) in enumerate(zip(starts, sights, strict=True)):
@@ -240,8 +240,8 @@ def _sights(picks: Sequence[Pick], vertices: Array) -> tuple[Array, Array, list[
     """Return the picked points of a scan and their pixels.
 
     Returns:
-        the points relative to their mean (P, 3), the mean (3,), and for each camera the indices of the points it saw
-        and their pixels (N, 2).
+        the points relative to their mean (P, 3), the mean (3,), and for each camera the indices of its points and their
+            pixels (N, 2).
     """
     points = np.stack([vertices[pick.vertex] for pick in picks])
     middle = points.mean(axis=0)

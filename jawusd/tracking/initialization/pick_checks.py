@@ -1,7 +1,7 @@
-"""Check that picks agree with one another and with the masks, and name the mistake that explains it if they do not.
+"""Check that picks agree with one another and with the masks; if not, find the mistake that explains it.
 
-Each mistake that can be undone is undone in turn. A mistake is reported if all picks agree once it is undone, and the
-masks then lie on the scans where the picks place them.
+Each possible mistake is undone in turn. A mistake is reported if, once it is undone, all picks agree and the masks
+coincide with the scans at the poses from the picks.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from jawusd.tracking.initialization.bootstrap import TOLERANCE_MM, picks_miss_mm
 from jawusd.tracking.initialization.pick_causes import Mistake, Setting, possible_mistakes
 
 _CLOSE_MM = 1.0  # mask pixels this near to a projected crown point count as covered
-_ON = 0.85  # fraction of a camera's masks on the scans from which the masks count as correctly placed
+_ON = 0.85  # fraction of a camera's mask pixels on the scans from which its masks count as consistent with the picks
 # Misfit of the given inputs above which mistakes are tested; exceeded by 1 of 60 valid subjects.
 _SUSPECT_MISFIT = 1.7
-# Fraction of the given misfit that may remain for a mistake to be believed. The second holds for mistakes that tracking
-# corrects, which are only warnings, if rejected picks then fit.
+# Largest ratio of the misfit after undoing a mistake to that of the given inputs, for the mistake to be reported. The
+# second value applies to mistakes that tracking corrects, which are only warnings, if rejected picks then fit.
 _PROOF, _PROOF_BY_PICKS = 0.5, 0.75
-_OFF, _MISS_MM = 0.05, 0.3  # fraction of masks off the scans, and rms pick error [mm], that add the same misfit
-_UNSEEN = 0.25  # assumed share off the scans of a camera without masks at this instant: it may show something else
-_SURE = 1.0  # misfit below which an exchange is accepted without testing mistakes of single cameras
-_ALIKE = 0.15  # extra misfit up to which other mistakes are reported besides the most likely one
-_MOST_TRIED = 400  # mistakes: all of 15 cameras; the 6,000 of 64 cameras would take most of an hour
+_OFF, _MISS_MM = 0.05, 0.3  # fraction of masks off the scans, and rms pick error [mm], that each add 1 to the misfit
+_UNSEEN = 0.25  # fraction off the scans assumed for a camera without masks at this instant, which may contradict picks
+_SURE = 1.0  # misfit below which swapped inputs are reported without testing mistakes of single cameras
+_ALIKE = 0.15  # excess misfit up to which other mistakes are reported in addition to the most likely one
+_MOST_TRIED = 400  # mistakes tested: all those of 15 cameras; the 6,000 of 64 cameras would take most of an hour
 _FEWEST = 3  # picks on an arch
 
 #: Pixels of the masks of both arches at the instant of the picks, shape (N, 2) each, N = 0 without a mask. Arguments:
@@ -45,10 +45,10 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
     """Yield findings about the picks of a frame, and about other inputs that the picks contradict.
 
     Args:
-        given: the inputs as the capture has them.
-        seen: the masks, once per candidate for the time offsets.
+        given: the inputs as in the capture.
+        seen: readers of the masks, one per candidate for the time offsets.
         masked: cameras that have masks.
-        frame: of the picks, for the findings.
+        frame: frame of the picks, for the findings.
 
     Raises:
         TrackingError: the picks contradict one another, and no single mistake explains it.
@@ -83,7 +83,7 @@ class _Evidence:
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     wrong: Mapping[str, list[int]]  # numbers of the rejected picks, by arch
     miss_mm: float  # rms error of the picks, clipped at the rejection limit
-    on: Mapping[str, float]  # fraction of each camera's masks that lies on the scans; cameras without masks are missing
+    on: Mapping[str, float]  # fraction of each camera's mask pixels on the scans; cameras without masks are omitted
     unseen: int  # number of cameras without masks at this instant
 
     @property
@@ -104,14 +104,14 @@ class _Evidence:
 
     @property
     def good(self) -> bool:
-        """Whether nothing remains to be explained."""
+        """Whether no contradiction remains."""
         return self.placed and not self.rejected
 
 
 def _evidence(setting: Setting, seen: Sequence[Seen], masked: Sequence[str]) -> _Evidence:
-    """Place the scans by the picks of a setting, and measure how well the masks of `masked` cameras agree.
+    """Estimate poses from the picks of a setting, and measure how well the masks of `masked` cameras agree.
 
-    `seen` provides the masks once per candidate for the time offsets; the best one counts for each camera.
+    `seen` reads the masks for each candidate for the time offsets; for each camera, the best candidate is used.
 
     Raises:
         TrackingError: the picks contradict one another.
@@ -127,7 +127,7 @@ def _evidence(setting: Setting, seen: Sequence[Seen], masked: Sequence[str]) -> 
 
 
 def _covered(setting: Setting, poses: Sequence[Array], seen: Sequence[Seen], masked: Sequence[str]) -> dict[str, float]:
-    """Return the fraction of each camera's masks that lies on the scans, for its best candidate of the time offsets."""
+    """Return the fraction of each camera's mask pixels that lie on the scans, for the best candidate time offset."""
     on = {}
     for name in masked:
         camera = setting.cameras[name]

@@ -1,6 +1,6 @@
 """Brute-force search for the pose of one arch: orientations one by one, all translations at once.
 
-For one orientation, a small translation mostly shifts the image of the arch. How well it fits its mask at every
+For one orientation, a small translation mostly shifts the image of the arch. Its fit to the mask as a function of the
 shift is a correlation, which the fast Fourier transform computes for all shifts together. The objective of a
 translation is the sum over the cameras.
 """
@@ -23,7 +23,7 @@ from jawusd.tracking.contour.scan import CROWN, Scan, prepare_scan
 from jawusd.tracking.contour.views import View
 
 _CELL_MM = 1.2  # vertices in cells of this size are merged
-_BLUR_MM = 0.9  # of the outlines, so that the coarse grid does not miss the optimum
+_BLUR_MM = 0.9  # blur of the outlines, so that the coarse grid does not miss the optimum
 # Penalty per mm^2 of uncovered mask, in mm of matched outline [1/mm].
 _UNCOVERED_PRICE = 1.0
 
@@ -33,7 +33,7 @@ class Grid:
     """A grid of poses about a guess.
 
     Attributes:
-        yaw_rad, pitch_rad, roll_rad: turns about the up, left and front axes of the arch.
+        yaw_rad, pitch_rad, roll_rad: rotations about the up, left and front axes of the arch.
         reach_mm: largest translation along left, up and front, in both directions.
         step_mm: spacing of the translations.
     """
@@ -45,7 +45,7 @@ class Grid:
     step_mm: float = 1.5
 
     def turns(self) -> Iterator[Array]:
-        """Yield the rotations, all rolls of one yaw and pitch together, shape (N, 3, 3)."""
+        """Yield the rotations, all roll angles of one yaw and pitch together, shape (N, 3, 3)."""
         rolls = so3_exp(self.roll_rad[:, None] * [0.0, 0.0, 1.0])
         for yaw in self.yaw_rad:
             for pitch in self.pitch_rad:
@@ -87,7 +87,7 @@ class ShiftCorrelation:
         some = np.abs(picture) > 1e-3
         y, x = np.flatnonzero(some.any(1)), np.flatnonzero(some.any(0))
         picture = picture[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
-        # A border as wide as the largest shift keeps wrapped-around content off the template.
+        # Padding by the largest shift prevents circular wrap-around onto the template.
         right, down = np.abs(pixels).max(0)
         picture = np.pad(picture, ((down, down), (right, right))).astype(np.float32)
         self._shape = picture.shape
@@ -149,11 +149,12 @@ def search_arch(
 
 
 def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> Array:
-    """Return the image whose correlation with the drawn crowns is their objective, up to a constant [px].
+    """Return the image whose correlation with rendered crowns is their objective, up to a constant [px].
 
-    The objective is the length of outline on the mask's outline, less a penalty for uncovered mask pixels. The first is
-    the correlation of the blurred gradients of both images, normalised to 1 per pixel of a straight edge. Moving both
-    derivatives to the mask turns it into -div(w grad m), with w = 0 where the outline belongs to the other arch.
+    The objective is the length of the outline that coincides with the mask's outline, minus a penalty for uncovered
+    mask pixels. The length is the correlation of the blurred gradients of both images, normalised to 1 per pixel of a
+    straight edge. Moving both derivatives to the mask turns it into -div(w grad m), with w = 0 where the outline is
+    that of the other arch.
     """
     sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # blur of both outlines combined
     inside = mask / 255.0
@@ -165,7 +166,7 @@ def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: floa
 
 
 def _slope(matrix: Array, point: Array) -> Array:
-    """Return the derivative of the pixel by the world point, shape (2, 3)."""
+    """Return the derivative of the pixel with respect to the world point, shape (2, 3)."""
     h = matrix @ np.append(point, 1.0)
     return (matrix[:2, :3] - (h[:2] / h[2])[:, None] * matrix[2, :3]) / h[2]
 
@@ -178,16 +179,16 @@ def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
         T_anatomical_scan: scan to anatomical axes, shape (4, 4).
     """
     points = transform_points(T_anatomical_scan, crowns)
-    front = points[points[:, 2] > points[:, 2].max() - 15.0]  # incisors to first premolars, which cameras see
+    front = points[points[:, 2] > points[:, 2].max() - 15.0]  # incisors to first premolars, which cameras can see
     return make_transform(np.eye(3), -front.mean(0)) @ T_anatomical_scan
 
 
 def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], use: Mask) -> Array:
     """Return the translation across the line of sight that moves the centre of the crowns to that of their masks [mm].
 
-    It brings teeth that were out of view back near their masks. Lips hide different teeth in every view, so a depth
-    estimate would be off by a centimetre or two; depth is not changed. Across, the result is accurate to a few
-    millimetres, enough to start a search.
+    It moves teeth that were out of view back near their masks. Lips hide different teeth in every view, so a depth
+    estimate would be off by a centimetre or two; depth is therefore not changed. Perpendicular to the line of sight,
+    the result is accurate to a few millimetres, enough to start a search.
 
     `pose` is T_world_scan, `use` the masks to use, shape (2, C). Zero without masks.
     """

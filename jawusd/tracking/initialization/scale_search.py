@@ -1,4 +1,4 @@
-"""A search for the world scale at which masks and scans agree best.
+"""Search for the world scale at which masks and scans agree best.
 
 Images of a calibration board do not reveal the size of its squares. A wrong size scales the whole world, and no pose
 of the teeth fits their masks in several views until the distances between cameras are corrected.
@@ -25,14 +25,15 @@ from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start_search import StartSearch
 
-# World scales at which poses are searched from scratch; between them the fit improves towards the true scale.
+# World scales at which poses are searched for from scratch; from the nearest one, the fit improves steadily towards the
+# true scale.
 _STARTS = (1.0, 1 / 1.15, 1.15, 1 / 1.32, 1.32)
 _STEPS = (0.03, 0.01, 0.005)
 _SMALLEST, _LARGEST = 0.5, 2.0
 _SURVEYED, _FRAMES_TRIED = 24, 2
-# Maximum evaluations of a hill climb: the whole range in the widest steps, and the finer ones.
+# Maximum number of evaluations of a hill climb: the whole range in the widest steps, plus the finer steps.
 _MOST_SIZES = 64
-_CLEAR_FIT = 0.3  # as for the start of a take: wrong poses stay below 0.1 in one arch
+_CLEAR_FIT = 0.3  # as for the start of a take: wrong poses have fits below 0.1 for one arch
 
 
 def seen_size(
@@ -42,7 +43,7 @@ def seen_size(
     meshes: Sequence[Mesh],
     map_: Mapper = map,
 ) -> float:
-    """Return the ratio of the teeth's size as seen by the cameras to the scans, accurate to half a per cent.
+    """Return the ratio of the teeth's size in the calibrated world to that of the scans, accurate to half a per cent.
 
     Args:
         capture: provides masks, frame range and anatomical axes.

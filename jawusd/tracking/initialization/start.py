@@ -32,9 +32,9 @@ from jawusd.tracking.initialization.start_causes import (
 )
 from jawusd.tracking.initialization.start_search import SearchResult, StartSearch
 
-#: Frames surveyed: two seconds of reading, covering every exercise of a usual take.
+#: Frames surveyed, which takes two seconds and covers every exercise of a usual take.
 SURVEYED = 24
-#: Maximum frames on which the teeth are searched.
+#: Maximum number of frames on which the teeth are searched for.
 FRAMES_TRIED = 5
 
 
@@ -58,7 +58,7 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
     Args:
         search: of the scans.
         footage: the masks.
-        suspects: hints of mistakes suggested by the scans.
+        suspects: hint texts of the mistakes that the scans suggest.
         explain: whether to look for a mistake if no frame fits, which takes several times as long.
 
     Raises:
@@ -75,7 +75,8 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
         try:
             found = search.at(footage, frame)
             fits[frame] = found.fits
-            # If most masks are correct, so are the poses, and they reveal the wrong masks. Poor poses prove nothing.
+            # If most masks are correct, so are the poses, and the poses reveal the wrong masks. Poor poses are no
+            # evidence.
             exchange = likely_exchange(footage, search.solver, found.poses, frame)
             if exchange is None:
                 found = replace(found, poses=aligned(search, footage, found.poses, frame))
@@ -127,7 +128,7 @@ def search_near(search: StartSearch, footage: Footage, frame: int, poses: Array)
 def fit_without_a_camera(
     search: StartSearch, footage: Footage, frame: int, poses: Array, found: SearchResult
 ) -> tuple[str, SearchResult] | None:
-    """Return a camera whose masks contradict the others, and the poses without it; None if all masks agree.
+    """Return a camera whose masks contradict the others, and the poses found without it; None if all masks agree.
 
     A camera is excluded only if the others then fit clearly.
     """
@@ -151,7 +152,7 @@ def fit_without_a_camera(
 
 
 def _check_upright(search: StartSearch, footage: Footage, frame: int, found: SearchResult) -> None:
-    """Reject masks that fit better with the arches exchanged: an upside-down upper arch resembles a lower one."""
+    """Reject masks that fit better with the arches swapped: an upside-down upper arch resembles a lower one."""
     exchange = all_arches_exchanged(footage.sources)
     try:
         other = search.at(replace(footage, sources=exchange.sources), frame)
@@ -166,7 +167,7 @@ def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Sea
         )
 
 
-_PICKS_OFF_MM = 3.0  # half a tooth
+_PICKS_OFF_MM = 3.0  # distance between picked and found poses that causes a warning: half a tooth
 # Uncertainty of picked poses up to which the contour solver converges from them [mm].
 _SURE_MM = 0.8
 
@@ -183,14 +184,14 @@ def find_start(
 
     Args:
         capture: provides masks, picks and frame range.
-        cameras, offsets: by camera name; reference frame minus own frame number.
+        cameras, offsets: by camera name; an offset is reference minus own frame number.
         meshes: upper and lower teeth scans in one frame, in occlusion [mm].
-        solver: holds the same scans, prepared.
+        solver: solver with the same scans, prepared.
         map_: distributes the search among threads.
 
     Raises:
-        TrackingError: invalid picks, scans that do not belong together, exchanged masks, or teeth that were found on no
-            frame.
+        TrackingError: invalid picks, scans that do not belong together, swapped masks, or no frame on which the teeth
+            were found.
         CaptureError: a mask cannot be read.
     """
     footage = Footage(masked_sources(capture.cameras, cameras, offsets), cameras, offsets, capture.frames)
@@ -256,7 +257,7 @@ def _picked(
     near = Start(start.frame, found.poses, notes | searched, _picks_off(search, start, found.poses, sigma_mm))
     if "camera_left_out" in notes or _fits(search, footage, near):
         return near
-    # The search may end in a wrong minimum although the picks were nearly good enough.
+    # The search may end in a wrong local minimum although the picks were nearly accurate enough.
     return start if _fits(search, footage, start) else _elsewhere(search, footage, start)
 
 
@@ -297,7 +298,7 @@ def _elsewhere(
 
 
 def _near_on_another_frame(search: StartSearch, footage: Footage, start: Start) -> Start | None:
-    """Return the first frame with a clear fit near the picked poses: heads and jaws move little."""
+    """Return the first frame with a clear fit near the picked poses, since heads and jaws move little."""
     try:
         frames = footage.survey(None, SURVEYED).promising(FRAMES_TRIED).tolist()
     except TrackingError:
@@ -313,7 +314,7 @@ def _near_on_another_frame(search: StartSearch, footage: Footage, start: Start) 
 
 
 def _fits(search: StartSearch, footage: Footage, start: Start) -> bool:
-    """Return whether a start passes the checks of a first frame, since hidden teeth have other minima nearby."""
+    """Return whether a start passes the checks of a first frame; hidden teeth may cause wrong local minima nearby."""
     try:
         aligned(search, footage, start.poses, start.frame)
     except TrackingError:

@@ -1,4 +1,4 @@
-"""Why a take has no start: exchanged masks, and other mistakes in scans or calibration, each tested by undoing it."""
+"""Causes of a failed start: swapped masks, and other mistakes in scans or calibration, each tested by undoing it."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_search import StartSearch
 
-# Fraction of the uncovered mask that may remain for an exchange to be believed.
+# Largest ratio of the uncovered mask after undoing a swap to that before, for the swap to be reported.
 _PROOF = 0.5
-# Uncovered fraction of a camera's masks from which an exchange is looked for: good poses leave 0.01, and exchanged
+# Uncovered fraction of a camera's masks from which swapped masks are suspected: good poses leave 0.01, and swapped
 # masks of similar cameras as little as 0.1.
 _ODD_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class MaskExchange:
-    """A possible exchange of masks."""
+    """A possible swap of masks."""
 
-    finding: str  # description of the exchange
+    finding: str  # description of the swap
     hint: str  # what to do
-    sources: tuple[CameraSource, ...]  # the cameras, with the exchange undone
+    sources: tuple[CameraSource, ...]  # the cameras, with the swap undone
 
     def error(self, frame: int) -> TrackingError:
-        """Return the error that reports the exchange."""
+        """Return the error that reports the swap."""
         return TrackingError(self.finding, frame=frame, hint=self.hint)
 
 
 def all_arches_exchanged(sources: Sequence[CameraSource]) -> MaskExchange:
-    """Return the exchange of arches in all cameras; exchanged scan files look the same."""
+    """Return the swap of arches in all cameras; swapped scan files have the same effect."""
     return MaskExchange(
         "the masks of the upper and lower teeth are exchanged in every camera",
         "Exchange masks.upper and masks.lower, or upper_teeth and lower_teeth in [scans].",
@@ -48,7 +48,7 @@ def all_arches_exchanged(sources: Sequence[CameraSource]) -> MaskExchange:
 
 
 def possible_exchanges(sources: Sequence[CameraSource]) -> list[MaskExchange]:
-    """Return every exchange of arches in one camera or all, and of masks between two cameras."""
+    """Return every swap of arches in one camera or in all, and of masks between two cameras."""
     out = []
     for k, source in enumerate(sources):
         out.append(
@@ -72,7 +72,7 @@ def possible_exchanges(sources: Sequence[CameraSource]) -> list[MaskExchange]:
 
 
 def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> MaskExchange | None:
-    """Return the exchange that best explains masks off their scans, with its evidence; None if none does.
+    """Return the swap that best explains masks off their scans, with its evidence; None if none does.
 
     `poses` are T_world_upper and T_world_lower of the frame, accurate to about 1 mm, shape (2, 4, 4).
     """
@@ -87,7 +87,7 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
             shares = _uncovered_shares(replace(footage, sources=exchange.sources), solver, poses, frame)
         except CaptureError:
             continue  # mask videos with another length than the clips of those cameras
-        # If an exchange leaves a camera without masks on this frame, that is not evidence.
+        # A swap that leaves a camera without masks on this frame is not evidence against it.
         both = np.isfinite(given) & np.isfinite(shares)
         if (given[both] >= _ODD_SHARE).any():
             found.append((float(shares[both].mean()), float(given[both].mean()), exchange))
@@ -129,14 +129,14 @@ def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
 CLEAR_FIT = 0.3
 #: Minimum acceptable fit with a mistake undone [-]: wrong poses do not reach it.
 EXPLAINS = 0.1
-_MOST_CAMERAS = 4  # up to which exchanges are tried; each costs a search
-#: Maximum images searched [-], separately for the start and for mistakes; each takes 2 to 3 s of CPU time.
-#: It covers all mistakes of four cameras, and of eight without exchanges. Work is counted instead of time, so that
+_MOST_CAMERAS = 4  # number of cameras up to which swaps are tried; each costs a search
+#: Maximum images searched [-], separately for the start and for mistakes; each takes 2 to 3 s of CPU time. The limit
+#: covers all mistakes of four cameras, and those of eight except swaps. Work is counted instead of time, so that
 #: messages do not depend on the machine.
 MOST_PICTURES = 120
-# Scan sizes that are tried; each finds teeth whose size differs by up to 5 %.
+# Scan sizes that are tried [-]; each finds teeth whose size differs by up to 5 %.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
-#: Hint for scans of a wrong size; if it is suspected, sizes are tried first.
+#: Hint for scans of a wrong size; if the size is suspected, sizes are tried first.
 SIZE_HINT = "Check the scans' unit and scaling, and the square size of the calibration board."
 
 
@@ -171,21 +171,21 @@ def raise_cause(
 ) -> str:
     """Raise an error for a mistake if undoing it makes the search succeed on one of some frames.
 
-    Suspected exchanges are tried before others, and suspected sizes before everything else. Mistakes of single cameras,
-    and otherwise of the scan size, come last, since excluding contradictions makes many poses fit. At most
-    `MOST_PICTURES` are searched; in a group of mistakes that was not fully tried, only a clear fit counts. A scan that
-    fits none of its masks is tested next, then other frames within the same budget, since the search can miss the
-    teeth on a frame.
+    Suspected swaps are tried before others, and suspected sizes before everything else. Mistakes of single cameras, and
+    sizes that are not suspected, come last, since many poses fit once contradictions are excluded. At most
+    `MOST_PICTURES` images are searched; in a group of mistakes that was not fully tried, only a clear fit counts. Next,
+    a scan that fits none of its masks is reported; then other frames are tried within the same budget, since the search
+    can miss the teeth on a frame.
 
     Args:
         search, footage: that failed.
         frames: tried in this order.
         fits: `arch_fit` of both arches by frame, as found by the search [-], shape (2,).
-        suspected: hints of mistakes.
+        suspected: hint texts of suspected mistakes.
         only_clear: whether only a clear fit counts.
 
     Returns:
-        A sentence that says what was tried, if no mistake explains the failure.
+        A sentence that describes what was tried, if no mistake explains the failure.
 
     Raises:
         TrackingError: names the mistake.
@@ -274,13 +274,13 @@ def _mirrored(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
 
 
 def _exchanges(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
-    """Yield exchanges of masks and of calibrations."""
+    """Yield swaps of masks and of calibrations."""
     if len(footage.sources) > _MOST_CAMERAS:
         return
     for exchange in possible_exchanges(footage.sources):
         yield _Cause(exchange.finding, exchange.hint, search, replace(footage, sources=exchange.sources))
     for a, b in combinations([source.name for source in footage.sources], 2):
-        if footage.offsets[a] != footage.offsets[b]:  # otherwise identical to an exchange of masks
+        if footage.offsets[a] != footage.offsets[b]:  # otherwise identical to a swap of masks
             cameras = {**footage.cameras, a: footage.cameras[b], b: footage.cameras[a]}
             message = f"the calibrations of cameras {a} and {b} are exchanged"
             hint = f"Exchange the names {a} and {b} in the calibration."

@@ -22,26 +22,27 @@ from jawusd.tracking.initialization.pose_search import Candidate, Grid, coarse_s
 
 _PX_PER_MM = 2.0  # search resolution: a pixel is a third of the step between orientations at the canines
 _FINALISTS = 5  # poses per arch that are refined
-_DISTINCT_MM = 2.0  # poses closer than this converge to the same minimum
-# Rotations about the guess that the teeth face the cameras and the upper ones are above. Lateral movements and lips
-# bias the roll most. With retracted lips, the centre of the masks lies up to 20 mm behind the front teeth.
+_DISTINCT_MM = 2.0  # poses closer than this converge to the same local minimum
+# Rotations and translations about a guess in which the teeth face the cameras with the upper arch above the lower one.
+# Lateral movements and lips mostly bias its roll. With retracted lips, the centre of the masks lies up to 20 mm behind
+# the front teeth.
 _GRID = Grid(
     yaw_rad=np.radians(np.arange(-50, 51, 10.0)),
     pitch_rad=np.radians(np.arange(-40, 41, 10.0)),
     roll_rad=np.radians(np.arange(-50, 51, 10.0)),
     reach_mm=(13.0, 9.0, 22.5),
 )
-# Rotations and translations about picked poses: the errors of four careless clicks close together.
+# Rotations and translations about picked poses: possible errors of four careless clicks close together.
 _NEAR_GRID = Grid(
     yaw_rad=np.radians(np.arange(-20, 21, 10.0)),
     pitch_rad=np.radians(np.arange(-20, 21, 10.0)),
     roll_rad=np.radians(np.arange(-20, 21, 10.0)),
     reach_mm=(6.0, 6.0, 6.0),
 )
-# Openings of the jaw that are tried relative to an arch found alone [mm], and position of the hinge axis above and
-# behind the front teeth [mm]: arches look alike when shifted by a tooth, but a jaw cannot be.
+# Jaw openings that are tried to place the other arch relative to one found alone [mm], and position of the hinge axis
+# above and behind the front teeth [mm]: a single arch also fits when shifted by a tooth, but jaws do not move that way.
 _OPENINGS_MM, _CONDYLES_MM = (0.0, 6.0, 14.0, 24.0, 36.0), (40.0, -90.0)
-_WIDEST_JAW_RAD = 0.8  # largest rotation between the arches of a jaw
+_WIDEST_JAW_RAD = 0.8  # largest possible rotation between the arches
 _FARTHEST_JAW_MM = 75.0  # largest distance between the front teeth of the arches
 
 
@@ -55,7 +56,7 @@ class SearchResult:
 
     @property
     def fit(self) -> float:
-        """The smaller fit of the two arches [-]."""
+        """Fit of the worse arch [-]."""
         return float(self.fits.min())
 
 
@@ -193,7 +194,7 @@ class StartSearch:
     def _objective(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> Array:
         """Return the matched contour less the penalty for uncovered mask per arch [px], shape (2,)."""
         uncovered, _ = uncovered_px(solver.scans, solution.poses, views)
-        # The penalty is per area, and coarse images have larger pixels.
+        # The penalty is proportional to the area, and coarse images have larger pixels.
         price = self._config.uncovered_price
         if solver is self._coarse_solver:
             price *= self._config.working_px_per_mm / _PX_PER_MM

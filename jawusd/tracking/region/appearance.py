@@ -1,4 +1,4 @@
-"""Appearance of teeth in every camera, learned while tracking, and the views that use it."""
+"""Appearance of the teeth in every camera, learned while tracking, and views that use it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from jawusd.tracking.region.view import Counts, RegionView
 # Distances that define the training areas of the initial colours [px]: inside crowns, outside, ring, background.
 _INSIDE_PX, _OUTSIDE_PX, _RING_PX, _BEYOND_PX = 2.0, 3.0, 30.0, 4.0
 
-#: Learning rates of tooth and background colours, usually and in the first frame.
+#: Learning rates of tooth and background colours: usual ones, and those of the first frame.
 RATES, FIRST_RATES = (0.1, 0.2), (0.5, 0.5)
-_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # learning rate of the gum-line offset [-], and its bound
+_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # learning rate [-] and bound [px] of the gum-line offset
 #: Correlation length of border errors along the contour [px]: lips and shadows affect whole teeth.
 CORRELATION_PX = 110.0
 
@@ -124,7 +124,7 @@ class LearnedColours:
         """Update the colours beside matched borders, and the offset of the gum line.
 
         Args:
-            views: of the images, with counts of one alignment.
+            views: of the images, with the counts of one alignment.
             pictures, poses: images and poses of this instant.
             rates: learning rates of tooth and background colours, 0 .. 1.
         """

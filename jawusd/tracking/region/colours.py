@@ -14,15 +14,15 @@ from jawusd.base.arrays import Array, Mask
 PATCHES = 8  # per arch
 KINDS = 2  # free edges and gum line
 TABLES = PATCHES * KINDS  # per arch; table = KINDS * patch + kind
-_BITS = 4  # per channel; finer bins would stay empty
+_BITS = 4  # per channel; most finer bins would stay empty
 BINS = 1 << (3 * _BITS)
 
-_BLUR = 0.7  # of histograms [bins]
-_REACH = 2  # of the blur [bins]
+_BLUR = 0.7  # standard deviation of the blur of histograms [bins]
+_REACH = 2  # radius of the blur kernel [bins]
 # Blur matrix along one axis of the colour cube; the border is replicated.
 _SPREAD = gaussian_filter1d(np.eye(1 << _BITS), _BLUR, axis=0, mode="nearest", radius=_REACH)
 _LOCAL = 0.5  # weight of a patch's own histogram
-_MOST = 3.0  # bound of the log ratios, as no colour is certain
+_MOST = 3.0  # bound of the log ratios, as no colour is conclusive
 _LIPS = 0.2  # weight of skin and lips in the background model
 _EMPTY = 2e-5  # probability of unseen colours
 _ENOUGH = 200.0  # counts from which a new histogram has full weight
@@ -53,16 +53,17 @@ class Areas:
     crowns: Mask  # well inside projected crowns
     ring: Mask  # around them, within reach of the search
     gum: Mask  # under projected gum, away from crowns
-    far: Mask  # away from everything: skin and lips
+    far: Mask  # away from the teeth: skin and lips
 
 
 class CameraColours:
-    """Colour model of teeth and surroundings that rates colours by log likelihood ratios."""
+    """Colour model of teeth and surroundings: log likelihood ratios of colours."""
 
     def __init__(self, bins: NDArray[np.uint16], areas: Areas) -> None:
         """Learn from a first image with colour bins of shape (h, w).
 
-        Lips may hide crowns, and teeth may lie outside them: repeated classification removes both.
+        Lips may hide projected crowns, and other teeth may lie beside them; repeated classification removes the pixels
+        of both.
         """
 
         def count(where: Mask) -> Array:

@@ -1,7 +1,7 @@
-"""Use of the condylar motion of a whole take: inflated covariances of implausible frames, and fused poses.
+"""Condylar motion of a whole take: it inflates the covariances of implausible frames and is fused with the poses.
 
-Masks generated around a wrong pose confirm it, and colours may prefer it, but such poses rarely fit the jaw's own
-condylar motion. While a take is tracked, the condylar prior has a low weight, as few frames have trained it. Once all
+Masks generated around a wrong pose confirm it, and colours may favour it, but such poses rarely fit the condylar motion
+of this jaw. While a take is tracked, the condylar prior has a low weight, as few frames have trained it. Once all
 frames are known, each pose is fused with the prediction at full weight.
 """
 
@@ -17,12 +17,13 @@ from jawusd.geometry import orthonormalise, relative_pose, se3_adjoint, se3_exp
 from jawusd.tracking.contour.quality import landmark_sigmas
 from jawusd.tracking.region.jaw_priors import CondyleMotion
 
-_STRAINED = 2.0  # squared distance of the condyles per coordinate above which a frame is implausible
-_USUAL, _LEAST = 0.9, 0.25  # quantile of the take with which an implausible frame is compared, and its lower bound
+_STRAINED = 2.0  # squared Mahalanobis distance of the condyles per coordinate above which a frame is implausible
+# Quantile of the take's distances that implausible frames are compared with, and its lower bound.
+_USUAL, _LEAST = 0.9, 0.25
 
 
 def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) -> Array:
-    """Train a motion with all frames; return factors on the covariances (F,), 1 for plausible frames.
+    """Train a condylar motion with all frames; return factors on the covariances (F,), 1 for plausible frames.
 
     The factor is the squared distance relative to the usual one (Birge 1932).
 
@@ -72,14 +73,14 @@ class CondyleFusion:
     axes: Array
 
     def __call__(self, poses: Array, covariance: Array, between: Array) -> tuple[Array, Array, Array]:
-        """Return the fused poses and covariances; covariances of implausible frames are inflated before.
+        """Return the fused poses and covariances; covariances of implausible frames are inflated first.
 
         Frames with a lost arch are not changed.
 
         Args:
             poses: T_world_upper and T_world_lower, NaN where lost, shape (F, 2, 4, 4).
             covariance: of their left twists about the world origin, shape (F, 2, 6, 6).
-            between: of the left twist of T_upper_lower about the skull origin, shape (F, 6, 6).
+            between: covariance of the left twist of T_upper_lower about the skull origin, shape (F, 6, 6).
         """
         poses, covariance, between = poses.copy(), covariance.copy(), between.copy()
         known = np.flatnonzero(np.isfinite(poses).all((1, 2, 3)) & np.isfinite(between).all((1, 2)))

@@ -14,7 +14,7 @@ from jawusd.tracking.contour.samples import NX, NY, U, V, pixel_of
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.region.edges import colour_at
 
-# Search range of creases, and of their edges from the darkest point; half-pixel steps over which a slope is measured.
+# Search range of dark lines, and of edges about a dark line [px]; half-pixel steps over which a gradient is measured.
 _CREASE_PX, _BESIDE_PX, _CREASE_ARM = 6.0, 3.0, 3
 
 
@@ -30,13 +30,13 @@ def search_creases(
     out: Array,
     clearness: Array,
 ) -> None:
-    """Find crown edges in front of the other arch, at the steepest brightness change beside the dark line between.
+    """Find crown edges in front of the other arch, where brightness changes most beside the dark line between both.
 
-    Either crown may darken towards the line, but shading is gradual, whereas the edge is as sharp as the lens.
+    Either crown may darken towards the line, but shading is gradual, whereas the edge is only blurred by the lens.
 
     Args:
         contrast: minimum difference between the brighter tooth and the line [8-bit steps].
-        weight: of the edges found [-].
+        weight: weight of the edges found [-].
         Other arguments as for `edges.search_borders`; only samples without a border are processed.
     """
     reach = min(reach_px, _CREASE_PX)
@@ -70,7 +70,7 @@ def search_creases(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _sharpest(line: Array, at: int, steps: int) -> float:
-    """Return the sub-sample index near `at` of the steepest change in a line; NaN at an end."""
+    """Return the sub-sample index of the steepest change in a line near index `at`; NaN at an end."""
     best, place = 0.0, np.nan
     before, slope = np.nan, np.nan
     first = max(at - steps, _CREASE_ARM)

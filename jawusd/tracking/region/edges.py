@@ -1,7 +1,7 @@
 """Tooth edges in a colour image: the most likely border along every contour normal.
 
-Pixels inside the border should look like teeth, pixels outside like background. The log ratios of both sum to the
-likelihood of every position (as in Stoiber et al. 2022). No mask is computed.
+Pixels inside the border should have tooth colours, pixels outside background colours. The log ratios of both sides sum
+to the log likelihood of every position (as in Stoiber et al. 2022). No mask is computed.
 
 All compiled functions release the GIL and are stateless.
 """
@@ -16,10 +16,10 @@ from jawusd.base.arrays import Array
 from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V, pixel_of
 from jawusd.tracking.contour.scan import CROWN
 
-_MOST_STEPS = 10  # to either side of a sample
+_MOST_STEPS = 10  # search steps to either side of a sample
 _LEAST_CLEAR = 0.15  # fraction of `clear_ratio` below which an edge is rejected
 _LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2  # range of compensated motion blur; gamma of the images
-_SMOOTH_PX = 1.0  # half the width over which slopes are measured
+_SMOOTH_PX = 1.0  # half the width over which gradients are measured
 _PER_CODE = 8  # linearisation table entries per 8-bit step
 _LIGHT = (np.arange(255 * _PER_CODE + 1) / (255 * _PER_CODE)) ** _GAMMA
 
@@ -32,7 +32,7 @@ def _within(bins: NDArray[np.uint16], x: float, y: float) -> bool:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _ratio_at(bins: NDArray[np.uint16], table: NDArray[np.float32], x: float, y: float) -> float:
-    """Interpolate the log ratio of a table bilinearly; neutral 0 outside the image."""
+    """Interpolate the log ratio of a table bilinearly; 0, which is neutral, outside the image."""
     if not _within(bins, x, y):
         return 0.0
     # Unsigned indices avoid numba's check for negative ones.
@@ -128,7 +128,7 @@ def _read_line(
     own_labels: NDArray[np.uint8],
     other_labels: NDArray[np.uint8],
 ) -> None:
-    """Read the log ratios along a normal; 0 inwards beyond the own crown, and outwards beyond any crown."""
+    """Read the log ratios along a normal; 0 beyond the own crown inwards, and from the next crown on outwards."""
     x, y, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
     r[:] = 0.0
     for i in range(n, 2 * n + 1):
@@ -198,7 +198,7 @@ def colour_at(rgb: NDArray[np.uint8], x: float, y: float) -> tuple[float, float,
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _light(code: float) -> float:
-    """Linearise a gamma-encoded value, 0 .. 255, with an error of 1e-7; a table is much faster than powers."""
+    """Linearise a gamma-encoded value, 0 .. 255, with an error of 1e-7; a table is much faster than pow()."""
     x = code * _PER_CODE
     k = min(int(x), 255 * _PER_CODE - 1)
     return _LIGHT[k] + (x - k) * (_LIGHT[k + 1] - _LIGHT[k])
@@ -222,7 +222,8 @@ def sharpen(
         contrast: minimum difference of both sides' mean colours [8-bit steps].
         reach_px: how far a border may move.
         blur_px: motion during the exposure along the normals, the width of a blurred edge, shape (n,).
-        out, clearness: as written by `search_borders`; borders without a steepest point lose most of their weight.
+        out, clearness: as written by `search_borders`; borders without a steepest point lose most of their
+            weight.
     """
     inner = np.empty(3)
     outer = np.empty(3)
@@ -271,12 +272,12 @@ def sharpen(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _steepest(line: Array, steps: int, arm: int) -> float:
-    """Return where a line falls most steeply, in samples from its middle; NaN if at an end or nowhere.
+    """Return where a line falls most steeply, in samples from its middle; NaN if at an end, or if it never falls.
 
     Args:
         line: 2 (steps + arm) + 1 samples.
         steps: search steps to either side.
-        arm: samples to either side whose linearly weighted difference is the slope.
+        arm: samples to either side whose linearly weighted difference is the gradient.
     """
     before, slope = np.nan, np.nan
     best, place = 0.0, np.nan

@@ -9,21 +9,21 @@ _Gates = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Effort:
-    """Steps of an alignment, and conditions and sizes of searches.
+    """Steps of an alignment, conditions for searches, and their sizes.
 
     Attributes:
         gates_px: residual gate of every step from a prediction.
-        next_px: the same after one dropped frame.
-        far_px: the same after several dropped frames.
-        wide_px: gates from other starts and at the end of a search; None for those of the prediction.
-        doubted, searched: shares of the usual matched contour below which other starts are tried, and poses are
-            searched, as long as hardly any frames were dropped.
+        next_px: gates after one dropped frame.
+        far_px: gates after several dropped frames.
+        wide_px: gates from other starts and at the end of a search; None to use those from the prediction.
+        doubted, searched: fractions of the usual matched contour below which other starts are tried, and a search
+            starts, as long as hardly any frames were dropped.
         jaws, finalists, heads: jaw poses tried by a search, those aligned fully, and head poses tried.
-        search_every: failed frames per search.
-        searches: number of failed frames after which teeth count as out of sight.
-        later_every: failed frames per search from then on.
+        search_every: number of failed frames per search.
+        searches: number of failed frames after which teeth count as not visible.
+        later_every: number of failed frames per search from then on.
         in_turn: from then on, search jaw and head in different frames, to limit the time per frame.
-        learn_every: frames per update of the colours.
+        learn_every: number of frames per update of the colours.
     """
 
     gates_px: _Gates
@@ -59,7 +59,7 @@ THOROUGH = Effort(
     in_turn=False,
     learn_every=1,
 )
-#: For live images. Frames are dropped during a search, so searches start later.
+#: For live images. Frames are dropped during a search, so searches start after more failed frames.
 FAST = Effort(
     gates_px=(8.0, 3.0, 2.0),
     next_px=(16.0, 6.0, 2.5, 2.0),

@@ -1,8 +1,8 @@
 """Priors on the jaw: condyles that follow the incisal point, and teeth that do not interpenetrate.
 
 When the teeth touch, or lips hide most of them, the contour hardly constrains the rotation of the jaw that raises the
-front teeth and lowers the condyles. In one jaw, the position of the incisal point nearly determines both condyles, as
-mandibles have about three degrees of freedom (Zoss et al. 2018). The relation is learned from earlier frames.
+front teeth and lowers the condyles. In a given jaw, the position of the incisal point nearly determines both condyles,
+as mandibles have about three degrees of freedom (Zoss et al. 2018). The relation is learned from earlier frames.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ _USUAL_MM = np.array(
     ]
 )
 _ODD = np.array([False, True, False, False, False, True, True, False, False, False])  # terms odd in x
-# Standard deviations of a subject's coefficients to the side, up and forwards [mm], the factor for products, and the
-# standard deviation of the constant, an error of the scans' bite.
+# Standard deviations of a subject's coefficients to the side, up and forwards [mm], their factor for the quadratic
+# terms, and the standard deviation of the constant term, which is an error of the scans' bite [mm].
 _SPREAD_MM, _PRODUCTS, _CONSTANT_MM = (0.4, 1.5, 1.5), 0.5, 1.0
-# Residuals of condyles about a jaw's own polynomials, standard deviations to the side, up and forwards [mm].
+# Standard deviations of the condyles about the polynomials of their own jaw, to the side, up and forwards [mm].
 _OFF_MM = (0.3, 0.8, 0.5)
-_NEWS = 0.1  # weight of a frame, as neighbouring frames are correlated
-_BACK = 0.25, 0.005  # backward motion of the incisal point in opening, per mm and per mm^2: mean of the same joints
+_NEWS = 0.1  # weight of a frame: below 1, as neighbouring frames are correlated
+_BACK = 0.25, 0.005  # backward motion of the incisal point in opening, per mm and per mm^2: mean over the same joints
 _DOUBT = 4.0  # squared distance per coordinate at which the weight of a frame is halved, as it may be wrong [-]
 
-# Standard deviation of the lower teeth above the closed bite of the scans [mm], by errors of the bite registration; and
-# the squared distance in these [-] at which the weight is halved, as the scans' bite may be wrong instead of the pose.
+# Standard deviation of the height of lower teeth above the closed bite of the scans [mm], due to errors of the bite
+# registration; and the squared height in standard deviations [-] at which the weight is halved, as the scans' bite may
+# be wrong instead of the pose.
 _ABOVE_MM, _BITE_DOUBT = 0.2, 4.0
 
 
@@ -49,7 +50,7 @@ class CondyleMotion:
     """
 
     def __init__(self, landmarks: Array, axes: Array) -> None:
-        """Start with the prior, which holds for any jaw.
+        """Start with the prior, which is the same for all jaws.
 
         Args:
             landmarks: as in `geometry.LANDMARKS`, in scan coordinates [mm], shape (5, 3).
@@ -79,7 +80,7 @@ class CondyleMotion:
         self._sums += (weight * condyles)[:, None] * features
 
     def expected(self, incisor: Array) -> tuple[Array, Array, Array]:
-        """Predict the condyles' motion from the incisal point's (3,): mean (6,), derivative (6, 3), variance (6,).
+        """Predict the condyles' motion from that of the incisal point: mean (6,), derivative (6, 3), variance (6,).
 
         In anatomical axes [mm]; left condyle first.
         """
@@ -112,7 +113,7 @@ class CondyleMotion:
     def residual(self, relative: Array) -> tuple[Array, Array, Array]:
         """Return the residuals of the condyles [mm], derivatives, and variances [mm^2]; shapes (6,), (6, 6), (6,).
 
-        `relative` is T_upper_lower (4, 4); the derivatives are by its left twist about the skull origin.
+        `relative` is T_upper_lower (4, 4); the derivatives are with respect to its left twist about the skull origin.
         """
         points = transform_point(relative, self._points)
         slopes = [self.axes @ np.hstack([-hat(point), np.eye(3)]) for point in points]
@@ -123,7 +124,7 @@ class CondyleMotion:
 
 @dataclass(frozen=True, eq=False)
 class CondyleTerm:
-    """Pull both condyles towards their predicted positions."""
+    """Penalise distances of both condyles from their predicted positions."""
 
     motion: CondyleMotion
     noise_px3: float  # outline variance times correlation length
@@ -139,7 +140,7 @@ class CondyleTerm:
 
 
 def _features(incisor: Array) -> tuple[Array, Array]:
-    """Return the monomials (K,) up to degree two of a point, and their derivatives by it (K, 3)."""
+    """Return the monomials (K,) of a point up to degree two, and their derivatives with respect to it (K, 3)."""
     x, unit = incisor / _UNIT_MM, np.diag(1.0 / np.array(_UNIT_MM))
     i, j = np.triu_indices(3)
     products = x[i, None] * unit[j] + x[j, None] * unit[i]
@@ -153,7 +154,7 @@ class BiteTerm:
     Attributes:
         points: of the lower teeth, in scan coordinates [mm], shape (N, 3).
         up: bite normal, scan coordinates, shape (3,).
-        noise_px3: variance of borders times their correlation length.
+        noise_px3: variance of border errors times their correlation length.
     """
 
     points: Array

@@ -25,7 +25,7 @@ from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import fitting_share
 
 _FACES = 3_000
-# Coarser than for recorded images, since dropped frames cost more accuracy than coarse steps.
+# Coarser than for recorded images, since dropped frames reduce accuracy more than coarse settings.
 _SETTINGS = replace(TrackingConfig(), sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
 _WIDER = 1.5  # ratio of true to computed standard deviation, as in the smoother
 

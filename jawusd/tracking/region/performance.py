@@ -28,8 +28,8 @@ from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import fitting_share
 
-#: Crops the images of a range of frames for cameras, possibly with changed focal lengths, at a resolution suited to
-#: teeth near a world point [mm], shape (3,).
+#: Crops the images of a range of frames. Arguments: cameras, possibly with changed focal lengths; a world point near
+#: the teeth, which determines the resolution [mm], shape (3,); and the frames.
 Cuts = Callable[[Sequence[Camera], Array, range], Iterator[Cut]]
 Progress = Callable[[int, int], None]
 
@@ -38,10 +38,11 @@ Progress = Callable[[int, int], None]
 _ROUGH_FACES, _FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 6_000, 20_000, 2.0, 2.0, 0.08
 # Frames used to estimate a fixed head and unknown focal lengths in advance, and rounds for focal lengths.
 _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
-# Prior on the offsets of colour borders over a take, and correlation length of the remaining errors [px]. Teeth darken
-# towards their free edges, where borders lie up to half a pixel inside; gum-line offsets are learned while tracking.
+# Prior on the offsets of colour borders from the teeth's edges in a take, and correlation length of the residual errors
+# [px]. Teeth darken towards their free edges, where borders lie up to half a pixel inside; gum-line offsets are learned
+# while tracking.
 _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
-_ALONE = 2.0  # inflation of the variance with a single camera, as no other view contradicts shifted borders [-]
+_ALONE = 2.0  # inflation of the variance with a single camera, as no other view reveals shifted borders [-]
 _CLEARLY = 1.05  # ratio of matched contour above which another pose replaces a trusted one
 
 
@@ -133,7 +134,7 @@ class PictureTake:
         return performance_of(self._jaw, pivot, shot.frames, smoothed, names, shot.fps, free_focal=shot.free_focal)
 
     def _known_before(self, at: int, start: Pose, progress: Progress) -> tuple[Sequence[Camera], Pose, Array]:
-        """Return cameras, start, and focal-length factors (C,), estimated from some frames if unknown."""
+        """Return cameras, start pose, and focal-length factors (C,), estimated from some frames if unknown."""
         shot = self._shot
         cameras, factors = shot.cameras, np.ones(len(shot.cameras))
         rounds = _FOCAL_ROUNDS if shot.free_focal else int(shot.fixed_head)
@@ -181,7 +182,7 @@ class PictureTake:
     def _turned(
         self, cameras: Sequence[Camera], one: RigTracker, fits: dict[int, FrameFit], frame: int, before: range
     ) -> Iterator[FrameFit]:
-        """Yield the fits of frames tracked from one frame against a tracker's direction."""
+        """Yield the fits of frames tracked from one frame in the opposite direction to a tracker's."""
         turned = one.reversed_from(fits[frame])
         for cut in self._shot.cuts(cameras, self._centre(fits[frame].pose), before):
             yield turned.step(cut)
@@ -205,7 +206,7 @@ class PictureTake:
 
 
 def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, range], Iterator[FrameFit]]) -> None:
-    """Track backwards into frames in which the teeth were not found or doubtful; keep the better fits.
+    """Track backwards into frames in which the teeth were not found or the fit is doubtful; keep the better fits.
 
     Teeth may be visible for some frames before a search finds them, and a wrong pose is often corrected only some
     frames later.

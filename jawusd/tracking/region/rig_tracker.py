@@ -29,15 +29,15 @@ _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _LAST_GATES_PX = (2.0,)
 _TRIAL_GATES_PX = (8.0, 6.0)  # for the many candidates of a search
-# Frames since the last step up to which no frame counts as dropped, and up to which motion is extrapolated.
+# Time since the last step, in frames, up to which no frame counts as dropped, and up to which motion is extrapolated.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
 _FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of a millimetre
-# Shares of the usual matched contour below which a pose is doubted, a search starts, an arch is given up, and a lost
+# Fractions of the usual matched contour below which a pose is doubted, a search starts, an arch is lost, and a lost
 # arch is not accepted again. `Effort` overrides the first two as long as no frames are dropped.
 _DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
-_UNSURE_FRAMES = 3.0  # frames since the last step after which an arch counts as lost
+_UNSURE_FRAMES = 3.0  # frames since the last step after which an arch that fits badly counts as lost
 _USUAL_FRAMES = 15  # window of the usual matched fraction
-_LEAST_USUAL = 0.7  # lower bound of the usual share, relative to the first frame
+_LEAST_USUAL = 0.7  # lower bound of the usual matched fraction, relative to the first frame
 _JAWS = 96  # jaw poses that a search ranks by colour
 
 
@@ -62,7 +62,7 @@ class RigTracker:
 
         Args:
             head: factor on the head's standard deviations, see `Prediction`.
-            free_focal: compute derivatives by focal lengths.
+            free_focal: compute derivatives with respect to focal lengths.
             effort: computational effort per instant.
             whole: solver with more faces of the scans for the last step; default: none.
         """
@@ -128,7 +128,7 @@ class RigTracker:
         return replace(fit, doubtful=bool((share < _DOUBTED * usual).any()))
 
     def _remember(self, share: Array) -> None:
-        """Add the matched shares (2,) to the statistics, except doubtful ones."""
+        """Add the matched fractions (2,) to the statistics, except doubtful ones."""
         usual = self._usual_share()
         self._usual.append(np.where(share >= _SEARCHED * usual, share, usual))
 
@@ -154,7 +154,7 @@ class RigTracker:
         effort, usual = self._effort, self._usual_share()
         in_turn, far = effort.in_turn and self._failed > effort.searches, frames > _STEADY_FRAMES
         gates = effort.gates_px if in_turn or frames <= _NEXT_FRAMES else effort.far_px if far else effort.next_px
-        # After dropped frames, partial fits are not trusted, as motion does not support them.
+        # After dropped frames, partial fits are not trusted, as the motion prior is weak.
         doubted, searched = (_DOUBTED, _SEARCHED) if far else (effort.doubted, effort.searched)
         found = look.align(expected.pose, expected, gates)
         if not (fitting_share(found.solution) < doubted * usual).any():
@@ -179,7 +179,7 @@ class RigTracker:
     def _best_in_turn(
         self, found: Aligned, expected: Expected, look: _InstantImages, cut: Cut
     ) -> tuple[Aligned, _InstantImages]:
-        """Search jaw and head in different frames, to limit the time per frame while teeth are out of sight."""
+        """Search jaw and head in different frames, to limit the time per frame while teeth are not visible."""
         turn = self._failed % self._effort.later_every
         if turn == 0:
             look = self._wide_look(found, cut)
@@ -201,7 +201,7 @@ class RigTracker:
         return look.align(found.pose, Expected(found.pose, LARGEST_SIGMA**-2.0), gates)
 
     def _searched(self, found: Aligned, expected: Expected, look: _InstantImages) -> Aligned:
-        """Try jaw poses over the whole range, ranked by the colours at their teeth."""
+        """Try jaw poses over the whole range of motion, ranked by the image colours at the projected teeth."""
         head, jaw = found.pose.head, self._coordinates.jaw
         places = [head @ jaw.pose(d) for d in self._jaws]
         order = rank_by_colour(places, look.views, self._instants.solver.scans, 1, look.upper_crowns(found.pose))

@@ -23,11 +23,12 @@ from jawusd.tracking.region.jaw_priors import BiteTerm, CondyleMotion, CondyleTe
 from jawusd.tracking.region.view import RegionView
 from jawusd.tracking.sequence.history import MotionPredictor
 
-_POINTS = 400  # points of a scan whose colours rank a start
+_POINTS = 400  # scan points at which image colours are read to rank starts
 # Candidate rotations of the jaw, opening and sideways [degrees].
 _OPENED, _ASIDE = (-6.0, -4.5, -3.0, -1.5, 1.5, 3.0, 4.5, 6.0), (-4.0, -2.0, 2.0, 4.0)
 # Candidate positions of the incisal point: left, down, and forward of the path of plain opening [mm]. The solver
-# converges from about 1.7 mm. A lateral excursion rotates about the condyle of that side: the point moves forward.
+# converges from about 1.7 mm. In a lateral excursion, the jaw rotates about the condyle of that side, so the point
+# moves forward.
 _DOWN = np.arange(0.0, 46.0, 2.5).tolist()
 _LEFT = (-12.0, -9.0, -6.0, -3.0, 3.0, 6.0, 9.0, 12.0)
 _PLACES_MM = [
@@ -43,21 +44,21 @@ _SHIFTS_MM = [
     *((0.0, far, 0.0) for far in _FAR_MM),
 ]
 
-# Gates of an alignment from the prediction, from farther away, of a trial, and of the final step with all faces;
+# Gates of an alignment from the prediction, from farther away, of a trial, and of the final step with all faces [px];
 # spacing of contour samples, and motion that triggers a redraw [px].
 _NEAR_GATES_PX, _FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _TRIAL_GATES_PX, _LAST_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
-_FACES = 6_000  # of the crowns before the final step
+_FACES = 6_000  # crown faces of the scans before the final step
 # Border variance times correlation length that sets the weight of the condylar prior [px^3]: for a clearly visible jaw,
 # and in doubtful frames, where a lower weight would let a hidden jaw drift.
 _LOOSE_PX3, _FIRM_PX3 = 3.0, 15.0
-_BORDER_PX3 = 0.7**2 * CORRELATION_PX  # the same, as estimated from residuals
+_BORDER_PX3 = 0.7**2 * CORRELATION_PX  # the same product, as estimated from residuals
 # Matched contour equivalent to one squared standard deviation of the condyles [px]: a sample beyond the gate costs
-# Tukey's loss of 4.685^2 / 6, and samples are correlated over the length above.
+# Tukey's loss of 4.685^2 / 6, and samples are correlated over `CORRELATION_PX`.
 _STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
 _FAST_MM = 1.0  # predicted motion above which other starts are tried
-# Starts that a search tries, near the last poses and anywhere in the human range, and those it aligns fully. Colours
-# rank the right start among the first 22 of 57.
+# Number of starts that a search tries, near the last poses and anywhere in the human range, and number that it aligns
+# fully. Colours rank the correct start among the first 22 of 57.
 _HOPEFUL_NEAR, _HOPEFUL, _FINALISTS = 12, 24, 3
 
 
@@ -83,7 +84,7 @@ def starts_everywhere(condyles: CondyleMotion) -> list[Array]:
 def rank_by_colour(
     places: Sequence[Array], views: Sequence[View], scans: Sequence[Scan], arch: int, taken: Sequence[Mask] = ()
 ) -> list[int]:
-    """Return the indices of poses T_world_arch (4, 4), ranked by how much the pixels at their crowns look like teeth.
+    """Return the indices of poses T_world_arch (4, 4), ranked by the tooth likelihood of the pixels at their crowns.
 
     Args:
         places: the poses.
@@ -139,7 +140,7 @@ class PoseSearch:
         """Align from a start accurate to some tenths of a millimetre, T_world_upper and T_world_lower (2, 4, 4).
 
         Args:
-            firm: give the condylar prior a high weight, for doubtful frames.
+            firm: use a high weight of the condylar prior, for doubtful frames.
         """
         return self._align(start, look, _FAR_GATES_PX, firm)
 
@@ -171,7 +172,7 @@ class PoseSearch:
         motion: MotionPredictor,
         everywhere: bool,
     ) -> Solution:
-        """Try earlier jaw poses, rotated ones and, on request, the whole human range, with the head as found."""
+        """Try earlier jaw poses, rotated ones and, if `everywhere`, the whole human range, with the head as found."""
         near = [se3_inverse(poses[0]) @ poses[1] for poses in (last, *motion.pose_history())]
         near += turned_starts(self.condyles, (se3_inverse(predicted[0]) @ predicted[1], near[0]))
         anywhere = starts_everywhere(self.condyles) if everywhere else []
@@ -186,7 +187,7 @@ class PoseSearch:
         return solution
 
     def with_head_alone(self, solution: Solution, start: Array, look: InstantViews) -> Solution:
-        """Align the head alone if its contour then fits better: a wrong jaw pulls it along by the condyles."""
+        """Align the head alone if it then fits better: a wrong jaw pose biases the head through the condylar prior."""
         alone = self._align(start, look, _FAR_GATES_PX, use=_upper_alone(look.views))
         return max((solution, alone), key=lambda trial: float(fitting_share(trial)[0]))
 

@@ -1,4 +1,4 @@
-"""Tracks of a take followed by colour, and checks of its cameras, scans and footage."""
+"""Tracks of a take tracked by colour, and checks of its cameras, scans and footage."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings, mirr
 from jawusd.tracking.sequence.time_checks import time_findings
 
 _LEAST_SHARE = 0.3  # matched fraction of the contour, relative to the best camera, below which a camera is reported
-# Standard deviation of the lower teeth beyond which a frame is uninformative [mm], and the shares of such frames above
-# which a take is doubtful, and unusable.
+# Standard deviation of the lower teeth above which a frame is uninformative [mm], and the fractions of such frames
+# above which a take is doubtful, and unusable.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
-_MOST = 0.6  # fraction of frames; a run of good frames this long suggests trimming the ends of the take
+_MOST = 0.6  # fraction of frames in one run of good ones from which trimming the ends of the take is suggested
 
-#: Prior on the offsets of colour borders from the teeth's edges: up to half a pixel inside, as teeth darken towards
-#: them; gum-line offsets are learned while tracking.
+#: Prior on the offsets of colour borders from the teeth's edges. Borders lie up to half a pixel inside, as teeth darken
+#: towards their edges; gum-line offsets are learned while tracking.
 BORDERS = AnnotatorPrior(edge_px=0.3, gum_px=0.08, gum_mm=0.02, arch_px=0.25, arch_mm=0.01, camera_px=0.08, frames=5.0)
 FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)
 
@@ -106,7 +106,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def footage_doubts(tracks: Tracks) -> list[Finding]:
-    """Return a warning if the jaw is lost or known to less than a millimetre in too many frames.
+    """Return a warning if in too many frames the jaw is lost or uncertain by more than a millimetre.
 
     Kind: "footage_doubtful" [%].
     """
@@ -132,14 +132,14 @@ def footage_doubts(tracks: Tracks) -> list[Finding]:
 
 @dataclass(frozen=True, eq=False)
 class TakeFacts:
-    """Description of a take apart from its frames.
+    """Everything that describes a take except its frames.
 
     Attributes:
         cameras: in view order.
         scans: upper and lower.
         landmarks: mandible coordinates [mm], shape (5, 3).
         axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-        rest_frame: frame with closed teeth named in the capture, or None.
+        rest_frame: frame with closed teeth, as specified in the capture, or None.
         registers: whether to register the lower scan by the closed bite of the take.
     """
 

@@ -21,14 +21,14 @@ from jawusd.tracking.region.search import InstantViews, PoseSearch, fitting_shar
 from jawusd.tracking.sequence.history import MotionPredictor
 
 _FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of a millimetre
-# Shares of the usual matched contour below which wider gates are tried, a jaw is searched, a lost arch is not accepted
-# again, and an arch is given up. The usual share is the median over the last frames, but at least `_LEAST_USUAL` of
-# that of the first frame, so that slowly closing lips do not become usual.
+# Fractions of the usual matched contour below which wider gates are tried, the jaw is searched for, a lost arch is not
+# accepted again, and an arch is lost. The usual matched contour is the median over the last frames, but at least
+# `_LEAST_USUAL` times that of the first frame, so that slowly closing lips do not become usual.
 _DOUBTED, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = 0.8, 0.6, 0.5, 0.25, 0.7
 _USUAL_FRAMES = 15  # window of the usual matched fraction
 _EAGER, _OFTEN = 6, 4
-_RESTING = 4  # frames without wide gates after these have failed, since lips stay closed for a while
-_WIDE_MM = 40.0  # largest expected opening of a jaw that was out of sight
+_RESTING = 4  # frames in which wide gates are not tried after they have failed, since lips stay closed for a while
+_WIDE_MM = 40.0  # largest expected opening of a jaw that was not visible
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class RegionPose:
     objective_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
     solution: Solution | None = None  # the alignment; None for poses read from a file
     usual: Array = field(default_factory=lambda: np.ones(2))  # matched fraction relative to the usual one, shape (2,)
-    least: Array = field(default_factory=lambda: np.zeros(2))  # threshold on it for an arch to be found, shape (2,)
+    least: Array = field(default_factory=lambda: np.zeros(2))  # minimum of `usual` for an arch to be found, shape (2,)
 
 
 class RegionTracker:
@@ -194,10 +194,10 @@ class _DirectionTracker:
 
 
 def _is_due(count: int, found: bool) -> bool:
-    """Return whether to search an arch that fits badly for the `count`-th frame in a row.
+    """Return whether to search for an arch that fits badly for the `count`-th frame in a row.
 
-    One that disappears is searched at doubling intervals, a lost one in the first `_EAGER` frames, then in every
-    `_OFTEN`-th one.
+    One that disappears is searched for at doubling intervals, a lost one in each of the first `_EAGER` frames, then in
+    every `_OFTEN`-th one.
     """
     return count > 0 and (count & (count - 1) == 0 if found else count <= _EAGER or count % _OFTEN == 0)
 

@@ -1,4 +1,4 @@
-"""Edge search by colour in one camera's image: colour tables, motion blur and borders of contour samples.
+"""Colour-based edge search in one camera's image: colour tables, motion blur and borders of contour samples.
 
 All compiled functions release the GIL and are stateless.
 """
@@ -19,15 +19,15 @@ from jawusd.tracking.region.colours import BINS, KINDS, TABLES
 from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
 
-_AHEAD_PX = 2.0  # distance outside a crown's silhouette at which gum is tested for
+_AHEAD_PX = 2.0  # distance outside a crown's silhouette at which the label is tested for gum
 
 _SHUTTER = 0.5  # assumed exposure as a fraction of the frame time, typical of film
 # Motion during the exposure at which the weight of a border is halved [px]: the variance of an edge grows with the
-# square of its blur. Applied in the final alignment only, since earlier ones decide by the matched fraction of the
-# contour whether teeth are lost.
+# square of its blur. Applied in the final alignment only, since in earlier ones the matched fraction of the contour
+# decides whether teeth are lost.
 _BLURRED_PX = 10.0
 _LEARNED_PX = (2, 7)  # range of distances from borders in which colours are learned
-# Estimate of the gum-line offset: minimum weight of a border [-], largest distance [px], minimum number of samples.
+# For estimating the gum-line offset: minimum weight of a border [-], largest distance [px], minimum number of samples.
 _SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
 _CLEAR_RATIO = 1.0  # mean log ratio on both sides from which a border has full weight [-]
 _SHARPEN_PX = 5.0  # search range up to which borders are refined by colour
@@ -91,7 +91,7 @@ class Counts:
 
     tooth: Array  # colours inside borders, shape (2, TABLES, BINS)
     outside: Array  # colours outside, shape (2, TABLES, BINS)
-    gum_px: Array  # outward offset of the gum line from the scans' [px], NaN where not measured, shape (2,)
+    gum_px: Array  # outward offset of observed gum lines from those of the scans [px], NaN if not measured, shape (2,)
 
     @classmethod
     def zeros(cls) -> Counts:
@@ -112,7 +112,7 @@ class RegionView:
     counts: Counts | None = None  # statistics to collect, in the final alignment of an instant
 
     def likeness(self, arch: int) -> NDArray[np.float32]:
-        """Return the mean log ratio of tooth to background per pixel, for an arch, shape (h, w)."""
+        """Return the mean log ratio of tooth to background of every pixel for an arch, shape (h, w)."""
         return np.asarray(self.ratio[arch].mean(0)[self.bins], np.float32)
 
     def search(

@@ -14,7 +14,7 @@ from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.scan import ARCHES
 
 _KEPT_POSES = 16  # earlier poses kept, enough to cover the range of motion of a jaw
-_APART_MM = 2.0  # poses closer than this converge to the same minimum
+_APART_MM = 2.0  # poses closer than this converge to the same local minimum
 # Failed multi-start searches allowed in any take, and number of frames for which one more is allowed: at up to five
 # seconds each, all of them together take no longer than tracking.
 _FRUITLESS, _FRAMES_PER_FRUITLESS = 8, 32
