@@ -1,6 +1,6 @@
 """Jaw models fitted to captured poses: decoder, bounds, error tables, and checks of the data.
 
-Independent of images: poses come as `formats.tracks.Tracks` or as arrays. Must not import another stage (capture,
+The input is poses, not images: `formats.tracks.Tracks` or arrays. This package must not import another stage (capture,
 tracking, paper, rig, ...); `pipeline` and `paper` import it.
 """
 

@@ -2,8 +2,8 @@
 
 The additive model is log M = Phi1(d1) + Phi2(d2) + Phi3(d3), fitted jointly to the captured poses. The twist is taken
 about the incisal point p, (omega, s = omega x p + v), and one component of s of each curve is its parameter t itself
-(-s_y of Phi1, s_x of Phi2, s_z of Phi3), which makes the sum unique. All other components are smoothing splines, solved
-for together by least squares while the poses are projected onto the sum.
+(-s_y of Phi1, s_x of Phi2, s_z of Phi3), which makes the sum unique. All other components are smoothing splines, fitted
+jointly by least squares, in alternation with the projection of the poses onto the sum.
 
 The linear baseline, PCA of the twists under the mandible metric, is the same sum with straight curves.
 """
@@ -25,7 +25,7 @@ from jawusd.fitting.metric import velocity_of
 from jawusd.fitting.spline import choose_smoothing, ridge_solve, within
 from jawusd.geometry import se3_exp, se3_left_jacobian, se3_log
 
-#: Map of a parameter t (n,) to twists (n, 6) and their derivatives by t (n, 6); the twist is zero at t = 0.
+#: Map from a parameter t (n,) to twists (n, 6) and their derivatives with respect to t (n, 6); zero twist at t = 0.
 Curve = Callable[[Array], tuple[Array, Array]]
 
 KNOTS = 97
@@ -34,14 +34,14 @@ MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 # Share of the mandible's rms speed below which the incisal point counts as standing still or reversing.
 _SLOWEST = 0.2
-_SHORTEST_MM = 0.01  # a shorter curve comes from a collapsed network
+_SHORTEST_MM = 0.01  # a curve that moves the incisal point less comes from a collapsed network
 
 _PIECES = (8, 6, 6)  # polynomial pieces of the three curves
 _ROUNDS = 8
 _SMOOTHING = 10.0 ** np.arange(-4.0, 5.0)
 _TAIL_RIDGE = 1e-4  # keeps coefficients finite in intervals without frames
 _HIDDEN_RIDGE = 1e9  # keeps coefficients at zero for parameters that the data do not show
-_TRIM_FLOOR_MM = 0.8  # residuals up to this are model error, not tracking failures
+_TRIM_FLOOR_MM = 0.8  # residuals up to this count as model error, not as tracking failures
 _CV_BLOCK, _CV_FOLDS, _CV_CAP_MM = 25, 5, 1.0
 _LARGEST_CONDITION = 1e3
 
@@ -51,8 +51,8 @@ def in_millimetres(
 ) -> tuple[HermiteCurve, Mask]:
     """Reparametrise a curve by d, the displacement of the incisal point along the curve's own axis [mm].
 
-    Where the incisal point stands still or reverses, d continues to grow with a fifth of the mandible's rms path, so
-    that every point of the curve has a parameter.
+    Where the incisal point stands still or reverses, d increases by a fifth of the mandible's rms displacement instead,
+    so that every point of the curve has a parameter.
 
     Args:
         limits: interval of t that the data reach, containing 0.
@@ -61,7 +61,7 @@ def in_millimetres(
         axis: 0 opening, 1 laterotrusion, 2 protrusion.
 
     Returns:
-        The curve over d, zero at d = 0, and the knots at which the incisal point advances steadily (mask).
+        The curve over d, zero at d = 0, and a mask of the knots at which the incisal point advances steadily.
 
     Raises:
         FittingError: the curve does not move at all.
@@ -100,7 +100,7 @@ def translation(axis: int) -> Array:
 
 
 def _incisal_advance(twist: Array, rate: Array, incisor: Array, direction: Array) -> tuple[Array, Array]:
-    """Return the displacement (n,) of the incisal point along a direction [mm], and its derivative by t."""
+    """Return the displacement (n,) of the incisal point along a direction [mm], and its derivative in t."""
     M = se3_exp(twist)
     point = M[:, :3, :3] @ incisor + M[:, :3, 3]
     spatial = np.einsum("nij,nj->ni", se3_left_jacobian(twist), rate)
@@ -156,13 +156,13 @@ def _own(curve: HermiteCurve, d: Array, incisor: Array, axis: int) -> Array:
 
 
 def _regress(data: TrainingData, t: Array, kept: Mask, shown: Mask) -> tuple[AdditiveModel, float]:
-    """Fit the curves with the parameters of the frames fixed at t (N, 3)."""
+    """Fit the curves while the parameters of the frames are fixed at t (N, 3)."""
     twists = se3_log(data.motion[kept])
     t, weights = t[kept], data.weights[kept]
     bases = [_Basis(t[:, i], _PIECES[i]) for i in range(3)]
     columns = [basis.columns(t[:, i]) for i, basis in enumerate(bases)]
     root = data.metric.twist_root()
-    # Residuals in mm: rotations by the displacement of the mandible, translations unchanged.
+    # Residuals in mm: rotations are scaled by the displacement of the mandible, translations are unchanged.
     L = np.linalg.cholesky(data.metric.about(data.incisor))
     turning = twists[:, :3] @ L
     gliding = (np.cross(twists[:, :3], data.incisor) + twists[:, 3:]) @ MEASURED.T - t
@@ -230,7 +230,7 @@ def fit_pca(data: TrainingData, shown: Mask) -> FittedForm:
     d = 0 is the closed bite. Its basis follows from the incisal velocity: to first order, d2 and d3 move the incisal
     point purely sideways and forward, and d1 along the mean opening direction of the take.
 
-    The note `singular_values_mm` lists the singular values of the weighted twists, rms over the mandible.
+    The note `singular_values_mm` lists the singular values of the weighted twists, as rms displacement of the mandible.
 
     Args:
         shown: parameters that the data show, shape (3,); the others become translations without rotation.

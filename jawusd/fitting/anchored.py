@@ -2,14 +2,15 @@
 
 On the three-dimensional set of reachable poses the displacement u of the incisal point is itself a coordinate system,
 so omega = f(u), t = u + p - R(omega) p with f(0) = 0 describes any smooth three-parameter jaw. f is a smoothing
-polyharmonic spline; it is refitted while the captured poses are projected onto it, so that noise in u does not bias f.
+polyharmonic spline. Refitting it alternates with projecting the captured poses onto it, so that noise in u does not
+bias f.
 Where no poses were captured, predictions from the condylar paths guide the spline with a low weight.
 
 Condylar paths: a condyle slides on its eminence, so its height is a function of its forward slide at any opening;
 its sideways movement is a function of the difference of the two slides (Bennett) and the opening. These three
-equations, learned from the captured poses, determine the rotation at every position of the incisal point. They are
-coarser than the spline where there are poses, but they extrapolate to combinations that few takes contain, such as wide
-open with the jaw to one side, because other exercises have measured the same slopes.
+equations, learned from the captured poses, determine the rotation at every position of the incisal point. They are less
+accurate than the spline where there are poses, but they extrapolate to combinations that few takes contain, such as a
+wide opening with the jaw to one side, because other exercises cover the same parts of the eminence.
 
 The kinematic centre, the point of the condyle that deviates least from one path (Yatabe et al. 1995, J Dent Res
 74:2006), is estimated near the landmark, which therefore need not be exact.
@@ -34,12 +35,12 @@ from jawusd.geometry import make_transform, so3_exp, so3_log
 _SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # normalise the polynomials' arguments
 _DEGREE = 4
 _RIDGE = 1e-3
-_RANGE_PERCENTILES = (0.5, 99.5)  # of the slides; outside, the eminence is extrapolated linearly
-_LANDMARK_SIGMA_MM = 10.0  # of the kinematic centre about the landmark
-_PATH_SIGMA_MM = 0.3  # of the kinematic centre about its path
-_FRAMES_ALIKE = 25  # consecutive frames (a second of video) that carry the information of one
+_RANGE_PERCENTILES = (0.5, 99.5)  # percentiles of the slides; outside them, the eminence is extrapolated linearly
+_LANDMARK_SIGMA_MM = 10.0  # standard deviation of the kinematic centre about the landmark
+_PATH_SIGMA_MM = 0.3  # standard deviation of the kinematic centre about its path
+_FRAMES_ALIKE = 25  # consecutive frames (a second of video) that count as one independent observation
 _NEWTON_STEPS, _LARGEST_STEP_RAD, _SETTLED_MM = 15, 0.1, 1e-6
-_FARTHER_MM = 4.0  # extrapolation allowed beyond the captured slides
+_FARTHER_MM = 4.0  # largest extrapolation beyond the captured slides
 
 CENTRES = 80
 _ROUNDS = 4
@@ -48,7 +49,7 @@ _HIDDEN_SCALE_MM = 1e9  # makes f independent of a parameter that the data do no
 _SMOOTHING = 10.0 ** np.arange(-6.0, 4.0)
 _CV_BLOCK, _CV_FOLDS = 25, 5  # block of frames held out together (about a second of video), number of folds
 _CV_CAP_MM = 1.0
-_TAIL_RIDGE = 1e-6  # keeps the slope finite along a direction without motion
+_TAIL_RIDGE = 1e-6  # keeps the linear coefficients finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
 _TRIM_FLOOR_MM = 0.5
 _GUIDED_GRID = (9, 7, 7)  # points along opening, sideways and forward with predictions from the condylar paths
@@ -61,7 +62,7 @@ class CondylarGuidance:
 
     incisor: Array  # lower incisal point at rest [mm], shape (3,)
     centres: Array  # kinematic centres at rest [mm], shape (2, 3)
-    slopes: Array  # polynomial coefficients of the height over the slide, shape (2, 4) [mm]
+    slopes: Array  # polynomial coefficients of the height as a function of the slide, shape (2, 4) [mm]
     slide_range: Array  # captured slides [mm], shape (2, 2)
     shift: Array  # coefficients of the sideways movement of the condyles' midpoint [mm], shape (5,)
     misfit_mm: float  # rms residual of the three equations over the captured poses
@@ -102,7 +103,7 @@ class CondylarGuidance:
         return so3_log(R), found
 
     def _residual(self, R: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return residuals (N, 3) [mm], their derivatives by a spatial rotation (N, 3, 3), and the slides (N, 2).
+        """Return residuals (N, 3) [mm], their derivatives in a spatial rotation (N, 3, 3), and the slides (N, 2).
 
         The poses are rotations R (N, 3, 3) at incisal displacements u (N, 3) [mm].
         """
@@ -120,7 +121,7 @@ class CondylarGuidance:
         return residual, np.concatenate([heights_by_w, middle_by_w[:, None]], axis=1), slides
 
     def _eminence(self, slides: Array) -> tuple[Array, Array]:
-        """Return height and slope over the slides (N, 2), extrapolated linearly beyond the captured ones."""
+        """Return the eminence's height and slope at slides (N, 2), extrapolated linearly beyond the captured ones."""
         inside = np.clip(slides, self.slide_range[:, 0], self.slide_range[:, 1])
         powers = np.arange(1, _DEGREE + 1)
         s = (inside / _SLIDE_SCALE_MM)[..., None]
@@ -131,7 +132,7 @@ class CondylarGuidance:
 def _kinematic_centre(motion: Array, weights: Array, condyle: Array) -> Array:
     """Return the point near a condyle landmark whose height follows its slide most closely [mm], shape (3,).
 
-    Only its height and depth are searched, since all points of the condylar axis move alike.
+    The search varies only its vertical and anterior coordinates, since all points on the condylar axis move alike.
     """
     root = np.sqrt(weights / _FRAMES_ALIKE)
 
@@ -153,7 +154,7 @@ def _powers(slide: Array) -> Array:
 
 
 def _shift_columns(difference: Array, opening: Array) -> tuple[Array, Array]:
-    """Return the regressors (N, 5) of the sideways movement, and their derivatives by the difference of the slides."""
+    """Return the regressors (N, 5) of the sideways movement, and their derivatives in the difference of the slides."""
     d, o = difference / _SLIDE_SCALE_MM, opening / _OPENING_SCALE_MM
     zero, one = np.zeros_like(d), np.ones_like(d)
     columns = np.stack([d, d * np.abs(d), d * o, o, o * o], axis=1)
@@ -196,7 +197,7 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
 
 @dataclass(frozen=True)
 class _Chart:
-    """Map from incisal displacements u (N, 3) [mm] to spline arguments q (N, 3): sheared by the path and scaled."""
+    """Map from incisal displacements u (N, 3) [mm] to spline arguments q (N, 3): a shear by the path, and scales."""
 
     path: Gauge
     scales: Array
@@ -212,7 +213,7 @@ class _Chart:
 
 
 def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bool) -> tuple[AnchoredModel, float]:
-    """Fit f to the best rotations of the frames with their incisal points fixed at u.
+    """Fit f to the best rotation of each frame with its incisal point fixed at u.
 
     The smoothing is chosen in every call, since f may be less stiff once outliers are trimmed.
     """
@@ -242,8 +243,8 @@ def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bo
 def _guided_rows(data: TrainingData, motion: Array, weights: Array, chart: _Chart) -> tuple[Array, Array, Array]:
     """Return rotation vectors (G, 3), spline arguments (G, 3) and weights (G,) predicted from the condylar paths.
 
-    They fill the box around the captured poses and carry a few percent of their total weight, so that they matter only
-    where there are no poses.
+    The predictions fill the box around the captured poses. Together they have a few percent of the poses' total weight,
+    so that they matter only where there are no poses.
     """
     guidance = CondylarGuidance.of_motion(motion, weights, data.incisor, data.landmarks[-2:])
     q = chart.of(motion[:, :3, :3] @ data.incisor + motion[:, :3, 3] - data.incisor)

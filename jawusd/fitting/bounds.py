@@ -4,11 +4,11 @@ Alpha shapes of (d1, d2) and (d1, d3): a Delaunay triangle belongs to the shape 
 after both axes were divided by the captured range (Edelsbrunner, Kirkpatrick & Seidel 1983 with r = alpha). The paper's
 alpha of 0.12 is in units of its network's components, whose ranges it does not print.
 
-Slice hull: for every opening a convex section of (laterotrusion, protrusion), in mm. A tight alpha shape in three
-dimensions is hollow: captured border movements leave the inside of the envelope empty. Sections of the envelope at one
-opening are close to convex, so the support function of the captured poses near that opening, smoothed over the opening,
-encloses it with few numbers. It is tight around the captured poses, so that every pose a slider reaches is anatomical;
-the tolerance for measured poses is estimated by cross-validation.
+Slice hull: a convex section in (laterotrusion, protrusion), in mm, for every opening. A tight alpha shape in three
+dimensions would be hollow, since captured border movements leave the inside of the envelope empty. Sections of the
+envelope at one opening are nearly convex, so the support function of the captured poses near that opening, smoothed
+over the opening, describes them with few parameters. The hull is tight around the captured poses, so that every pose a
+slider reaches is anatomical; the tolerance for measured poses is estimated by cross-validation.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from jawusd.evaluator.bounds import SliceHull
 PLANES = {"polygon_d1d2": [0, 1], "polygon_d1d3": [0, 2]}
 
 _SMALLEST_RANGE_MM = 0.5  # smaller ranges are noise, which normalisation would amplify
-_SLIVER = 1e-12  # twice the smallest triangle area, normalised units
-_THIN = 0.02  # width of the shape of collinear points, normalised units
+_SLIVER = 1e-12  # twice the smallest triangle area that is not degenerate, normalised units
+_THIN = 0.02  # distance by which the shape of collinear points is widened, normalised units
 
 DIRECTIONS = 16
 KNOTS = 48
 SOFTNESS_MM = 0.1
 
 _PROTRUSION_STRETCH = 1.6  # protrusion, the shorter axis, is stretched before directions are spaced evenly
-_WINDOW_MM = 3.5  # a section uses the frames within this opening
-_FEWEST_IN_WINDOW = 12  # nearest frames used where the window holds fewer
-_TAPER = 0.35  # share by which a frame at the edge of the window is pulled towards the section's middle
-_KERNEL_KNOTS = 1.0  # sd of the smoothing over the opening, in knots
-_FOLDS, _BLOCK = 5, 50  # folds of blocks of about one exercise each [frames]
+_WINDOW_MM = 3.5  # a section is built from the frames whose opening differs by less than this
+_FEWEST_IN_WINDOW = 12  # number of nearest frames used if fewer are in the window
+_TAPER = 0.35  # fraction by which a frame at the edge of the window is moved towards the section's median
+_KERNEL_KNOTS = 1.0  # standard deviation of the smoothing kernel over the opening, in knots
+_FOLDS, _BLOCK = 5, 50  # number of folds, and length of their blocks [frames], about one exercise
 # The soft maximum over all half-spaces is up to SOFTNESS_MM * log(DIRECTIONS + 2) = 0.29 mm above the largest one. With
 # a smaller margin, a section without extent (a parameter the data do not show) would be empty.
 _MARGIN_MM = 0.38
 _CONTACT_TOLERANCE_MM = 0.05  # extension of the hull below the captured openings
-_FRAMES_PER_SLIP = 400  # one frame in this many may lie beyond closed teeth by noise
+_FRAMES_PER_SLIP = 400  # noise may place one frame in this many beyond closed teeth
 _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
 
@@ -94,11 +94,11 @@ def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, 
     """Build the slice hull of captured parameters (N, 3) [mm] in temporal order.
 
     Args:
-        closed_mm: d1 at which the hull ends at closed teeth; default: the least captured d1, apart from noise.
+        closed_mm: d1 of closed teeth, where the hull ends; default: the smallest captured d1, apart from noise.
 
     Returns:
-        The `slice_*` arrays of a model; and the tolerance for measured poses [mm]: the 95 % quantile over held-out
-        frames, since other exercises reach slightly farther than those captured.
+        The `slice_*` arrays of a model; and the tolerance for measured poses [mm]: the 95 % quantile of the distance of
+        held-out frames outside the hull, since other exercises reach slightly farther than those captured.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
     excess = [
@@ -139,8 +139,8 @@ def _section(distance: Array, reach: Array) -> Array:
     """Return the support values (K,) of one section [mm].
 
     Args:
-        distance: of the frames in opening, in units of the window, shape (N,).
-        reach: of the frames along each direction [mm], shape (N, K).
+        distance: difference in opening between the frames and the section, in units of the window, shape (N,).
+        reach: coordinates of the frames along each direction [mm], shape (N, K).
     """
     order = np.argsort(distance, kind="stable")
     count = max(int((distance < 1.0).sum()), min(_FEWEST_IN_WINDOW, len(distance)))

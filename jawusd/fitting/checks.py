@@ -1,7 +1,7 @@
 """Checks of the training data: human ranges, common mistakes, and movements that are missing.
 
 Human ranges: opening 49 +-9 mm, laterotrusion 10-12 +-3 mm, protrusion 8-9 +-2.5 mm, rotation 39 +-6 deg, condylar path
-20 +-4 mm (Zawawi 2003; Hirsch 2006; Muto & Kanazawa 1996). Limits lie at least three standard deviations out.
+20 +-4 mm (Zawawi 2003; Hirsch 2006; Muto & Kanazawa 1996). Limits are at least three standard deviations from the mean.
 """
 
 from __future__ import annotations
@@ -18,41 +18,42 @@ from jawusd.geometry import landmark_frame, se3_inverse, so3_log
 _OPENING_MAX_MM = 75.0
 _LATERAL_MAX_MM = 20.0
 _PROTRUSION_MAX_MM = 16.0
-_RETRUSION_MAX_MM = 6.0  # backwards beyond the habitual path, teeth nearly together
+_RETRUSION_MAX_MM = 6.0  # posterior to the habitual path, teeth nearly together
 _NEAR_CLOSED_MM = 5.0  # openings up to which protrusion and retrusion are measured
-_RISE_MAX_MM = 4.0  # of the lower incisor above the closed bite
+_RISE_MAX_MM = 4.0  # largest rise of the lower incisor above the closed bite
 _ROTATION_MAX_DEG = 57.0
 _CONDYLE_MAX_MM = 32.0
 _CONDYLES_APART_MM = (70.0, 140.0)
 _QUANTILE = 99.5
-_SAME_FRAME = 0.01  # tolerance of rotation matrices: the frame was derived from the landmarks themselves
+_SAME_FRAME = 0.01  # largest difference of rotation matrices if the frame was derived from the landmarks themselves
 
 _UNITS = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 1e-3}  # mm in one unit
 
 # Ranges below which a take should be repeated; nearly all adults exceed them (Hirsch 2006, Zawawi 2003).
 _SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
-_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # share of the largest opening that counts as wide open; frames required there
-_HALF_OPEN = (0.25, 0.65)  # shares of the largest opening
-_HALF_OPEN_SHARE = 0.35  # of the full range that should be reached half open
-# Directions of (laterotrusion, protrusion); half open, enough of them should be reached to this share of the range.
+_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # fraction of the largest opening that counts as wide open; frames required
+_HALF_OPEN = (0.25, 0.65)  # fractions of the largest opening between which the mouth counts as half open
+_HALF_OPEN_SHARE = 0.35  # fraction of the full range that should be reached with the mouth half open
+# Directions in (laterotrusion, protrusion), the fraction of the range that counts as covering one with the mouth half
+# open, and the number that should be covered.
 _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
 #: A point of the bound farther than this from all captured poses lies in a gap, per parameter [mm].
 FAR_MM = np.array([3.0, 2.0, 2.0])
-_MOST_GAPS = 0.15  # share of the bound in gaps above which more should be recorded
+_MOST_GAPS = 0.15  # fraction of the bound in gaps above which more should be recorded
 # Ranges (1st to 99th percentile) below which a parameter counts as not exercised [mm].
 _SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
 
 
 @dataclass(frozen=True)
 class AnatomyWarning:
-    """A finding outside human anatomy: a short code, and a message with the normal range."""
+    """A value outside the human range: a short code, and a message with the normal range."""
 
     code: str
     message: str
 
 
 def check_anatomy(data: TrainingData, anatomy: SubjectAnatomy) -> list[AnatomyWarning]:
-    """Compare landmarks and motions with human ranges; if a common mistake explains them, report it alone."""
+    """Compare landmarks and motions with human ranges; if one common mistake explains the result, report only that."""
     mistake = _frame_mistake(data) or _unit_mistake(data, anatomy) or _swap_mistake(data)
     return [mistake] if mistake else _out_of_range(data)
 

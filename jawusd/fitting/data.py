@@ -22,14 +22,14 @@ Source = Tracks | tuple[ArrayLike, ArrayLike]
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
 #: How far real jaws deviate from a three-parameter model: smaller tracking errors hardly matter [mm].
 MODEL_SIGMA_MM = 0.3
-_LARGEST_SIGMA_MM = 2.0  # frames less certain than this over the mandible (rms) are discarded
+_LARGEST_SIGMA_MM = 2.0  # frames with a larger standard deviation (rms over the mandible) are discarded
 _RIGID = 1e-3
 _FEWEST_POSES = 15
-_SMALLEST_MOTION_MM = 1.0  # rms over the mandible from the first pose, 95 % quantile
+_SMALLEST_MOTION_MM = 1.0  # 95 % quantile of the rms displacement of the mandible from the first pose
 
 _FEWEST = 60  # poses required for screening
-_TRIALS, _SAMPLE = 300, 15  # number and size of the random samples; there are ten unknowns per component
-_CONSENSUS = 0.75  # share of the poses that must agree
+_TRIALS, _SAMPLE = 300, 15  # number and size of the random samples; each output component has ten unknowns
+_CONSENSUS = 0.75  # fraction of the poses that must agree
 _REFITS = 3
 # Outlier threshold, relative to the majority's spread and absolute [mm, rms over the mandible]. A jaw deviates from the
 # quadratic by one or two millimetres at its borders; the smooth models trim smaller failures themselves.
@@ -83,7 +83,7 @@ class SubjectAnatomy:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Poses a model is fitted to."""
+    """Poses to which a model is fitted."""
 
     frames: NDArray[np.int64]
     motion: Array  # motions away from the closed bite, anatomical frame, shape (N, 4, 4)
@@ -121,7 +121,7 @@ def displacement(motion: Array, point: Array) -> Array:
 
 
 def select(source: Source, anatomy: SubjectAnatomy) -> Selection:
-    """Select the frames of a source that can train a model; raises as `select_tracks` and `select_poses` do."""
+    """Select the frames of a source that can train a model; raise as `select_tracks` and `select_poses` do."""
     return select_tracks(source, anatomy) if isinstance(source, Tracks) else select_poses(*source, anatomy)
 
 
@@ -238,8 +238,9 @@ def _check_motion(data: TrainingData) -> None:
 def _mandible_sigma(T: Array, covariance: Array, anatomy: SubjectAnatomy) -> Array:
     """Return the rms standard deviation of the mandible's points [mm], shape (F,).
 
-    The twist covariance is that of xi in T_true = exp(xi) T, skull frame, about the skull origin; a point y moves by
-    omega x y + v, so its variance is the trace of J Sigma J^T with J = [-hat(y), I], averaged over the points.
+    The covariance Sigma is that of the twist xi in T_true = exp(xi) T, skull frame, about the skull origin. A point y
+    moves by omega x y + v, so its variance is the trace of J Sigma J^T with J = [-hat(y), I]; the result averages the
+    variance over the points.
     """
     points = anatomy.mandible_vertices
     mean, spread = points.mean(0), np.cov(points.T, bias=True)
@@ -264,9 +265,9 @@ class FittedForm:
 def screened(selection: Selection) -> Selection:
     """Return the selection without gross outliers: isolated tracking failures of centimetres.
 
-    A spline would interpolate such poses. A quadratic map from the incisal displacement to the rotation cannot: fitted
-    by random sample consensus (Fischler & Bolles 1981), it follows the majority, and the residuals of the outliers
-    equal their errors.
+    A spline would interpolate such poses. A quadratic map from the incisal displacement to the rotation is too stiff
+    for that: fitted by random sample consensus (Fischler & Bolles 1981), it follows the majority, and the residual of
+    an outlier equals its error.
     """
     outliers = gross_outliers(selection.data)
     if not outliers.any():
@@ -278,7 +279,7 @@ def screened(selection: Selection) -> Selection:
 
 
 def gross_outliers(data: TrainingData) -> Mask:
-    """Return which poses lie centimetres off the majority's quadratic map, shape (N,); all False below 60 poses."""
+    """Return which poses lie centimetres off the majority's quadratic map, shape (N,); none below 60 poses."""
     count = len(data)
     if count < _FEWEST:
         return np.zeros(count, dtype=bool)

@@ -1,4 +1,4 @@
-"""Error tables: distances of a model from captured poses on the mandible and at the landmarks, trained and held out."""
+"""Error tables: distances between model and captured poses at the mandible and landmarks, trained and held out."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ Refit = Callable[[TrainingData], FittedForm]
 #: Mean, median, p95, max [mm] and number of frames, by landmark or "mandible".
 ErrorTable = dict[str, dict[str, float]]
 
-_INSIDE_TWO_SD = 0.97  # of held-out frames; more than 95 %, as other exercises lie farther from the training poses
-_SLOWEST_GROWTH = 0.01  # mm per mm: errors grow with distance even if all held-out frames lie near the training poses
+_INSIDE_TWO_SD = 0.97  # fraction of held-out frames; more than 95 %, as other exercises are farther from training poses
+_SLOWEST_GROWTH = 0.01  # [mm/mm] smallest growth of errors with distance, even if held-out frames show none
 
 
 def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
@@ -63,8 +63,8 @@ def unseen_errors(
     """Cross-validate: hold out contiguous parts of a take in turn, refit, and measure the error on them.
 
     Args:
-        kept: frames that are scored, shape (N,): those that the fit to all frames did not trim.
-        notify: called with the index of each part.
+        kept: frames whose errors count, shape (N,): those that the fit to all frames did not trim.
+        notify: called with the index of each part before it is processed.
 
     Returns:
         The error table; the growth of the errors with the distance of a pose's parameters from the training poses: for
@@ -93,7 +93,7 @@ def _errors(data: TrainingData, form: FittedForm) -> dict[str, Array]:
 
 
 def _distance(model: JawModelForm, seen: TrainingData, unseen: TrainingData) -> Array:
-    """Return the distance of each held-out frame's parameters to the nearest training frame's [mm], shape (N,)."""
+    """Return the distance [mm] of each held-out frame's parameters from those of the nearest training frame, (N,)."""
     captured, wanted = (part.metric.nearest(model, part.motion)[0] for part in (seen, unseen))
     return cKDTree(captured[np.isfinite(captured).all(1)]).query(np.nan_to_num(wanted))[0]
 
@@ -103,7 +103,7 @@ def _growth(distance: Array, errors: Array) -> dict[str, float]:
     count = len(errors)
     above, below = np.full(count, _INSIDE_TWO_SD), np.full(count, 1 - _INSIDE_TWO_SD)
     cost = np.concatenate([[0.0, 0.0], above, below])
-    # Sparse, as the two dense identity matrices of a take of 20,000 frames would need 6 GB.
+    # Sparse, since two dense identity matrices for a take of 20,000 frames would need 6 GB.
     one = eye_array(count, format="csc")
     equal = hstack([np.column_stack([np.ones(count), distance]), one, -one], format="csc")
     limits = [(0, None), (_SLOWEST_GROWTH, None)] + [(0, None)] * (2 * count)

@@ -12,14 +12,14 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.arkit import ArkitMapping, FaceCapture, moved_terms, shares_of
 from jawusd.geometry import transform_points
 
-_REST_SHARE = 0.1  # of the frames, nearest to the closed bite, that give the neutral weights
-_DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # candidates for each weight
+_REST_SHARE = 0.1  # fraction of the frames, those nearest to the closed bite, that determine the neutral weights
+_DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # candidate dead zones of each weight
 _ROUNDS = 2
-_COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # coarse and fine step of the offset search, fine steps per side
+_COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # coarse and fine step of the offset search, fine steps to each side
 _BLOCKS = 5  # contiguous blocks for cross-validation
 _LEAST_SECONDS = 10.0
-_LEAST_REACH = 0.4  # share of the person's range that a take must reach in each direction
-_LEAST_FOLLOWING = 0.7  # correlation of JawOpen with the opening; takes of different exercises stay below
+_LEAST_REACH = 0.4  # fraction of the person's range that a take must reach in each direction
+_LEAST_FOLLOWING = 0.7  # smallest correlation of JawOpen with the opening; mismatched takes stay below
 _DIRECTIONS = ("opening", "movement to the left", "movement to the right", "movement forward")
 
 
@@ -29,16 +29,16 @@ class ArkitFit:
 
     mapping: ArkitMapping
     error_mm: float  # mean error of the incisal point on held-out parts
-    shares_error_mm: float  # the same for fixed shares of the person's ranges
-    offset_s: float  # clock of the jaw minus clock of the face, both counted from their first frames
+    shares_error_mm: float  # the same if weights are used as fixed fractions of the person's ranges
+    offset_s: float  # clock of the jaw minus clock of the face, each counted from its first frame
     frames: int  # jaw frames that the mapping was learned from
 
 
 def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s: float | None = None) -> ArkitFit:
-    """Learn a mapping from a face capture and the jaw of the same performance.
+    """Learn a mapping from a face capture and a jaw take of the same performance.
 
-    Neutral weights are medians near the closed bite, gains and cross-talk a least-squares fit, and dead zones the
-    result of a coordinate search on its residual.
+    Neutral weights are medians near the closed bite, gains and cross-talk follow from a least-squares fit, and dead
+    zones from a coordinate search on the residual of that fit.
 
     Args:
         times_s: times of d [s] from an arbitrary start, shape (N,).
@@ -103,12 +103,12 @@ def _learned(rig: JawRig, weights: Array, d: Array) -> ArkitMapping:
 
 
 def _weights_at(face_s: Array, weights: Array, times_s: Array) -> Array:
-    """Interpolate the weights at times (N,), shape (N, 4); NaN outside the capture and where no face was found."""
+    """Interpolate the weights to times (N,), shape (N, 4); NaN outside the capture and where no face was found."""
     return np.stack([np.interp(times_s, face_s, column, np.nan, np.nan) for column in weights.T], axis=1)
 
 
 def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
-    """Return the offset [s] with the best correlation to opening and side, among those that overlap by half a take.
+    """Return the offset [s] at which weights correlate best with opening and side, of those that overlap half a take.
 
     The opening alone is ambiguous if the person opens rhythmically.
     """
@@ -135,7 +135,7 @@ def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> flo
 
 
 def _refined_offset(offset_s: float, face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
-    """Return the offset [s] near an initial one at which all weights together explain d best."""
+    """Return the offset [s] near an initial one at which all weights together predict d best."""
     tried = offset_s + _FINE_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1)
     left = []
     for offset in tried:

@@ -1,8 +1,8 @@
-"""The semantic gauge: define d1, d2, d3 so that moving each slider alone stays anatomical.
+"""The semantic gauge: a choice of d1, d2, d3 for which moving each slider alone stays anatomical.
 
-d1 follows the habitual opening path, where the incisal point is most often at each opening. A plain lateral slide at
-closed teeth carries the incisal point forward (gothic arch) and down (tooth guidance). All three are learned from the
-captured poses and stored in the gauge, outside the regression of the poses.
+d1 follows the habitual opening path, the most frequent position of the incisal point at each opening. A plain lateral
+slide at closed teeth moves the incisal point forward (gothic arch) and down (tooth guidance). Path, arch and guidance
+are learned from the captured poses and stored in the gauge; the regression of the poses does not depend on them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SOFTNESS_MM = 2.0  # rounding of the arch across d2 = 0, which keeps slider moti
 FADE_MM = 14.0  # opening at which tooth guidance has faded to 1/e
 
 _PATH_DEGREE, _PATH_ITERATIONS, _PATH_RIDGE = 5, 40, 1e-5
-_SMALLEST_SPREAD_MM = 0.3  # least scale of the path's residuals
+_SMALLEST_SPREAD_MM = 0.3  # lower limit of the scale of the path's residuals
 #: Range of openings (1st to 99th percentile) below which no path is fitted: the teeth glide while closed [mm].
 SMALLEST_OPENING_MM = 5.0
 
@@ -39,11 +39,11 @@ _GRID = 33
 
 @dataclass(frozen=True)
 class GaugeFit:
-    """A fitted gauge with its invertibility check and regularisation."""
+    """A fitted gauge with the results of its invertibility check."""
 
     gauge: Gauge
-    smallest_minor: float  # least principal minor of the Jacobian over the box, see `smallest_minor()`
-    # factor on the ridge penalties, above 1 if a softer gauge folded; None if there is no glide surface
+    smallest_minor: float  # smallest principal minor of the Jacobian over the box, see `smallest_minor()`
+    # factor on the ridge penalties, above 1 if a less stiff gauge was not invertible; None without a glide surface
     stiffness: float | None
 
 
@@ -84,7 +84,7 @@ def _robust_fit(basis: Array, values: Array, weights: Array) -> Array:
 
 
 def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
-    """Fit arch and glide surface to incisal displacements u (N, 3) [mm], stiffening them until invertible.
+    """Fit arch and glide surface to incisal displacements u (N, 3) [mm], stiffening them until the gauge is invertible.
 
     Args:
         path: the gauge of the habitual path alone.
@@ -109,9 +109,9 @@ def _smallest_minor_around(gauge: Gauge, u: Array) -> float:
 
 
 def smallest_minor(gauge: Gauge, box: Array) -> float:
-    """Return the least principal minor of the Jacobian of (-y, x, z) by d on a dense grid over a box of d (3, 2) [mm].
+    """Return the smallest principal minor of d(-y, x, z)/dd on a dense grid over a box of d (3, 2) [mm].
 
-    A map whose Jacobian has only positive principal minors on a box is one-to-one there (Gale & Nikaido 1965,
+    A map whose Jacobian has only positive principal minors on a box is injective there (Gale & Nikaido 1965,
     Math. Annalen 159:81); a positive determinant alone is not sufficient.
     """
     axes = [np.linspace(low, high, _GRID) for low, high in box]
@@ -146,7 +146,7 @@ def _with_arch(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: f
 
 
 def _with_drop(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: float) -> Gauge:
-    """Fit the downward displacement of the incisal point by gliding teeth, as a low quantile of the frames."""
+    """Fit the downward displacement that gliding teeth impose on the incisal point, as a low quantile of the frames."""
     _, d2, d3 = np.nan_to_num(gauge.inverse(u)).T
     columns = np.stack([replace(gauge, glide_drop=row).drop(d2, d3)[0] for row in np.eye(4)], axis=-1)
     low = -u[:, 1] < _DROP_MAX_OPENING_MM

@@ -1,8 +1,8 @@
-"""Make d1 = 0 tooth contact: the glide surface of a gauge measured on the scans, and the bounds in its parameters.
+"""Align d1 = 0 with tooth contact: measure the glide surface of a gauge on the scans, and adapt the bounds.
 
 The gauge fitted to captured poses approximates the glide surface by a smooth bowl. The true surface is rough: this
 module measures the opening at which the scans touch over a grid of d2 and d3, and builds an upper envelope of it with
-limited slopes, so that the gauge does not fold. The poses of the model do not change, only their parameters.
+limited slopes, so that the gauge stays invertible. The poses of the model do not change, only their parameters.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from jawusd.geometry.se3 import make_transform
 from jawusd.meshes.contact import Teeth
 
 _STEP_MM = 0.5  # knot spacing; cusps and fossae are a few times as wide
-_BEYOND_MM = 1.5  # margin around the captured parameters that is measured too
+_BEYOND_MM = 1.5  # width of the margin around the captured parameters that is also measured
 _HIGHEST_MM, _LOWEST_MM = 5.0, -2.5  # range of drops searched for contact
-_HALVINGS = 4  # bisections of the search step, to 0.03 mm
-_SMOOTHING = 0.7  # standard deviation, in knots
+_HALVINGS = 4  # bisections of the search step, down to 0.03 mm
+_SMOOTHING = 0.7  # standard deviation of the Gaussian filter, in knots
 _RAISES = 3  # iterations that restore the height lost in smoothing
 _REST_MM = 2.0  # radius within which the surface is blended to 0 at the closed bite, the bottom of the fossae
 # Slope limits along d2 and d3 in the order tried; steeper surfaces follow deep fossae more closely.
@@ -41,7 +41,7 @@ def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
     """Return an anchored model whose d1 is measured from tooth contact, with bounds that end there.
 
     Returns:
-        The unchanged model if it has no gauge or if every surface would fold the gauge.
+        The unchanged model if it has no gauge, or if the gauge would not be invertible with any surface.
     """
     form = JawRig(model.arrays, model.meta).model
     if not isinstance(form, AnchoredModel):
@@ -125,7 +125,7 @@ def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captu
 
 
 def _near(points: Array, captured: Array) -> Mask:
-    """Return which points (n, 2) lie about `_BEYOND_MM` or less from a captured one (m, 2) or from 0, by grid cells."""
+    """Return which points (n, 2) are within about `_BEYOND_MM` of a captured one (m, 2) or of 0, by grid cells."""
     reach = int(np.ceil(_BEYOND_MM / _STEP_MM)) + 1
     cells = {(int(a), int(b)) for a, b in np.round(np.vstack([captured, [[0.0, 0.0]]]) / _STEP_MM)}
     around = [(a, b) for a in range(-reach, reach + 1) for b in range(-reach, reach + 1)]
@@ -146,7 +146,7 @@ def _hull(d2: Array, d3: Array, down: Array, slopes: tuple[float, float]) -> Arr
 
 
 def _dilated(surface: Array, slopes: tuple[float, float]) -> Array:
-    """Return the lowest surface above a given one (n2, n3) [mm] whose slopes [mm/mm] along both axes are limited."""
+    """Return the lowest surface on or above a given one (n2, n3) [mm] with limited slopes [mm/mm] along both axes."""
     out = surface
     for axis, slope in enumerate(slopes):
         n = surface.shape[axis]

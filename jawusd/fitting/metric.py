@@ -16,8 +16,8 @@ from jawusd.evaluator.encoding import landmark_vectors, nearest_in_chart, vector
 from jawusd.evaluator.models import JawModelForm
 from jawusd.geometry import hat, make_transform
 
-_TOGETHER = 32  # poses per block, so that displacements stay in the CPU cache
-_EVERY = 32  # stride through the hull vertices for a lower bound
+_TOGETHER = 32  # poses per block: few enough that displacements stay in the CPU cache
+_EVERY = 32  # stride through the hull vertices in `largest_at_least`
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class MandibleMetric:
         return _farthest(M - target, self.extremes[::_EVERY])
 
     def nearest(self, model: JawModelForm, target: Array) -> tuple[Array, Array]:
-        """Return the parameters (N, 3) [mm] and motions (N, 4, 4) of a model nearest to motions (N, 4, 4)."""
+        """Return the parameters (N, 3) [mm] and motions (N, 4, 4) of a model that are nearest to motions (N, 4, 4)."""
         x = nearest_in_chart(model, *_parts(target), self.vectors)
         return model.chart_parameters(x), make_transform(*model.chart_motion(x))
 
@@ -85,7 +85,7 @@ class MandibleMetric:
 
 
 def _farthest(difference: Array, points: Array) -> Array:
-    """Return the largest displacement of points (H, 3) by differences of motions (N, 4, 4) [mm], shape (N,)."""
+    """Return the largest distance [mm] (N,) between images of points (H, 3), for differences of motions (N, 4, 4)."""
     found = np.empty(len(difference))
     for first in range(0, len(found), _TOGETHER):
         D = difference[first : first + _TOGETHER]

@@ -13,7 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from jawusd.base.arrays import Array, Indices, Mask
 
-_RANK = 1e-9  # singular values below this share of the largest count as zero
+_RANK = 1e-9  # singular values below this fraction of the largest count as zero
 _TIE_DIGITS = 9
 _SAME_CENTRE = 1e-6  # normalised distance below which two points count as one centre
 
@@ -21,12 +21,12 @@ _SAME_CENTRE = 1e-6  # normalised distance below which two points count as one c
 def farthest_points(points: Array, count: int) -> Array:
     """Return `count` of the points (N, D) by farthest-point sampling (Gonzalez 1985).
 
-    The first is nearest to the origin; fewer are returned if points repeat.
+    The first is the one nearest to the origin; fewer are returned if points repeat.
     """
     chosen = [int(np.argmin((points**2).sum(1)))]
     distance = ((points - points[chosen[0]]) ** 2).sum(1)
     while len(chosen) < min(count, len(points)):
-        # Rounding breaks ties, as on a grid, the same way in every coordinate frame.
+        # Rounding makes ties, which occur on grids, break the same way in every coordinate frame.
         farthest = int(np.argmax(np.round(distance, _TIE_DIGITS)))
         if distance[farthest] < _SAME_CENTRE**2:
             break

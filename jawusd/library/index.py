@@ -1,6 +1,6 @@
 """The index of a folder of rigs: `library.json`, format jawusd-library/1.
 
-The index is only a cache of the scan: paths in it are never opened. Rigs are searched below the folder only, and
+The index is only a cache of the scan: paths in it are never opened. Rigs are searched for below the folder only, and
 reread when their content has changed.
 """
 
@@ -45,12 +45,12 @@ class Entry:
     kind: str  # kind of the model
     content: str  # SHA-256 of the rig's files
     ranges_mm: dict[str, list[float]]  # lowest and highest value of each parameter
-    # in the person's own landmark frame (occlusal plane, origin at the lower incisal point)
+    # landmarks by name, in the person's own landmark frame (occlusal plane, origin at the lower incisal point)
     landmarks_mm: dict[str, list[float]]
-    condylar_distance_mm: float  # between the condyle centres
-    condyle_incisor_mm: float  # from the middle between the condyles to the incisal point
+    condylar_distance_mm: float  # distance between the condyle centres
+    condyle_incisor_mm: float  # distance from the midpoint of the condyles to the incisal point
     errors_mm: dict[str, object]  # error tables from the model's header
-    not_shown: bool  # the capture lacks a movement: not usable for transfer
+    not_shown: bool  # whether the capture lacks a movement, which makes the rig unusable for transfer
 
     def landmarks(self) -> Array:
         """Return the landmarks in the order of `LANDMARKS` [mm], shape (5, 3)."""
@@ -62,8 +62,8 @@ class Library:
     """A scanned folder."""
 
     folder: Path  # the folder, resolved
-    entries: tuple[Entry, ...]  # its rigs, by path
-    skipped: dict[str, str]  # reasons, by path, of files that could not be read
+    entries: tuple[Entry, ...]  # its rigs, sorted by path
+    skipped: dict[str, str]  # for files that could not be read, the reason by path
     reread: int  # number of new or changed rigs
 
     def find(self, name: str) -> Entry:
@@ -89,7 +89,7 @@ class Library:
 def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
     """Scan a folder and update its index.
 
-    Every subfolder is one person, with a `model.npz` or otherwise an `actor.usda`. Links out of the folder are not
+    Every subfolder with a `model.npz`, or else an `actor.usda`, is one person. Links out of the folder are not
     followed.
 
     Raises:

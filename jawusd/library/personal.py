@@ -1,12 +1,11 @@
-"""Motion for a person without a capture: that of the library's persons, transferred and averaged.
+"""Motion for a person without a capture: the motion of the library's persons, transferred and averaged.
 
-Motion is transferred by the five landmarks: joints and teeth shape the motion, size scales it. The displacement of each
-landmark is scaled laterally by the ratio of the distances between the condyles, and in the sagittal plane by the ratio
-of the distances from the condyles to the incisal point. The pose is the rigid motion nearest to the displaced
-landmarks.
+Motion is transferred by the five landmarks. The displacement of each landmark is scaled laterally by the ratio of the
+two persons' condylar distances, and in the sagittal plane by the ratio of their distances from the condyles to the
+incisal point. The pose is the rigid motion that best fits the displaced landmarks.
 
-The weight of a library person falls with the distance between the landmarks. The bandwidth and the expected error come
-from leave-one-out: each person of the library is predicted from the others.
+The weight of a library person decreases with the distance between the landmarks. The bandwidth and the expected error
+come from leave-one-out validation: each person of the library is predicted from the others.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ def condylar_distance_mm(landmarks: Array) -> float:
 
 
 def condyle_incisor_mm(landmarks: Array) -> float:
-    """Return the distance [mm] from the middle between the condyles to the incisal point of landmarks (5, 3)."""
+    """Return the distance [mm] from the midpoint of the condyles to the incisal point of landmarks (5, 3)."""
     return float(np.linalg.norm(landmarks[0] - landmarks[3:5].mean(axis=0)))
 
 
@@ -71,17 +70,17 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
 
 # Candidate bandwidths [mm]: landmark distance at which a weight falls to exp(-1/2); inf means equal weights.
 BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)
-_POSES = 1600  # poses of the result
-_POSES_LEFT_OUT = 120  # poses per person in leave-one-out
-_MIN_DONORS = 2  # for leave-one-out
+_POSES = 1600  # number of predicted poses
+_POSES_LEFT_OUT = 120  # poses per person in leave-one-out validation
+_MIN_DONORS = 2  # smallest number of persons for leave-one-out validation
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
     """Leave-one-out errors."""
 
-    # landmark errors [mm], shape (K, 5), by name of the person left out, at equal fractions of the ranges: they include
-    # errors of the shape of the motion and of the ranges
+    # landmark errors [mm], shape (K, 5), by name of the person left out; predicted and true poses are compared at equal
+    # fractions of the ranges, so that errors of the ranges are included
     errors_mm: dict[str, Array]
 
     def pooled(self) -> Array:
@@ -129,8 +128,8 @@ class PersonalMotion:
 
     # T_skull_mandible in the landmark frame, the identity with the teeth together, shape (N, 4, 4)
     poses: Array
-    weights: dict[str, float]  # of the library's persons; they sum to 1
-    learned: Learned  # the source of the weights and the expected error
+    weights: dict[str, float]  # weights of the library's persons, by name; they sum to 1
+    learned: Learned  # the bandwidth from which the weights follow, and the expected error
 
 
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:

@@ -3,9 +3,9 @@
 Ranges depend on the opening, so a curve retargeted by fractions of the ranges may peak some frames before or after the
 original. The result is the least-squares nearest curve that moves in the same direction as the original between any two
 samples: isotonic regression (Barlow et al. 1972) whose direction follows the sign of the original's steps. It is solved
-exactly by dynamic programming over the cost of all samples so far as a function of the last value. The derivative of
-that cost is piecewise linear and increasing, and each step truncates one end of it, as in R. Tibshirani, H. Hoefling,
-R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
+exactly by dynamic programming; its state is the cost of all samples so far as a function of the last value. The
+derivative of that cost is piecewise linear and increasing, and each step truncates one end of it, as in R. Tibshirani,
+H. Hoefling, R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 
-STILL_MM = 1e-6  # smaller steps of the original have no direction
+STILL_MM = 1e-6  # smaller steps of the original count as having no direction
 
 
 def follow(original: Array, carried: Array, least: float) -> Array:
     """Return the curve [mm] (F,) nearest to a retargeted one that rises and falls where the original (F,) does.
 
     Args:
-        least: Smallest step of the result per 1 mm step of the original, > 0: keeps peaks from becoming plateaus.
+        least: Smallest step of the result per 1 mm step of the original, > 0, which keeps peaks from becoming plateaus.
     """
     steps = np.diff(original)
     still = np.flatnonzero(np.abs(steps) < STILL_MM) + 1
