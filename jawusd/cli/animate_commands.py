@@ -195,7 +195,7 @@ def arkit_fit(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Learn what a person's ARKit jaw weights mean from face and jaw captured together, for `animate --mapping`.
+    """Learn what a subject's ARKit jaw weights mean from face and jaw captured together, for `animate --mapping`.
 
     The performance must open wide and move to both sides and forward.
     """
@@ -283,7 +283,7 @@ def _rate_of(rig: Path, prim: str | None) -> float:
 
 
 def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None) -> AuthoredMotion:
-    """Read the jaw of an ARKit face capture, by the person's mapping or as fractions of the person's ranges.
+    """Read the jaw of an ARKit face capture, by the subject's mapping or as fractions of the subject's ranges.
 
     As shares, JawOpen 1 is the full opening; JawLeft minus JawRight, and JawForward, are fractions of the range at that
     opening. Left is the subject's left.
@@ -294,7 +294,7 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
         mapping: file of `jawusd arkit-fit`, None for shares.
 
     Raises:
-        FormatError: the file is invalid or has no row with a face, or the mapping belongs to another person.
+        FormatError: the file is invalid or has no row with a face, or the mapping belongs to another subject.
     """
     import numpy as np
 

@@ -236,7 +236,7 @@ def demo(
     frames: Annotated[int, typer.Option(min=24, max=20000, help="Exercise frames.")] = 240,
     force: Force = False,
 ) -> None:
-    """Render a synthetic capture with ground truth: a random person in front of three cameras."""
+    """Render a synthetic capture with ground truth: a random subject in front of three cameras."""
     from functools import partial
 
     from jawusd.base.errors import explain_missing_packages

@@ -1,4 +1,4 @@
-"""Commands on several actors: library; retarget, to another rig or to a person without one."""
+"""Commands on several actors: library; retarget, to another rig or to a subject without one."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def retarget(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Retarget a motion to another rig, or make a rig for a person from landmarks and a library."""
+    """Retarget a motion to another rig, or make a rig for a subject from landmarks and a library."""
     others = (landmarks, library_folder)
     if anim and source and target and not any(others):
         _retarget_motion(anim, source, target, prim, fps, out or Path("retargeted.usdc"), force, as_json)

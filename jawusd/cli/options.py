@@ -129,7 +129,7 @@ def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig
     return jawusd.load(rig, prim=None if beside or rig.suffix == ".npz" else prim)
 
 
-# the person
+# the subject
 CaptureOption = Annotated[Path | None, typer.Option(help="Capture with scans and landmarks.", show_default=False)]
 UpperOption = Annotated[
     Path | None, typer.Option(help="Scan of the upper teeth, instead of a capture.", show_default=False)
@@ -229,10 +229,10 @@ def subject_given(
     landmarks: Path | None,
     allow_outside: bool,
 ) -> Subject:
-    """Return the person given by a capture, both scans, or landmarks.
+    """Return the subject given by a capture, both scans, or landmarks.
 
     Args:
-        name: of a person without a capture.
+        name: of a subject without a capture.
 
     Raises:
         typer.BadParameter: none or several of these are given.

@@ -1,4 +1,4 @@
-"""Commands on a person whose rig exists: solve a take, or follow a live feed."""
+"""Commands on a subject whose rig exists: solve a take, or follow a live feed."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def solve(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Track a performance of a person with a rig, from masks or else videos of one or more cameras."""
+    """Track a performance of a subject with a rig, from masks or else videos of one or more cameras."""
     from jawusd.pipeline import solve as stage
 
     stage.check_output(rig, out, overlay, report)
@@ -143,7 +143,7 @@ def live(
     prim: Prim = None,
     allow: Allow = None,
 ) -> None:
-    """Track the jaw of a person with a rig in live video: a line of JSON per instant, OSC, a page.
+    """Track the jaw of a subject with a rig in live video: a line of JSON per instant, OSC, a page.
 
     Frames are dropped if images arrive too fast; every line contains the latency.
     """

@@ -25,7 +25,7 @@ _TEETH_APART_MM = 15.0  # generous: molar landmarks may be picked by hand or det
 
 
 def check_same_jaw(subject: Subject, model: JawModel) -> None:
-    """Check that a model and a person's scans share one coordinate frame, by their tooth landmarks.
+    """Check that a model and a subject's scans share one coordinate frame, by their tooth landmarks.
 
     Raises:
         RigError: the landmarks are too far apart.
@@ -50,12 +50,12 @@ def bake_subject(
     table_size: int = 33,
     prim_name: str | None = None,
 ) -> list[Path]:
-    """Write the rig of a person with meshes, and the captured motion if there is any; return the files.
+    """Write the rig of a subject with meshes, and the captured motion if there is any; return the files.
 
     Args:
         fps: frame rate if the subject has none.
         table_size: knots per axis of the sampled decoder, 17, 33 or 65.
-        prim_name: name of the actor's prim; None: derived from the name of the person.
+        prim_name: name of the actor's prim; None: derived from the name of the subject.
 
     Raises:
         RigError, OutputError: the rig cannot be written.
@@ -127,7 +127,7 @@ def joint_deltas(rig: JawRig, mapping: ArkitMapping | None = None) -> list[Joint
     The other weights are neutral. d is brought inside the bound, as `jawusd animate` does.
 
     Args:
-        mapping: the person's own; None for fractions of the ranges, whose neutral face is the closed bite.
+        mapping: the subject's own; None for fractions of the ranges, whose neutral face is the closed bite.
     """
     from jawusd.rig.skel import joint_poses
 

@@ -39,7 +39,7 @@ def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture,
     """Draw the contacts in the closed bite, and halfway through protrusion and both laterotrusions.
 
     Args:
-        subject: the person; the scans are registered like the poses of the model.
+        subject: its scans must be registered like the poses of the model.
 
     Raises:
         RigError: the scans do not show contacts.

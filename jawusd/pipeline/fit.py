@@ -93,7 +93,7 @@ def fit_subject(
     progress: Progress = no_progress,
     fps: float | None = None,
 ) -> JawModel:
-    """Fit the jaw model of a person.
+    """Fit the jaw model of a subject.
 
     Args:
         fps: frame rate stated by the file of poses; None for that of the subject.

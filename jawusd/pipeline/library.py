@@ -48,7 +48,7 @@ def load_any_rig(path: Path) -> JawRig:
 
 
 def open_library(folder: str | os.PathLike[str]) -> Library:
-    """Scan a folder with a subfolder per person and update its index; see `library.index.scan_library`."""
+    """Scan a folder with a subfolder per subject and update its index; see `library.index.scan_library`."""
     return scan_library(folder, load_any_rig)
 
 
@@ -56,12 +56,12 @@ def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, forc
     """Copy a rig into a library, as the model file `NAME/model.npz`, and return that file.
 
     Args:
-        name: of the person and the subfolder; None: the name in the rig.
-        force: overwrite a person of the same name.
+        name: of the subject and the subfolder; None: the name in the rig.
+        force: overwrite a subject of the same name.
 
     Raises:
         FormatError: not a rig, or the name is not a valid folder name.
-        OutputError: there is such a person already, or the file cannot be written.
+        OutputError: there is such a subject already, or the file cannot be written.
     """
     rig = load_any_rig(source)
     called = name or str(rig.meta.get("actor") or "")
@@ -94,7 +94,7 @@ def _as_model(rig: JawRig, source: Path, name: str) -> JawModel:
 
 @explain_missing_packages()
 def plot_ranges(entries: Sequence[Entry], folder: Path, force: bool) -> list[Path]:
-    """Draw the ranges of persons of a library side by side, as PNG and SVG, and return the files.
+    """Draw the ranges of subjects of a library side by side, as PNG and SVG, and return the files.
 
     Raises:
         MissingDependencyError: matplotlib is not installed.
@@ -113,24 +113,24 @@ class PersonalRig:
 
     model: JawModel  # the fitted model
     motion: PersonalMotion  # what it was fitted to
-    left_out: tuple[str, ...]  # library persons not used, as their captures lack a movement
+    left_out: tuple[str, ...]  # library subjects not used, as their captures lack a movement
     header: Mapping[str, object]  # provenance stored in the model's header
 
 
 def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str, progress: Progress) -> PersonalRig:
-    """Make a rig for a person without a capture, from landmarks and a library.
+    """Make a rig for a subject without a capture, from landmarks and a library.
 
-    The motion of the library's persons is transferred to the landmarks and averaged (see `library.personal`), and the
+    The motion of the library's subjects is transferred to the landmarks and averaged (see `library.personal`), and the
     anchored model is fitted to it. Its header states the expected error, from leave-one-out over the library; the
     residual limit of measured poses allows for that error.
 
     Args:
         landmarks: file of format jawusd-landmarks/1.
-        closest: use the motion of the person with the most similar landmarks instead of the average.
+        closest: use the motion of the subject with the most similar landmarks instead of the average.
 
     Raises:
         FormatError: the file is not of that format.
-        FittingError: the library has no usable person, or the landmarks are not those of a jaw.
+        FittingError: the library has no usable subject, or the landmarks are not those of a jaw.
     """
     subject = subject_of_landmarks(landmarks, name)
     progress("carry", 0, 1)
@@ -146,7 +146,7 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
 
 @explain_missing_packages()
 def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
-    """Fit the anchored model to motion transferred to a person, and state the expected error in its header.
+    """Fit the anchored model to motion transferred to a subject, and state the expected error in its header.
 
     Raises:
         FittingError: see `fitting.fit_model`.
@@ -157,7 +157,7 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         (np.arange(len(motion.poses)), motion.poses),
         T_anatomical_skull=subject.T_anatomical_skull,
         landmarks=subject.landmarks,
-        config=FittingConfig(holdout_folds=0),  # held-out frames would be poses of the library, not of this person
+        config=FittingConfig(holdout_folds=0),  # held-out frames would be poses of the library, not of this subject
         actor=subject.name,
         progress=partial(progress, "fit"),
     )
@@ -169,7 +169,7 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         "expected_error_mm": None if expected is None else expected.summary(),
         "fit_to_carried_motion_mm": model.meta["errors"],
     }
-    # The training error says nothing about the person, whose motion was not measured.
+    # The training error says nothing about the subject, whose motion was not measured.
     model.meta["errors"] = {} if expected is None else {"expected": expected.table()}
     caution = {"code": "personal", "message": _caution(motion)}
     model.meta["warnings"] = [*fit_summary(model)["warnings"], caution]

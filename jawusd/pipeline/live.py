@@ -1,4 +1,4 @@
-"""Follow the jaw of a person whose rig exists in live video, and send it as OSC: `jawusd live`."""
+"""Follow the jaw of a subject whose rig exists in live video, and send it as OSC: `jawusd live`."""
 
 from __future__ import annotations
 

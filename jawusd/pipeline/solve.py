@@ -1,4 +1,4 @@
-"""Solve the performance of a person whose rig exists, and write it: `jawusd solve`."""
+"""Solve the performance of a subject whose rig exists, and write it: `jawusd solve`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class VideoOptions:
 
 
 class PreparedTeeth:
-    """The scans of a person, prepared for tracking.
+    """The scans of a subject, prepared for tracking.
 
     Attributes:
         scans: upper and lower teeth.

@@ -1,4 +1,4 @@
-"""The person of a capture, of loose scans or of a build: labelled scans, bones, axes and landmarks."""
+"""The subject of a capture, of loose scans or of a build: labelled scans, bones, axes and landmarks."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def registration_of(meta: Mapping[str, object]) -> Array | None:
 class Subject:
     """A person: anatomical axes, landmarks and meshes, for fitting and reports."""
 
-    name: str  # of the person or the capture
+    name: str  # of the subject or the capture
     T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
     landmarks: Array  # `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3)
     meshes: Mapping[str, Mesh]  # by the names in `MESHES`, scan frame [mm]; may be empty
@@ -218,7 +218,7 @@ class Subject:
 
 
 def registered_subject(subject: Subject, meta: Mapping[str, object]) -> Subject:
-    """Return a person with the registration of the take applied; see `registered_meshes`."""
+    """Return a subject with the registration of the take applied; see `registered_meshes`."""
     T = registration_of(meta)
     if T is None:
         return subject
@@ -228,7 +228,7 @@ def registered_subject(subject: Subject, meta: Mapping[str, object]) -> Subject:
 
 
 def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = None) -> Subject:
-    """Return the person of a capture; missing axes and landmarks are derived from the scans.
+    """Return the subject of a capture; missing axes and landmarks are derived from the scans.
 
     Args:
         meshes: result of `load_meshes`; None: load them.
@@ -248,7 +248,7 @@ def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = Non
 
 
 def subject_of_scans(files: Mapping[str, Path], name: str) -> Subject:
-    """Return the person of mesh files in one coordinate frame, teeth in occlusion.
+    """Return the subject of mesh files in one coordinate frame, teeth in occlusion.
 
     Args:
         files: mesh files by the names in `MESHES`; both teeth scans are required.
@@ -288,7 +288,7 @@ def _measured(
 
 
 def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
-    """Return the person of a landmarks file (jawusd-landmarks/1); errors are then measured at the landmarks.
+    """Return the subject of a landmarks file (jawusd-landmarks/1); errors are then measured at the landmarks.
 
     Raises:
         FormatError: see `formats.landmarks.load_landmarks`.
@@ -302,7 +302,7 @@ def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
 
 @explain_missing_packages()
 def subject_of_build(folder: Path) -> Subject:
-    """Return the person of a finished build, from its model and the meshes of its rig.
+    """Return the subject of a finished build, from its model and the meshes of its rig.
 
     Raises:
         FormatError: the model is missing.

@@ -96,7 +96,7 @@ def track(
         out: `tracks.npz` to write.
         solver: "contour", or "paper" for the paper's method, for comparison.
         backend: where the paper's method draws, "cpu" or "gl".
-        model: jaw model of this person, used as a prior to track uncertain frames again.
+        model: jaw model of this subject, used as a prior to track uncertain frames again.
         overlay: folder, or .mp4 file, for videos with the tracked scans over the footage; see `write_overlay`.
         jobs: number of threads; the result does not depend on it.
         allow_outside: let paths in the capture leave its folder.

@@ -178,7 +178,7 @@ def _track(tracks: Tracks) -> Verdict:
     wrong = [one.message for one in found if one.kind in _WRONG_SCANS]
     if wrong:
         checks.append(Check("scans", " ".join(wrong), "match the masks", BAD))
-    # False alarms: 7 of 30 valid persons (`population.py --persons 30 --seed 9500`), 3 of them with a true underbite.
+    # False alarms: 7 of 30 valid subjects (`population.py --persons 30 --seed 9500`), 3 of them with a true underbite.
     others = [one.line() for one in found if one.severity == "warning" and one.kind not in _UNUSED | _WRONG_SCANS]
     if others:
         checks.append(Check("warnings", " ".join(others), "none", LOOK))
@@ -252,7 +252,7 @@ def _bounds(data: ReportData) -> Verdict:
     return _verdict("bounds", checks)
 
 
-# Limits of the pose table's error [mm]. The worst vertex of rigs of 11 persons was off by 0.007 to 0.136 mm
+# Limits of the pose table's error [mm]. The worst vertex of rigs of 11 subjects was off by 0.007 to 0.136 mm
 # (`tests/benchmarks/contact.py`).
 _TABLE_MM = (0.06, 0.5)
 

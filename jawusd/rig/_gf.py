@@ -53,7 +53,7 @@ def rotations(T: ArrayLike) -> list[Gf.Quatd]:
 
 
 def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
-    """Return rotations as `rotations` does, each a Vt.QuatfArray of length one: samples of a one-joint animation."""
+    """Return the rotations of `rotations`, each as a Vt.QuatfArray of length one: samples of a one-joint animation."""
     return [Vt.QuatfArray([Gf.Quatf(w, x, y, z)]) for w, x, y, z in continuous_wxyz(np.asarray(T)[:, :3, :3]).tolist()]
 
 

@@ -1,7 +1,7 @@
 """Animation layers: samples of d for tools that know the rig, and a baked translation and quaternion for all others.
 
-All readers interpolate d linearly between samples; the baked ops follow that motion through the model. Matrix samples
-would shear, and a product of one transform per parameter is millimetres off when parameters combine.
+All readers interpolate d linearly between samples; the baked ops follow the model along that motion. Interpolated
+matrix samples would shear, and a product of one transform per parameter is millimetres off when parameters combine.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ from jawusd.rig.read import load_rig, open_stage
 from jawusd.rig.skel import add_skeleton_variant
 from jawusd.rig.table import landmark_distance
 
-#: Largest landmark distance [mm] from the model between two baked samples, at these fractions of the interval.
+#: Largest landmark distance [mm] from the model between two baked samples, and the fractions of the interval that are
+#: tested.
 BETWEEN_MM = 0.02
 _FRACTIONS = (0.25, 0.5, 0.75)
 _MAX_HALVINGS = 5
-_USD_LERP_BELOW = 1e-5  # of 1 - cosine: GfSlerp interpolates linearly below
+_USD_LERP_BELOW = 1e-5  # GfSlerp interpolates linearly if 1 - cosine is below
 # Limits: every whole frame is baked, and an hour at 60 frames per second must fit.
 _MAX_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
 #: Keys in an animation layer's `customLayerData`: frames without d, and frames with d inferred from their neighbours.
@@ -55,14 +56,14 @@ def write_animation(
     Args:
         out: File to write, `.usdc` or `.usda`.
         actor: The `actor.usda` it animates.
-        frames: Increasing frame numbers (F,), integers or not; every frame, or keys only.
+        frames: Increasing frame numbers (F,), integers or not: all frames, or those of keys only.
         d: Parameters (F, 3) [mm]; rows with NaN are lost frames: interpolated linearly, and listed in the layer's
             `customLayerData["lostFrames"]`.
         rig: The evaluator; read from `actor` if None.
-        carried: Frames whose d was not measured but inferred from their neighbours; listed in
+        carried: Frames whose d was not measured but interpolated from neighbouring frames; listed in
             `customLayerData["carriedFrames"]`.
-        skinned: Paths of meshes that `actor_skel.usdc` next to the layer can also move, with the same motion. They add
-            a variant, see `add_skeleton_variant`.
+        skinned: Paths of meshes that `actor_skel.usdc` next to the layer binds, with the same motion. If not empty, a
+            variant is added, see `add_skeleton_variant`.
 
     Raises:
         RigError: The actor is missing, frames do not increase, no frame has d, or the frame rate is not positive.
@@ -105,7 +106,7 @@ def write_animation(
 
 
 def root_prim_of(actor: Path) -> str:
-    """Return the name of the root prim that is the rig in an actor's file.
+    """Return the name of the root prim that is the rig, in an actor's file.
 
     Raises:
         RigError: Not exactly one root prim is a rig.
@@ -189,7 +190,7 @@ def _interpolated(times: Array, frames: Array, d: Array) -> Array:
 
 
 def _as_shown_by_usd(T_a: Array, T_b: Array, share: float) -> Array:
-    """Return the transforms that OpenUSD computes between two samples, at a fraction of the interval.
+    """Return the transforms that OpenUSD computes between two samples, at the fraction `share` of the interval.
 
     OpenUSD interpolates quaternions by slerp (Shoemake 1985). Nearly equal ones (GfSlerp: cosine above 1 - 1e-5) are
     interpolated linearly without normalising, and the angle is then taken from the real part alone (GfRotation). Near
@@ -221,11 +222,11 @@ def write_splines(
 ) -> Path:
     """Write a layer with the keys of an animation as splines; it sublayers the animation.
 
-    The splines pass through the values of the animation's samples. Delivered layers contain no splines, because OpenUSD
-    before 25.05 ignores or cannot parse them, and other readers reject the whole file.
+    The splines interpolate the animation's samples. Other layers of a rig contain no splines, because OpenUSD before
+    25.05 ignores them or cannot parse them, and other readers reject the whole file.
 
     Args:
-        animation: The animation layer made from the same keys.
+        animation: The animation layer written from the same keys.
         frames: Increasing key frames (F,).
         d: Keys (F, 3) [mm].
         slopes: Tangents at the keys (F, 3) [mm per frame]; zero if None.

@@ -16,13 +16,13 @@ from jawusd.rig.motion_read import mandible_of, prims_between, skull_of
 from jawusd.rig.skel import bones_of
 
 _UNEVEN = 1e-3  # relative difference of the three scales; far above single precision, 0.1 mm at jaw size
-_SIZES = 0.5, 2.0  # plausible scale factors of a head; others come from wrong units
-_MM = 0.001  # in metres
+_SIZES = 0.5, 2.0  # plausible scale factors of a head; factors outside come from wrong units
+_MM = 0.001  # a millimetre in metres
 _FIRST = Usd.TimeCode.EarliestTime()
 
 
 class Fault(NamedTuple):
-    """A fault: severity ("error" or "warning"), prim concerned, message."""
+    """A fault: severity ("error" or "warning"), path of the prim, message."""
 
     severity: str
     prim: Usd.Prim
@@ -40,7 +40,7 @@ def faults_of_assembly(actor: Usd.Prim) -> Iterator[Fault]:
     except FormatError as error:
         if error.message.startswith("jaw:skull"):
             yield Fault("error", actor, error.message)
-        return  # the rule for the mandible reports it
+        return  # reported by the rule for the mandible
     if skull is None:
         yield Fault("warning", actor, "has no active skull (jaw:skull).")
     elif skull.GetPath().HasPrefix(mandible.GetPath()) or mandible.GetPath().HasPrefix(skull.GetPath()):
@@ -90,7 +90,7 @@ def _shape(actor: Usd.Prim) -> Iterator[Fault]:
     axes = np.array([_axes(actor, time) for time in times])
     scales = np.linalg.svd(axes, compute_uv=False)
     uneven = scales[:, 0] - scales[:, 2] > _UNEVEN * scales[:, 0]
-    mirrored = np.linalg.det(axes) < 0  # not meaningful if a scale is zero
+    mirrored = np.linalg.det(axes) < 0  # meaningless if a scale is zero
     if uneven.any():
         first = int(np.argmax(uneven))
         listed = ", ".join(f"{scale:.4g}" for scale in scales[first])

@@ -34,10 +34,10 @@ def is_layer(asset: str) -> bool:
 
 
 def target_of(layer: Sdf.Layer, asset: str) -> str | None:
-    """Return the full path of an asset of a layer: as OpenUSD resolves it, or where the missing file would be.
+    """Return the full path of an asset of a layer, as resolved by OpenUSD, or the expected path of a missing file.
 
-    None if it is not a path on this machine, such as one with a drive letter or the scheme of a URL that no resolver
-    knows. The resolver context of the stage must be bound.
+    None if it is not a path on this machine, such as one with a drive letter, or a URL whose scheme no resolver
+    supports. The resolver context of the stage must be bound.
     """
     path, arguments = Sdf.Layer.SplitIdentifier(layer.ComputeAbsolutePath(asset))
     found = str(Ar.GetResolver().Resolve(path))
@@ -72,11 +72,11 @@ def asset_paths(layer: Sdf.Layer) -> list[str]:
         return asset
 
     edited = layer.dirty
-    silent = UsdUtils.CoalescingDiagnosticDelegate()  # an anonymous copy has no folder to search for clip templates
+    silent = UsdUtils.CoalescingDiagnosticDelegate()  # hides a warning: anonymous copies have no folder of clips
     UsdUtils.ModifyAssetPaths(layer, note)
     del silent
     if layer.dirty and not edited and not layer.anonymous:
-        layer.Reload(force=True)  # restores expressions, which were replaced by their values
+        layer.Reload(force=True)  # restores the expressions, which evaluation has replaced by their values
     return [asset for asset in dict.fromkeys(found) if asset]
 
 

@@ -4,7 +4,7 @@ To add a format version:
 
 1. Raise `layout.FORMAT_VERSION`.
 2. Add the upgrade from the previous version to `UPGRADES`. It derives the new attributes from the old ones.
-3. Let `tests/golden/make_golden_rig.py` write golden rigs of the new version next to the old ones, which tests upgrade.
+3. Write golden rigs of the new version with `tests/golden/make_golden_rig.py`; keep the old ones, which tests upgrade.
 4. Do the same in `plugins/jawusd_reader.py`.
 
 Upgrades happen in memory; files are never rewritten. `jawusd bake` on the model writes a rig of the current version.
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _TYPES = Sdf.ValueTypeNames
 
-#: Largest array that is read, in numbers or points: the corners of the largest mesh that is accepted.
+#: Largest number of elements of an array that is read: the face corners of the largest accepted mesh.
 MAX_VALUES = 30_000_000
 
 
@@ -113,11 +113,11 @@ def value_of(attribute: Usd.Attribute, where: object, time: Usd.TimeCode | None 
     return value
 
 
-MAX_FRAMES = 220_000  # the limit for writing, too: an hour at 60 frames per second
+MAX_FRAMES = 220_000  # an hour at 60 frames per second, the same limit as for writing
 
 
 def key_times(attribute: Usd.Attribute) -> list[float]:
-    """Return the times of an attribute's samples. For a spline: its knots and the whole frames between them."""
+    """Return the times of an attribute's samples; of a spline, its knots and the whole frames between them."""
     spline = _spline_of(attribute)
     if spline is None:
         return list(attribute.GetTimeSamples())
@@ -158,7 +158,7 @@ def key_and_frame_times(attributes: Iterable[Usd.Attribute]) -> tuple[Array, Mas
 
 
 def time_codes(times: Array) -> list[Usd.TimeCode]:
-    """Return times as time codes; the default time code if there are none."""
+    """Return times as time codes; if there are none, the default time code."""
     return [Usd.TimeCode(time) for time in times.tolist()] or [Usd.TimeCode.Default()]
 
 

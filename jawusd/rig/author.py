@@ -1,9 +1,9 @@
 """Build the layers that define a rig: the interface `actor.usda`, the decoder `rig.usdc` and proxies `proxy.usdc`.
 
-Proxies are meshes of few faces for crowds, chosen by the variant set `detail`. The scans are in the actor's own
-payload, so that tools without variant support show them. The variant `proxy` adds a stronger payload that replaces the
-scans. The variant `both` adds the proxies next to the scans, with purposes: viewports can draw proxies and renderers
-scans.
+Proxies are meshes of few faces for crowds, selected by the variant set `detail`. The scans are in the actor's own
+payload, so that tools without variant support display them. The variant `proxy` adds a stronger payload that replaces
+the scans. The variant `both` adds the proxies next to the scans, with purposes, so that viewports can draw proxies and
+renderers scans.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _with_ordered_fields(layer: Sdf.Layer) -> Sdf.Layer:
 
 def _define_proxy_class(layer: Sdf.Layer, proxies: Iterable[str]) -> None:
     """Define the class with the proxies under new names. A binary layer stores equal arrays once."""
-    Sdf.CopySpec(layer, ACTOR, layer, _PROXY_CLASS)  # with the materials that its meshes are bound to
+    Sdf.CopySpec(layer, ACTOR, layer, _PROXY_CLASS)  # including the materials to which its meshes are bound
     layer.GetPrimAtPath(_PROXY_CLASS).specifier = Sdf.SpecifierClass
     mandible = layer.GetPrimAtPath(MANDIBLE.replace(ACTOR, _PROXY_CLASS))
     for attribute in list(mandible.properties):
@@ -172,7 +172,7 @@ def record_sidecars(layer: Sdf.Layer, folder: Path) -> None:
 def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
     """Build `rig.usdc`: the exact model, the bounds, and the sampled table with its error.
 
-    JawRigAPI is not applied here: only the interface that sublayers it is a rig.
+    JawRigAPI is not applied in this layer: only the interface that sublayers it is a rig.
     """
     layer = new_layer()
     actor = define_prim(layer, layout.ACTOR, "Xform")

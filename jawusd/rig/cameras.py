@@ -1,6 +1,6 @@
 """A take as a scene for compositing over the footage: calibrated cameras, and the actor moved by the head.
 
-Cameras are also written and read alone, to exchange calibrations with other programs.
+Cameras alone are also written and read, to exchange calibrations with other programs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from jawusd.rig.untrusted import raises_format_error
 
 TAKE, TAKE_CAMERAS = "/Take", "/Take/Cameras"
 
-# Undistorted images of a camera, relative to the take, numbered by time code; the second for footage in linear light.
+# Undistorted images of a camera, relative to the take, numbered by time code; the second pattern is for footage in
+# linear light.
 PLATE = "plates/{name}/{name}.%06d.jpg"
 LIGHT_PLATE = "plates/{name}/{name}.%06d.exr"
 
@@ -34,7 +35,7 @@ LIGHT_PLATE = "plates/{name}/{name}.%06d.exr"
 _SENSOR_WIDTH = 360.0
 _CLIPPING_MM = (1.0, 10_000.0)
 _LARGEST_SKEW = 1e-6
-# Attributes for the lens model in Omniverse: before its lens schemas, and with them.
+# Attributes that name the lens model in Omniverse: older, and with its lens schemas.
 _LENS_MODELS = ("cameraProjectionType", "omni:lensdistortion:model")
 # Camera and world axes are x right, y down, z forward in OpenCV, and x right, y up, z backward in USD.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -52,7 +53,7 @@ def write_cameras(
     """Write the take: one `UsdGeom.Camera` per camera, and the actor moved by the tracked head.
 
     The cameras are pinholes, which match undistorted images. `jaw:plate` is the printf pattern of such images, by time
-    code and relative to the take. `jaw:distortion` holds the OpenCV coefficients of the footage itself, `jaw:imageSize`
+    code and relative to the take. `jaw:distortion` has OpenCV's coefficients of the distorted footage, `jaw:imageSize`
     its size. The head's motion is written to a binary layer that the take sublayers.
 
     Args:
@@ -151,8 +152,8 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     read at their first time.
 
     Args:
-        path: A stage, or Alembic (in cm) if OpenUSD has the plugin for it, which its wheels lack.
-        sizes: Returns (width, height) [px] by camera, for cameras without `jaw:imageSize`.
+        path: A stage, or an Alembic file (in cm) if OpenUSD has the plugin for it; the wheels of OpenUSD do not.
+        sizes: Callback that returns (width, height) [px] by camera, for cameras without `jaw:imageSize`.
 
     Raises:
         RigError: The stage cannot be opened, refers to files outside its folder, or has no perspective camera.
@@ -170,7 +171,7 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     stage = open_stage(path)
     mm = UsdGeom.GetStageMetersPerUnit(stage) * 1000.0
     cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
-    # orthographic cameras are the top and side views of a program
+    # orthographic cameras are top and side views of 3-D programs
     prims = [prim for prim in cameras if UsdGeom.Camera(prim).GetProjectionAttr().Get() != "orthographic"]
     names = names_of_labels(Path(path), [str(prim.GetPath())[1:] for prim in prims])
     known: Mapping[str, tuple[int, int]] | None = None
@@ -216,7 +217,7 @@ def _read_camera(name: str, prim: Usd.Prim, size: tuple[int, int], mm: float) ->
     cy = size[1] * (0.5 + optics.verticalApertureOffset / high) - 0.5
     K = np.array([[focal / wide * size[0], 0.0, cx], [0.0, focal / high * size[1], cy], [0.0, 0.0, 1.0]])
     placed = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time), np.float64).T
-    u, _, vt = np.linalg.svd(placed[:3, :3])  # drop scales of parents, which move cameras but do not change the image
+    u, _, vt = np.linalg.svd(placed[:3, :3])  # drop the parents' scales: they move a camera but do not change its image
     T_world_cam = make_transform(u @ vt @ _FLIP[:3, :3], mm * placed[:3, 3])
     lens = prim.GetAttribute("jaw:distortion").Get() if prim.HasAttribute("jaw:distortion") else None
     return Camera(name, size, K, np.zeros(0) if lens is None else np.array(lens), se3_inverse(T_world_cam))

@@ -21,7 +21,7 @@ from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL, rig_prims
 from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.untrusted import raises_format_error
 
-# Mesh names are unique, because Blender merges an Xform with its only child and keeps the child's name.
+# Mesh names differ from those of their parents, because Blender merges an Xform with its only child, keeping its name.
 MESH_PATHS = {
     "skull": f"{SKULL}/SkullMesh",
     "upper_teeth": f"{SKULL}/UpperTeethMesh",
@@ -59,7 +59,7 @@ def write_look(prim: UsdGeom.Mesh, mesh: Mesh, plain: tuple[float, float, float]
 
 
 def hide_look(prim: UsdGeom.Mesh, mesh: Mesh, below: Mesh) -> None:
-    """Override the primvars of a mesh in a weaker layer, which has other points, if this mesh does not set them."""
+    """Override the primvars that only the mesh in a weaker layer, `below`, has, since the points differ."""
     if natural_colors(mesh) is None and natural_colors(below) is not None:
         prim.GetDisplayColorPrimvar().SetInterpolation(UsdGeom.Tokens.constant)
     if mesh.uv is None and below.uv is not None:
@@ -135,7 +135,7 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str |
 
 
 def _mark_placeholder(mesh: Sdf.PrimSpec, condyles: str) -> None:
-    """Mark a mesh as a placeholder in all fields that programs display."""
+    """Mark a mesh as a placeholder in all metadata that programs display."""
     text = f"Not anatomy: a placeholder grown from the lower scan, there was no mandible mesh. Condyles: {condyles}."
     mesh.SetInfo("displayName", "Mandible (placeholder)")
     mesh.SetInfo("documentation", text)
@@ -213,7 +213,7 @@ def vertex_normals(mesh: Mesh) -> Array:
     for axis in range(3):
         normals[:, axis] = np.bincount(corners, np.repeat(area[:, axis], 3), minlength=len(mesh.vertices))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    # vertices of degenerate faces only: any unit vector will do
+    # vertices with degenerate faces only get an arbitrary unit vector
     return np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
 
 

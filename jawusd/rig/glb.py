@@ -18,8 +18,8 @@ from jawusd.rig.animation import bake_times
 from jawusd.rig.geo import MATERIAL_LOOKS, MESH_PATHS, linear_from_srgb, read_geometry, read_gum, vertex_normals
 from jawusd.rig.layout import MANDIBLE, SKULL
 
-_HIGHEST_FRAME = 100_000.0  # up to here, single precision resolves a hundredth of a frame
-_SCAN = "Scan"  # white, because it is multiplied by the vertex colours
+_HIGHEST_FRAME = 100_000.0  # up to this frame number, single precision resolves a hundredth of a frame
+_SCAN = "Scan"  # name of a white material, as vertex colours are multiplied by the material's colour
 
 
 def write_glb(
@@ -78,8 +78,8 @@ def write_glb(
 def frame_at_zero(frames: Array) -> float:
     """Return the frame of a take, frames (F,), at 0 s of a .glb: frame 0, so that frame numbers are kept.
 
-    It is the first frame if that is negative, because glTF has no times before 0, or if frame numbers are too high for
-    its single precision.
+    If the first frame is negative, it is the first frame, because glTF has no times before 0; also if frame numbers are
+    too high for single precision, which glTF uses for times.
     """
     return 0.0 if frames[0] >= 0 and frames[-1] <= _HIGHEST_FRAME else float(frames[0])
 

@@ -87,7 +87,7 @@ def rename_actor(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name
 
 
 def _replace(items: object, change: Callable[[T], T]) -> None:
-    """Change the items of an OpenUSD list op in place."""
+    """Replace each item of an OpenUSD list op by its result under a function, in place."""
     for group in ("explicitItems", "prependedItems", "appendedItems", "addedItems", "deletedItems"):
         old = list(getattr(items, group))
         new = [change(item) for item in old]
@@ -132,7 +132,7 @@ def set_attribute(
 ) -> None:
     """Write an attribute with its default value, uniform unless animated.
 
-    All are `custom`: Blender imports no other attributes.
+    All attributes are `custom`: Blender imports no others.
     """
     variability = Sdf.VariabilityVarying if animated else Sdf.VariabilityUniform
     attribute = Sdf.AttributeSpec(spec, name, type_name, variability, declaresCustom=True)
@@ -186,7 +186,7 @@ def write_layer(layer: Sdf.Layer, path: Path) -> Path:
         try:
             with without_warning(_SPLINE_WARNING):
                 written = layer.Export(str(temporary))
-        except Tf.ErrorException:  # its text names a source line of OpenUSD, not the reason
+        except Tf.ErrorException:  # its message names a source line of OpenUSD, not the reason
             written = False
         if not written:
             raise OutputError("could not be written; is the disk full? Any previous file is unchanged.", path=path)

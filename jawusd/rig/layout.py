@@ -60,7 +60,7 @@ def check_prim_name(name: str) -> str:
 
 
 def actor_in_folder(path: Path) -> Path:
-    """Return the actor file of a rig folder, as built or published under another name. Other paths are returned as is.
+    """Return the actor file in the folder of a built or published rig; return other paths unchanged.
 
     Raises:
         RigError: The folder has no actor file.

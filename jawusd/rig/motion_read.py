@@ -1,6 +1,6 @@
-"""Read how the mandible moves in a stage, from transforms, bones or samples of d.
+"""Read the motion of the mandible in a stage, from transforms, bones or samples of d.
 
-Also: at which times and how closely a baked mandible must match its d, and whether the skull is moved.
+Also determines at which times and how closely a baked mandible must match its d, and whether the skull is moved.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jawusd.rig.untrusted import raises_format_error
 
 #: Largest distance [mm] of a baked pose from that of d.
 BAKED_MM = 0.01
-_RIGID = 1e-5  # largest rigidity defect; single-precision quaternions, as DCCs write them, stay below
+_RIGID = 1e-5  # largest rigidity defect; single-precision quaternions, as written by DCCs, stay below
 
 
 @raises_format_error(0)
@@ -51,7 +51,7 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
 
 
 def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object) -> Array:
-    """Return the poses of a mandible relative to the skull, given by transforms or bones.
+    """Return the poses of a mandible relative to the skull, from transforms or bones.
 
     Args:
         times: Shape (F,); the default time is read if it is empty.
@@ -103,7 +103,7 @@ def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode
 
 
 def moving_attributes(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Attribute]:
-    """Return the attributes that move a prim in its actor: those of joints, or the ops of prims up to the actor."""
+    """Return the attributes that move a prim in its actor: of joints, or the ops of the prims up to the actor."""
     bones = bones_of(prim)
     if bones is not None:
         return bones.animated_attributes()
@@ -112,7 +112,7 @@ def moving_attributes(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Attribute]:
 
 
 def prims_between(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Prim]:
-    """Return the transformable prims from a prim up to, but without, its actor."""
+    """Return the transformable prims from a prim up to its actor, excluding the actor."""
     found = []
     while prim and prim != actor and not prim.IsPseudoRoot():
         found.append(prim)
@@ -121,7 +121,7 @@ def prims_between(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Prim]:
 
 
 def _moving_prims(prim: Usd.Prim) -> list[Usd.Prim]:
-    """Return the meshes below a prim if any prim between has transforms, otherwise the prim."""
+    """Return the meshes below a prim if they or prims in between have transforms, otherwise the prim."""
     meshes = meshes_below(prim)
     below = [above for mesh in meshes for above in prims_between(mesh, prim)]
     is_transformed = any(UsdGeom.Xformable(each).GetXformOpOrderAttr().HasAuthoredValue() for each in below)
@@ -238,8 +238,8 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
 def comparison_times(actor: Usd.Prim, moving: list[Usd.Attribute], by_bones: bool) -> tuple[Array, Array]:
     """Return the times at which a mandible is compared with d, and the allowed distances.
 
-    The times are the keys of both, because a jaw whose d alone is keyed does not move, and the whole frames between
-    them, because d and the mandible are interpolated differently. For bones, keys are enough: they have one at every
+    The times are the keys of both, because a jaw of which only d is keyed does not move, and the whole frames between
+    them, because d and the mandible are interpolated differently. For bones the keys suffice: they have one at every
     key of d.
 
     Args:

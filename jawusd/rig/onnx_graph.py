@@ -19,7 +19,7 @@ from jawusd.geometry.rodrigues import Triple, angle_quotients
 # |B_2k|, k = 1..8: Bernoulli numbers in the series of the inverse left Jacobian
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510)
 _INVERSE_SERIES = [number / factorial(2 * k) for k, number in enumerate(_BERNOULLI, start=1)]
-# Below this squared angle the closed forms lose digits to cancellation in float32; above it the series is inaccurate.
+# Below this squared angle, the closed forms suffer from cancellation in float32; above it, the series is inaccurate.
 _SERIES_BELOW_RAD2 = 0.25
 
 _ARITHMETIC = {"Add": "Add", "Subtract": "Sub", "Multiply": "Mul", "Divide": "Div"}
@@ -29,7 +29,7 @@ FloatType = type[np.float32] | type[np.float64]
 
 @dataclass(frozen=True)
 class Value(Symbol):
-    """A value in a graph: a column (n, 1), or a wide number (n, m), see `jawusd.evaluator.operations`."""
+    """A value in a graph: a column (n, 1), or a wide value (n, m), see `jawusd.evaluator.operations`."""
 
     graph: Graph = field(repr=False)
     name: str
@@ -64,7 +64,7 @@ class Graph:
 
     @property
     def elem_type(self) -> int:
-        """The ONNX element type of the graph's numbers."""
+        """The ONNX element type of the graph's floating-point values."""
         return TensorProto.DOUBLE if self.dtype is np.float64 else TensorProto.FLOAT
 
     def constant(self, value: ArrayLike, dtype: type[np.int64] | type[np.bool_] | None = None) -> Value:
@@ -133,7 +133,7 @@ class Graph:
         return self.op("Where", small, series[3], (1.0 - a / (2.0 * b)) / far)
 
     def _near_and_far(self, squared: Value) -> tuple[Value, Value, list[Value]]:
-        """Return where a squared angle is small, the angle limited for the closed forms, and the series.
+        """Return a mask of small squared angles, the squared angle clipped for the closed forms, and the series.
 
         Both branches are evaluated everywhere and must not overflow, because infinity times 0 is NaN.
         """
@@ -142,7 +142,7 @@ class Graph:
         return self.op("Less", squared, _SERIES_BELOW_RAD2), self.op("Max", squared, _SERIES_BELOW_RAD2), series
 
     def polynomials(self, coefficients: Sequence[Sequence[float]], x: Value) -> list[Value]:
-        """Return polynomials of x as its powers times one matrix: a third of the operators of Horner's scheme."""
+        """Return polynomials of x, as its powers times one matrix: a third of the operators of Horner's scheme."""
         degree = max(map(len, coefficients)) - 1
         powers = [x]
         while len(powers) < degree:
@@ -171,15 +171,15 @@ class Graph:
         return triple(self.parts(factors[0] @ weights, 3))
 
     def lookup(self, x: Value, knots: Array, tables: Sequence[Array]) -> list[tuple[Value]]:
-        """Return the row (n, k) of each table whose index is the number of knots (m, 1) at or below x.
+        """Return from each table the row (n, k) whose index is the number of knots (m, 1) at or below x.
 
-        Computed as the first row plus the difference of the next row for each knot passed, which is a matrix product.
+        The row is the first one plus, for each knot at or below x, the difference of two rows: a matrix product.
         """
         passed = self.op("Cast", self.op("GreaterOrEqual", x, self.constant(knots.T)), to=self.elem_type)
         return [(passed @ np.diff(table, axis=0) + self.constant(table[:1]),) for table in tables]
 
     def split(self, row: Sequence[Value], width: int) -> list[Value]:
-        """Return the columns (n, 1) of a wide number (n, width)."""
+        """Return the columns (n, 1) of a wide value (n, width)."""
         return self.parts(row[0], width)
 
 

@@ -22,10 +22,10 @@ from jawusd.rig.onnx_graph import Graph, Value
 from jawusd.rig.table import grid_points, valid_box
 
 _ITERATIONS = 30
-_CONVERGED_MM = 1e-7  # a row has converged when its step is shorter; the loop ends when all rows have
+_CONVERGED_MM = 1e-7  # a row has converged when its step is shorter; the loop ends when all rows have converged
 _STARTS = (19, 11, 11)  # grid of starts along d1, d2, d3
-_START_MARGIN_MM = 3.0  # the grid extends beyond the bounds by this much, for poses a little outside
-_STEP_MM = 1e-3  # of the central differences
+_START_MARGIN_MM = 3.0  # extension of the grid beyond the bounds, for poses slightly outside
+_STEP_MM = 1e-3  # step of the central differences
 _START_DAMPING = 1e-6
 _MIN_DAMPING = 1e-12
 _LOOP_STATE = {"d": 3, "cost": 1, "damping": 1}  # values passed between iterations, and their widths
@@ -44,7 +44,7 @@ def add_margin(g: Graph, rig: JawRig, d: Value) -> Value:
 
 
 def add_twist(g: Graph, rig: JawRig, motion: RigidMotion[Value], name: str) -> None:
-    """Add an output: the twists (omega [rad], v [mm]) of motions, skull frame, shape (n, 6)."""
+    """Add the twists (omega [rad], v [mm]) of motions as an output, skull frame, shape (n, 6)."""
     x = dot(motion.omega, motion.omega)
     a, b, _ = g.angle_coefficients(x)
     v = apply_series(motion.omega, motion.t, -0.5, g.inverse_coefficient(x, a, b))
@@ -55,7 +55,7 @@ def add_twist(g: Graph, rig: JawRig, motion: RigidMotion[Value], name: str) -> N
 def images(g: Graph, rig: JawRig, motion: RigidMotion[Value], vectors: Array) -> Value:
     """Return homogeneous vectors (4, m) of the mandible frame transformed to the skull frame, shape (n, 3 m).
 
-    Computed as a displacement from the closed bite, which is therefore exact in any precision.
+    Computed as a displacement from the closed bite, so that the closed bite is exact in any precision.
     """
     to_skull = se3_inverse(rig.T_anatomical_skull)[:3, :3]
     at_rest = rig.T_anatomical_skull @ rig.T_rest @ vectors
@@ -86,7 +86,7 @@ def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> No
     found = ["f_d", "f_cost", "f_damping"]
     f.nodes.append(helper.make_node("Loop", [value.name for value in state], found, body=_body(rig, vectors)))
     found_d, found_cost, _ = (Value(f, name) for name in found)
-    # a NaN in the pose is in the cost, but not in the start
+    # a NaN of the pose propagates to the cost, but not to the start
     checked_d = found_d + found_cost * 0.0
     distance = f.op("Squeeze", f.sqrt(found_cost), f.constant([1], np.int64))
     g.nodes += f.nodes
@@ -114,7 +114,7 @@ def _nearest_start(g: Graph, rig: JawRig, vectors: Array, target: Value) -> tupl
     axes = [np.linspace(low, high, count) for (low, high), count in zip(box, _STARTS, strict=True)]
     grid = grid_points(axes)
     candidates = np.swapaxes((rig.pose(grid) @ vectors)[:, :3], 1, 2).reshape(-1, 12)
-    # |a - b|^2 without the |a|^2 that all candidates share
+    # |a - b|^2 without |a|^2, which is the same for all candidates
     distance = g.constant((candidates**2).sum(axis=1)[None]) - (target @ candidates.T) * 2.0
     nearest = g.op("ArgMin", distance, axis=1, keepdims=0)
     start = g.op("Gather", g.constant(grid), nearest, axis=0)

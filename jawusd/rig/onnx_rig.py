@@ -1,4 +1,4 @@
-"""A rig whose poses, twists, margins and encoding onnxruntime computes from its sidecars, in single precision."""
+"""A rig whose poses, twists, margins and encoding onnxruntime computes with its sidecars, in single precision."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from jawusd.evaluator.rig import load
 from jawusd.rig.onnx_sidecar import Run, load_sidecar, runner
 from jawusd.rig.read import load_rig
 
-# Within this distance of the bound, margins are recomputed exactly: single precision cannot decide the side.
+# Within this distance of the bound, margins are recomputed in double precision, as their sign is uncertain in single.
 _NEAR_MM = 1e-3
 
 
@@ -31,7 +31,7 @@ def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
     """Load the rig in the folder of an ONNX file, to be evaluated by that file.
 
     `X.onnx` decodes; `X_encode.onnx`, if it exists, encodes. The rig, `X.usda` or `model.npz` in the same folder,
-    supplies what the graphs lack: limits, landmarks and searches inside the bound.
+    provides what the graphs lack: limits, landmarks and projection into the bound.
 
     Raises:
         FormatError: No rig in the folder, not a decoder of jawusd, or made from another model.
@@ -59,7 +59,7 @@ def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
 
 
 class OnnxKernels(NumpyKernels):
-    """Kernels that run ONNX graphs for poses, twists, margins and the nearest pose, and numpy for the rest."""
+    """Kernels that use ONNX graphs for poses, twists, margins and the nearest pose, and numpy for the rest."""
 
     def __init__(self, decode: bytes, encode: bytes | None, parts: RigParts) -> None:
         super().__init__(parts)

@@ -1,7 +1,7 @@
 """The ONNX sidecars of a rig: graphs of the exact model, d -> pose, twist, margin and pose -> d, residual.
 
-Decoding and encoding are separate files, because decoding needs only arithmetic, which every runtime supports, and
-encoding needs a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is installed, otherwise by the
+Decoder and encoder are separate files, because the decoder needs only arithmetic, which every runtime supports, but the
+encoder a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is installed, otherwise by the
 reference evaluator of the package onnx, which is slower.
 """
 
@@ -137,8 +137,8 @@ def runner(graph: bytes) -> Run:
     else:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
-        options.log_severity_level = 4  # failures are raised as exceptions as well
-        # optimising takes longer than it saves over thousands of poses
+        options.log_severity_level = 4  # no log: failures are raised as exceptions
+        # optimising the graph takes longer than it saves over thousands of poses
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         run = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"]).run
 
@@ -213,10 +213,10 @@ def load_sidecar(path: str | os.PathLike[str], rig: JawRig, recorded: str | None
     try:
         model = onnx.load_from_string(content)
         onnx.checker.check_model(model)
-        convert_model_from_external_data(model)  # raises if weights are in other files, which runtimes would read
+        convert_model_from_external_data(model)  # fails if weights are in other files, which runtimes would read
     except Exception as error:  # the protobuf and onnx exceptions share no base
         raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error
-    if model.functions or model.graph.sparse_initializer:  # not covered by the check for other files
+    if model.functions or model.graph.sparse_initializer:  # the check for other files does not cover these
         raise FormatError("has functions or sparse weights, which graphs written by jawusd do not have.", path=path)
     properties = {entry.key: entry.value for entry in model.metadata_props}
     if properties.get("format") != FORMAT:

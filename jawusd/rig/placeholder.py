@@ -1,9 +1,9 @@
 """A placeholder for a missing mandible mesh: a tube swept below the lower scan and up to the condyles.
 
-It shows roughly where bone may be. It is not anatomy, and is marked as such. The condyles are taken from the landmarks,
-or from the motion if the landmarks are only mean adult positions. In opening and in protrusion the condyle slides along
-the same path, the eminence, so its trajectories form a thinner band than those of points around it (the kinematic
-condylar centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
+It indicates roughly where bone may be; it is not anatomy, and is marked as a placeholder. The condyles are taken from
+the landmarks, or from the motion if the landmarks are only mean adult positions. In opening and in protrusion the
+condyle slides along the same path, the eminence, so its trajectories form a thinner band than those of the points
+around it (the kinematic condylar centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 _CONDYLES = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
 _INCISOR = LANDMARKS.index("incisor")
 
-# Search range and step for the point of the thinnest trajectories, up and forward from the mean adult position [mm].
+# Search range and step for the point with the thinnest band of trajectories: upward and forward from the mean adult
+# position [mm].
 _REACH_MM = 18.0
 _STEP_MM = 1.5
 _PATH_DEGREE = 3
-# The motion is used only if the condyles travel this far, and if their paths are thinner by this factor than those at
-# the mean position.
+# The motion is used only if the condyles travel at least this far, and if the thickness of their band of trajectories
+# is below this fraction of that at the mean position.
 _LEAST_TRAVEL_MM = 5.0
 _CLEARLY_THINNER = 0.85
 _FEWEST_POSES = 30
 
-# Stations of the body below the arch: directions from the middle of its open end, 0 is the front [rad].
+# Stations of the body below the arch, as directions from the middle of the arch's open end [rad]; 0 is the front.
 _STATIONS = np.radians([75.0, 50.0, 25.0, 0.0, -25.0, -50.0, -75.0])
 _STATION_WIDTH = np.radians(9.0)
 _FEWEST_VERTICES = 10
@@ -41,7 +42,7 @@ _BODY_MM = (5.5, 13.0)
 _BODY_BELOW_SCAN_MM = 9.0
 _HEAD_MM, _NECK_MM, _RAMUS_MM, _ANGLE_MM = (9.0, 4.5), (5.0, 4.0), (4.5, 14.0), (5.0, 13.0)
 _CORNERS = 20
-_SECTIONS = 12  # per part between two control sections
+_SECTIONS = 12  # interpolated between two control sections
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ def grow_placeholder(rig: JawRig, lower_teeth: Mesh) -> Placeholder:
 def find_condyles(rig: JawRig) -> tuple[Array, str]:
     """Return the centres of left and right condyle, mandible frame [mm], shape (2, 3), and their source.
 
-    The motion determines height and depth of a condyle; its distance from the midline is that of the landmark.
+    The motion determines a condyle's height and its position front to back; the landmark its distance from the midline.
     """
     landmarks = rig.landmarks[_CONDYLES]
     inferred = [text for text in rig.inferred if text.startswith("condyle")]
@@ -89,7 +90,7 @@ def find_condyles(rig: JawRig) -> tuple[Array, str]:
 
 
 def _thinnest(poses: Array, mean: Array) -> Array | None:
-    """Return the point near a mean position with the thinnest sagittal trajectory; None if the motion is too small."""
+    """Return the point near a mean position with the thinnest sagittal band; None if the motion is too small."""
     offsets = np.arange(-_REACH_MM, _REACH_MM + 0.5 * _STEP_MM, _STEP_MM)
     grid = np.stack(np.meshgrid([0.0], offsets, offsets, indexing="ij"), axis=-1)[0] + mean
     thickness = np.array([[_thickness(poses, point) for point in row] for row in grid])
@@ -141,7 +142,7 @@ def _body(scan: Array) -> tuple[Array, Array, Array]:
         if len(near) >= _FEWEST_VERTICES:
             known.append(station)
             found.append([*near[:, [0, 2]].mean(axis=0), np.percentile(near[:, 1], 5)])
-    if len(known) < 2:  # a scan of a few teeth: use a body of default size around them
+    if len(known) < 2:  # a scan of a few teeth: use a body of default size below them
         known, found = [0.0], [[*scan[:, [0, 2]].mean(axis=0), scan[:, 1].min()]]
     # stations run from left to right; np.interp needs increasing values
     x, z, low = (np.interp(_STATIONS, known[::-1], column) for column in np.array(found)[::-1].T)

@@ -1,7 +1,7 @@
 """Packages for viewers (`.usdz`), and copies of a rig with unique file names.
 
-A package is an actor or a whole shot, flattened into one layer. Unique names are needed by tools that gather files of
-several actors in one folder and confuse files of equal names.
+A package is an actor or a whole shot, flattened into one layer. Unique names are needed in tools that collect the files
+of several actors in one folder and confuse files of equal names.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ from jawusd.rig.layout import (
 )
 from jawusd.rig.read import describe, open_stage
 
-# Archives store file times; a fixed time makes packages reproducible. It is the first that a zip can store in any zone.
+# Archives store file times; a fixed time makes packages reproducible. It is the earliest a zip can store in any time
+# zone.
 _ZIP_EPOCH = 315_619_200
 _OP = "xformOp:"
 _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 _LAYERS, _COPIED = (".usda", ".usdc", ".usd"), (".onnx",)
-_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # each before those that refer to it
+_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # each file before its referrers
 _NAMES_INSIDE = "actor.usdc", "shot.usdc"
-# Binary layers compress vectors of small integers, which three.js (r187) reads as NaN. This offset avoids integers.
+# Binary layers compress vectors of small integers, which three.js (r187) decodes as NaN. This offset avoids integers.
 _OFFSET = 1e-9
 
 
@@ -85,20 +86,20 @@ def _flattened(stage: Usd.Stage, source: str | os.PathLike[str]) -> Sdf.Layer:
         for attribute in ONNX_ATTRIBUTES:
             if attribute in actor.properties:
                 actor.RemoveProperty(actor.properties[attribute])
-        # the identifier is an asset path, and would be packed
+        # the identifier is an asset path, so its file would be packed
         actor.assetInfo = {key: value for key, value in dict(actor.assetInfo).items() if key != "identifier"}
     _avoid_integers(layer)
     return layer
 
 
 def _rigs_in(layer: Sdf.Layer) -> list[Sdf.Path]:
-    """Return the rig prims of a flattened layer, in which prototypes have other paths than in the stage."""
+    """Return the rig prims of a flattened layer; its prototypes have other paths than those of the stage."""
     flat = Usd.Stage.Open(layer)
     return [prim.GetPath() for prim in flat.TraverseAll() if has_jaw_api(prim)]
 
 
 def _avoid_integers(layer: Sdf.Layer) -> None:
-    """Offset integer-valued transforms by a millionth of a micrometre, or the least possible in single precision."""
+    """Offset integer-valued transforms by a nanometre's thousandth, or by the least difference in single precision."""
     found: list[Sdf.Path] = []
     layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if _OP in path.name else None)
     for path in found:

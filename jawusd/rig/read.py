@@ -104,7 +104,8 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
         rig = JawRig(arrays, meta)
     except EvaluatorError as error:
         raise FormatError(error.message, path=str(where)) from error
-    # In a folder, thresholds may have been edited. In a package, a mismatch means that files of equal names were mixed.
+    # In a folder, a mismatch may come from edited thresholds. In a package, it means that files of equal names were
+    # mixed.
     packed = prim.GetStage().GetRootLayer().identifier.endswith(".usdz")
     if packed and not set(recorded_hashes(prim)) <= {None, rig.model_hash}:
         raise FormatError(
@@ -116,7 +117,7 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
 
 
 def recorded_hashes(prim: Usd.Prim) -> tuple[object, object]:
-    """Return the recorded hashes of a rig's model and of the model its motion was made with; None if not recorded.
+    """Return the recorded hashes of a rig's model and of the model that its motion was made with; None if missing.
 
     Both are None for a rig of an older format version, because upgraded arrays have another hash.
     """

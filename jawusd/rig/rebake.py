@@ -1,4 +1,4 @@
-"""Make d and the mandible of a stage consistent again after only one of them was edited."""
+"""Make d and the mandible of a stage consistent again after one of them was edited."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
 Origin = Literal["d", "mandible"]
-_SAME_MM = 1e-6  # keys of d that differ by less are equal
+_SAME_MM = 1e-6  # keys of d that differ by less count as equal
 
 
 class StageMotion(NamedTuple):
@@ -108,7 +108,8 @@ def motion_of_stage(
 
     Args:
         prim_path: The rig's prim, if the stage has several rigs.
-        origin: Source to read; None: the one that is animated. If both are and disagree, the one in the stronger layer.
+        origin: Source to read; None: the animated one. If both are animated and disagree, the one in the stronger
+            layer.
 
     Raises:
         RigError: Not a stage, or d and mandible disagree and are in the same layer.
@@ -148,7 +149,7 @@ def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, deviating: De
 
 
 def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -> Usd.Prim:
-    """Return a rig's prim in a stage: of several, the only one with the same model. Reject rigs of other people."""
+    """Return a rig's prim in a stage: of several, the only one with the same model. Reject rigs of other subjects."""
     alike = [p for p in rig_prims(stage) if p.GetAttribute("jaw:modelHash").Get() == rig.model_hash]
     found = alike[0] if prim_path is None and len(alike) == 1 else find_rig_prim(stage, path, prim_path)
     own, other = (str(meta.get("actor") or "") for meta in (rig.meta, rig_of(found, path).meta))
@@ -162,7 +163,7 @@ def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -
 
 
 def _constant_motion(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array, float]:
-    """Return a d without keys as a constant motion: first and last frame, d at both [mm], frames per second."""
+    """Return the unanimated d as a constant motion: first and last frame, d at both [mm], frames per second."""
     frames = frames_of_stage(stage, path)[[0, -1]]
     d = np.array([actor.GetAttribute(name).Get() for name in PARAMETERS], dtype=np.float64)
     if not np.isfinite(d).all():
@@ -172,7 +173,7 @@ def _constant_motion(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[A
 
 
 def _rank(stage: Usd.Stage, attributes: list[Usd.Attribute]) -> float:
-    """Return the number of layers that are stronger than the strongest opinion about any of several attributes."""
+    """Return how many layers are stronger than the layer with the strongest opinion about any of the attributes."""
     layers = stage.GetLayerStack(includeSessionLayers=False)
     strongest = [stack[0].layer for stack in (attribute.GetPropertyStack() for attribute in attributes) if stack]
     return min((float(layers.index(layer)) for layer in strongest if layer in layers), default=np.inf)
@@ -327,7 +328,7 @@ def _overridden_by_root(stage: Usd.Stage, layer: Sdf.Layer) -> list[str]:
         if path.IsPrimPropertyPath() and root.GetAttributeAtPath(path):
             times, attribute = layer.ListTimeSamplesForPath(path), stage.GetAttributeAtPath(path)
             same = not times and root.GetAttributeAtPath(path).default == layer.GetAttributeAtPath(path).default
-            if path.name in PARAMETERS:  # unchanged keys of d do not count
+            if path.name in PARAMETERS:  # keys of d that are unchanged do not count
                 now, then = (
                     [value(time) for time in times] for value in (attribute.Get, partial(layer.QueryTimeSample, path))
                 )

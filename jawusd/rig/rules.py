@@ -29,7 +29,7 @@ from jawusd.rig.skel import bones_of
 from jawusd.rig.table import landmark_distance, sample_valid
 from jawusd.rig.untrusted import VALUE_ERRORS, value_error_message
 
-_TABLE_SLACK_MM = 0.01  # above the stated error of the table, which was measured at other parameters
+_TABLE_SLACK_MM = 0.01  # tolerance above the table's stated error, which was measured at other parameters
 _OPS = [("xformOp:translate", "double3"), ("xformOp:orient", "quatd")]
 _PROBES = 500  # random valid d at which the table is compared with the model
 
@@ -41,7 +41,7 @@ class Finding:
     Attributes:
         severity: "error", "warning" or "info".
         rule: Name of the rule.
-        path: Prim or attribute concerned.
+        path: Path of the prim or attribute.
         message: The value found and the values allowed.
     """
 
@@ -119,7 +119,7 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that d1, d2, d3 are inside the bound at every time; within the tolerance it is information only."""
+    """Check that d1, d2, d3 are inside the bound at every time; deviations within the tolerance are only noted."""
     rig = _rig(prim)
     if rig is None:
         return

@@ -17,7 +17,7 @@ from jawusd.base import errors, guard
 from jawusd.base.inputs import SETTING, allowed_folders
 from jawusd.evaluator import JawRig
 
-#: Limits of the process: memory [GB], processor time [s], wall time [s] (for slow disks). Rigs take 0.3 GB and 1 s.
+#: Limits of the process: memory [GB], processor time [s], wall time [s], longer for slow disks. Rigs take 0.3 GB, 1 s.
 MAX_MEMORY_GB, MAX_CPU_S, MAX_WAIT_S = 4, 10, 60
 
 _DAMAGED = "the file is damaged or malicious."

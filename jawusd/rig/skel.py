@@ -39,8 +39,8 @@ _TYPES = Sdf.ValueTypeNames
 JOINTS = ("skull", "skull/jaw")
 SKEL, KEYS = f"{ACTOR}/Skel", f"{ACTOR}/Skel/Motion"
 _SKEL_IN_GEO = f"{GEO}/Skel"
-# Largest difference between matrix entries of meshes that move together [mm or 1]. Single precision, 100 mm from the
-# origin, stays far below.
+# Largest difference between the matrix entries of meshes that move together [mm or 1]. Rounding to single precision,
+# 100 mm from the origin, stays far below.
 SAME_MOTION = 1e-4
 _BIND_RIGIDLY = "Bind every mesh of the mandible to one joint, or name meshes to be fitted with --mandible and --skull."
 
@@ -87,7 +87,7 @@ def add_skeleton_variant(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -
     """Add the variants `transforms` (selected, empty) and `skeleton` to the actor of an animation layer.
 
     Joints and keys are referenced from `actor_skel.usdc` next to the layer. The prim above the meshes becomes the
-    SkelRoot, because a variant cannot change the type that `actor.usda` gives the actor itself.
+    SkelRoot, because a variant cannot change the type of the actor's prim, which `actor.usda` sets.
 
     Args:
         meshes: Paths of the meshes that follow the bones.
@@ -103,7 +103,7 @@ def add_skeleton_variant(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -
     def in_variant(path: str) -> Sdf.Path:
         return Sdf.Path(path).ReplacePrefix(Sdf.Path(ACTOR), inside)
 
-    # all are overs: the meshes come from the payload
+    # all specs are overs: the meshes are defined in the payload
     Sdf.CreatePrimInLayer(layer, in_variant(GEO)).typeName = "SkelRoot"
     skeleton = Sdf.CreatePrimInLayer(layer, in_variant(_SKEL_IN_GEO))
     skeleton.referenceList.prependedItems = [Sdf.Reference(f"./{SKEL_FILE}", SKEL)]
@@ -158,7 +158,7 @@ def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: A
 
 def _bind(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[Sdf.Path], skeleton: Sdf.Path, mandible: Sdf.Path) -> None:
     """Bind meshes of the payload, which is not loaded, rigidly to the joints: those of the mandible to the jaw."""
-    # The bind transforms place the meshes. Blender would apply the ops of the payload as well.
+    # The bind transforms place the meshes. Without this order, Blender would apply the payload's ops as well.
     order = Sdf.AttributeSpec(
         Sdf.CreatePrimInLayer(layer, mandible), "xformOpOrder", _TYPES.TokenArray, Sdf.VariabilityUniform
     )

@@ -1,8 +1,7 @@
 """Read the motion of the jaw from a stage without a rig: from Xforms, bones or point caches of the actor's meshes.
 
-Exporters change names, units, axes and hierarchy, and formats such as glTF split and reorder vertices. Meshes of
-the rig are therefore identified by their number of vertices, or of distinct positions, and fitted to the stage in every
-frame.
+Exporters change names, units, axes and hierarchy, and formats such as glTF split and reorder vertices. The meshes of
+the rig are therefore identified by their number of vertices, or of distinct positions, and fitted in every frame.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from jawusd.rig.motion_read import frames_of_stage
 from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.untrusted import raises_format_error
 
-_POINTS = 2000  # vertices of a mesh that are fitted, evenly spaced by index
-# Largest RMS distance of a fitted mesh. Exports in single precision, even in metres, stay far below; other meshes with
-# the same number of vertices do not.
+_POINTS = 2000  # number of vertices of a mesh that are fitted, evenly spaced by index
+# Largest RMS distance of a fitted mesh. Exports in single precision, even in metres, stay far below; meshes that only
+# have the same number of vertices do not.
 _MAX_MISFIT_MM = 0.5
 _SAME_POINT_MM = 0.02  # far above single precision, below the spacing of a scan's vertices
 _SKULL, _MANDIBLE = ("upper_teeth", "skull"), ("lower_teeth", "mandible")
@@ -100,7 +99,7 @@ def fit_poses_of_stage(
     fitted, misfit_mm = np.empty((2, len(frames), 4, 4)), 0.0
     for k, frame in enumerate(frames.tolist()):
         seen = [place.points(Usd.TimeCode(frame)) for place in places]
-        # one scale for both: the stage may be in cm, or the actor scaled
+        # one scale for skull and mandible: the stage may be in cm, or the actor scaled
         scale = _spread(seen[0]) / _spread(places[0].source)
         for i, (place, points) in enumerate(zip(places, seen, strict=True)):
             fitted[i, k] = rigid_fit(place.source, points / scale)
@@ -152,7 +151,7 @@ class _StageMesh:
 def _find(
     stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below: str | None, path: object
 ) -> _StageMesh:
-    """Return the mesh of the stage that matches one of the named meshes of the rig; teeth before bone."""
+    """Return the mesh of the stage that matches one of the named meshes of the rig; teeth take precedence over bone."""
     if below is not None and not (Sdf.Path.IsValidPathString(below) and stage.GetPrimAtPath(below)):
         raise FormatError(f"has no prim {below}.", path=str(path))
     meshes = meshes_below(stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot())
@@ -162,7 +161,7 @@ def _find(
     for name, mesh in wanted.items():
         alike = [prim for prim in meshes if len(found[str(prim.GetPath())].all) == len(mesh.vertices)]
         alike = alike or [prim for prim in meshes if found[str(prim.GetPath())].distinct == _distinct(mesh)]
-        # upper and lower teeth may have equally many vertices: then names decide
+        # upper and lower teeth may have equally many vertices; then decide by name
         named = [prim for prim in alike if _plain(name) in _plain(str(prim.GetPath()))] or alike
         if len(named) == 1:
             return _StageMesh(named[0], mesh.vertices, *_correspondence(mesh, found[str(named[0].GetPath())]))

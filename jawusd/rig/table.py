@@ -22,13 +22,13 @@ from jawusd.geometry.se3 import se3_exp, transform_points
 DEFAULT_SIZE = 33  # values per axis
 SIZES = (17, 33, 65)
 _VALID_SAMPLES = 10_000  # random valid d at which the error is measured
-_FULL_CHECKS = 200  # worst d that are checked at every vertex
+_FULL_CHECKS = 200  # number of worst d that are checked at every vertex
 
-_PROBES_PER_AXIS = 41  # of the grid that finds the box of valid d
+_PROBES_PER_AXIS = 41  # of the grid with which the box of valid d is found
 _FINE = 161  # values per axis at which the curvature is measured
 _COARSE = 13  # values along the two other axes
-_NEAR_BOUND_MM = -0.5  # smallest margin that is considered: cells extend beyond the bound
-_SMOOTHING = 9  # window over the curvature, in fine steps
+_NEAR_BOUND_MM = -0.5  # smallest margin at which the curvature counts; negative, as cells extend beyond the bound
+_SMOOTHING = 9  # width of the window that smooths the curvature, in fine steps
 _FLOOR = 0.05  # lower limit of the curvature, as a fraction of its maximum
 _POINTS = 40  # mandible points at which the curvature is measured
 
@@ -179,7 +179,7 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
     else:
         twists = _balanced_twists(rig, axes)
         table = DecoderTable("grid", axes, twists.astype(np.float32))
-    # the error of linear interpolation peaks in the middle of the cells
+    # the error of linear interpolation is largest in the middle of the cells
     middles = grid_points([0.5 * (axis[1:] + axis[:-1]) for axis in axes])
     samples = np.concatenate([middles[rig.margin(middles) >= 0], sample_valid(rig, _VALID_SAMPLES)])
     error = table_error(rig, table, vertices, samples)
@@ -199,7 +199,7 @@ def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
         found = np.moveaxis(rig.twist(grid_points(middles)).reshape(*map(len, middles), 6), i, 0)
         knots, taken = np.moveaxis(exact, i, 0), np.moveaxis(out, i, 0)
         error = np.concatenate([[np.zeros_like(knots[0])], found - 0.5 * (knots[1:] + knots[:-1])])
-        error[0] = error[1]  # cells at the ends have one neighbour
+        error[0] = error[1]  # knots at the ends have one cell only
         after = np.concatenate([error[1:], error[-1:]])
         taken += 0.25 * (error + after)
     closed = tuple(int(np.searchsorted(axis, 0.0)) for axis in axes)
@@ -210,8 +210,8 @@ def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
 def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> float:
     """Return the largest distance [mm] between table and model at any vertex (V, 3), over parameters d (n, 3).
 
-    The distance is a convex function of the vertex, so vertices that are extreme in some direction suffice to find the
-    worst parameters, which are then checked at every vertex.
+    The distance is a convex function of the vertex, so the worst parameters are found with the vertices that are
+    extreme in some direction, and then checked at every vertex.
     """
     exact = rig.pose(d)
     read = table.pose(d, rig.T_rest)

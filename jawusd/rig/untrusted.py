@@ -33,7 +33,7 @@ class _LayerRef(NamedTuple):
     Attributes:
         target: Full path of the layer.
         rig_folder: Folder of the rig it is part of; None if it is not part of one.
-        user: The layer that refers to it from another folder, if any.
+        user: The layer in another folder that refers to it, if any.
         variables: Expression variables of the layers that refer to it.
         is_sublayer: Whether it is a sublayer, whose own variables are ignored.
     """
@@ -48,7 +48,7 @@ class _LayerRef(NamedTuple):
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Raised by code that meets a value of an unexpected type: values in USD have any type that their file declares.
+#: Exceptions raised by values of an unexpected type; values in USD have whatever type their file declares.
 VALUE_ERRORS = (
     ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError, Tf.ErrorException,
 )  # fmt: skip
@@ -192,7 +192,7 @@ def _referenced_layers(layer: Sdf.Layer, rig_folder: Path | None, variables: Map
     folder = rig_folder or file_of_layer(layer).resolve().parent
     read = evaluated(layer, variables)
     found: list[_LayerRef] = []
-    for template in clip_templates(read):  # first: OpenUSD lists their folders when asset paths are collected
+    for template in clip_templates(read):  # first: OpenUSD lists their folders when collecting asset paths
         pattern = _checked_file(layer, template, folder)
         for file in files_of_template(pattern):
             _checked_file(layer, str(file), folder)

@@ -23,7 +23,7 @@ from jawusd.rig.rules import RULES, Finding, Rule
 
 try:
     from pxr import UsdValidation
-except ImportError:  # OpenUSD before 25.02 has no such module
+except ImportError:  # not in OpenUSD before 25.02
     UsdValidation = None
 
 PROGRAM = "nvidia_usd_validate"
