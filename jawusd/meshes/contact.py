@@ -1,4 +1,4 @@
-"""How the teeth of a person meet: both scans as solids, the clearance of poses, and pictures of the contacts."""
+"""How the teeth of a person meet: both scans as solids, the clearance of poses, and images of the contacts."""
 
 from __future__ import annotations
 
@@ -197,9 +197,9 @@ class _Arch:
 
     Attributes:
         points: Surface points, frame of the solid [mm], shape (n, 3).
-        pixels: Their rows and columns in the picture, shape (n, 2).
+        pixels: Their rows and columns in the image, shape (n, 2).
         shade: Brightness, shape (n,).
-        size: Rows and columns of the picture.
+        size: Rows and columns of the image.
     """
 
     points: Array
@@ -209,7 +209,7 @@ class _Arch:
 
 
 class ContactMap:
-    """Pictures of the contacts of one subject's teeth in any pose, like articulating paper."""
+    """Images of the contacts of one subject's teeth in any pose, like articulating paper."""
 
     def __init__(self, teeth: Teeth) -> None:
         """Prepare both arches."""

@@ -260,7 +260,7 @@ def _popcount(x: np.uint64) -> np.uint64:
 
 @numba.njit(_INT(_BITS), nogil=True, cache=True)
 def count_bits(bits: Bits) -> np.int64:
-    """Count the set pixels of a (h, words) uint64 bit-row picture."""
+    """Count the set pixels of a (h, words) uint64 bit-row image."""
     total = np.uint64(0)
     for y in range(bits.shape[0]):
         for k in range(bits.shape[1]):
@@ -273,7 +273,7 @@ def count_and_not(first: Bits, second: Bits) -> np.int64:
     """Count the pixels set in first and not in second; both (h, words) uint64.
 
     Raises:
-        ValueError: the two pictures differ in shape.
+        ValueError: the two images differ in shape.
     """
     if first.shape != second.shape:
         raise ValueError("bit rows: the two pictures differ in shape")
@@ -290,7 +290,7 @@ def words_for(width: int) -> int:
 
 
 def pack_bits(mask: Mask | NDArray[np.uint8]) -> Bits:
-    """Pack a (h, w) picture (non-zero = set) into (h, words) uint64 bit rows.
+    """Pack a (h, w) image (non-zero = set) into (h, words) uint64 bit rows.
 
     Raises:
         ValueError: mask is not two-dimensional.
@@ -304,7 +304,7 @@ def pack_bits(mask: Mask | NDArray[np.uint8]) -> Bits:
 
 
 def unpack_bits(bits: Bits, width: int) -> Mask:
-    """Unpack (h, words) uint64 bit rows into a (h, width) bool picture.
+    """Unpack (h, words) uint64 bit rows into a (h, width) bool image.
 
     Raises:
         ValueError: the rows are shorter than width.

@@ -1,4 +1,4 @@
-"""Paper Fig. 5: the paths of the condyles as the jaw opens, by the first principal component and by the models."""
+"""Paper Fig. 5: the paths of the condyles as the jaw opens, for the first principal component and for the models."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ EXPERIMENT = "condyle path"
 PRINCIPAL = "principal component 1"
 
 _STEPS = 121
-_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the path at which the condyle's outline is drawn
-_AROUND_MM = 24.0  # half size of the outlines
+_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # fractions of the path at which the condyle's outline is drawn
+_AROUND_MM = 24.0  # distance from the condyle's centre up to which bone is drawn
 _NEAR_CLOSED_MM = 5.0
 _HABITUAL_MM = 1.5  # captured poses with smaller |d2| and |d3| count as plain opening
-_BESIDE_MM = 0.75  # captured condyles this near in z limit the height of a condyle under the eminence
+_BESIDE_MM = 0.75  # distance in z within which captured condyles limit the height of a condyle below the eminence
 _FEWEST_BESIDE = 3
 
 
@@ -33,7 +33,7 @@ def condyle_paths(
     """Sweep the first principal component, then the opening d1 of each model up to `widest_mm`.
 
     Args:
-        mandible: for outlines of the condyle, mandible frame.
+        mandible: mesh for outlines of the condyle, mandible frame; None draws none.
     """
     sweeps = {PRINCIPAL: principal_opening(data)}
     d = np.zeros((_STEPS, 3))
@@ -105,7 +105,7 @@ def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
         return np.empty((0, 2, 2))
     height = cut[:, :, 0] - centre[0]
     above = height > 0
-    # One of the three corners lies alone on its side of the plane; the cut connects its two edges.
+    # One of the three corners is alone on its side of the plane; the cut connects points on its two edges.
     alone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
     rows = np.arange(len(cut))
     ends = []

@@ -1,4 +1,4 @@
-"""The energy of the paper, eqs. 6 to 9: pixels in which a projected scan and its masks disagree, counted on the CPU."""
+"""The energy of the paper, eqs. 6 to 9: the number of pixels in which a projected scan and its masks disagree."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jawusd.meshes.meshio import winding
 from jawusd.meshes.raster import Bits, Singles, count_and_not, draw_silhouette, pack_bits, project
 from jawusd.tracking.contour.views import View
 
-_MARGIN_PX = 48  # margin of the screen buffer around the initial scan: 7 mm, more than any search moves it
+_MARGIN_PX = 48  # margin of the screen buffer around the initial scan: 7 mm, farther than any search moves the scan
 _FARTHEST_PX = 1024  # largest extent of the buffer beyond the masks
 
 _MATRICES = types.Array(types.float32, 3, "C", readonly=True)
@@ -45,14 +45,14 @@ class PaperScan:
     """Regions of a teeth scan as drawn in the paper (fig. 8)."""
 
     vertices: Array  # scan coordinates [mm], shape (V, 3)
-    plain_faces: NDArray[np.int32]  # red: teeth that only have to cover their masks, shape (F, 3)
+    plain_faces: NDArray[np.int32]  # red: parts of teeth that only have to cover the mask, shape (F, 3)
     boundary_faces: NDArray[np.int32]  # green: the boundary of interest, shape (B, 3)
     cull: bool  # whether back faces may be culled
     centre: Array  # centroid of the teeth [mm], shape (3,)
 
 
 def paper_scan(mesh: Mesh, name: str) -> PaperScan:
-    """Extract the red and green regions of a painted teeth scan; two corners decide the region of a face.
+    """Extract the red and green regions of a painted teeth scan; a face belongs to the region of two of its corners.
 
     Args:
         mesh: the scan with vertex colours.
@@ -93,7 +93,7 @@ class PaperEnergy:
 
     Every view is rendered into its own screen buffer around the teeth, undistorted and at the working resolution. There
     is no depth buffer: a pixel is red or green if any triangle of that colour covers its centre. With back-face
-    culling, the count differs by about ten pixels from that of a depth buffer.
+    culling, the count differs by about ten pixels from one with a depth buffer.
     """
 
     def __init__(self, counter: PixelCounter, scan: PaperScan, boundary_weight: float) -> None:
@@ -114,7 +114,7 @@ class PaperEnergy:
             views: views with a mask of this arch.
             row: 0 upper, 1 lower.
             start: initial pose of the search, T_world_scan, shape (4, 4).
-            other_row_hides: do not count boundary pixels inside the mask of the other arch.
+            other_row_hides: whether to ignore boundary pixels inside the mask of the other arch.
         """
         boxes = np.stack([self._box(view, start) for view in views])
         width, height = (boxes[:, 2:] - boxes[:, :2]).max(0)
@@ -170,7 +170,7 @@ def _count(
     width: int,
     counts: NDArray[np.int64],
 ) -> None:
-    """Fill counts (T, 2) for renderings first .. first + T, enumerated pose by pose and view by view."""
+    """Write the counts (T, 2) of renderings first .. first + T; renderings are numbered pose by pose, then by view."""
     points = np.empty((vertices.shape[0], 3), np.float32)
     bits = np.empty((masks.shape[1], masks.shape[2]), np.uint64)
     for t in range(counts.shape[0]):
@@ -195,14 +195,15 @@ class RasterCounter:
         cull: bool = False,
         threads: int = 1,
     ) -> None:
-        """Store the used part of the scan.
+        """Store the parts of the scan that are rendered.
 
         Args:
             vertices: scan coordinates [mm], shape (V, 3).
             plain_faces: teeth without the boundary of interest (red in the paper's fig. 8), shape (F, 3).
             boundary_faces: the boundary of interest (green), shape (B, 3).
-            cull: cull back faces, which halves the time; all faces must be counter-clockwise seen from outside.
-            threads: worker threads; the counts do not depend on it.
+            cull: whether to cull back faces, which halves the time; all faces must be counter-clockwise seen from
+                outside.
+            threads: number of worker threads; the counts do not depend on it.
         """
         used, index = np.unique(np.concatenate([plain_faces, boundary_faces]), return_inverse=True)
         faces = np.ascontiguousarray(index.reshape(-1, 3), np.int32)
@@ -230,7 +231,7 @@ class RasterCounter:
         self._free = np.stack([pack_bits(mask) for mask in free])
 
     def counts(self, poses: Array) -> NDArray[np.int64]:
-        """Return the disagreeing pixels of T_world_scan (N, 4, 4), shape (N, C, 2).
+        """Return the numbers of disagreeing pixels for T_world_scan (N, 4, 4), shape (N, C, 2).
 
         Counted are mask pixels not covered by the scan (E_SP, eq. 8) and boundary pixels outside `free` (E_BND, eq. 9).
         """

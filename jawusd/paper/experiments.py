@@ -38,7 +38,7 @@ QUICK = ("additive", DEFAULT, LINEAR)
 RECONSTRUCTION, SYNTHESIS = "reconstruction", "synthesis"
 
 _LARGEST = "largest vertex distance"
-_OPENING_QUANTILE = 0.995  # end of the sweep of Fig. 5, robust against single frames
+_OPENING_QUANTILE = 0.995  # quantile of d1 at which the sweep of Fig. 5 ends, robust to single frames
 _SKULL_AROUND_MM = 30.0
 _GRID_MM = 0.5
 _SLICES = 60
@@ -46,7 +46,7 @@ _SLICES = 60
 
 @dataclass(frozen=True)
 class _Fitted:
-    """The models of one take, with the captured poses in their parameters."""
+    """The models of one take, and the captured poses encoded with each."""
 
     forms: dict[str, FittedForm]
     d: dict[str, Array]
@@ -70,8 +70,8 @@ def run_experiments(
     Args:
         source: tracks, whose raw poses without a prior are used, or frame numbers and poses.
         bones: meshes "mandible" and "skull" for outlines, scan frame [mm]; either may be missing.
-        config: starts and seed of the networks, trimming, alpha, folds; the method is ignored.
-        quick: skip the networks and the paper's model, and draw random poses of the default model only.
+        config: starts and seed of the networks, trimming, alpha, folds; `method` is ignored.
+        quick: whether to skip the networks and the paper's model, and draw random poses of the default model only.
 
     Returns:
         The results. Models that cannot be fitted to the take are omitted and listed in `notes`.
@@ -214,7 +214,7 @@ def _coverage(d: Array, bounds: Bounds, sentences: tuple[str, ...]) -> Coverage:
 
 
 def _gaps(d: Array, bounds: Bounds, axis: int) -> tuple[Array, float]:
-    """Return the points (d1, d_axis) of the slice hull that are far from every pose, and their share."""
+    """Return the points (d1, d_axis) of the slice hull that are far from every pose, and their fraction."""
     first, second = (np.arange(low, high, _GRID_MM) for low, high in bounds.slices_box[[0, axis]])
     grid = np.zeros((len(first) * len(second), 3))
     grid[:, 0], grid[:, axis] = (part.ravel() for part in np.meshgrid(first, second))

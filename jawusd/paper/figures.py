@@ -31,10 +31,10 @@ FIGURES = ("fig5_condyle_path", "fig12_reconstruction", "fig13_synthesis", "cove
 
 _HEADS = (PALE, SKY, BLUE, BLACK)  # colours of the condyle outlines from closed to wide open
 _BINS = 40
-_SCALE_QUANTILE = 0.8  # of the models' 95 % quantiles: upper end of the histograms' shared axis
+_SCALE_QUANTILE = 0.8  # quantile over the models' 95 % quantiles at which the histograms' shared axis ends
 _BONES_MM, _CLOSE_MM = 12.0, 1.5  # margins around the paths
-_ADVICE_LETTERS = 140  # per line above the coverage plot
-_FEW_MM = 1.0  # smallest range of a histogram
+_ADVICE_LETTERS = 140  # characters per line of advice above the coverage plot
+_FEW_MM = 1.0  # smallest range of the histograms' axis
 _MANY = 2500  # number of points above which they are rasterised to limit the file size
 _MOVES = ("opening d1", "laterotrusion d2", "protrusion d3")
 
@@ -55,7 +55,7 @@ def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
 
 
 def inline_figures(found: Experiments) -> dict[str, Markup]:
-    """Return the plots of the experiments as SVG, by their slots in the report page."""
+    """Return the plots of the experiments as SVG, keyed by their placeholders in the report page."""
     figures = {
         "coverage": (coverage_figure(found.coverage, found.actor), "Captured poses, the bounds and the gaps."),
         "reconstruction": (reconstruction_figure(found), "Histograms of the reconstruction error of each model."),
@@ -115,7 +115,7 @@ def _frame(axis: Axes, found: Experiments, around_mm: float) -> None:
 
 
 def parameter_figure(found: Experiments) -> Figure:
-    """Draw the path of the left condyle when each parameter moves alone: the linear model against the default one.
+    """Draw the path of the left condyle as each parameter varies alone, for the linear and the default model.
 
     After paper Figs. 5 and 6; above seen from the side, below from above, one column per parameter.
     """
@@ -181,7 +181,7 @@ def _histograms(
     columns = min(columns, len(samples))
     rows = -(-len(samples) // columns)
     figure, axes = new_figure(11.0, 1.9 * rows + 0.6, rows, columns, sharex=True, sharey=True)
-    # A shared scale that the long tail of one model does not dominate; values beyond it are counted.
+    # The long tail of one model must not dominate the shared scale; values beyond its end are counted.
     end = max(_FEW_MM, float(np.quantile([np.percentile(one.values_mm, 95) for one in samples], _SCALE_QUANTILE)))
     bins = np.linspace(0.0, end, _BINS + 1).tolist()
     for axis, one, label in zip(axes, samples, labels, strict=False):

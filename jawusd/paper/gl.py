@@ -1,4 +1,4 @@
-"""GPU pixel counter: renders many poses and views into one layered texture and counts there.
+"""GPU pixel counter: renders many poses and views into one layered texture and counts pixels on the GPU.
 
 Needs OpenGL 4.3 through EGL, but no display; a software driver (llvmpipe) is sufficient. Counts may differ slightly
 from the CPU's, where a pixel centre lies within rounding error of a triangle's edge.
@@ -27,7 +27,7 @@ except ModuleNotFoundError as error:
 
 
 _LAYER_EXTENSION = "GL_ARB_shader_viewport_layer_array"
-_MOST_PIXELS = 1 << 26  # of one layered texture: 64 MB
+_MOST_PIXELS = 1 << 26  # largest number of pixels in one layered texture: 64 MB
 _TILE_PX = 64  # side of the tile that one work group of 16 x 16 counts
 _ROUND_PX = 64  # texture sizes are rounded up to a multiple of this, so that frames can share textures
 
@@ -80,7 +80,7 @@ void main() {{
 
 
 def open_context() -> moderngl.Context:
-    """Open an OpenGL 4.3 context without a window. It is bound to the calling thread; release it when done.
+    """Open an OpenGL 4.3 context without a window, bound to the calling thread; the caller must release it.
 
     Raises:
         MissingDependencyError: EGL, a driver, or an extension of the driver is missing.
@@ -188,7 +188,7 @@ class GlCounter:
             self._drop_textures()
             self._masks = self._gl.texture_array((*size, views), 1, dtype="u1")
             self._masks.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        # Padding is neither mask nor forbidden for boundary pixels.
+        # Padding is not part of the mask, and boundary pixels there are not counted.
         flags = np.full((views, size[1], size[0]), 2, np.uint8)
         flags[:, :height, :width] = masks + np.uint8(2) * free
         self._masks.write(flags, alignment=1)

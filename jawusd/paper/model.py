@@ -1,12 +1,14 @@
 """The model of Yang et al. (2019): hierarchical NLPCA with five components, reduced to a sum of three curves.
 
-Phi_gen is the decoder of a network trained on the twists. Phi1 is its first component alone; the generated points of
-two groups of components (D23, D45) are each reduced to one dimension by a network of their own, Phi2 and Phi3; and
+Phi_gen is the decoder of a network trained on the twists. Phi1 is Phi_gen with the first component alone. For two
+groups of components, the points that Phi_gen generates (D23, D45) are each reduced to one dimension by another network,
+Phi2 and Phi3; and
 
     Phi(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)                                                       (paper eq. 5)
 
-Taken literally, the sum counts Phi_gen(0) three times; here it counts once. The meaning of a component varies between
-trainings, so components are grouped by how they move the incisal point unless the paper's fixed groups are requested.
+Taken literally, the sum contains Phi_gen(0) three times; here it contains it once. What a component represents varies
+between trainings, so components are grouped by how they move the incisal point unless the paper's fixed groups are
+requested.
 Twists are given in mandible-metric coordinates, which makes the result independent of units and origin.
 """
 
@@ -44,7 +46,7 @@ _ALL_STAGES, _SEARCH_STAGES = 7, 4  # training stages of the one-dimensional net
 
 @dataclass(frozen=True)
 class _Part:
-    """One summand: the components of a group, reduced to one dimension where the group has several."""
+    """One summand: the components of a group, reduced to one dimension if there are several."""
 
     group: tuple[int, ...]
     reduced: Nlpca | None
@@ -56,7 +58,7 @@ class _Part:
         return self.reduced.encode(net.decode(_only(components, self.group)))[:, 0]
 
     def value(self, net: Nlpca, t: Array) -> tuple[Array, Array]:
-        """Return metric coordinates (N, 6) and their derivative by t (N,)."""
+        """Return metric coordinates (N, 6) and their derivative with respect to t (N,)."""
         if self.reduced is not None:
             return self.reduced.decode(t[:, None]), self.reduced.decode_rate(t[:, None], np.ones(1))
         direction = np.zeros(net.components)
@@ -66,7 +68,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Sum:
-    """The sum of three parts in metric coordinates, Phi_gen(0) counted once."""
+    """The sum of three parts in metric coordinates, containing Phi_gen(0) once."""
 
     net: Nlpca
     parts: tuple[_Part, _Part, _Part]
@@ -114,13 +116,13 @@ def fit_paper(
 
     Args:
         shown: parameters that the data show, shape (3,).
-        literal: keep the paper's groups (1), (2, 3), (4, 5), whichever motion the components describe.
+        literal: whether to keep the paper's groups (1), (2, 3), (4, 5), whichever motion the components describe.
         starts: number of random initialisations; the sum with the smallest training error is kept.
-        seed: of the first initialisation.
-        nets: cache of trained networks of five components by seed, updated in place.
+        seed: seed of the first initialisation.
+        nets: cache of trained networks with five components, by seed, updated in place.
 
     Raises:
-        FittingError: the data do not show a parameter, or no component moves the incisal point that way.
+        FittingError: the data do not show a parameter, or no component moves the incisal point in its direction.
     """
     from jawusd.paper.nlpca import train_nlpca  # imports torch, which takes two seconds
 
@@ -189,7 +191,7 @@ def _groups_by_incisal_motion(net: Nlpca, points: Array, root: Array, incisor: A
 
 
 def _with_leftovers(base: _Sum, points: Array, error: Callable[[_Sum], float]) -> _Sum:
-    """Try to assign the remaining components to the three groups or to none; return the best sum."""
+    """Return the best sum over assignments of the remaining components to one of the three groups or to none."""
     used = {part.group[0] for part in base.parts}
     left = [index for index in range(base.net.components) if index not in used]
     components = base.net.encode(points)
@@ -207,7 +209,7 @@ def _with_leftovers(base: _Sum, points: Array, error: Callable[[_Sum], float]) -
 
 
 def _curves(found: _Sum, points: Array, root: Array, data: TrainingData) -> tuple[AdditiveModel, dict[str, object]]:
-    """Move the rest of a sum to the closed bite and reparametrise its curves in mm; return the model and notes."""
+    """Shift the rest pose of a sum to the closed bite and reparametrise its curves in mm; return model and notes."""
     encoded = found.encode(points)
     rest = found.rest(encoded)
     reached = encoded - rest

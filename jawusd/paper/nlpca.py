@@ -35,9 +35,9 @@ class Nlpca:
 
     # weights and biases, input to output: (D, h), (h,), (h, k), (k,), (k, h), (h,), (h, D), (D,)
     layers: tuple[Array, ...]
-    scale: float  # factor on the data before the network
+    scale: float  # factor on the centred data, the input of the network
     centre: Array  # subtracted from the data first, shape (D,)
-    cost: float  # of the training
+    cost: float  # final value of the training cost
 
     @property
     def components(self) -> int:
@@ -67,8 +67,8 @@ def train_nlpca(data: Array, components: int, seed: int, *, centre: bool = False
     Args:
         data: shape (N, D).
         components: size k of the bottleneck.
-        centre: subtract the mean first, unlike the toolbox.
-        stages: number of training stages; 4 of 7 come within a few percent in a tenth of the time.
+        centre: whether to subtract the mean first, unlike the toolbox.
+        stages: number of training stages; 4 of 7 reach a cost within a few percent in a tenth of the time.
     """
     mean = data.mean(0) if centre else np.zeros(data.shape[1])
     scale = _SCALED_SD / max(float((data - mean).std(0).max()), 1e-12)
@@ -144,7 +144,7 @@ def _split(flat: Values, shapes: list[tuple[int, ...]]) -> list[Values]:
 
 
 def _ordered(flat: Array, shapes: list[tuple[int, ...]], data: Array) -> Array:
-    """Return the weights with components reordered greedily by the remaining variance they explain."""
+    """Return the weights with components reordered greedily by the remaining variance that each explains."""
     W1, b1, W2, b2, W3, b3, W4, b4 = _split(flat, shapes)
     components = np.tanh(data @ W1 + b1) @ W2 + b2
     order: list[int] = []

@@ -1,4 +1,4 @@
-"""The optimiser of the paper (section 4): descent along finite differences, then a dense local search.
+"""The optimiser of the paper (section 4): descent with finite differences, then a dense local search.
 
 It exists for comparison; `tracking.contour.solver` is faster and more accurate.
 """
@@ -32,22 +32,22 @@ class PaperConfig:
     boundary_weight: float = 0.4
     # Resolution at the teeth [px/mm]: about that of the paper's 940 x 480 buffer and of the default solver.
     working_px_per_mm: float = 7.2
-    # Half step of the finite differences: smaller steps see discrete pixel jumps, larger ones curvature.
+    # Half step of the finite differences: smaller steps are dominated by pixel quantisation, larger ones by curvature.
     difference_rad: float = radians(0.3)
     difference_mm: float = 0.15
-    # Length of the line search: the motion between two frames of an exercise.
+    # Length of the line search: about the motion between two frames of an exercise.
     reach_rad: float = radians(1.0)
     reach_mm: float = 1.0
-    # Interval at which the golden-section search stops: a motion of a tenth of a pixel.
+    # Interval length at which the golden-section search stops: a motion of a tenth of a pixel.
     tolerance_rad: float = radians(0.01)
     tolerance_mm: float = 0.01
-    # Rounds of rotation and translation; most frames need fewer than ten.
+    # Largest number of rounds of rotation and translation; most frames need fewer than ten.
     most_rounds: int = 40
     # Dense samples: number per degree of freedom (odd), and spacing.
     dense_samples: int = 3
     dense_rad: float = radians(0.2)
     dense_mm: float = 0.1
-    # Whether to ignore boundary pixels inside the mask of the other arch. The paper counts them, which pulls the lower
+    # Whether to ignore boundary pixels inside the mask of the other arch. The paper counts them, which biases the lower
     # arch out from behind the upper one when the teeth are closed.
     other_row_hides: bool = False
 
@@ -65,7 +65,7 @@ def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig
     """Minimise the energy of one arch at one instant.
 
     The six parameters are those of eq. 6, R = Rz(theta_z) Ry(theta_y) Rx(theta_x) and t, relative to the start: zero is
-    the pose of the previous frame, and rotations are about the centroid of the teeth. The paper leaves this open.
+    the pose of the previous frame, and rotations are about the centroid of the teeth. The paper does not specify this.
 
     Args:
         energy: E of poses (N, 4, 4), shape (N,).
@@ -120,7 +120,7 @@ def golden_section(line: Line, reach: float, tolerance: float) -> tuple[float, f
     """Find a minimum on [0, reach] by golden-section search (J. Kiefer, Proc. AMS 4, 1953).
 
     Args:
-        line: function values at a list of points.
+        line: function that returns its values at a list of points.
         reach: end of the interval.
         tolerance: interval length at which the search stops.
 
@@ -143,7 +143,7 @@ def golden_section(line: Line, reach: float, tolerance: float) -> tuple[float, f
 
 
 def _poses(start: Array, centre: Array, parameters: Array) -> Array:
-    """Return T_world_scan of angles and translations (N, 6) relative to the start, shape (N, 4, 4)."""
+    """Return T_world_scan for angles and translations (N, 6) relative to the start, shape (N, 4, 4)."""
     cx, cy, cz = np.cos(parameters[:, :3]).T
     sx, sy, sz = np.sin(parameters[:, :3]).T
     R = np.array(

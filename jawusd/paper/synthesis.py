@@ -17,7 +17,7 @@ from jawusd.fitting.metric import MandibleMetric
 POSES = 1000
 BOX, POLYGONS, SLICES = "static: box", "dynamic: two polygons", "dynamic: slice hull"
 
-_BATCH, _BATCHES = 4000, 50  # rejection sampling; bounds filling less than 0.5 % of their box yield fewer poses
+_BATCH, _BATCHES = 4000, 50  # rejection sampling; bounds that fill less than 0.5 % of their box yield fewer poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Bounds:
     polygons: PolygonBound  # the paper's alpha shapes
     rings: tuple[tuple[Array, ...], tuple[Array, ...]]  # their outlines in (d1, d2) and (d1, d3) [mm], each ring (n, 2)
     slices: SliceHull  # the slice hull
-    slices_box: Array  # the box that holds the slice hull [mm], shape (3, 2)
+    slices_box: Array  # bounding box of the slice hull [mm], shape (3, 2)
 
     @classmethod
     def of(cls, d: Array, alpha: float) -> Bounds:
@@ -41,7 +41,7 @@ class Bounds:
         return cls(box, polygons, (lateral, protrusive), SliceHull.from_arrays(hull), valid_box(hull))
 
     def draw(self, rng: np.random.Generator) -> dict[str, Array]:
-        """Return up to `POSES` uniformly distributed parameters (n, 3) [mm] within each bound, by its name."""
+        """Return up to `POSES` uniformly distributed parameters (n, 3) [mm] within each bound, keyed by its name."""
         return {
             BOX: _spread(self.box, lambda d: np.full(len(d), -1.0), rng),
             POLYGONS: _spread(self.box, self.polygons.signed_distance, rng),
@@ -61,8 +61,8 @@ def _spread(box: Array, excess: Callable[[Array], Array], rng: np.random.Generat
 
 def distance_to_nearest(metric: MandibleMetric, motion: Array, captured: Array) -> Array:
     """Return the largest vertex distance (n,) [mm] of motions (n, 4, 4) to the nearest captured motion (N, 4, 4)."""
-    # The rms distance is Euclidean in these columns and never exceeds the largest distance, so only captured poses
-    # within the best known largest distance can be nearer.
+    # The rms distance is Euclidean in these columns and never exceeds the largest vertex distance, so only captured
+    # poses whose rms distance is below the best largest distance so far can be nearer.
     at, places = _columns(metric, motion), _columns(metric, captured)
     tree = cKDTree(places)
     guess = tree.query(at)[1]

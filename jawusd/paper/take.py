@@ -1,4 +1,4 @@
-"""A whole take tracked with the paper's method: from the picks on, each frame starts at the pose of its neighbour."""
+"""Tracking of a whole take with the paper's method: from the picks on, each frame starts at its neighbour's pose."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ def track_capture_paper(
 ) -> Tracks:
     """Track both arches through a capture with the paper's method.
 
-    The method detects neither failure nor uncertainty: an arch with at least two masks counts as tracked however badly
-    it fits. Covariances, sigmas, residuals and matched lengths are NaN, meaning unknown, and models fitted to these
-    tracks weight all frames equally. The only quality measure is `coverage_error`.
+    The method neither detects failure nor estimates uncertainty: an arch with at least two masks counts as tracked
+    however badly it fits. Covariances, sigmas, residuals and matched lengths are NaN, meaning unknown, and models
+    fitted to these tracks weight all frames equally. The only quality measure is `coverage_error`.
 
     Args:
         capture: masks, bootstrap picks and frame range.
@@ -153,7 +153,7 @@ def _instant(
     last: Array,
     views: Sequence[View],
 ) -> _Record:
-    """Align both arches independently; an arch with too few masks keeps its pose and counts as lost."""
+    """Align both arches independently; an arch with too few masks keeps its previous pose and counts as lost."""
     poses, status = last.copy(), np.full(2, LOST, np.int8)
     coverage = np.full((2, len(views)), np.nan)
     for r in ARCHES:

@@ -1,4 +1,4 @@
-"""Bones and teeth of a synthetic person, matching the person's joint, in occlusion at the identity pose."""
+"""Bones and teeth of a synthetic person that match the person's joint; teeth are in occlusion at the identity pose."""
 
 from __future__ import annotations
 

@@ -14,24 +14,24 @@ from jawusd.geometry.points import meet_triangles
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.surfaces import vertex_normals
 
-# Amplitude and cell size of the jitter [px] at a picture height of 1080; the constant fraction of its variance and the
-# temporal correlation of the rest.
+# Amplitude and cell size of the jitter [px] at an image height of 1080; the fraction of its variance that is constant
+# over time, and the frame-to-frame correlation of the rest.
 _WOBBLE_PX, _CELL_PX = 0.7, 36.0
 _REFERENCE_HEIGHT = 1080.0
 _CONSTANT_SHARE = 0.5
 _KEEP = 0.6
 _HOLE_CHANCE, _SPECK_CHANCE = 0.12, 0.08
 _FINE = 4
-# Smallest distance of a pick to the picture border, and smallest cosine between ray and normal (about 70 degrees).
+# Smallest distance of a pick to the image border, and smallest cosine between ray and normal (about 70 degrees).
 _BORDER_PX = 10.0
 _FACING = 0.35
-# A surface closer to the camera by more than this hides a point.
+# A surface occludes a point if it is closer to the camera by more than this.
 _CLEARANCE_MM = 0.05
 _TIPS_PER_TOOTH = 6
 
 
 class Outline:
-    """Jitter of a mask's outline over time as a displacement field."""
+    """Jitter of a mask's outline over time, as a displacement field."""
 
     def __init__(self, size_px: tuple[int, int], rng: np.random.Generator) -> None:
         """Initialise for masks of a width and height."""
@@ -43,7 +43,7 @@ class Outline:
         self._varying = rng.normal(size=(*cells, 2))
 
     def next(self) -> Array:
-        """Return the displacement field over the picture for the next frame [px], shape (rows, columns, 2)."""
+        """Return the displacement field over the image for the next frame [px], shape (rows, columns, 2)."""
         fresh = self._rng.normal(size=self._varying.shape)
         self._varying = _KEEP * self._varying + np.sqrt(1.0 - _KEEP**2) * fresh
         field = np.sqrt(_CONSTANT_SHARE) * self._constant + np.sqrt(1.0 - _CONSTANT_SHARE) * self._varying
@@ -64,7 +64,7 @@ def _refined(field: Array, axis: int) -> Array:
 
 
 def drawn_mask(coverage: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Return a mask (h, w), 0 or 255, from the coverage (h, w), 0..255, sometimes with a small hole or speck."""
+    """Threshold the coverage (h, w), 0..255, to a mask (h, w), 0 or 255; sometimes add a small hole or speck."""
     mask = coverage > 127
     hole, speck = rng.random() < _HOLE_CHANCE, rng.random() < _SPECK_CHANCE
     place, radius = rng.random(2), rng.uniform(1.2, 3.5, 2) * len(mask) / _REFERENCE_HEIGHT * 1.5
@@ -87,7 +87,7 @@ def _ellipse(mask: Mask, row: float, column: float, radius: Array, value: bool) 
 
 @dataclass(frozen=True)
 class VisibleVertex:
-    """A vertex of a scan and its pixels (camera, x, y) in two cameras."""
+    """A vertex of a scan and its image points (camera, x, y) in two cameras."""
 
     vertex: int
     views: tuple[tuple[str, float, float], ...]
@@ -106,8 +106,8 @@ def choose_picks(
 
     Args:
         T_world_arch: pose of the arch, shape (4, 4).
-        occluders: meshes that may hide the teeth, including the arch itself, in world coordinates.
-        noise_px: standard deviation of the picked pixels, per axis.
+        occluders: meshes that may occlude the teeth, including the arch itself, in world coordinates.
+        noise_px: standard deviation of the picked image points, per axis.
 
     Raises:
         ValueError: too few vertices are visible in two cameras.
@@ -144,7 +144,7 @@ def _tips(arch: DentalArch) -> NDArray[np.int64]:
 
 
 def _seen(camera: Camera, points: Array, normals: Array, occluders: list[Mesh]) -> Array:
-    """Return the cosine between normals and rays of a camera, 0 for hidden or averted points, shape (N,)."""
+    """Return the cosine between normals and viewing rays, 0 for occluded or back-facing points, shape (N,)."""
     eye = camera.centre_world()
     rays = eye - points
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -154,7 +154,7 @@ def _seen(camera: Camera, points: Array, normals: Array, occluders: list[Mesh]) 
     facing[((pixels < _BORDER_PX) | (pixels > limit)).any(1)] = 0.0
     facing[facing < _FACING] = 0.0
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in occluders])
-    # A triangle can hide a point only if its bounding box in the picture contains the point.
+    # A triangle can occlude a point only if its bounding box in the image contains the point.
     pixels_of_corners = camera.project_pinhole(corners)
     low, high = pixels_of_corners.min(1), pixels_of_corners.max(1)
     at = camera.project_pinhole(points)

@@ -1,6 +1,6 @@
 """The mandible and the adjacent parts of the skull: fossa and eminence, cheekbone, upper jaw bone; without teeth.
 
-The joint surfaces follow the person's kinematics: condyles that slide along them trace the paths of
+The joint surfaces follow from the person's kinematics: condyles that slide along them trace the paths of
 `jawusd.synthetic.kinematics`. Everything is in the scan frame [mm], in the closed bite.
 """
 
@@ -84,7 +84,7 @@ def _spline(knots: Array, values: Array, at: Array) -> Array:
 
 
 def _body(joint: Joint) -> tuple[Array, Faces]:
-    """Return the horseshoe from ramus to ramus, below the lower gum."""
+    """Return the horseshoe of the body, from ramus to ramus, below the lower gum."""
     x, y, z = joint.incisor
     # x, y of the middle, z, half width, half height; from the chin to the left ramus
     half = np.array(
@@ -101,7 +101,7 @@ def _body(joint: Joint) -> tuple[Array, Faces]:
 
 
 def _ramus(joint: Joint, side: float, centre: Array) -> tuple[Array, Faces]:
-    """Return the plate from the angle of the jaw up to the notch."""
+    """Return the plate of one ramus, from the angle of the jaw up to the notch."""
     # height below the condyle, inward shift, forward position of its middle, half thickness, half length
     rows = np.array(
         [
@@ -137,7 +137,7 @@ def _condyle(side: float, centre: Array) -> tuple[Array, Faces]:
 
 
 def _coronoid(side: float, centre: Array) -> tuple[Array, Faces]:
-    """Return the process in front of the notch."""
+    """Return the coronoid process, in front of the notch."""
     rows = np.array(
         [
             [-24.0, 2.5, 21.0, 2.6, 7.0],

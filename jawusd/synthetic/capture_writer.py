@@ -46,19 +46,20 @@ _SCANS = ("upper_teeth", "lower_teeth", "mandible", "skull")
 _PICKS = 4
 _PICK_NOISE_PX = 1.0
 _PICTURES_PER_BOARD = 2
-# Sensor noise [grey levels of 255]: random shifts of a few patterns, instead of a new one per picture.
+# Standard deviation of the sensor noise [grey levels of 255], which shifts a few patterns randomly instead of drawing a
+# new one per image.
 _SENSOR_NOISE = 1.3
 _NOISE_PATTERNS = 5
 
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Person and size of a synthetic capture."""
+    """Seed, size and quality of a synthetic capture."""
 
-    seed: int = 0  # of person and performance
-    frames: int = 240  # tracked frames at 24 per second
-    size_px: tuple[int, int] = (1280, 720)  # width and height of the pictures
-    boards: int = 24  # poses of the calibration board
+    seed: int = 0  # seed of the person and the performance
+    frames: int = 240  # number of tracked frames, at 24 per second
+    size_px: tuple[int, int] = (1280, 720)  # width and height of the images
+    boards: int = 24  # number of poses of the calibration board
     quality_crf: int = 23  # H.264 constant rate factor of the videos
 
     def __post_init__(self) -> None:
@@ -71,9 +72,9 @@ class DemoConfig:
 
 
 def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Progress | None = None) -> Path:
-    """Record a synthetic person into a capture folder, overwriting existing files; return the path of capture.toml.
+    """Record a synthetic person to a capture folder, overwriting existing files; return the path of capture.toml.
 
-    Progress is reported in pictures, done and total.
+    Progress is reported as the number of images done and the total.
 
     Raises:
         MissingDependencyError: there is no headless OpenGL (EGL).
@@ -99,7 +100,7 @@ def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Pro
 
 
 class _Recorder:
-    """Renders every picture of a capture and writes the video files."""
+    """Renders every image of a capture and writes the video files."""
 
     def __init__(
         self, folder: Path, config: DemoConfig, cameras: list[Camera], renderer: Renderer, progress: Progress | None
@@ -118,7 +119,7 @@ class _Recorder:
         self.picks: dict[str, list[VisibleVertex]] = {}
 
     def performance(self, scene: Scene, take: Take) -> None:
-        """Record the exercises with videos and masks, and the picks of the first tracked frame."""
+        """Record videos and masks of the exercises, and the picks in the first tracked frame."""
         outlines = [[Outline(self._config.size_px, rng) for _ in ("upper", "lower")] for rng in self._rng]
         black = np.zeros(self._config.size_px[::-1], np.uint8)
         with contextlib.ExitStack() as stack:

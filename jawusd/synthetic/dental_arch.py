@@ -17,7 +17,7 @@ from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
 
 RED, GREEN, GREY = (215, 45, 40), (40, 190, 60), (150, 150, 150)
-# Depth of the contact points behind the incisal edges and buccal cusp tips [mm]; the teeth are aligned at them.
+# Depth of the contact points behind the incisal edges and buccal cusp tips [mm]; teeth are aligned at contact points.
 CONTACT_MM = 0.9
 CONTACT_OVERLAP_MM = 0.22
 _BOUNDARY_MM = 2.5
@@ -32,9 +32,9 @@ COLUMN_MM = 0.55
 class ArchShape:
     """Shape and position of one arch."""
 
-    quadratic_per_mm: float  # the line of edges and buccal cusps recedes by a x^2 + b x^4: a [1/mm]
-    quartic_per_mm3: float  # b [1/mm^3]
-    setback_mm: float  # distance of this line inside that curve
+    quadratic_per_mm: float  # a of the curve z = -(a x^2 + b x^4) outside the edges and buccal cusps [1/mm]
+    quartic_per_mm3: float  # b of this curve [1/mm^3]
+    setback_mm: float  # distance by which the edges and buccal cusps lie inside this curve
     # height of edge or highest cusp of each tooth, first incisor to second molar, left then right, shape (2, 7)
     tips_mm: Array
     midline_mm: float  # x of the midline
@@ -89,8 +89,8 @@ def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float
     Args:
         forms: tooth kinds from the first incisor to the second molar.
         cusp_slope: drop of the cusps per mm.
-        upper: mirror it downwards.
-        seed: seed of the positions and irregularities of the teeth, independent of their tips.
+        upper: whether to mirror the arch downwards.
+        seed: seed of the positions and irregularities of the teeth; they do not depend on the heights of the tips.
     """
     rng = np.random.default_rng([seed, 0x7EE7, int(upper)])
     line = ArchLine(shape)
@@ -123,7 +123,7 @@ def _centres(forms: tuple[CrownForm, ...]) -> Array:
 def _placed(
     local: Array, form: CrownForm, line: ArchLine, s: float, side: int, tip_mm: float, rng: np.random.Generator
 ) -> Array:
-    """Transform a crown to its position, occlusal side up."""
+    """Return a crown's vertices transformed to its position in the arch, occlusal side up."""
     point, normal = line.at(np.array(s))
     distal = side * np.array([normal[1], 0.0, -normal[0]])
     facial = np.array([normal[0], 0.0, normal[1]])
@@ -163,7 +163,7 @@ def gum_ridge(line: ArchLine, s: Array, margin: Array, crowns: Array) -> tuple[A
 
     Args:
         s: arc lengths of the cross-sections, evenly spaced, shape (S,).
-        margin: height of the gum margin there [mm], shape (S,).
+        margin: height of the gum margin at each cross-section [mm], shape (S,).
         crowns: vertices of the crowns, shape (V, 3).
     """
     crown_s, crown_n = line.coordinates(crowns[:, [0, 2]])
@@ -200,7 +200,7 @@ def _margin(forms: tuple[CrownForm, ...], shape: ArchShape, s: Array) -> Array:
 
 
 def _crown_extent(s: Array, margin: Array, crown_s: Array, crown_n: Array, crown_y: Array) -> tuple[Array, Array]:
-    """Return the largest facial and lingual offset of the crowns at the margin, per column of the gum."""
+    """Return the largest facial and lingual offsets of the crowns at the margin, for each cross-section of the gum."""
     facial, lingual = np.full(len(s), np.nan), np.full(len(s), np.nan)
     for i, (column, level) in enumerate(zip(s, margin, strict=True)):
         near = (np.abs(crown_s - column) < 0.8) & (np.abs(crown_y - level) < 1.2)

@@ -40,8 +40,8 @@ class Recording:
 
     controls: Array  # opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3)
     phase: NDArray[np.str_]  # name of the exercise of each frame, shape (F,)
-    T_manifold: Array  # poses of the controls alone
-    T_true: Array  # poses with small extra movements
+    T_manifold: Array  # poses that follow from the controls alone
+    T_true: Array  # the same with small additional movements
     T_noisy: Array  # `T_true` with tracking noise
 
 
@@ -52,7 +52,7 @@ def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", no
         n_frames: number of frames; the paper trained on 833.
         kind: "training": clinical exercises, chewing and speech; "hidden": a different order, other amplitudes and
             random motion through the whole envelope, to test models fitted to "training".
-        noise_scale: multiplies the tracking noise.
+        noise_scale: factor on the tracking noise.
 
     Raises:
         ValueError: the kind is unknown or there is less than one frame.
@@ -113,7 +113,7 @@ def _faster(curve: Array, tempo: float) -> Array:
 
 
 def smoothed(curves: Array) -> Array:
-    """Smooth curves (F, n) in time with a seven-frame Hann window, since muscles move smoothly."""
+    """Smooth curves (F, n) in time with a seven-frame Hann window, since muscles move the jaw smoothly."""
     kernel = np.hanning(9)[1:-1]
     kernel = kernel / kernel.sum()
     padded = np.pad(curves, ((3, 3), (0, 0)), mode="edge")
@@ -139,7 +139,7 @@ def _swing(n: int) -> Array:
 
 
 def _border(n: int, turn: float, end: int) -> tuple[Array, Array]:
-    """Trace the border: move to one side while closed, open along it, cross over and close along the other side.
+    """Trace the border: move to one side while closed, open along that side, cross over, close along the other side.
 
     The mandible crosses over during the fraction `turn` of the closing and returns to the middle in the last `end`
     frames.

@@ -1,8 +1,8 @@
 """Temporomandibular joint: two condyles on curved eminences, driven by opening, lateral and protrusion controls.
 
 Frame: scan frame (x to the subject's left, y up, z anterior, mm), teeth in occlusion at identity. The mandible has four
-joint coordinates: the pitch about the condylar axis, the forward slide of each condyle, and the side shift. The
-eminences determine the heights and the constant distance between the condyles their lateral positions, so both
+joint coordinates: the pitch about the condylar axis, the forward slide of each condyle, and the side shift. The heights
+of the condyles follow from the eminences, and their lateral positions from the constant distance between them, so both
 condyles stay on their slopes in every pose. Joint surfaces, guidance and ranges follow textbook TMJ mechanics
 (Posselt 1952, Okeson 2019) and share nothing with the models that jawusd fits.
 """
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry import make_transform, so3_exp
 
-# Pitch [rad] over which the Gaussian tooth guidance falls by a factor of e.
+# Pitch [rad] at which the Gaussian tooth guidance has decreased by a factor of e.
 _CONTACT_FADE_RAD = np.deg2rad(4.0)
 # Rounding of corners in the tooth guidance [mm], since cusps are blunt.
 _CUSP_ROUNDING_MM = 0.3
@@ -29,15 +29,15 @@ class Joint:
 
     condyles: Array  # centres of the condyles at rest, shape (2, 3)
     incisor: Array  # lower incisal point at rest, shape (3,)
-    eminence_height_mm: Array  # drop of each eminence from fossa over its crest, shape (2,)
+    eminence_height_mm: Array  # drop of each eminence from fossa to crest, shape (2,)
     eminence_width_mm: Array  # half width of the slope, shape (2,)
     eminence_start_mm: Array  # forward distance from rest to the steepest point, shape (2,)
     medial_slope: Array  # drop per medial mm, shape (2,)
     bennett_rad: Array  # angle of each condyle's path to the sagittal plane on the balancing side, shape (2,)
     side_shift_mm: Array  # immediate side shift for each working side, shape (2,)
     lateral_max_mm: Array  # largest difference of the two slides for each working side, shape (2,)
-    lateral_shrink: float  # fraction of it lost at full opening
-    working_share: float  # fraction of the difference taken by the balancing condyle when closed
+    lateral_shrink: float  # fraction by which that difference shrinks at full opening
+    working_share: float  # fraction of the difference that is the balancing condyle's slide when closed
     rotation_max_rad: float  # pitch at full opening
     rotation_bend: float  # curvature of pitch over opening (0: proportional)
     slide_open_mm: float  # forward slide at full opening
@@ -48,7 +48,7 @@ class Joint:
     retrusion_max_mm: float  # backward slide in full retrusion, closed
     hinge_share: float  # fraction of the opening slide reversed by retrusion below half opening
     deviation_mm: Array  # lateral deviation of the opening path: S-shaped and one-sided part, shape (2,)
-    protrusive_guidance: Array  # glide of the teeth: initial slope, later slope, transition [mm], shape (3,)
+    protrusive_guidance: Array  # tooth guidance: initial slope, later slope, transition length [mm], shape (3,)
     lateral_guidance: Array  # the same for lateral movements, shape (3,)
 
     @property
@@ -63,7 +63,7 @@ class Joint:
 
 
 def smoothstep(x: ArrayLike) -> Array:
-    """Blend from 0 to 1 over 0..1 with zero slope at the ends, any shape."""
+    """Return a smooth step from 0 to 1 over x in 0..1 with zero slope at both ends, any shape."""
     x = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
@@ -145,7 +145,7 @@ def controlled_pose(
 
 
 def _coupling(joint: Joint, opening: Array) -> Array:
-    """Return the fraction of the opening slide at an opening: translation starts early but lags behind the rotation."""
+    """Return the fraction of the full slide at an opening: translation starts early but lags behind rotation."""
     onset = joint.slide_onset
     early = opening**2 * (1.0 + onset) / (opening + onset)
     return joint.slide_early * early + (1.0 - joint.slide_early) * smoothstep(opening)
@@ -160,7 +160,7 @@ def _protrusive_range(joint: Joint, opening: Array, share: Array, protrusion: Ar
 
 
 def _lateral_range(joint: Joint, opening: Array, mean_mm: Array, lateral: Array) -> Array:
-    """Return the largest difference of the slides [mm], also limited by the stop of the balancing condyle."""
+    """Return the largest difference between the slides [mm], also limited by the stop of the balancing condyle."""
     own = np.where(lateral > 0, joint.lateral_max_mm[0], joint.lateral_max_mm[1])
     own = own * (1.0 - joint.lateral_shrink * np.clip(opening, 0.0, 1.1) ** 1.1)
     room = (joint.slide_limit_mm + 1.2 - mean_mm) / (joint.working_share - 0.45 * smoothstep(opening))
@@ -188,7 +188,7 @@ def _side_shift(joint: Joint, opening: Array, difference_mm: Array, balancing: A
 
 
 def _guided(joint: Joint, pitch: Array, slides: Array, forward_mm: Array, difference_mm: Array) -> Array:
-    """Return the pitch with tooth contact: near closure the incisors follow the glide, independent of the condyles."""
+    """Return the pitch with tooth contact: near closure, guidance alone determines the height of the incisors."""
     lateral_mm = difference_mm * joint.lever_mm / joint.condylar_distance_mm
     drop_mm = _glide(joint.protrusive_guidance, _soft_positive(forward_mm))
     drop_mm = drop_mm + _glide(joint.lateral_guidance, np.hypot(lateral_mm, _CUSP_ROUNDING_MM) - _CUSP_ROUNDING_MM)
@@ -198,7 +198,7 @@ def _guided(joint: Joint, pitch: Array, slides: Array, forward_mm: Array, differ
 
 
 def _glide(guidance: Array, distance_mm: Array) -> Array:
-    """Return the drop of the lower incisors after a glide [mm]: steep at first, flatter towards edge-to-edge."""
+    """Return the drop of the lower incisors over a glide distance [mm]: steep first, flatter towards edge-to-edge."""
     steep, flat, transition_mm = guidance
     return flat * distance_mm + (steep - flat) * transition_mm * -np.expm1(-distance_mm / transition_mm)
 

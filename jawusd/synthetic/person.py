@@ -29,7 +29,7 @@ _GRID = (13, 9, 9)
 # Poses near zero protrusion need the most steps, since the manifold has a kink there.
 _STEPS = 30
 _DIFFERENCE = 1e-5
-# Relative damping per control: at these poses their gradients differ by a factor of ten.
+# Damping relative to the scale of each control, since their gradients differ by a factor of ten.
 _DAMPING = 1e-3
 _CHUNK = 2000
 EnvelopeKind = Literal["box", "competing"]
@@ -129,7 +129,7 @@ class Envelope:
 
 
 def _asymmetric(rng: np.random.Generator, value: float, relative: float) -> Array:
-    """Left and right value around a common one."""
+    """Draw a left and a right value around a common one."""
     return value * (1.0 + relative * rng.uniform(-1.0, 1.0, 2))
 
 
@@ -174,26 +174,26 @@ def draw_joint(rng: np.random.Generator) -> Joint:
 class Noise:
     """Standard deviations of tracking noise and of movements outside the three controls."""
 
-    tracking_mm: float  # at the middle of the dental arch, per axis, independent between frames
-    tracking_rad: float  # of the rotation, per axis, independent between frames
+    tracking_mm: float  # translation at the middle of the dental arch, per axis, independent between frames
+    tracking_rad: float  # rotation, per axis, independent between frames
     side_mm: float  # side shift outside the three controls, smooth in time
     lift_mm: float  # lift of each condyle off its eminence, smooth in time
 
 
 class Person:
-    """One synthetic person, all numbers drawn from the seed.
+    """One synthetic person, with all parameters drawn from the seed.
 
     Attributes:
         landmarks: `jawusd.geometry.LANDMARKS` on the mandible, scan frame [mm], shape (5, 3).
-        mandible_points: points spread over the whole mandible for errors of poses, scan frame [mm], shape (42, 3).
+        mandible_points: points all over the mandible, for measuring pose errors, scan frame [mm], shape (42, 3).
     """
 
     def __init__(self, seed: int, envelope: EnvelopeKind = "box") -> None:
         """Draw a person.
 
         Args:
-            envelope: "box": lateral and protrusive range do not depend on each other; "competing": a wide lateral
-                movement leaves less room for protrusion (|lateral|^1.3 + protrusion^1.3 <= 1).
+            envelope: "box": lateral and protrusive range are independent; "competing": a wide lateral movement reduces
+                the protrusive range (|lateral|^1.3 + protrusion^1.3 <= 1).
 
         Raises:
             ValueError: unknown envelope.
@@ -224,14 +224,15 @@ class Person:
         return controlled_pose(self.joint, opening, lateral, protrusion, extra_mm)
 
     def limit(self, controls: ArrayLike) -> Array:
-        """Return controls (..., 3) brought into the envelope; those inside are unchanged."""
+        """Return controls (..., 3) limited to the envelope; those inside are unchanged."""
         return self._envelope.limit(np.asarray(controls, dtype=np.float64))
 
     def nearest(self, T_skull_mandible: ArrayLike, bounded: bool = True) -> tuple[Array, Array]:
         """Find the poses of the manifold nearest to given ones (..., 4, 4), in the rms distance of the mandible points.
 
         Args:
-            bounded: stay within the envelope; False gives the lower limit of the error of any three-parameter fit.
+            bounded: whether to stay within the envelope. If not, the distance is a lower limit on the error of any
+                three-parameter fit.
 
         Returns:
             Controls (..., 3), and the largest distance of a mandible point [mm], shape (...).
@@ -241,7 +242,7 @@ class Person:
     def is_valid(self, T_skull_mandible: ArrayLike, tolerance_mm: float = 1.0) -> Mask:
         """Return which poses (..., 4, 4) are possible: all mandible points within the tolerance of a possible pose.
 
-        The extra movements alone reach 0.7 mm.
+        The movements outside the three controls alone reach 0.7 mm.
         """
         return self.nearest(T_skull_mandible)[1] <= tolerance_mm
 
@@ -251,7 +252,7 @@ class Person:
 
 
 def _mandible_points(joint: Joint) -> Array:
-    """Points on condyles, coronoids, rami, lower border, chin and teeth, scan frame, shape (42, 3)."""
+    """Return points on condyles, coronoids, rami, lower border, chin and teeth, scan frame [mm], shape (42, 3)."""
     x, y, z = joint.incisor
     points = []
     for side, centre in zip((1.0, -1.0), joint.condyles, strict=True):

@@ -1,7 +1,7 @@
-"""Render the synthetic scene with OpenGL: colour pictures and exact teeth masks through distorted lenses.
+"""Render the synthetic scene with OpenGL: colour images and exact teeth masks through distorted lenses.
 
-The scene is rendered without distortion at a multiple of the picture's size. Every pixel of the picture then samples it
-along its distorted ray, so that straight edges bend as in a real lens.
+The scene is rendered without distortion at a multiple of the image's size. Every pixel of the image then samples that
+rendering along its distorted ray, so that straight edges bend as in a real lens.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jawusd.synthetic.soft_tissue import Surface
 from jawusd.synthetic.surfaces import vertex_normals
 
 NEAR_MM, FAR_MM = 80.0, 700.0
-#: Labels of surfaces; all surfaces occlude the teeth.
+#: Labels of surfaces; surfaces of every label can occlude the teeth.
 OTHER, UPPER_TEETH, LOWER_TEETH = 0, 1, 2
 _NOTHING = 9.0
 _SCALE = 2
@@ -30,7 +30,7 @@ _BACKDROP = (0.035, 0.050, 0.066)
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """One rendered picture.
+    """One rendered image.
 
     Attributes:
         color: sRGB-like, shape (h, w, 3).
@@ -43,7 +43,7 @@ class Picture:
 
 
 class Renderer:
-    """Renders named surfaces through cameras of the same picture size; a context manager that frees the GL context."""
+    """Renderer of named surfaces for cameras of one image size; a context manager that frees the GL context."""
 
     def __init__(self, cameras: list[Camera]) -> None:
         """Open a headless GL context and prepare the cameras, all of the same size.
@@ -93,15 +93,15 @@ class Renderer:
         light: float = 1.0,
         jitter_px: tuple[Array, Array] | None = None,
     ) -> Picture:
-        """Render a picture.
+        """Render an image.
 
         Args:
             camera: index of the camera.
             T_world_part: poses of the surfaces to draw, (4, 4) each; other surfaces are hidden.
-            T_world_head: pose of the skull, shape (4, 4), which determines the depth inside the mouth.
-            light: brightness, 1 is normal.
+            T_world_head: pose of the skull, shape (4, 4), from which depth inside the mouth is measured for shading.
+            light: brightness factor.
             jitter_px: displacement fields of the upper and the lower mask [px], shape (gh, gw, 2) each, stretched over
-                the picture; None is zero.
+                the image; None is zero.
         """
         with self._gl:
             self._draw_scene(self._cameras[camera], T_world_part, T_world_head, light)
@@ -177,7 +177,7 @@ class Renderer:
         self._lens_quad = gl.vertex_array(self._lens_program, [(corners, "2f", "in_corner")])
 
     def _projection(self, view: Camera) -> Array:
-        """Return the OpenGL clip matrix of the enlarged and padded pinhole picture, first row at the top."""
+        """Return the OpenGL clip matrix of the enlarged and padded pinhole image, first row at the top."""
         (width, height), m = self._scene_size, self._margin
         K = np.diag([_SCALE, _SCALE, 1.0]) @ view.K  # pixel centres coincide with scene pixel centres
         out = np.zeros((4, 4))
@@ -192,7 +192,7 @@ class Renderer:
         """Return the displacement from recorded to pinhole pixels on a coarse grid, for linear sampling."""
         width, height = self._size
         columns, rows = -(-width // _BEND_STEP_PX), -(-height // _BEND_STEP_PX)
-        # Texel centres in pixels of the picture.
+        # Texel centres in image pixels.
         x = (np.arange(columns) + 0.5) * width / columns - 0.5
         y = (np.arange(rows) + 0.5) * height / rows - 0.5
         pixels = np.stack(np.meshgrid(x, y), -1)
@@ -278,5 +278,5 @@ def _context() -> moderngl.Context:
             f"rendering needs OpenGL 3.3 through EGL, which failed to start ({error}).",
             hint="Install it, on Debian or Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri",
         ) from error
-    context.front_face = "cw"  # pictures are rendered with their first row at the bottom of the target
+    context.front_face = "cw"  # images are rendered with their first row at the bottom of the target
     return context

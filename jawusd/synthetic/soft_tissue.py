@@ -1,4 +1,4 @@
-"""Lips, face, mouth lining, palate and tongue, which surround and occlude the teeth in pictures.
+"""Lips, face, mouth lining, palate and tongue, which surround the teeth and occlude them in images.
 
 The face is a single grid of rings around the mouth, from the throat over cheek lining and lips to the edge of the face.
 It is built in the scan frame for the closed bite and follows the mandible by linear blend skinning.
@@ -25,7 +25,7 @@ _THROAT = np.array([0.10, 0.025, 0.025])
 _TONGUE = np.array([0.72, 0.36, 0.35])
 _PALATE = np.array([0.70, 0.40, 0.38])
 
-# Midline profile of the face from the neck up, with retracted lips: height and depth [mm].
+# Midline profile of the face from the neck up, with retracted lips: rows of height and depth [mm].
 _PROFILE = np.array(
     [
         [-95.0, -58.0], [-75.0, -48.0], [-62.0, -34.0], [-54.0, -18.0], [-48.0, -6.5], [-42.0, 1.5], [-36.0, 5.0],
@@ -50,8 +50,8 @@ _LIP = np.array(
 class LipState:
     """Shape of the lips."""
 
-    upper_mm: float  # height of the upper lip's midpoint over the upper incisal edge
-    lower_mm: float  # depth of the lower lip's midpoint below the lower incisal edge, which moves with the jaw
+    upper_mm: float  # height of the upper lip's midpoint above the upper incisal edge
+    lower_mm: float  # distance of the lower lip's midpoint below the lower incisal edge, which moves with the jaw
     width_mm: float  # half distance between the corners
     slant: float  # rise of the mouth line per mm to the left
 
@@ -64,8 +64,8 @@ class Surface:
     faces: Faces  # shape (F, 3)
     colors: Array  # linear diffuse reflectance, shape (V, 3), 0..1
     gloss: Array  # strength of the highlight, shape (V,), 0..1
-    skin: Array  # 1 on skin texture, 0 elsewhere, shape (V,)
-    inside: Array  # 1 inside the mouth, where light falls off with depth, shape (V,)
+    skin: Array  # strength of the skin texture, shape (V,), 0..1
+    inside: Array  # 1 inside the mouth, where light decreases with depth, 0 elsewhere, shape (V,)
 
 
 class Face:
@@ -76,7 +76,7 @@ class Face:
         self._incisor_y = float(lower_incisor[1])
         angle = 2 * np.pi * (np.arange(_COLUMNS) + 0.5) / _COLUMNS
         self._cos, self._sin = np.cos(angle), np.sin(angle)
-        # The lower lip moves with the jaw, the mouth corners by a third of it.
+        # The lower lip moves with the jaw, the mouth corners by a third of the jaw's motion.
         self._follow = smoothstep((0.35 - self._sin) / 0.95)
         lining_rows, lip_rows = 4, len(_LIP)
         self.rows = lining_rows + lip_rows + _SKIN_ROWS
@@ -129,7 +129,7 @@ class Face:
         shape = np.abs(self._sin) ** 0.8
         y = middle + np.where(self._sin > 0, upper, -lower) * shape
         x = lips.width_mm * np.sign(self._cos) * np.abs(self._cos) ** 0.9
-        # The notch in the middle of the upper lip.
+        # Add the notch in the middle of the upper lip.
         y = y - 0.9 * np.exp(-((x / 4.0) ** 2)) * (self._sin > 0)
         return np.stack([x, y + lips.slant * x], -1)
 
@@ -149,7 +149,7 @@ class Face:
         share = (np.arange(1, _SKIN_ROWS + 1) / _SKIN_ROWS)[:, None, None] ** 1.35
         xy = border[None, :, :2] + share * (far - border[:, :2])
         z = _skin_depth(xy[..., 0], xy[..., 1])
-        # The first rows continue the lip smoothly.
+        # Make the first rows continue the lip smoothly.
         offset = border[:, 2] - _skin_depth(border[:, 0], border[:, 1])
         z = z + offset * np.exp(-((share[..., 0] / 0.10) ** 1.5))
         return np.concatenate([xy, z[..., None]], -1)
@@ -168,7 +168,7 @@ def _skin_depth(x: Array, y: Array) -> Array:
     middle = np.mean([np.interp(y + shift, *_PROFILE.T) for shift in (-4.0, -2.0, 0.0, 2.0, 4.0)], axis=0)
     chin = smoothstep((-22.0 - y) / 20.0)
     z = middle - (0.0138 + 0.0045 * chin) * x**2 - 1.1e-6 * x**4
-    # Philtrum, nose and nasolabial folds.
+    # Add philtrum, nose and nasolabial folds.
     lip = np.exp(-(((y - 17.0) / 7.5) ** 2))
     z = z + lip * (0.7 * np.exp(-(((np.abs(x) - 5.0) / 2.6) ** 2)) - 0.8 * np.exp(-((x / 3.0) ** 2)))
     z = z + 15.0 * np.exp(-((x / 12.5) ** 2)) * smoothstep((y - 21.0) / 13.0)

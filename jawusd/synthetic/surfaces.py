@@ -1,4 +1,4 @@
-"""Primitives of closed surfaces: grids, lofts, merged meshes."""
+"""Primitives for surfaces: grids, lofts, merged meshes, normals."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The studio, a performance in front of its cameras, and the scene at any instant.
 
 A studio has three cameras about 200 mm from the mouth and a chessboard. A take samples jaw, head, lips, tongue and
-light; the scene poses the person's surfaces for an instant and renders them.
+light over time; the scene poses the person's surfaces at an instant and renders them.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from jawusd.synthetic.surfaces import grid_faces
 #: Scan frame to world with the head at rest; the world is the first camera's frame: x right, y down, z forward.
 T_WORLD_SCAN = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, -14.0, 214.0])
 BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM = 9, 6, 8.0
-# Focal length over picture width. Per camera: direction from the mouth [deg left, deg up], radial and tangential
-# distortion, and offsets of principal point and focal length relative to the picture width.
+# Focal length over image width. Per camera: direction from the mouth [deg left, deg up], radial and tangential
+# distortion, and offsets of principal point and focal length relative to the image width.
 _FOCAL = 1.494
 _CAMERAS = (
     ((0.0, 0.0), (-0.031, 0.012, 0.0003, -0.0004, 0.0), (0.0043, -0.0031), 1.000),
@@ -35,9 +35,9 @@ _CAMERAS = (
     ((-38.0, -6.0), (-0.034, 0.015, 0.0002, 0.0005, 0.0), (0.0026, 0.0048), 0.994),
 )
 FPS = 24.0
-#: Frames before the first and after the last tracked frame, which contain the flashes.
+#: Numbers of frames before the first and after the last tracked frame, which contain the flashes.
 LEAD, TAIL = 20, 16
-#: Frames of the slightly open mouth and of the closed bite at the start of the tracked range.
+#: Numbers of frames with the mouth slightly open and with the bite closed at the start of the tracked range.
 OPEN_HOLD, REST_HOLD = 10, 12
 _DARK_FRAMES = 4
 _FLASH_START, _FLASH_BEFORE_END = 8, 10
@@ -60,7 +60,7 @@ def build_cameras(size_px: tuple[int, int]) -> list[Camera]:
     cameras = []
     for k, ((left, up), distortion, shift, zoom) in enumerate(_CAMERAS):
         a, b = np.deg2rad([left, up])
-        # The subject's left is on the right in the first camera's picture.
+        # The subject's left is on the right in the first camera's image.
         turn = so3_exp([0.0, -a, 0.0]) @ so3_exp([-b, 0.0, 0.0])
         T_world_cam = np.eye(4)
         if k:
@@ -178,7 +178,7 @@ def _controls(
 
 
 def _drift(n: int, rng: np.random.Generator, count: int) -> Array:
-    """Return slow drifts of unit variance: a few sinusoids of 2 to 7 s, shape (n, count)."""
+    """Return slow drifts of unit variance: sums of sinusoids with periods of 2 to 7 s, shape (n, count)."""
     seconds = np.arange(n) / FPS
     period, phase = rng.uniform(2.0, 7.0, (4, count)), rng.uniform(0.0, 2 * np.pi, (4, count))
     return np.sin(2 * np.pi * seconds[:, None, None] / period + phase).sum(1) / np.sqrt(2.0)
@@ -194,7 +194,7 @@ def _head(n: int, rng: np.random.Generator) -> Array:
 
 
 def _lips(controls: Array, phase: NDArray[np.str_], rng: np.random.Generator) -> list[LipState]:
-    """Return the lips, retracted to show the teeth, less so in chewing and speech."""
+    """Return the lips of every instant: retracted to show the teeth, less so in chewing and speech."""
     drift = _drift(len(controls), rng, 4)
     relaxed = smoothed(np.isin(phase, ["chew", "speech"]).astype(np.float64)[:, None])[:, 0]
     wide = smoothstep(controls[:, 0])

@@ -32,10 +32,10 @@ class CrownForm:
     depth_mm: float  # facio-lingual
     height_mm: float  # gum line to the highest cusp or the edge
     torque_deg: float  # tilt of the occlusal end towards the facial side
-    # cusps of premolars and molars: x and z relative to half the width and depth, and the depth below the highest cusp
-    # [mm]; empty for incisors and canines
+    # cusps of premolars and molars: x and z relative to half the width and half the depth, and distance below the
+    # highest cusp [mm]; empty for incisors and canines
     cusps: tuple[tuple[float, float, float], ...] = ()
-    tip_mm: float = 0.0  # height of a canine's tip over its shoulders; 0 for other teeth
+    tip_mm: float = 0.0  # height of a canine's tip above its shoulders; 0 for other teeth
 
     @property
     def tip_z_mm(self) -> float:
@@ -45,7 +45,7 @@ class CrownForm:
         return self.depth_mm * float(_bezier(_EDGE_MIDDLE, np.array(1.0)))
 
 
-# Central incisor to second molar.
+# Forms of the crowns, central incisor to second molar.
 UPPER = (
     CrownForm(8.6, 7.0, 10.4, 7.0),
     CrownForm(6.7, 6.2, 9.2, 7.0),
@@ -87,7 +87,7 @@ def _bezier(control: tuple[float, ...], t: Array) -> Array:
 
 
 def _relative_width(control: tuple[float, ...], t: Array) -> Array:
-    """Return the width profile scaled to a maximum of 1, so that the tables contain widths between contact points."""
+    """Return the width profile scaled to a maximum of 1, so that tabulated widths are those between contact points."""
     return _bezier(control, t) / _bezier(control, np.linspace(0.0, 1.0, 101)).max()
 
 
