@@ -1,4 +1,4 @@
-"""Calibration boards in single pictures: reading board clips, corner detection, and edge sharpness."""
+"""Calibration boards in single images: reading board clips, corner detection, and edge sharpness."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ from jawusd.media.video import Video
 
 Search = Callable[[NDArray[np.uint8]], Array | None]
 
-_TIMES, _FEW_MARKERS = 2, 4  # pictures that must agree on a different board; fewest markers in each
-_FEWEST_CORNERS = 8  # of a ChArUco board; fewer do not determine its pose
-# Refinement window as a fraction of a cell: blur and distortion bias larger windows, noise dominates smaller ones.
+_TIMES, _FEW_MARKERS = 2, 4  # images that must agree on a different board, and minimum number of markers in each
+_FEWEST_CORNERS = 8  # minimum for a ChArUco board: fewer do not determine its pose
+# Refinement window as a fraction of a cell: blur and distortion bias corners in larger windows, noise dominates in
+# smaller ones.
 _WINDOW_SHARE, _WINDOW_PX = 0.12, (3, 12)
-_LARGE_PX = 1000  # width from which pictures are searched at half resolution first, in a quarter of the time
+_LARGE_PX = 1000  # width from which images are first searched at half resolution, which takes a quarter of the time
 _FLAGS = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 
 
 def detector(boards: Boards) -> Search:
-    """Return a function that finds a board's corners in a gray picture: (N, 2) row by row, NaN where hidden, or None.
+    """Return a function that finds a board's corners in a gray image: (N, 2) row by row, NaN where hidden, or None.
 
     Raises:
         CalibrationError: the dictionary has too few markers for the board.
@@ -38,10 +39,11 @@ def detector(boards: Boards) -> Search:
 
 
 def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: bool) -> str | None:
-    """Return the board that gray pictures (h, w) show if it differs from the one described, else None.
+    """Return a description of the board in gray images (h, w) if it differs from that of [boards], otherwise None.
 
     Args:
-        missed: the described board is not found in most pictures of the clip, so missing markers count as evidence.
+        missed: whether the board of [boards] is not found in most images of the clip, so that missing markers are
+            evidence.
     """
     plain: Counter[tuple[int, int]] = Counter()
     for image in images:
@@ -71,7 +73,7 @@ def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed:
 
 
 def corners_and_width(search: Search, image: NDArray[np.uint8], boards: Boards) -> tuple[Array, float]:
-    """Return the corners in a picture, shape (N, 2), and the edge width [px]; NaN without a board."""
+    """Return the corners in an image, shape (N, 2), and the edge width [px]; NaN without a board."""
     corners = search(image)
     if corners is None:
         return np.full((boards.cols * boards.rows, 2), np.nan), np.nan
@@ -101,7 +103,7 @@ def _chessboard(boards: Boards) -> Search:
 
 
 def _refined(image: NDArray[np.uint8], corners_px: Array, boards: Boards) -> Array:
-    """Return corners refined to the saddle points (Förstner & Gülch 1987, by OpenCV): a third of the scatter."""
+    """Return corners refined to the saddle points (Förstner & Gülch 1987, in OpenCV): a third of the scatter."""
     grid = corners_px.reshape(boards.rows, boards.cols, 2)
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     half = int(np.clip(round(_WINDOW_SHARE * min(sides)), *_WINDOW_PX))
@@ -119,14 +121,15 @@ def _charuco(boards: Boards) -> Search:
             f"[boards] a ChArUco board of {boards.cols} x {boards.rows} inner corners needs {markers} markers, "
             f"{boards.dictionary} has {known}."
         )
-    # Before version 4.6, OpenCV started boards with an even number of rows with the other colour; these are still sold.
+    # Before version 4.6, OpenCV drew boards with an even number of rows with the colours exchanged; these are still
+    # sold.
     detectors = [_charuco_detector(boards, size, legacy) for legacy in (False, True)[: 2 - size[1] % 2]]
 
     def search(image: NDArray[np.uint8]) -> Array | None:
         for detector in list(detectors):
             corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(image))
             if ids is not None and len(ids) >= _FEWEST_CORNERS:
-                detectors.sort(key=lambda other: other is not detector)  # the next picture shows the same board
+                detectors.sort(key=lambda other: other is not detector)  # the next image probably has the same board
                 break
         else:
             return None
@@ -156,7 +159,7 @@ def _marker_count(boards: Boards) -> int:
 
 
 def edge_width_px(image: NDArray[np.uint8], corners_px: Array, cols: int) -> float:
-    """Return the 10 to 90 % edge width of a chessboard in a gray picture (h, w) from its gradient energy.
+    """Return the 10 to 90 % edge width of a chessboard in a gray image (h, w) from its gradient energy.
 
     A step of contrast C blurred by a Gaussian of sigma has the gradient energy C^2 / (2 sigma sqrt(pi)) per length of
     edge; a chessboard with cell sides a and b has (|a| + |b|) / |a x b| of edge per area.
@@ -184,19 +187,19 @@ def edge_width_px(image: NDArray[np.uint8], corners_px: Array, cols: int) -> flo
 
 
 class BoardClip:
-    """Board pictures of one camera: a video or numbered pictures.
+    """Board images of one camera: a video or numbered images.
 
     Attributes:
         path: video or pattern.
-        numbers: increasing picture numbers; in a video, the frames at which the pictures are shown.
-        size_px: (width, height) of every picture.
+        numbers: increasing image numbers; in a video, the frames at which the images are shown.
+        size_px: (width, height) of every image.
     """
 
     def __init__(self, path: Path) -> None:
-        """Find the pictures.
+        """Find the images.
 
         Raises:
-            CaptureError: there are no pictures, or the first cannot be read.
+            CaptureError: there are no images, or the first cannot be read.
         """
         self.path = path
         self._files: dict[int, Path] = {}
@@ -212,20 +215,20 @@ class BoardClip:
 
     @property
     def is_video(self) -> bool:
-        """Return whether the pictures are frames of a video."""
+        """Return whether the images are frames of a video."""
         return self._video is not None
 
     @property
     def is_interlaced(self) -> bool:
-        """Return whether any picture read so far is flagged as interlaced."""
+        """Return whether any image read so far is flagged as interlaced."""
         return self._video is not None and self._video.is_interlaced
 
     def pictures(self, wanted: list[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield (number, gray picture) of the given numbers, in order.
+        """Yield (number, gray image) for the given numbers, in order.
 
         Raises:
-            CalibrationError: a picture differs in size from the first one.
-            CaptureError: a picture cannot be read.
+            CalibrationError: an image differs in size from the first one.
+            CaptureError: an image cannot be read.
         """
         if self._video is None:
             for number in wanted:
@@ -259,5 +262,5 @@ def _read(path: Path) -> NDArray[np.uint8]:
 
 
 def sharpness(image: NDArray[np.uint8]) -> float:
-    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000), comparable among pictures of one camera."""
+    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000), comparable among images of one camera."""
     return float(cv2.Laplacian(image, cv2.CV_16S).var()) + 1e-9

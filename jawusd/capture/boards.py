@@ -1,4 +1,4 @@
-"""Find calibration boards in videos or pictures, using only sharp pictures."""
+"""Find calibration boards in videos or images, using only sharp images."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from jawusd.capture.board_detection import BoardClip, corners_and_width, detecto
 from jawusd.formats.capture import Boards
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT
 
-MOST_VIEWS = 80  # more add time but no accuracy
-_LOOKED_AT = 6  # pictures searched for a different board
+MOST_VIEWS = 80  # more views take more time without increasing accuracy
+_LOOKED_AT = 6  # images searched for a different board
 _PER_WINDOW = 2  # consecutive video frames of which the sharpest is used
-# A picture is blurred if its 10 to 90 % edge width exceeds this multiple of the camera's median, within these limits.
+# An image is blurred if its 10 to 90 % edge width exceeds this multiple of the camera's median, within these limits.
 _BLUR_RATIO, _BLUR_LIMITS_PX = 1.5, (4.0, 8.0)
 
 
@@ -27,25 +27,25 @@ class BoardDetections:
     """Detected board corners."""
 
     names: tuple[str, ...]  # camera names, C of them
-    sizes_px: tuple[tuple[int, int], ...]  # picture (width, height) per camera
-    numbers: NDArray[np.int64]  # picture number of each view, shape (V,)
+    sizes_px: tuple[tuple[int, int], ...]  # image (width, height) per camera
+    numbers: NDArray[np.int64]  # image number of each view, shape (V,)
     corners_px: Array  # pixel of each corner, NaN where hidden, shape (C, V, N, 2)
-    blurred: dict[str, list[int]]  # per camera the numbers of pictures rejected as blurred
-    missed: dict[str, list[int]]  # per camera the numbers of pictures in which no board was found
+    blurred: dict[str, list[int]]  # numbers of the images rejected as blurred, by camera
+    missed: dict[str, list[int]]  # numbers of the images in which no board was found, by camera
     notes: tuple[str, ...]  # remarks on the clips for the user
 
 
 def board_points(boards: Boards) -> Array:
-    """Return the inner corners row by row, with the origin at the board's centre [mm], shape (cols * rows, 3)."""
+    """Return the inner corners row by row [mm], with the origin at the board's centre, shape (cols * rows, 3)."""
     i, j = np.meshgrid(np.arange(boards.cols), np.arange(boards.rows))
     x, y = i.ravel() - (boards.cols - 1) / 2, j.ravel() - (boards.rows - 1) / 2
     return np.stack([x, y, 0.0 * x], axis=1) * boards.square_mm
 
 
 def board_symmetries(boards: Boards) -> list[NDArray[np.int64]]:
-    """Return the orders in which a detector may list the corners of a board, as permutations of (N,).
+    """Return the orders in which a detector may list the corners of a board, as permutations of shape (N,).
 
-    A chessboard has a two-fold symmetry, a square one a four-fold symmetry; a ChArUco board numbers its corners.
+    A chessboard has a two-fold symmetry, a square one a four-fold symmetry; the corners of a ChArUco board are numbered.
     """
     grid = np.arange(boards.cols * boards.rows).reshape(boards.rows, boards.cols)
     if boards.pattern == "charuco":
@@ -55,10 +55,10 @@ def board_symmetries(boards: Boards) -> list[NDArray[np.int64]]:
 
 
 def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int, int], None]) -> BoardDetections:
-    """Select sharp pictures from each camera's board clip and find the corners in them.
+    """Select sharp images from each camera's board clip and find the corners in them.
 
     Raises:
-        CalibrationError: the clips share no picture number, or show no board or a different one.
+        CalibrationError: the clips share no image number, or show no board or a different one.
         CaptureError: a clip cannot be read.
     """
     clips = [BoardClip(path) for path in boards.videos]
@@ -100,7 +100,7 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
 
 
 def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], list[str]]:
-    """Return the numbers of the pictures to search, and notes for the user."""
+    """Return the numbers of the images to search, and notes for the user."""
     notes = []
     counts = [len(clip.numbers) for clip in clips]
     shared = sorted(set.intersection(*(set(clip.numbers) for clip in clips)))
@@ -119,19 +119,19 @@ def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], 
     with ThreadPoolExecutor(max_workers=min(len(clips), 4)) as pool:
         for values in pool.map(lambda clip: [sharpness(image) for _, image in clip.pictures(shared)], clips):
             sharp.append(np.array(values) / np.median(values))
-    worst = np.min(sharp, axis=0)  # a picture must be sharp in all cameras
+    worst = np.min(sharp, axis=0)  # an image must be sharp in all cameras
     windows = np.array_split(np.arange(len(shared)), min(MOST_VIEWS, -(-len(shared) // _PER_WINDOW)))
     return [shared[window[np.argmax(worst[window])]] for window in windows], notes
 
 
 def _limits_px(widths: Array) -> Array:
-    """Return per camera the edge width above which a picture is blurred, shape (C,)."""
+    """Return the edge width above which an image is blurred, for each camera, shape (C,)."""
     median = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in widths])
     return np.clip(_BLUR_RATIO * median, *_BLUR_LIMITS_PX)
 
 
 def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, found: int) -> None:
-    """Raise an error if the pictures show no board or a different one."""
+    """Raise an error if the images show no board or a different one."""
     missed = found < len(chosen) / 2
     if missed and clip.is_interlaced:
         raise CalibrationError(
@@ -141,7 +141,7 @@ def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, 
             hint=INTERLACED_HINT,
         )
     if not missed and boards.pattern == "chessboard":
-        return  # part of a different ChArUco board may match the described one
+        return  # checked because part of a different ChArUco board may match that of [boards]
     some = [image for _, image in clip.pictures(chosen[:: max(1, len(chosen) // _LOOKED_AT)])]
     if (other := different_board(some, boards, missed)) is not None:
         raise CalibrationError(
@@ -163,7 +163,7 @@ def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, 
 
 
 def _check_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, blurred: Mask) -> None:
-    """Raise an error if all pictures of the board by a camera are blurred."""
+    """Raise an error if all images of the board by a camera are blurred."""
     for name, clip, row, out, limit in zip(names, clips, widths, blurred, _limits_px(widths)):
         seen = np.isfinite(row)
         if seen.any() and out[seen].all():

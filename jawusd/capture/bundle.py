@@ -1,8 +1,9 @@
 """Bundle adjustment of fixed cameras over views of a planar board.
 
 Minimises the robust reprojection error over intrinsics (fx, fy, cx, cy, k1, k2; the other coefficients stay 0, since
-few pictures of a small board do not determine them), camera poses (the first camera is the world) and board poses.
-The Jacobian is analytic and sparse: OpenCV's for the lens, Solà et al. 2018 (eq. 143) for the rotations.
+few images of a small board do not determine them), camera poses (the first camera is the world frame) and board poses.
+The Jacobian is analytic and sparse: it is OpenCV's for the lens, and follows Solà et al. 2018 (eq. 143) for the
+rotations.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _LENS = 6  # fx, fy, cx, cy, k1, k2
 _POSE = 6  # rotation vector [rad], translation [mm]
 _HUBER_SIGMAS, _LEAST_SIGMA_PX = 3.0, 0.02
 _MOST_STEPS = 100
-_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # a corner beyond both is an outlier
+_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # a corner whose residual exceeds both is an outlier
 _FEWEST_CORNERS = 6  # views with fewer inliers are dropped
 
 
@@ -85,18 +86,18 @@ def camera_from(parameters: Array) -> tuple[Array, Array, Array]:
 
 
 class _Problem:
-    """Residuals and Jacobian over the views that any camera sees."""
+    """Residuals and Jacobian over all views with corners in any camera."""
 
     def __init__(self, corners_px: Array, points_mm: Array) -> None:
         self.views = np.flatnonzero(np.isfinite(corners_px[..., 0]).any((0, 2)))
         self.corners_px, self.points_mm = corners_px[:, self.views], points_mm
         self.cameras = len(corners_px)
         self.seen = np.isfinite(self.corners_px[..., 0])
-        # Per camera, the view and corner of each observed point.
+        # For each camera, view and corner index of each observed point.
         self.points = [np.nonzero(seen) for seen in self.seen]
 
     def pack(self, start: InitialGuess) -> Array:
-        """Return the unknowns of an initial guess: lenses, poses of cameras 1.., poses of boards."""
+        """Return the unknowns of an initial guess: lenses, poses of all cameras but the first, poses of boards."""
         lens = np.stack([start.K[:, 0, 0], start.K[:, 1, 1], start.K[:, 0, 2], start.K[:, 1, 2]], axis=1)
         T = np.concatenate([start.T_cam_world[1:], start.T_world_board[self.views]])
         poses = np.concatenate([so3_log(T[:, :3, :3]), T[:, :3, 3]], axis=1)
@@ -108,12 +109,12 @@ class _Problem:
         return x[:own], x[own:].reshape(-1, _POSE)
 
     def solve(self, x: Array) -> Array:
-        """Return the unknowns with the least robust error (reweighted Levenberg-Marquardt; Triggs et al. 2000).
+        """Return the unknowns that minimise the robust error (reweighted Levenberg-Marquardt; Triggs et al. 2000).
 
         The normal equations are formed from the sparse Jacobian and solved densely. Iterative solvers converge slowly,
         since focal length and distance are strongly correlated.
         """
-        for _ in range(2):  # the second time with the residual scale of the first
+        for _ in range(2):  # the second run uses the residual scale of the first
             scale = _HUBER_SIGMAS * max(_LEAST_SIGMA_PX, 1.4826 * float(np.median(np.abs(self.residuals(x)))))
             x = self._descend(x, scale)
         return x
@@ -171,7 +172,7 @@ class _Problem:
         J, residual = self.jacobian(x), self.residuals(x)
         sigma = 1.4826 * np.median(np.abs(residual))
         normal = (J.T @ J).toarray()
-        scale = 1 / np.sqrt(np.diag(normal))  # px, rad and mm: normalise before inverting
+        scale = 1 / np.sqrt(np.diag(normal))  # units are px, rad and mm: normalise before inverting
         inverse = np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
         own = len(self.split(x)[0])
         return sigma**2 * inverse[:own, :own]
@@ -196,7 +197,7 @@ class _Problem:
         return residual.ravel(), np.asarray(derived, np.float64), turned, carried
 
     def _parts(self, x: Array, turns: Array, slopes: Array, c: int) -> list[tuple[Array | int, Array]]:
-        """Return the blocks of one camera's Jacobian, shape (2n, 6), with their first column, an int or one per row.
+        """Return the blocks of one camera's Jacobian, shape (2n, 6), each with its first column, an int or one per row.
 
         Args:
             turns, slopes: rotations of the boards and their left Jacobians, shape (V, 3, 3).
@@ -217,7 +218,7 @@ class _Problem:
         return parts
 
     def _pose(self, x: Array, c: int) -> Array:
-        """Return the pose of a camera; the first camera is the world."""
+        """Return the pose of a camera; the first camera is the world frame."""
         column = self.cameras * _LENS + (c - 1) * _POSE
         return x[column : column + _POSE] if c else np.zeros(_POSE)
 

@@ -24,13 +24,13 @@ from jawusd.capture.scale import (
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera
 
-#: Called with the cameras and the reason why the picks do not determine the scale.
+#: Called with the cameras and a check that has the reason why the picks do not determine the scale.
 MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 
-_ENOUGH_VIEWS = 40  # a quarter of the shape error of 20 views
+_ENOUGH_VIEWS = 40  # with these, the shape error is a quarter of that with 20 views
 _GOOD_RMS_PX = 0.5
-_FAR_MM = 40.0  # from the board's nearest corner to the centre of the mouth
-_GRID = (8, 5)  # cells of the picture for the coverage
+_FAR_MM = 40.0  # largest distance of the board's nearest corner from the centre of the mouth without advice
+_GRID = (8, 5)  # cells of the image for which coverage is computed
 _LITTLE_COVERAGE = 0.5
 _LARGE_EXPECTED_MM = 0.05  # half of the typical tracking error of 0.1 mm
 
@@ -38,7 +38,7 @@ _LARGE_EXPECTED_MM = 0.05  # half of the typical tracking error of 0.1 mm
 class CameraFigures(TypedDict):
     """Statistics of one camera's calibration.
 
-    `coverage` is the fraction of the picture's cells with corners; `blurred` and `missed` are picture numbers.
+    `coverage` is the fraction of the image's cells with corners; `blurred` and `missed` are image numbers.
     """
 
     views: int
@@ -55,7 +55,7 @@ class CalibrationReport:
 
     cameras: dict[str, CameraFigures]
     views: int  # board poses used
-    board_shape: ShapeError  # error of distances between triangulated corners near the mouth, on the pictures used
+    board_shape: ShapeError  # error of distances between triangulated corners near the mouth, in the images used
     expected_shape_mm: float  # expected mean error of distances in the mouth, from the scatter of the corners
     mouth_mm: tuple[float, float, float]  # centre of the mouth in the world, and its source
     mouth_from: str
@@ -145,7 +145,7 @@ def _camera_figures(c: int, camera: Camera, bundle: Bundle, detections: BoardDet
     cells = np.floor(pixels / camera.size_px * _GRID).astype(int)
     covered = {(x, y) for x, y in cells.tolist()}
     corners = {"top left": (0, 0), "top right": (1, 0), "bottom left": (0, 1), "bottom right": (1, 1)}
-    # Corners of the picture extend over a quarter of its width and height.
+    # Each corner of the image extends over a quarter of its width and height.
     share = pixels / camera.size_px
     empty = [name for name, (right, low) in corners.items() if not ((np.abs(share - [right, low]) < 0.25).all(1)).any()]
     return {

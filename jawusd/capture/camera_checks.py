@@ -11,12 +11,12 @@ from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
 
-# Focal length over picture width: fields of view from 100 down to 3 degrees.
+# Range of the ratio of focal length to image width: fields of view from 100 down to 3 degrees.
 _FOCAL_WIDTHS = (0.4, 20.0)
 _SQUARE = 0.03  # relative difference of fx and fy; current cameras have square pixels
-_CENTRE_SHARE = 0.15  # offset of the principal point from the picture's centre, over its width
+_CENTRE_SHARE = 0.15  # offset of the principal point from the image centre, relative to the image width
 _LEAST_BASELINE_MM, _MOST_BASELINE_MM = 10.0, 5000.0
-_LEAST_ANGLE_DEG = 3.0  # between two views of the teeth; depth is then ten times as uncertain as a pixel
+_LEAST_ANGLE_DEG = 3.0  # smallest angle between two views of the teeth: depth is then ten times as uncertain as a pixel
 _NEAREST_MM, _FARTHEST_MM = 40.0, 5000.0
 
 
@@ -89,7 +89,7 @@ def _fold(camera: Camera) -> float | None:
 
 
 def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
-    """Yield findings about cameras that do not look at the same point as the others."""
+    """Yield findings about cameras that do not point at the same target as the others."""
     target = common_target(cameras)
     for camera in cameras:
         depth = float(camera.depth(target))

@@ -1,4 +1,4 @@
-"""Synchronise cameras by the clocks of their clips: time codes or picture numbers."""
+"""Synchronise cameras by the clocks of their clips: time codes or image numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jawusd.media.footage import open_clip
 _DAY_S = 86400
 _RATE_TOLERANCE = 1e-3
 _NEARLY_WHOLE = 0.01
-_FASTEST_USUAL = 30.5  # frames per second; above it, two or four pictures often share a time code
+_FASTEST_USUAL = 30.5  # frames per second; above it, two or four images often have the same time code
 
 
 def check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
@@ -34,10 +34,11 @@ def check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
 
 
 def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ...]]:
-    """Return the offset of every camera by `[sync] method`, "timecode" or "numbers", and notes for the user.
+    """Return the offset of every camera by clock `[sync] method`, "timecode" or "numbers", and notes for the user.
 
     Raises:
-        SyncError: a camera has no video or its clip no clock of that kind, the clips do not overlap, or rates differ.
+        SyncError: a camera has no video, or its clip has no clock of that kind; the clips do not overlap, or their
+            rates differ.
         CaptureError: a clip cannot be read.
     """
     path = capture.folder / "capture.toml"
@@ -55,7 +56,7 @@ def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ..
     for name, start in starts.items():
         offset = start - reference
         if by_code and abs(offset) > day // 2:
-            offset -= day if offset > 0 else -day  # recorded over midnight
+            offset -= day if offset > 0 else -day  # the take was recorded over midnight
         if offset >= clips[capture.reference].timeline.count or -offset >= clips[name].timeline.count:
             raise SyncError(
                 f"starts {abs(offset)} frames {'after' if offset > 0 else 'before'} camera {capture.reference} by its "
@@ -84,7 +85,7 @@ def _notes(clips: Mapping[str, Clip]) -> Iterator[str]:
 
 
 def _frames_of_number(clip: Clip) -> int:
-    """Return the number of pictures per time code.
+    """Return the number of images per time code.
 
     Raises:
         CaptureError: it is not an integer.

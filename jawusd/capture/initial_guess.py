@@ -1,8 +1,8 @@
-"""Initial values of a calibration: the board that clips show, intrinsics per camera, then the camera poses.
+"""Initial values of a calibration: the kind of board in the clips, intrinsics per camera, then the camera poses.
 
-A detector may list a symmetric board's corners in a different order in every picture. Each order corresponds to the
-board rotated in its plane. The relative pose of two fixed cameras is the same in all views only if both list the same
-corner first, so the pose that most views agree on resolves the orders and exposes views that were not simultaneous.
+A detector may list a symmetric board's corners in a different order in every image. Each order corresponds to the board
+rotated in its plane. The relative pose of two fixed cameras is the same in all views only if both list the same corner
+first, so the pose that most views agree on determines the orders and reveals views that were not simultaneous.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log
 
 FEWEST_VIEWS = 6  # per camera; with fewer, focal length and distance are ambiguous
 _SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # tolerance of equal relative poses: angle, relative distance
-_LEAST_AGREEMENT = 0.5  # fraction of the views shared by two cameras
+_LEAST_AGREEMENT = 0.5  # fraction of the views shared by two cameras that must agree
 _INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-_WIDTH_PX = 960  # search width; large enough for boards that fill a fifth of the picture
-_FEWEST_PICTURES = 2  # pictures that must agree
+_WIDTH_PX = 960  # search width: sufficient for boards that fill a fifth of the image
+_FEWEST_PICTURES = 2  # images that must agree
 _FEWEST_MARKERS = 4
 _FAMILIES = ("4X4", "5X5", "6X6", "7X7")
 _SIZES = (50, 100, 250, 1000)  # OpenCV's smaller dictionaries are prefixes of the larger ones
@@ -62,14 +62,14 @@ def initial_cameras(
     K, distortion, T_cam_board = np.empty((count, 3, 3)), np.empty((count, 2)), np.full((count, views, 4, 4), np.nan)
     for c, name in enumerate(names):
         K[c], distortion[c], T_cam_board[c] = _single_camera(name, sizes_px[c], corners_px[c], points_mm)
-    # Reordering the corners rotates the board: T_cam_board of order s = T_cam_board @ turns[s].
+    # Reordering the corners rotates the board: with order s, T_cam_board becomes T_cam_board @ turns[s].
     turns = [_turn(points_mm, order) for order in symmetries]
     T_cam_world = _place_cameras(names, T_cam_board, turns)
     corners, T_world_board = corners_px.copy(), np.full((views, 4, 4), np.nan)
     for v in range(views):
         seen = [c for c in range(count) if np.isfinite(T_cam_board[c, v, 0, 0])]
         agreed: list[tuple[int, int]] = []
-        for first in seen:  # use the board pose of the camera that most others agree with
+        for first in seen:  # use the board pose from the camera that most others agree with
             T = se3_inverse(T_cam_world[first]) @ T_cam_board[first, v]
             found = [
                 (c, s)
@@ -88,7 +88,7 @@ def initial_cameras(
 def _single_camera(
     name: str, size_px: tuple[int, int], corners_px: Array, points_mm: Array
 ) -> tuple[Array, Array, Array]:
-    """Return K (3, 3), k1 and k2 and T_cam_board (V, 4, 4) of one camera (Zhang 2000, by OpenCV)."""
+    """Return K (3, 3), k1 and k2 and T_cam_board (V, 4, 4) of one camera (Zhang 2000, in OpenCV)."""
     seen = np.isfinite(corners_px[..., 0])
     used = np.flatnonzero(seen.any(1))
     if len(used) < FEWEST_VIEWS:
@@ -118,7 +118,7 @@ def _single_camera(
 
 def _turn(points_mm: Array, order: NDArray[np.int64]) -> Array:
     """Return the rotation of the board about its centre with points[order] = R points."""
-    # Planar: least squares for the two in-plane axes; the normal is fixed.
+    # The points are planar: least squares for the two in-plane axes; the normal is fixed.
     plane = np.linalg.lstsq(points_mm[:, :2], points_mm[order, :2], rcond=None)[0].T
     R = np.eye(3)
     R[:2, :2] = np.round(plane)
@@ -133,7 +133,7 @@ def _equal(a: Array, b: Array) -> Mask:
 
 
 def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array]) -> Array:
-    """Return T_cam_world (C, 4, 4), chained from the first camera over the pairs that share most views."""
+    """Return T_cam_world (C, 4, 4), chained from the first camera over the pairs with most shared views."""
     seen = np.isfinite(T_cam_board[..., 0, 0])
     T_cam_world = np.full((len(names), 4, 4), np.nan)
     T_cam_world[0] = np.eye(4)
@@ -154,7 +154,7 @@ def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array
 
 
 def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Array]) -> Array:
-    """Return the T_b_a that most shared views agree on in any of the orders."""
+    """Return the T_b_a that most shared views agree on, each in any of the orders."""
     both = np.isfinite(T_cam_board[..., 0, 0]).all(0)
     T_a, T_b = T_cam_board[0, both], T_cam_board[1, both]
     # (orders, views, 4, 4): T_b_a if b lists the corners in that order.
@@ -169,7 +169,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
             f"{both.sum()} agree on the relative camera pose.",
             hint="The board clips must be synchronous frame by frame, and the cameras must not move.",
         )
-    # The most central one of the well supported poses.
+    # Choose the most central of the well-supported poses.
     strong = flat[support >= 0.8 * support[best]]
     near = strong[_equal(strong, flat[best])]
     gap = np.linalg.norm(near[:, None, :3] - near[None, :, :3], axis=(-1, -2)).sum(1)
@@ -178,7 +178,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
 
 @dataclass(frozen=True)
 class DetectedBoard:
-    """Board found in clips: inner corners of a chessboard, or a dictionary of markers."""
+    """Board found in clips: size in inner corners of a chessboard, or dictionary of markers."""
 
     pattern: str
     cols: int | None = None
@@ -187,7 +187,7 @@ class DetectedBoard:
 
 
 def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
-    """Return the board that most gray pictures (h, w) show; None if no two agree."""
+    """Return the board found in most gray images (h, w); None if no two agree."""
     boards: Counter[tuple[int, int]] = Counter()
     markers: Counter[str] = Counter()
     highest: dict[str, int] = {}
@@ -217,7 +217,7 @@ def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _markers(picture: NDArray[np.uint8]) -> Iterable[tuple[str, int]]:
-    """Yield each marker family seen, with the highest marker number."""
+    """Yield each marker family detected, with its highest marker number."""
     for family in _FAMILIES:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}_{_SIZES[-1]}"))
         numbers = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)[1]

@@ -1,6 +1,6 @@
 """Consistency checks of masks, calibration and offsets before tracking.
 
-Mask centres of two cameras must lie on each other's epipolar lines, and masks swapped between two cameras start and
+The mask centres of two cameras must lie on each other's epipolar lines, and masks swapped between two cameras start and
 end at the wrong frames.
 """
 
@@ -17,20 +17,20 @@ from jawusd.geometry import Camera, triangulate
 
 #: First and last frame with a mask of the upper and of the lower teeth, in the camera's own numbers; None if empty.
 Ranges = tuple[tuple[int, int] | None, tuple[int, int] | None]
-#: Centre of all teeth pixels at one instant by camera [px], shape (2,).
+#: Centre of all teeth pixels at one instant, by camera [px], shape (2,).
 MaskCentres = Mapping[str, Array]
 
 # Largest distance of the two rays through the mask centres [mm]; the visible part of the teeth differs between views.
-# No false alarm on 70 valid synthetic persons, with at most 10.4 mm.
+# 70 valid synthetic subjects have at most 10.4 mm, so there is no false alarm.
 _RAYS_MM = 15.0
-# Plausible width of the teeth in the masks at the triangulated depth [mm]; lips may hide much of them.
+# Plausible width of the teeth in the masks at the triangulated depth [mm]; lips may hide a large part of them.
 _SEEN_MM = (10.0, 90.0)
 
 
 def swapped_cameras(
     ranges: Mapping[str, Ranges], offsets: Mapping[str, int], first: int, stop: int
 ) -> list[tuple[str, str]]:
-    """Return pairs of cameras whose masks start and end with the take only when swapped.
+    """Return pairs of cameras whose masks start and end with the take only if swapped.
 
     Args:
         ranges: frames with masks, by camera.
@@ -52,9 +52,9 @@ def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[Ma
 
     Args:
         cameras: calibrated cameras by name.
-        centres: mask centres at some instants, one entry per candidate offset; the best candidate counts.
+        centres: mask centres at some instants, one entry per candidate offset; the best candidate is used.
 
-    The camera that is part of most inconsistent pairs is reported.
+    The camera in most of the inconsistent pairs is reported.
     """
     apart: dict[tuple[str, str], float] = {}
     for pair in combinations(cameras, 2):

@@ -15,27 +15,27 @@ from jawusd.capture.camera_checks import common_target
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, triangulate
 
-_FEWEST_PICKS = 3  # per jaw
-_TOLERANCE = 0.03  # picks determine the scale to about 0.5 %
+_FEWEST_PICKS = 3  # minimum per arch
+_TOLERANCE = 0.03  # largest deviation of the size ratio from 1; picks determine it to about 0.5 %
 _SIGMAS = 4.0
-_MOUTH_RADIUS_MM = 35.0  # contains both arches up to an opening of 40 mm
+_MOUTH_RADIUS_MM = 35.0  # radius that contains both arches up to an opening of 40 mm
 _DRAWS = 40
 _POINTS = 150
 
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """Size of the teeth seen by the cameras relative to the scan."""
+    """Size of the teeth measured with the cameras, relative to the scan."""
 
     ratio: float | None  # measured / scanned, None if unknown
     sigma: float | None  # its standard error
-    reason: str = ""  # why it is unknown, else ""
+    reason: str = ""  # why the ratio is unknown, otherwise empty
 
 
 def triangulated_picks(
     cameras: list[Camera], bootstrap: Bootstrap | None
 ) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Return per jaw the picked vertices (n,) and their triangulated positions [mm], shape (n, 3)."""
+    """Return the picked vertices (n,) and their triangulated positions (n, 3) [mm], by arch."""
     known = {camera.name: camera for camera in cameras}
     out = {}
     for jaw in ("upper", "lower"):
@@ -105,7 +105,7 @@ class ShapeError:
     """Errors of distances between points [mm]."""
 
     mean: float  # mean absolute error
-    p95: float  # its 95th percentile
+    p95: float  # 95th percentile of the absolute error
     max: float  # largest error
     distances: int  # number of distances compared; 0 if no corner near the mouth was seen by two cameras
 

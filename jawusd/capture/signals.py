@@ -1,12 +1,13 @@
 """Signals for synchronisation: light flashes and sound.
 
-The mean brightness of a picture falls and rises with the room light. The times of these steps, matched between two
-cameras, give their offset in whole frames. A step during an exposure leaves a picture of intermediate brightness,
-which gives the fraction of a frame: always with an open shutter, otherwise only if the step hits the exposure.
+The mean brightness of an image falls and rises with the room light. The times of these steps, matched between two
+cameras, give their offset in whole frames. A step during an exposure results in an image of intermediate brightness,
+from which the fraction of a frame follows: always if the shutter never closes, otherwise only if the step falls into an
+exposure.
 
 Sounds are matched by generalised cross-correlation (Knapp & Carter 1976) with partial whitening: full whitening (PHAT)
-weights noisy bands as much as the voice, and none lets hum dominate. The resolution is 1/16000 s, but sound travels at
-3 ms per metre, so cameras that are metres apart are off by that.
+weights noisy bands as much as the voice, and without whitening hum dominates. The resolution is 1/16000 s, but sound
+takes 3 ms per metre, which is an error for cameras that are metres apart.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ from jawusd.media.containers import Sound
 
 _FIRST_WINDOW_S = 4.0  # initial search window at both ends; doubled until a flash is found
 _SPARSE = 8  # subsampling of pixels in both directions for the mean brightness
-_CONTRAST = 0.3  # smallest relative change of brightness by a flash; moving people change it by a few per cent
+_CONTRAST = 0.3  # smallest relative change of brightness due to a flash; moving people cause a few per cent
 _ABRUPT_FRAMES = 3  # longest duration of a light step
 _TOLERANCE_FRAMES = 1.0  # tolerance of matched steps
-_DROPPED_S = 0.5  # steps that match at an offset differing by up to this indicate dropped frames
+_DROPPED_S = 0.5  # difference in offset up to which further matching steps indicate dropped frames
 _FEWEST_STEPS = 2
-_BETWEEN_FRAMES = 0.15  # smaller fractions of a frame are noise
+_BETWEEN_FRAMES = 0.15  # fractions of a frame below this are noise
 RATE_HZ = 16000
 _WHITENING = 0.75
-_LOWEST_HZ = 80.0  # mains hum and wind lie below
-_APART_S = 0.02  # closer peaks are the same peak
-_LEAST_SIGMAS = 9.0  # the largest of millions of random correlations stays below 6
-_SECOND_PEAK = 0.7  # relative to the highest; a higher second peak is a periodic sound
+_LOWEST_HZ = 80.0  # lower frequencies, such as mains hum and wind, are ignored
+_APART_S = 0.02  # peaks closer than this count as one
+_LEAST_SIGMAS = 9.0  # minimum height of the peak; the largest of millions of random correlations is below 6
+_SECOND_PEAK = 0.7  # height of the second peak relative to the highest; above, the sound is periodic
 
 
 @dataclass(frozen=True)
@@ -44,19 +45,19 @@ class Step:
     """A sudden change of brightness."""
 
     time_frames: float  # time in frames of the camera's video; k is the start of the exposure of frame k
-    rising: bool  # whether the light goes on
-    slack_frames: float = 0.0  # how much earlier the step may be, because preceding pictures are missing
+    rising: bool  # whether the light is switched on
+    slack_frames: float = 0.0  # how much earlier the step may be, since preceding images are missing
 
 
 @dataclass(frozen=True)
 class Offset:
-    """Time offset of a camera: its frame k shows the instant of frame k + frames of the reference camera."""
+    """Time offset of a camera: its frame k is simultaneous with frame k + `frames` of the reference camera."""
 
     frames: int  # the offset in whole frames
     exact_frames: float  # the offset with its estimated fraction
     spread_frames: float  # largest deviation of a matched step from exact_frames; 0 for sound
     matched_steps: int  # number of steps found in both cameras; 0 for sound
-    confidence: float  # fraction of the steps of both cameras that match, or that of `SoundMatch`; 0 .. 1
+    confidence: float  # fraction of the steps of both cameras that match, or `SoundMatch.confidence`; 0 .. 1
 
 
 @dataclass(frozen=True)
@@ -64,14 +65,14 @@ class Flashes:
     """Light steps of one video."""
 
     steps: list[Step]  # in order of time
-    reason: str = ""  # why there are too few steps to synchronise by, else ""
+    reason: str = ""  # why there are too few steps to synchronise by, otherwise empty
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
-    """Return the times when the light goes off or on, in order; empty if brightness changes less than by a flash.
+    """Return the times at which the light is switched, in order; empty if brightness changes less than in a flash.
 
     Args:
-        brightness: mean brightness of successive pictures, 0 .. 255, shape (n,).
+        brightness: mean brightness of successive images, 0 .. 255, shape (n,).
     """
     if len(brightness) < 2 or brightness.max() - brightness.min() < _CONTRAST * brightness.max():
         return []
@@ -134,7 +135,7 @@ def _check_dropped_frames(
 
 
 def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[list[tuple[int, int]], float, float]:
-    """Return the pairs of step numbers that match at an offset, their spread and their exact offset [frames]."""
+    """Return the pairs of step indices that match at an offset, their spread and their exact offset [frames]."""
     pairs, differences, slacks = [], [], []
     for i, step in enumerate(steps):
         for j, partner in enumerate(reference):
@@ -147,20 +148,21 @@ def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[lis
                 break
     if not pairs:
         return [], 0.0, float(offset)
-    # Use only the most precise pairs for the offset.
+    # Compute the offset from the most precise pairs only.
     best = np.array(differences)[np.array(slacks) == min(slacks)]
     exact = float(np.median(best))
     return pairs, float(np.abs(best - exact).max()), exact
 
 
 def to_frames(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
-    """Convert the times of steps from picture indices to frame numbers; numbers (n,) are the pictures' frames."""
+    """Convert the times of steps from image indices to frame numbers; `numbers` (n,) are the frames of the images."""
     out = []
     for step in steps:
         nearest = round(step.time_frames)
         between = abs(step.time_frames - nearest) < _BETWEEN_FRAMES and 0 < nearest < len(numbers)
         picture = nearest if between else min(int(step.time_frames), len(numbers) - 1)
-        # Between two pictures, the step is anywhere in the gap; within one, that picture's brightness determines it.
+        # A step between two images is anywhere in the gap; the time of one within an exposure follows from its
+        # brightness.
         gap = float(numbers[picture] - numbers[picture - 1] - 1) if between else 0.0
         out.append(Step(float(numbers[picture]) + step.time_frames - picture, step.rising, max(0.0, gap)))
     return out
@@ -200,7 +202,7 @@ def _brightness(video: Clip, first: int, last: int) -> Array:
 
 
 def mean_brightness(image: NDArray[np.uint8]) -> float:
-    """Return the mean brightness of a picture from every 8th pixel in both directions."""
+    """Return the mean brightness of an image from every 8th pixel in both directions."""
     return float(image[::_SPARSE, ::_SPARSE].mean())
 
 
@@ -211,15 +213,15 @@ def _listed(steps: list[Step]) -> str:
 class SoundMatch(NamedTuple):
     """Time offset between two sounds."""
 
-    delay_s: float  # time of an event in the reference's file minus that in the other's [s]
+    delay_s: float  # time of an event in the reference recording minus that in the other one [s]
     confidence: float  # 1 minus the height of the second peak over that of the first, 0 .. 1
 
 
 def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
-    """Find the delay between two sounds of one scene.
+    """Find the delay between two recordings of the sound of one scene.
 
     Raises:
-        SyncError: a sound is silent, the sounds do not match, or the delay is ambiguous.
+        SyncError: a recording is silent, the sounds do not match, or the delay is ambiguous.
     """
     if not (np.ptp(sound.samples) > 0 and np.ptp(reference.samples) > 0):
         raise SyncError("the sound is silent.")

@@ -1,7 +1,7 @@
-"""Synchronise cameras by light flashes, or by sound without flashes.
+"""Synchronise cameras by light flashes or, if there are none, by sound.
 
-Pictures are placed by their presentation times: in a video of variable rate, frame k is the picture shown k nominal
-frame durations after the first one.
+Images are counted by their presentation times: in a video of variable rate, frame k is the image shown k nominal frame
+durations after the first one.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from jawusd.media.containers import Sound, read_sound
 from jawusd.media.footage import open_clip
 from jawusd.media.video import Video
 
-_FPS_TOLERANCE = 5e-3  # relative; allows 24 for 23.976
-_EARLY_S = 2.0  # usual difference between the ends of clips
+_FPS_TOLERANCE = 5e-3  # relative: accepts 24 for 23.976
+_EARLY_S = 2.0  # largest usual difference between the ends of clips
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ def estimate_offsets(capture: Capture) -> Alignment:
 def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_light: bool = True) -> Alignment:
     """Synchronise videos with the reference camera by light flashes or sound.
 
-    Only the start and end of each video are decoded, and more only until flashes are found. Sound is used if a video
-    shows no flash, or without `by_light`; all videos must have sound then.
+    At first, only the start and end of each video are decoded, then more until flashes are found. If a video has no
+    flash, or without `by_light`, sound is used, which all videos must then have.
 
     Raises:
         SyncError: there are neither flashes nor sound, frame rates differ, or the signals do not match.
@@ -130,7 +130,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
 
 
 def light_curve(clip: Path | ClipSource) -> LightCurve:
-    """Return the mean brightness of every picture of a video, and its sudden changes.
+    """Return the mean brightness of every image of a video, and its sudden changes.
 
     Raises:
         CaptureError: the video cannot be read.
@@ -175,7 +175,7 @@ def _by_sound(name: str, reference: str, sounds: Mapping[str, Sound], videos: Ma
 def _compared(
     name: str, reference: str, video: Clip, hint: str, work: Callable[[], Offset], before: str = ""
 ) -> Offset:
-    """Run a comparison of two cameras, naming both in its errors."""
+    """Run a comparison of two cameras, and name both in its errors."""
     try:
         return work()
     except SyncError as error:

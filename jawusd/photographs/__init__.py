@@ -1,6 +1,6 @@
 """The bite estimated from photographs of closed teeth taken with an uncalibrated camera.
 
-Uses scans and contours of `tracking`. Imported by `pipeline` alone; must not import other stages.
+Uses scans and contours of `tracking`. Only `pipeline` imports it; it must not import other stages.
 """
 
 from jawusd.photographs.align import PhotoAlignment, align_photographs

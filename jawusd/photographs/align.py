@@ -1,4 +1,4 @@
-"""Photographs of closed teeth: pose and focal length of each one, and the bite they share."""
+"""Alignment of photographs of closed teeth: pose and focal length of each, and the bite they have in common."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _STAGES = (
     (1.0, (1.0,) * 8),
 )
 _AT_WIDTH_PX = 1440.0  # reference width; distances in px are scaled to it
-_TURN_PX = 10.0  # penalty for a difference in direction when lines are matched to outlines, at that width
-_CLEAR_MISFIT = 0.2  # a photograph with a smaller misfit is accepted as the first one
-_GATE_MM, _MOST_MISFIT = 0.5, 0.45  # gate of the final misfit, and misfit above which the scans are another person's
-_SAME_HAND = 1.15  # ratio of the misfits, mirrored to not mirrored, below which the choice is ambiguous
-_APART_MM = 1.5  # largest plausible distance between the bites of single photographs and of all
+_TURN_PX = 10.0  # distance equivalent to a difference in direction when lines are matched to outlines, at that width
+_CLEAR_MISFIT = 0.2  # misfit below which the bite of a photograph is used to start the others
+_GATE_MM, _MOST_MISFIT = 0.5, 0.45  # gate of the final misfit, and limit above which scans are another subject's
+_SAME_HAND = 1.15  # ratio of the misfits with wrong and with chosen mirroring, below which the choice is ambiguous
+_APART_MM = 1.5  # largest plausible distance between the bite of a single photograph and that of all
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoAlignment:
-    """Result of an alignment, with the data needed to draw it."""
+    """Result of an alignment, with the data needed to render it."""
 
     result: AlignedPhotos
     bite: Bite  # poses at the full size of the photographs
@@ -46,7 +46,7 @@ def align_photographs(
     """Align both arches with lines drawn in photographs of one bite, taken with one uncalibrated camera.
 
     Args:
-        drawings: lines of each photograph; names must be unique.
+        drawings: the lines drawn in each photograph; names must be unique.
         meshes: upper and lower scan, each in an arbitrary frame [mm].
         progress: called with the stage, the number of photographs done, and the total.
 
@@ -71,7 +71,7 @@ def align_photographs(
 def _starts(
     drawings: Sequence[Drawing], scans: Sequence[Scan], contact: Contact, progress: Callable[[str, int, int], None]
 ) -> list[PhotoStart]:
-    """Return the start of each photograph: one is found for an unknown bite, the others with its bite."""
+    """Return the start of each photograph: the first is found with an unknown bite, the others with its bite."""
     usual = typical_bites(scans)
     leads: list[tuple[int, PhotoStart]] = []
     for k, drawing in enumerate(drawings):
@@ -107,7 +107,7 @@ def _refined(bite: Bite, lines: Sequence[Drawing], rows: ArchPair, contact: Cont
 
 
 def _together(alone: Sequence[Bite], lines: Sequence[Drawing], rows: ArchPair, contact: Contact) -> Bite:
-    """Return all photographs aligned to one bite, the best result over starts from each single bite."""
+    """Return all photographs aligned to one bite: the best of the results started from each single bite."""
     if len(alone) == 1:
         return alone[0]
     photos = tuple(bite.photos[0] for bite in alone)
@@ -152,7 +152,7 @@ def _result(
 
 
 def _line_distances(photo: Photo, joint: Bite, rows: ArchPair) -> tuple[Array, Array]:
-    """Return the distances from outlines of all drawn points (N,) and of those off the gum line (M,) [px of 1440]."""
+    """Return the distances of all drawn points (N,), and of those off the gum line (M,), from outlines [px of 1440]."""
     to_usual = _AT_WIDTH_PX / photo.drawing.size_px[0]
     found = match(seen_outlines(rows.fine, photo, joint), photo.drawing, _TURN_PX / to_usual)
     distance = to_usual * np.linalg.norm(found.outlines.pixels - photo.drawing.pixels, axis=1)

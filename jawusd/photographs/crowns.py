@@ -16,11 +16,11 @@ from jawusd.geometry import transform_points
 from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.tracking.contour.scan import Faces, Scan
 
-_FEWEST_FACES = 50  # smaller pieces are scan debris
+_FEWEST_FACES = 50  # smaller pieces are scanning artefacts
 _MOST_TEETH = 120  # per arch, as labels of both arches share one byte
-# Substitute wall for missing gum: segments along the arch, start as a share of the crown height [-], height [mm].
+# Substitute wall for missing gum: segments along the arch, start as a fraction of the crown height [-], height [mm].
 _WALL_PARTS, _WALL_FROM, _WALL_MM = 24, 0.75, 15.0
-_SMOOTH_PX = 2.0  # Gaussian over which the direction of an outline is averaged
+_SMOOTH_PX = 2.0  # standard deviation of the Gaussian over which the direction of an outline is averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Outlines:
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
     """Return the crowns of a scan as connected pieces, with a substitute wall if the scan has no gum.
 
-    Without the wall, teeth of the far side would be visible where gum hides them.
+    Without the wall, teeth of the far side would be rendered where gum hides them.
 
     Args:
         scan: one arch.
@@ -159,10 +159,10 @@ def outlines_of(
 
 
 def _ends(depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[Array, Array, Array, Array]:
-    """Return the ends of teeth along pixel rows: column and row of the end, column and row of its tooth pixel."""
+    """Return the ends of teeth along pixel rows: column and row of each end, column and row of its tooth pixel."""
     rows, columns = np.nonzero(labels[:, 1:] != labels[:, :-1])
     right_is_near = depth[rows, columns + 1] > depth[rows, columns]
-    # Gum in front has number 0; the outline belongs to the tooth behind it.
+    # If gum, which has number 0, is in front, the outline belongs to the tooth behind it.
     right_is_near = np.where(labels[rows, columns] == 0, True, right_is_near & (labels[rows, columns + 1] > 0))
     row = rows.astype(np.float64)
     return np.asarray(columns + 0.5, np.float64), row, (columns + right_is_near).astype(np.float64), row

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 
-_WIDTH_PX = 1.8  # Gaussian that turns lines a few pixels wide into a single ridge
+_WIDTH_PX = 1.8  # standard deviation of the Gaussian that turns lines a few pixels wide into a single ridge
 _FAINT = 0.12  # threshold of the ridge strength, relative to the strongest ridges
 _SHORTEST_PX = 60  # shorter isolated strokes are ignored
 _FEWEST_POINTS = 300
@@ -23,7 +23,7 @@ class Drawing:
     """Lines drawn in one photograph.
 
     Attributes:
-        name: of the photograph, for messages.
+        name: name of the photograph, for messages.
         pixels: points on the lines, about a pixel apart [px], shape (N, 2).
         normals: unit vectors across the lines, of arbitrary sign, shape (N, 2).
         size_px: width and height of the image.
@@ -64,7 +64,7 @@ def read_lines(picture: NDArray[np.uint8], name: str) -> Drawing:
     strength = -(0.5 * (dxx + dyy) - np.hypot(half, mixed))
     rows, columns = np.nonzero(strength > max(_FAINT * np.percentile(strength, 99.9), 1e-6))
     angle = 0.5 * np.arctan2(mixed, half)[rows, columns]
-    # The direction of the most negative curvature is perpendicular to that of the largest.
+    # The directions of the most negative and of the largest curvature are perpendicular.
     nx, ny = -np.sin(angle), np.cos(angle)
     along = nx * dx[rows, columns] + ny * dy[rows, columns]
     step = along / strength[rows, columns]
@@ -94,6 +94,6 @@ def features(pixels: Array, normals: Array, turn_px: float) -> Array:
 
 
 def nearest(these: Array, others: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the distance to and index of the nearest of `others` for each of these `features`."""
+    """Return the distance to the nearest of the features `others`, and its index, for each of the features `these`."""
     distance, index = cKDTree(others).query(these)
     return distance, index

@@ -1,4 +1,4 @@
-"""Initial poses of photographs: an exhaustive search over views, with outlines correlated with the drawn lines."""
+"""Initial poses of photographs: an exhaustive search over views that correlates outlines with the drawn lines."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ _ROLL = np.radians([-10.0, 0.0, 10.0])
 # Candidate widths of the field of view at the teeth [mm].
 _WIDTHS_MM = 38.0 * 1.1 ** np.arange(9)
 _ROWS_APART_MM = 10.0
-_SECTORS = 4  # direction bins; lines match outlines of the same bin only
-_NEAR_PX = 2.0  # distance at which a line counts half
+_SECTORS = 4  # direction bins: lines match only outlines of the same bin
+_NEAR_PX = 2.0  # distance from an outline at which a line counts half
 # Typical bite: overjet and overbite of the front teeth [mm].
 _OVERJET_MM, _OVERBITE_MM = 2.5, 2.0
 
 _WIDTH_PX = 360  # image width at which candidates are aligned
 _FACES = 6000  # crown faces per arch, sufficient at this resolution
-_CANDIDATES, _FINALISTS = 20, 4  # mirrored and not mirrored, each
-# Gates of the steps [mm]: from one tooth width to half of it; then with shifted bites.
+_CANDIDATES, _FINALISTS = 20, 4  # numbers with and without mirroring, each
+# Gates of the steps [mm], from one tooth width down to half of it: for the given bite, and for shifted bites.
 _WIDE_GATES, _SLID_GATES = (4.0, 4.0, 3.5, 3.5, 3.0, 3.0, 2.5, 2.5), (3.0, 3.0, 2.5, 2.0, 2.0, 2.0)
-# Shifts of the lower arch from a typical bite. All are scored, the best few aligned.
+# Shifts of the lower arch from a typical bite: all are scored, and the best `_SLIDES` are aligned.
 _ASIDE_MM, _UP_MM, _AHEAD_MM = (-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-4.0, -2.0, 0.0, 2.0, 4.0)
 _SLIDES = 4
 _MISFIT_GATE_MM = 1.5
@@ -47,7 +47,7 @@ _MISFIT_GATE_MM = 1.5
 class Candidate:
     """A candidate view of a photograph."""
 
-    share: float  # of the drawn lines that are near an outline [-]
+    share: float  # fraction of the drawn lines that are near an outline [-]
     T_cam_upper: Array  # shape (4, 4)
     focal_px: float
     mirrored: bool
@@ -83,7 +83,7 @@ def typical_bites(scans: Sequence[Scan]) -> list[TypicalBite]:
 
 
 def _sides(scan: Scan, arch: int) -> list[float]:
-    """Return the possible signs of an arch's smallest principal axis such that it points up."""
+    """Return the signs with which an arch's smallest principal axis may point up."""
     if len(scan.gum_faces) < len(scan.crown_faces) // 10:
         return [1.0, -1.0]
     gum = scan.vertices[np.unique(scan.gum_faces)].mean(0) - scan.centre
@@ -100,7 +100,7 @@ def _row_frame(scan: Scan, arch: int, side: float) -> Array:
     """Return T_anatomical_scan of one arch, with its origin at the edges of the front teeth, shape (4, 4)."""
     points = scan.crown_vertices(4000)
     up = side * _least_axis(scan)
-    # The frame of a bite whose other arch is a shifted copy of this one.
+    # Computed as the frame of a bite whose other arch is a shifted copy of this one.
     T = anatomical_frame(points, points - _ROWS_APART_MM * up)
     x, y, z = (points @ T[:3, :3].T).T
     edge = np.percentile(y[z > np.percentile(z, 90)], 2 if arch == 0 else 98)
@@ -115,7 +115,7 @@ def searched(
     Args:
         drawing: the lines of the photograph.
         crowns: upper and lower, decimated for fast rendering.
-        usual: gives the anatomical axes.
+        usual: typical bite, from which the anatomical axes are taken.
         T_upper_lower: the assumed bite, shape (4, 4).
         count: number of candidates to return, mirrored and not mirrored each.
     """
@@ -153,7 +153,7 @@ def _facing(turn: tuple[float, float, float]) -> Array:
 
 
 def _drawn_spectra(drawing: Drawing, size: int) -> Iterator[tuple[float, bool, NDArray[np.complex128], float]]:
-    """Yield the field of view at the teeth [mm], mirrored or not, spectra by direction bin, and number of points."""
+    """Yield field of view at the teeth [mm], whether mirrored, spectra by direction bin, and number of points."""
     for mirrored in (False, True):
         lines = drawing.mirrored() if mirrored else drawing
         middle = 0.5 * (np.array(drawing.size_px) - 1.0)
@@ -193,7 +193,7 @@ def _seen_spectra(
 
 @dataclass(frozen=True, eq=False)
 class ArchPair:
-    """Both arches split into teeth, full and decimated, in a typical bite."""
+    """Both arches split into teeth, at full resolution and decimated, and their typical bite."""
 
     usual: TypicalBite
     fine: tuple[Crowns, Crowns]
@@ -213,8 +213,8 @@ class ArchPair:
 class PhotoStart:
     """Initial pose of one photograph."""
 
-    misfit: float  # of its lines, see `Aligner.misfit` [-]
-    other_misfit: float  # the same with the opposite choice of mirroring
+    misfit: float  # misfit of its lines, see `Aligner.misfit` [-]
+    other_misfit: float  # misfit with the opposite choice of mirroring
     mirrored: bool
     bite: Bite  # of this photograph alone, at reduced size
     rows: ArchPair
@@ -238,7 +238,7 @@ def find_first(drawing: Drawing, scans: Sequence[Scan], usual: Sequence[TypicalB
 
 
 def _slid(bite: Bite, rows: ArchPair, aligner: Aligner) -> list[Bite]:
-    """Return a photograph with its own bite and the shifted bites that fit best."""
+    """Return a photograph with its current bite and with the shifted bites that fit best."""
     axes = rows.usual.T_anatomical_upper[:3, :3]
     out = []
     for slide in product(_ASIDE_MM, _UP_MM, _AHEAD_MM):
@@ -279,7 +279,7 @@ def _aligned_candidates(
 
 
 def _finalists(tried: Sequence[tuple[float, bool, Bite, ArchPair]]) -> list[tuple[float, bool, Bite, ArchPair]]:
-    """Return the best starts, some mirrored and some not, so that both are compared fairly."""
+    """Return the best starts, equally many mirrored and not mirrored, so that both are compared fairly."""
     ordered = sorted(tried, key=lambda one: one[0])
     return [one for way in (False, True) for one in [o for o in ordered if o[1] is way][:_FINALISTS]]
 

@@ -1,4 +1,4 @@
-"""Joint alignment of both arches with photographs: one bite, and a pose and lens for each photograph.
+"""Joint alignment of both arches with photographs: one bite for all, and a pose and lens for each.
 
 The camera model has one focal length, the principal point at the image centre, and one distortion coefficient.
 """
@@ -21,22 +21,22 @@ from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.initialization.occlusion import crown_surface
 
 #: Unknowns of a photograph: twist of the upper teeth about their centre [rad, mm], log focal length, distortion. A step
-#: in focal length also changes the distance such that the size of the teeth stays the same, which permits large steps.
+#: in focal length also changes the distance so that the teeth keep their size in the image, which permits large steps.
 UNKNOWNS = 8
 
-_SIGMA_MM = 0.15  # gap or penetration of scanned teeth in contact, standard deviation
-_SHARE = 0.04  # share of the lower crowns on a side that is in contact
-_REACH_MM = 3.0  # greater depths are beyond the base of a crown
+_SIGMA_MM = 0.15  # standard deviation of gap or penetration of scanned teeth in contact
+_SHARE = 0.04  # fraction of the lower crowns on a side that is in contact
+_REACH_MM = 3.0  # largest penetration: deeper points are beyond the base of a crown
 # Prior distance, with the standard deviation of its logarithm, and standard deviation of the distortion [-]: phones are
 # held 80 to 200 mm from the teeth, macro lenses 200 to 400 mm.
 _DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02
-_LOG_FOCAL = 0.05  # variation of the log focal length between photographs of one camera, by focusing
+_LOG_FOCAL = 0.05  # standard deviation of the log focal length between photographs of one camera, due to focusing
 _BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)  # of the bite about a typical one, at the lower teeth's centre [rad, mm]
-# Standard deviation of a step [rad, mm, log, -]: damps directions that the lines do not determine.
+# Prior standard deviation of a step [rad, mm, log, -]: damps directions that the lines do not determine.
 _LARGEST_STEP = np.array([0.1] * 3 + [3.0, 3.0, 30.0] + [0.2, 0.02])
-# Error of a drawn line along tooth edges and along the gum, and its correlation length.
+# Standard deviation of a drawn line from tooth edges and from the gum line, and correlation length of its error.
 _LINE_MM, _GUM_LINE_MM, _STRETCH_MM = 0.15, 0.3, 2.0
-_GUM_MM = 0.5  # difference between the gum lines of scan and photograph, standard deviation
+_GUM_MM = 0.5  # standard deviation of the difference between the gum lines of scan and photograph
 _SHARED = 8  # shared unknowns: twist of the bite about the centre of the lower teeth, gum-line offset per arch
 
 
@@ -49,7 +49,7 @@ class PhotoPose:
     distortion: float  # k1 of x (1 + k1 r^2), with r the distance from the centre over half the image width
 
     def stepped(self, centre: Array, step: Array) -> PhotoPose:
-        """Return the pose after a step (8,) of the unknowns; `centre` of the upper teeth in camera coordinates [mm]."""
+        """Return the pose after a step (8,) of the unknowns; `centre`: upper teeth in the camera frame [mm]."""
         pose = orthonormalise(motion_about(centre, step[:6]) @ self.T_cam_upper)
         pose[2, 3] += centre[2] * np.expm1(step[6])
         return PhotoPose(pose, self.focal_px * float(np.exp(step[6])), self.distortion + float(step[7]))
@@ -75,7 +75,7 @@ class PhotoPose:
     def slopes(
         self, points: Array, directions: Array, size_px: tuple[int, int], distance_mm: float
     ) -> tuple[Array, Array]:
-        """Return derivatives along image directions by the camera point (N, 3) [px/mm] and by the lens (N, 2).
+        """Return derivatives along image directions with respect to camera point (N, 3) [px/mm] and lens (N, 2).
 
         The lens columns are log focal length, with the coupled change of distance, and distortion. `directions` are
         unit vectors, shape (N, 2).
@@ -119,7 +119,7 @@ class Contact:
         self._sides = [across > np.percentile(across, 60), across < np.percentile(across, 40)]
 
     def equations(self, T_upper_lower: Array, centre: Array) -> tuple[Array, Array, Array]:
-        """Return derivatives (N, 6) by a twist of the bite about `centre`, distances [mm] and weights [1/mm^2]."""
+        """Return derivatives (N, 6) with respect to a bite twist about `centre`, distances [mm], weights [1/mm^2]."""
         points = transform_points(T_upper_lower, self._lower.points)
         away, normals = self._signed(points)
         slopes, residuals, weights = [], [], []
@@ -132,7 +132,7 @@ class Contact:
         return np.vstack(slopes), np.concatenate(residuals), np.concatenate(weights)
 
     def depth_mm(self, T_upper_lower: Array) -> float:
-        """Return the greatest penetration of the crowns, apart from outliers [mm]."""
+        """Return the greatest penetration of the crowns, excluding outliers [mm]."""
         away, _ = self._signed(transform_points(T_upper_lower, self._lower.points))
         return max(0.0, -float(np.percentile(away, 0.2)))
 
@@ -150,7 +150,7 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """Lines of one photograph, unmirrored, and its pose."""
+    """The lines of one photograph, after undoing any mirroring, and its pose."""
 
     drawing: Drawing
     pose: PhotoPose
@@ -162,11 +162,11 @@ class Photo:
 
 @dataclass(frozen=True, eq=False)
 class Bite:
-    """Poses of photographs and the bite they share."""
+    """Poses of photographs and the bite they have in common."""
 
     photos: tuple[Photo, ...]
     T_upper_lower: Array  # shape (4, 4)
-    gum_mm: Array  # offset of the drawn gum lines from the crowns' edges towards the gum, upper and lower, shape (2,)
+    gum_mm: Array  # offset of drawn gum lines from the edges of the crowns towards the gum, upper and lower, shape (2,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ def match(seen: Outlines, drawing: Drawing, turn_px: float) -> Match:
 
 
 def seen_outlines(crowns: Sequence[Crowns], photo: Photo, bite: Bite) -> Outlines:
-    """Return the outlines of all teeth expected in a photograph."""
+    """Return the expected outlines of all teeth in a photograph."""
     width, height = photo.drawing.size_px
     K = photo.pose.camera_matrix(photo.drawing.size_px)
     T = photo.pose.T_cam_upper
@@ -205,10 +205,10 @@ def seen_outlines(crowns: Sequence[Crowns], photo: Photo, bite: Bite) -> Outline
 
 
 class Aligner:
-    """Gauss-Newton alignment of both arches with photographs, on distances between drawn lines and outlines."""
+    """Gauss-Newton alignment of both arches with photographs, minimising distances of drawn lines from outlines."""
 
     def __init__(self, crowns: Sequence[Crowns], usual_bite: Array, contact: Contact | None) -> None:
-        """Store both arches, a typical bite as prior, and the contact prior, if it is to be used."""
+        """Store both arches, a typical bite as prior, and the contact prior, or None to omit it."""
         self._crowns, self._usual, self._contact = crowns, usual_bite, contact
 
     def aligned(self, bite: Bite, gates_mm: Sequence[float]) -> Bite:
@@ -261,7 +261,7 @@ class Aligner:
     def _equations(
         self, photo: Photo, bite: Bite, centre: Array, centre_lower: Array, gate_mm: float
     ) -> tuple[Array, Array, Array]:
-        """Return derivatives (N, 16) by own and shared unknowns, residuals [px] and weights [1/px^2]."""
+        """Return derivatives (N, 16) with respect to own and shared unknowns, residuals [px], weights [1/px^2]."""
         px_per_mm = _px_per_mm(photo, self._crowns)
         seen = seen_outlines(self._crowns, photo, bite)
         found = match(seen, photo.drawing, 0.5 * gate_mm * px_per_mm)
@@ -274,7 +274,7 @@ class Aligner:
         J = np.hstack([turns[0], by_point, by_lens, turns[1], in_bite, by_gum])
         share = np.clip(1.0 - (found.apart / (gate_mm * px_per_mm)) ** 2, 0.0, None) ** 2
         sigma_px = px_per_mm * (_LINE_MM + (_GUM_LINE_MM - _LINE_MM) * own.gum)
-        # Errors of neighbouring points are correlated, so each correlation length counts once.
+        # Errors of neighbouring points are correlated, so each correlation length counts as one measurement.
         return J, found.off_px, share / sigma_px**2 / max(1.0, _STRETCH_MM * px_per_mm)
 
     def _bite_prior(self, T_upper_lower: Array) -> tuple[Array, Array, Array]:
@@ -285,7 +285,7 @@ class Aligner:
 
 
 def _add(H: Array, g: Array, part: NDArray[np.int64], J: Array, residual: Array, weight: Array) -> None:
-    """Add residuals with derivatives J by a subset of the unknowns to the normal equations."""
+    """Add residuals to the normal equations; J are derivatives with respect to the unknowns with indices `part`."""
     H[np.ix_(part, part)] += J.T @ (weight[:, None] * J)
     g[part] -= J.T @ (weight * residual)
 

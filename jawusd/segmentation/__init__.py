@@ -1,4 +1,4 @@
 """Segment both arches in footage, guided by the projected scans.
 
-Produces mask files that a person can edit; imports no other stage.
+Writes mask files that the user can edit; imports no other stage.
 """

@@ -1,4 +1,4 @@
-"""Both arches in one picture: projected crowns, the three-way cut, and the cost of colour, position and edges."""
+"""Both arches in one image: projected crowns, the three-way cut, and its costs from colour, position and edges."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 OTHER, UPPER, LOWER = 0, 1, 2
 _TAU = _SIGMA = 0.35  # step sizes of the primal-dual iteration; convergence needs tau sigma 8 < 1
 _NEVER = 30.0  # log-odds of a hard constraint
-_FEWEST_OPEN = 20  # fewest undecided pixels between the arches to re-estimate their border
-_ARCH_BLUR_PX = 0.8  # softens the border between the arches to fractions of a pixel
+_FEWEST_OPEN = 20  # number of undecided pixels between the arches from which their border is re-estimated
+_ARCH_BLUR_PX = 0.8  # blur that gives the border between the arches fractional coverage
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class ScanSurface:
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """Expected crowns in a picture; px are pixels of that picture."""
+    """Expected crowns in an image; px are pixels of that image."""
 
     labels: NDArray[np.uint8]  # visible crowns: OTHER, UPPER or LOWER, shape (h, w)
     # signed distance to the outline of each arch's visible crowns, positive inside, shape (2, h, w)
@@ -87,8 +87,8 @@ def _iterate(
 ) -> None:
     """Run the first-order primal-dual iteration (Chambolle and Pock 2011) of the relaxed Potts energy.
 
-    cost (3, h, w); edge (2, h, w), weights of the links to the right and down; u (3, h, w), in and out; spans (h, 2),
-    range of free columns per row, all others are fixed.
+    Shapes: cost (3, h, w); edge (2, h, w), weights of the links to the right and down; u (3, h, w), updated in place;
+    spans (h, 2), the range of free columns in each row, outside which pixels are fixed.
     """
     n, h, w = cost.shape
     px, py = np.zeros_like(u), np.zeros_like(u)
@@ -152,7 +152,7 @@ def cut_three_ways(
     """Return the label weights of the minimal cut, non-negative with sum 1, shape (3, h, w).
 
     The energy is the cost of the labels plus the weighted length of the borders between them: the convex relaxation of
-    the Potts model with separate labels (Zach et al. 2008), with links to the right and down.
+    the Potts model with one indicator per label (Zach et al. 2008), and with links to the right and down.
 
     Args:
         cost: cost of each label per pixel, shape (3, h, w).
@@ -165,7 +165,7 @@ def cut_three_ways(
     for y in np.flatnonzero(free.any(1)):
         columns = np.flatnonzero(free[y])
         spans[y] = columns[0], columns[-1] + 1
-    # Each border belongs to two labels but counts once.
+    # Each border is part of the outline of two labels, but its cost counts once.
     half = np.ascontiguousarray(0.5 * edge, np.float32)
     _iterate(np.ascontiguousarray(cost, np.float32), half, u, spans, steps)
     return u
@@ -173,7 +173,7 @@ def cut_three_ways(
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """Annotations in a working picture."""
+    """Annotations in a working image."""
 
     known: Mask  # annotated pixels of each arch, shape (2, h, w)
     share: NDArray[np.float32]  # annotated tooth coverage, shape (2, h, w)
@@ -193,13 +193,13 @@ def learn_colours(
     px_per_mm: float,
     weight: float = 1.0,
 ) -> None:
-    """Update a colour model with a picture, shape (h, w, 3), and the expected position of the crowns."""
+    """Update a colour model with an image, shape (h, w, 3), and the expected position of the crowns."""
     nearest = expected.inside_px.max(0) / px_per_mm
     model.learn(rgb, nearest > config.inner_mm, nearest < -config.outer_mm, weight)
 
 
 def excess_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
-    """Return the log-odds of tooth by colour alone minus the required threshold, shape (h, w)."""
+    """Return the log-odds of tooth from colour alone, minus the required threshold, shape (h, w)."""
     demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
     return model.log_odds(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
 
@@ -213,7 +213,7 @@ def cut_arches(
     reach_mm: float,
     seeds: Seeds | None = None,
 ) -> NDArray[np.float32]:
-    """Segment a picture (h, w, 3); return the coverage of both arches, 0 .. 1, shape (2, h, w).
+    """Segment an image (h, w, 3); return the coverage of both arches, 0 .. 1, shape (2, h, w).
 
     Args:
         reach_mm: largest distance of teeth outside their projection.
@@ -249,7 +249,8 @@ def separate_arches(
     """Return the coverage of both arches, shape (2, h, w), with the border between them re-estimated from edges.
 
     The sum of both is unchanged. Edges between upper and lower teeth are much weaker than those between teeth and lips.
-    A common edge weight would ignore them: the border would stay at its prediction and bias the poses towards it.
+    With a common edge weight, these weak edges would have no effect: the border would stay at its predicted position,
+    and bias the poses towards the prediction.
     """
     inside = expected.inside_px / px_per_mm
     teeth = shares.sum(0)
@@ -277,7 +278,7 @@ def separate_arches(
 def _edge_prices(rgb: NDArray[np.uint8], config: SegmentationConfig, where: Mask | None = None) -> NDArray[np.float32]:
     """Return the cost of a border between each pixel and its right and lower neighbour, shape (2, h, w).
 
-    The contrast is normalised by that of the picture (Boykov and Jolly 2001), or of a part of it, shape (h, w).
+    Edge contrast is normalised by the mean contrast of the image (Boykov and Jolly 2001), or of its part `where`.
     """
     smooth = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), (0, 0), 0.8).astype(np.float32)
     out = np.full((2, *rgb.shape[:2]), config.border, np.float32)

@@ -1,4 +1,4 @@
-"""Sub-pixel refinement of mask borders to edges of the picture."""
+"""Sub-pixel refinement of mask borders to image edges."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from jawusd.base.arrays import Mask
 from jawusd.segmentation.colours import SegmentationConfig, log_chroma
 
 _EVEN = 1e-4  # variance added to log colours [-]: half an 8-bit step
-_FEWEST = 100  # fewest pixels for a covariance of colours
-_ARCH_BLUR_PX = 0.8  # blur that makes the border between the arches soft
+_FEWEST = 100  # minimum number of pixels for a covariance of colours
+_ARCH_BLUR_PX = 0.8  # blur that gives the border between the arches fractional coverage
 _FAR_BLUR_PX = 2.0  # blur that assigns new tooth pixels to the nearer arch
 
 
@@ -29,12 +29,13 @@ class _Sides:
 def refine_borders(
     shares: NDArray[np.float32], rgb: NDArray[np.uint8], config: SegmentationConfig, px_per_mm: float
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Return coverages (2, h, w) with soft borders, 0.5 at the outline, and where borders are visible, shape (h, w).
+    """Return coverages (2, h, w) with soft borders, 0.5 at the outline, and a mask of visible borders, shape (h, w).
 
     Along the border, teeth are separated from their surroundings again by the local colours on both sides. The colours
-    learned over the take decide what is tooth but not its exact end, since the midpoint between two colours varies
-    locally. Fisher's discriminant between the local means finds it (local region statistics, Lankton & Tannenbaum
-    2008). Where the sides do not differ the border is unchanged; parts with mostly such borders are discarded.
+    learned over the take determine which parts are teeth, but not their exact borders, since the midpoint between two
+    colours varies locally. Fisher's discriminant between the local means determines the border (local region
+    statistics, Lankton & Tannenbaum 2008). Where the colours of both sides do not differ, the border is unchanged;
+    parts with mostly such borders are discarded.
     """
     colours = _blurred(log_chroma(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1
@@ -81,7 +82,7 @@ def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], wi
 
 
 def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[NDArray[np.float32], Mask]:
-    """Return the local mean colour of one side at every pixel, and where enough of that side is nearby."""
+    """Return the local mean colour of one side at every pixel, and the pixels that have enough of that side nearby."""
     weight = side.astype(np.float32)
     count = cv2.boxFilter(weight, -1, (window, window), normalize=False)
     total = cv2.boxFilter(colours * weight[..., None], -1, (window, window), normalize=False)

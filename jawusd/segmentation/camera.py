@@ -1,4 +1,4 @@
-"""Segment the pictures of one camera, frame by frame."""
+"""Segment the images of one camera, frame by frame."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ _EVERY = 20  # stride of the crown vertices projected to find the window
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Segmentation of both arches in one picture."""
+    """Segmentation of both arches in one image."""
 
     camera: Camera  # pinhole camera of the window
     masks: NDArray[np.uint8]  # coverage of the upper and lower arch, 0..255, uint8, shape (2, h, w)
-    present: Mask  # which arches are visible, shape (2,)
-    # contrast of tooth likelihood across the outline, per arch, -1 .. 1; NaN without an outline
+    present: Mask  # whether each arch is visible, shape (2,)
+    # difference of tooth likelihood across the outline, per arch, -1 .. 1; NaN without an outline
     contrast: Array
     # fraction of each arch's mask outside the expected crowns; NaN without a mask
     unexpected: Array
-    # outline pixels of each arch that are visible edges, that are not, and that border the other arch, shape (2, 3)
+    # numbers of outline pixels of each arch: on visible edges, on no visible edge, and next to the other arch, shape
+    # (2, 3)
     outline: NDArray[np.int64]
     # the segmented window and the expected crowns
     window: Window
@@ -57,14 +58,14 @@ class Segment:
 
 
 class CameraSegmenter:
-    """Segmentation of both arches in one camera's pictures.
+    """Segmentation of both arches in one camera's images.
 
     Attributes:
         colours: the colour model learned so far.
     """
 
     def __init__(self, source: Camera, meshes: Sequence[Mesh], poses: Array, config: SegmentationConfig) -> None:
-        """Prepare with the upper and lower scan, and their poses (2, 4, 4) in the world at any time of the take."""
+        """Prepare the upper and lower scan; `poses` (2, 4, 4) are their world poses at any time of the take."""
         self._config = config
         upper, lower = meshes
         self._scans = ScanSurface.of(upper), ScanSurface.of(lower)
@@ -83,11 +84,11 @@ class CameraSegmenter:
         turn: int,
         keys: Sequence[Key | None] = (None, None),
     ) -> Segment | None:
-        """Segment a recorded RGB picture (H, W, 3); None if the teeth are out of view.
+        """Segment a recorded RGB image (H, W, 3); None if the teeth are out of view.
 
         Args:
             poses: expected T_world_upper, T_world_lower, shape (2, 4, 4).
-            turn: iteration; 0 for predicted poses, then 1 and so on as they are refined.
+            turn: iteration: 0 for predicted poses, then 1 and so on for refined ones.
         """
         c = self._config
         window = self._frame.window(image, self._around(poses), c.margin_mm)
@@ -98,11 +99,11 @@ class CameraSegmenter:
         if turn == 0 or not self.colours.is_trained():
             self._learn(window, expected, keys, seeds)
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
-        # Computed outlines are more consistent over time than annotated ones, which matters to the tracker: a
-        # finished mask replaces a computed one only if it is wrong.
+        # Computed outlines are more consistent over time than annotated ones, which the tracker needs: a finished mask
+        # replaces a computed one only if the computed one is wrong.
         drawn = seeds.share if seeds is not None and seeds.known.all() else None
         guide = None if drawn is not None else seeds
-        # Refine borders in the first iteration too: the tracker interprets rough outlines as a lost arch.
+        # Refine borders in the first iteration too: with rough outlines, the tracker reports a lost arch.
         shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide)
         if drawn is not None and _overlap(shares, drawn) < c.key_overlap:
             shares = drawn
@@ -119,7 +120,7 @@ class CameraSegmenter:
         return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ARCHES])
 
     def study(self, image: ColourPicture, poses: Array, keys: Sequence[Key | None]) -> Example | None:
-        """Learn the colours of an annotated picture at aligned poses, and return it as an example.
+        """Learn the colours of an annotated image at aligned poses, and return it as an example.
 
         Return None if the masks are not finished or the teeth are out of view.
         """
@@ -145,7 +146,7 @@ class CameraSegmenter:
         return Seeds(known | all(key is not None and key.finished for key in keys), share)
 
     def _learn(self, window: Window, expected: Expectation, keys: Sequence[Key | None], seeds: Seeds | None) -> None:
-        """Update the colours with a picture, with a higher weight for annotations."""
+        """Update the colours with an image, with a higher weight for annotations."""
         c = self._config
         if not all(key is not None and key.finished for key in keys):
             learn_colours(self.colours, window.rgb, expected, c, self._frame.px_per_mm)

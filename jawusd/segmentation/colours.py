@@ -1,7 +1,7 @@
 """Colour model of teeth and surroundings in one camera, its saved state, and the configuration.
 
-Colour histograms follow the take. Their state is saved after every frame, so that resumed runs equal uninterrupted
-runs.
+Colour histograms adapt during the take. Their state is saved after every frame, so that resumed runs give the same
+masks as uninterrupted ones.
 """
 
 from __future__ import annotations
@@ -19,48 +19,50 @@ from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.base.npz import DAMAGED
 from jawusd.formats.atomic import write_npz_atomic
 
-_BINS = 32  # per channel
+_BINS = 32  # histogram bins per channel
 _FLOOR = 12.0  # added to every channel before ratios [8-bit steps], since dark pixels have noisy hues
-_RATIO_STEP = 0.03  # bin width of the log ratios [-]; covers red over green from 0.6 to 1.6 and beyond
+_RATIO_STEP = 0.03  # bin width of the log ratios [-]; the bins cover red over green from 0.6 to more than 1.6
 _MOST = 6.0  # bound of the log-odds by colour alone [-]
-_ROUNDS, _STEPS = 5, 8  # reclassifications of hidden crowns, and Newton steps per round
+_ROUNDS, _STEPS = 5, 8  # reclassifications of pixels under crowns, and Newton steps per round
 _LIGHT = 1  # index of the lightness term
-_RIDGE = 0.01  # regularisation; keeps weights finite for separable colours
-# Two files alternate, since a run may be killed between saving the colours of a frame and recording the frame.
+_RIDGE = 0.01  # regularisation, which keeps weights finite for separable colours
+# Used alternately, since a run may be killed between saving the colours of a frame and recording the frame as done.
 _FILES = ("colours_0.npz", "colours_1.npz")
 
 
 @dataclass(frozen=True)
 class SegmentationConfig:
-    """Configuration of the segmentation; px are pixels of the working picture."""
+    """Configuration of the segmentation; px are pixels of the working image."""
 
-    # Working resolution at the teeth [px/mm]; same as the tracker's.
+    # Working resolution at the teeth [px/mm], the same as the tracker's.
     working_px_per_mm: float = 7.2
-    # Margin around the projected crowns [mm]: lips, gum and tongue, but no background.
+    # Margin around the projected crowns [mm]: includes lips, gum and tongue, but no background.
     margin_mm: float = 4.0
-    # Distance inside the projected crowns from which colours are learned as crowns [mm]; larger than the pose error.
+    # Distance inside the projected crowns from which pixels train the tooth colours [mm]: larger than the pose error.
     inner_mm: float = 0.4
-    # Distance outside the projected crowns from which colours are learned as surroundings [mm].
+    # Distance outside the projected crowns from which pixels train the colours of the surroundings [mm].
     outer_mm: float = 1.0
-    # Largest distance of teeth outside their projection [mm]: in the first iteration, and after poses were aligned.
+    # Largest distance of tooth pixels outside the projected crowns [mm]: in the first iteration, and after alignment.
     reach_mm: tuple[float, ...] = (1.6, 1.0)
-    # Time constant of the colours [frames]; light changes slowly, with the head.
+    # Time constant of the colour histograms [frames]: light changes slowly, as the head moves.
     memory_frames: float = 24.0
-    # Quantile of the surroundings' log-odds that tooth colours must exceed [-], and by how much [-] without evidence
-    # from position; the separability of colours differs between persons.
+    # Quantile of the surroundings' log-odds that tooth colours must exceed [-], and the margin required without
+    # evidence from position [-]: the separability of colours differs between subjects.
     surroundings_share: float = 0.95
     doubt: float = 1.5
     # Limits of the required log-odds [-].
     doubt_range: tuple[float, float] = (-1.0, 1.0)
-    # Log-odds of tooth per mm inside the projected outline [1/mm], and their limits against and in favour.
+    # Log-odds of tooth per mm inside the projected outline [1/mm], and their limits outside and inside [-].
     place_per_mm: float = 2.0
     place_most: tuple[float, float] = (1.5, 1.0)
-    # Cost of a border in log-odds per pixel of length [-], and the fraction that remains on the strongest edges.
+    # Cost of a border per pixel of length, in log-odds [-], and the fraction of it that remains on the strongest edges.
     border: float = 4.0
     border_on_edge: float = 0.15
-    # Log-odds between the arches per mm from their projected common border [1/mm]; the name is used in segment.json.
+    # Log-odds between the arches per mm from their projected common border [1/mm]; segment.json uses the name of this
+    # setting.
     rows_per_mm: float = 2.0
-    # Largest refinement of a border [mm], and the distance to both sides over which colours are compared [mm].
+    # Largest displacement of a border by refinement [mm], and distance on both sides over which colours are compared
+    # [mm].
     border_band_mm: float = 0.4
     border_side_mm: float = 0.8
     # Blur of the compared colours [px], and the required separation in standard deviations [-].
@@ -69,32 +71,32 @@ class SegmentationConfig:
     # Outward shift of the outlines of the upper and lower arch [-], learned from annotated masks; 1 is the width of the
     # soft border, about 3 px.
     wider: tuple[float, float] = (0.0, 0.0)
-    # Fraction of a part's outline that must be a visible edge [-], and the smallest size of a part [px].
+    # Fraction of a part's outline that must be on visible edges [-], and the smallest area of a part [px].
     founded_share: float = 0.5
     speck_px: int = 25
     # Iterations of the cut [-].
     steps: int = 40
-    # Search range of the border between the arches [mm], and iterations [-].
+    # Search range of the border between the arches [mm], and iterations of its cut [-].
     arch_band_mm: float = 1.0
     arch_steps: int = 60
-    # Weight of an annotated mask in the colours [frames].
+    # Weight of an annotated mask in the colour histograms, as a number of frames.
     key_weight: float = 12.0
-    # Intersection over union with a finished mask below which a segmentation is rejected [-].
+    # Intersection over union with a finished mask below which the finished mask replaces the segmentation [-].
     key_overlap: float = 0.8
-    # Smallest mask [px]: 4 square millimetres.
+    # Smallest area of a mask [px]: 4 square millimetres.
     least_px: int = 200
 
 
 class ColourModel:
-    """Colour model of teeth and their surroundings that gives log-odds.
+    """Colour model of teeth and their surroundings: log-odds of tooth by colour.
 
     Pixels under projected crowns are teeth or, where lips, cheeks or tongue hide them, surroundings; all other pixels
     are surroundings. A logistic regression on the colours, their squares and products separates the two. Pixels under
-    the crowns that it classifies as surroundings change class, and it is fitted again. With so few terms it cannot
-    overfit to lip colours that occur only under crowns.
+    the crowns that it classifies as surroundings change class, and the regression is repeated. With so few terms, it
+    cannot overfit lip colours that occur only under crowns.
 
-    Colours are lightness and the logs of red and blue over green. Shade scales all channels equally, so the ratios are
-    invariant (Finlayson et al. 2006), and shaded back teeth look like lit front teeth.
+    Colours are lightness and the logs of red and blue over green. Shading scales all channels equally, so the ratios
+    are invariant to it (Finlayson et al. 2006), and shaded back teeth have the same ratios as lit front teeth.
     """
 
     def __init__(self, memory: float) -> None:
@@ -105,7 +107,7 @@ class ColourModel:
         self._table: NDArray[np.float32] | None = None
 
     def learn(self, rgb: NDArray[np.uint8], under: Mask, beyond: Mask, weight: float = 1.0) -> None:
-        """Update the histograms with a picture (h, w, 3), given pixels (h, w) well inside and outside the crowns."""
+        """Update the histograms with an image (h, w, 3), and masks (h, w) well inside and outside the crowns."""
         index = _bins(rgb)
         for counts, where in ((self._under, under), (self._beyond, beyond)):
             new = np.bincount(index[where], minlength=_BINS**3).reshape(counts.shape)
@@ -114,7 +116,7 @@ class ColourModel:
         self._table = None
 
     def is_trained(self) -> bool:
-        """Return whether any picture was learned."""
+        """Return whether any image was learned."""
         return bool(self._under.any() and self._beyond.any())
 
     def counts(self) -> tuple[NDArray[np.int64], Array]:
@@ -131,7 +133,7 @@ class ColourModel:
         self._table = None
 
     def log_odds(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the log-odds of tooth against surroundings per pixel, shape (h, w)."""
+        """Return the log-odds of tooth against surroundings at each pixel, shape (h, w)."""
         return self._odds()[_bins(rgb)]
 
     def surroundings_quantile(self, share: float) -> float:
@@ -148,7 +150,7 @@ class ColourModel:
 
 
 def log_chroma(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the logs of lightness, red over green and blue over green of an 8-bit picture, shape (h, w, 3)."""
+    """Return the logs of lightness, red over green and blue over green of an 8-bit image, shape (h, w, 3)."""
     red, green, blue = (_LOGS[rgb[..., k]] for k in range(3))
     return np.stack([(red + green + blue) / 3, red - green, blue - green], axis=-1)
 
@@ -170,7 +172,7 @@ def _bins(rgb: NDArray[np.uint8]) -> Indices:
 def _terms() -> Array:
     """Return the terms of the regression for the centre of every bin, shape (bins, 7).
 
-    Lightness is only linear, so that dark lips under crowns cannot make dark colours look like teeth.
+    Lightness enters only linearly, so that dark lips under crowns cannot raise the log-odds of dark colours.
     """
     step = np.arange(_BINS) + 0.5
     light, ratio = np.log(step * 256 / _BINS + _FLOOR), (step - _BINS // 2) * _RATIO_STEP
@@ -181,7 +183,7 @@ def _terms() -> Array:
 
 
 def _fitted_weights(under: Array, beyond: Array) -> Array:
-    """Fit the weights of the terms to the counts of every bin, shape (7,); darkness never favours teeth."""
+    """Fit the weights of the terms to the counts of every bin, shape (7,); that of lightness is never negative."""
     seen = np.flatnonzero(under + beyond)
     x = _terms()[seen]
     under, beyond = (c[seen] / max(c.sum(), 1e-12) for c in (under, beyond))
@@ -193,7 +195,7 @@ def _fitted_weights(under: Array, beyond: Array) -> Array:
 
 
 def _regress(x: Array, under: Array, beyond: Array) -> Array:
-    """Fit the weights of terms (N, 7) that separate two weighted classes (N,), the first of them a mixture."""
+    """Fit the weights of terms (N, 7) that separate two classes with weights (N,), the first of which is a mixture."""
     weights, ridge = np.zeros(x.shape[1]), _RIDGE * np.eye(x.shape[1])
     ridge[0, 0] = 1e-9
     tooth = np.ones(len(x))
@@ -232,7 +234,7 @@ class ColourStates:
         write_npz_atomic(self._folder / _FILES[frame % 2], arrays, packed=False)
 
     def restore(self, done: int, step: int) -> int | None:
-        """Restore the latest colours saved up to a finished frame; step is 1 (forwards) or -1 (backwards).
+        """Restore the latest colours saved up to frame `done`; step is 1 (forwards) or -1 (backwards).
 
         Return the frame after which they were saved; None if there are none.
         """

@@ -1,4 +1,4 @@
-"""Mask files: their paths, writing masks, annotated masks, and contact sheets."""
+"""Mask files: paths, writing, annotated masks, and contact sheets."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from jawusd.media.pictures import read_gray
 ARCHES = ("upper", "lower")
 PATTERN = "%06d.png"
 _UNKNOWN = 128  # gray value of pixels without annotation
-_STROKES_UNKNOWN = 0.5  # fraction of such pixels from which a picture contains strokes
+_STROKES_UNKNOWN = 0.5  # fraction of such pixels from which an image contains strokes
 _COLUMNS = 3
 _TILE_PX = (480, 270)
-_MARGIN = 0.15  # relative to the extent of the teeth
+_MARGIN = 0.15  # margin of a tile, relative to the extent of the teeth
 
 
 def mask_pattern(folder: Path, camera: str, arch: str) -> Path:
-    """Return the file pattern of a camera's masks of an arch, numbered by the camera's frames."""
+    """Return the file pattern of a camera's masks of an arch, numbered like the camera's frames."""
     return folder / camera / arch / PATTERN
 
 
@@ -52,7 +52,7 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Key:
-    """Annotation of one arch in one picture."""
+    """Annotation of one arch in one image."""
 
     mask: NDArray[np.uint8]  # 255 = tooth, (H, W) uint8
     # 255 at annotated pixels, (H, W) uint8: everywhere in a finished mask, otherwise under strokes
@@ -61,14 +61,14 @@ class Key:
 
 
 class KeyMasks:
-    """Annotations of some frames, in folders named like those that are written.
+    """Annotations of some frames, in folders with the same names as those of the written masks.
 
-    A picture is a finished mask or, if at least half of it has the gray value 128, strokes: 255 on teeth of the arch, 0
-    on anything else, 128 where nothing was drawn.
+    An image is a finished mask or, if at least half of its pixels have the gray value 128, strokes: 255 on teeth of the
+    arch, 0 on anything else, 128 where nothing was drawn.
     """
 
     def __init__(self, folder: Path | None, sizes_px: dict[str, tuple[int, int]]) -> None:
-        """Find the pictures CAMERA/upper/%06d.png and CAMERA/lower/%06d.png of a folder, if any.
+        """Find the images CAMERA/upper/%06d.png and CAMERA/lower/%06d.png in a folder, if one is given.
 
         Raises:
             CaptureError: the folder is missing or contains nothing for these cameras.
@@ -90,7 +90,7 @@ class KeyMasks:
             )
 
     def frames(self, camera: str) -> list[int]:
-        """Return the annotated frames of a camera, in its own numbers."""
+        """Return the numbers of a camera's annotated frames."""
         files = [path for arch in ARCHES if self._folder for path in (self._folder / camera / arch).glob("*.png")]
         return sorted({int(path.stem) for path in files if path.stem.isdecimal()})
 
@@ -98,7 +98,7 @@ class KeyMasks:
         """Return the annotation of both arches at a camera's own frame, None for an arch without one.
 
         Raises:
-            CaptureError: a picture cannot be decoded or has the wrong size.
+            CaptureError: an image cannot be decoded or has the wrong size.
         """
         return [self._key(camera, arch, own) for arch in ARCHES]
 
@@ -123,7 +123,7 @@ class KeyMasks:
 
 
 def _is_strokes(picture: RawImage) -> bool:
-    """Return whether a picture, (h, w) or with channels, contains strokes rather than a finished mask."""
+    """Return whether an image, (h, w) or with channels, contains strokes rather than a finished mask."""
     return bool((picture == _UNKNOWN).mean() >= _STROKES_UNKNOWN)
 
 
@@ -133,7 +133,7 @@ def write_sheet(
     """Write a PNG with one tile per (camera, own frame, remark), with both arches outlined.
 
     Raises:
-        CaptureError: a picture or mask cannot be decoded.
+        CaptureError: an image or mask cannot be decoded.
         OutputError: the file cannot be written.
     """
     opened = {name: open_clip(videos[name]) for name in {camera for camera, _, _ in shown}}
@@ -148,7 +148,7 @@ def write_sheet(
 
 
 def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None], caption: str) -> NDArray[np.uint8]:
-    """Return an RGB picture cropped to its masks, outlined and captioned."""
+    """Return an RGB image cropped to its masks, outlined and captioned."""
     extent = np.zeros(picture.shape[:2], bool)
     for _, mask, colour in zip(ARCHES, masks, (UPPER_COLOUR, LOWER_COLOUR), strict=True):
         if mask is not None:
@@ -160,7 +160,7 @@ def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None],
 
 
 def _cut(picture: NDArray[np.uint8], extent: Mask) -> NDArray[np.uint8]:
-    """Crop a picture around the marked pixels, with the aspect ratio of a tile where possible."""
+    """Crop an image around the marked pixels, with the aspect ratio of a tile where possible."""
     if not extent.any():
         return picture
     rows, columns = np.flatnonzero(extent.any(1)), np.flatnonzero(extent.any(0))

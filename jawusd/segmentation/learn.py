@@ -1,4 +1,4 @@
-"""Learn the weights of the energy, and the outline offset of the annotator, from finished masks of a few frames."""
+"""Learn the weights of the energy, and the annotator's outline offset, from finished masks of a few frames."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from jawusd.segmentation.border import refine_borders
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.picture import Window
 
-_FACTORS = (0.5, 2.0)  # tried for every weight
+_FACTORS = (0.5, 2.0)  # factors tried on every weight
 _NUMBERS = ("border", "place_per_mm", "rows_per_mm")
-_DOUBTS = (-1.0, 1.0)  # tried as changes of the doubt
-_WIDER = np.arange(-6, 7) * 0.05  # tried as outward shifts of outlines
-_LEAST_GAIN = 0.01  # smallest relative improvement that is not chance
+_DOUBTS = (-1.0, 1.0)  # changes tried on `doubt`
+_WIDER = np.arange(-6, 7) * 0.05  # outward shifts tried on outlines
+_LEAST_GAIN = 0.01  # smallest relative improvement that counts as significant
 
 
 class LearnedNumbers(TypedDict):
-    """Changed weights, and the mean error (1 - intersection over union) before and after."""
+    """The weights that changed, and the mean error (1 - intersection over union) before and after."""
 
     numbers: dict[str, object]
     disagreement: list[float]
@@ -32,14 +32,14 @@ class LearnedNumbers(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A picture with finished masks."""
+    """An image with finished masks."""
 
-    # the picture and the expected crowns
+    # the image and the expected crowns
     window: Window
     expected: Expectation
     drawn: NDArray[np.float32]  # annotated coverage of both arches, shape (2, h, w)
     colours: ColourModel  # the colours of its camera
-    px_per_mm: float  # resolution of the picture
+    px_per_mm: float  # resolution of the image
 
     def cut(self, config: SegmentationConfig) -> NDArray[np.float32]:
         """Segment without the annotated masks; return the coverage of both arches, shape (2, h, w)."""
@@ -58,7 +58,7 @@ def cut_picture(
 ) -> tuple[NDArray[np.float32], Mask]:
     """Segment both arches, refine their borders and keep annotations.
 
-    Return the coverage of both arches, shape (2, h, w), and where borders are visible, shape (h, w).
+    Return the coverage of both arches, shape (2, h, w), and the pixels with visible borders, shape (h, w).
     """
     shares = cut_arches(window.rgb, expected, colours, config, px_per_mm, reach_mm, seeds)
     shares, clear = refine_borders(shares, window.rgb, config, px_per_mm)
@@ -68,7 +68,7 @@ def cut_picture(
 
 
 def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tuple[SegmentationConfig, LearnedNumbers]:
-    """Optimise the weights one after the other for agreement with annotated masks; also return the changes."""
+    """Optimise the weights one after the other for agreement with annotated masks; also return what changed."""
     best, cuts = config, [example.cut(config) for example in examples]
     before = least = _disagreement(examples, cuts)
     for trial in _trials(config):

@@ -1,4 +1,4 @@
-"""Pictures of all cameras per instant, and windows around the teeth, undistorted and reduced."""
+"""Images of all cameras at each instant, and windows around the teeth, undistorted and downscaled."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ _NODE_PX = 8  # grid spacing of the undistortion map
 _CHUNK = 16  # instants buffered when reading backwards: 50 MB per full HD camera
 
 Pictures: TypeAlias = "dict[str, ColourPicture | None]"
-_Frames = range  # inside the class below, `range` is its method
+_Frames = range  # needed because `range` is a method of the class below
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A part of a working picture."""
+    """A part of a working image."""
 
     camera: Camera  # pinhole camera of the part
     rgb: NDArray[np.uint8]  # pixels, 8 bit, shape (h, w, 3)
-    corner: tuple[int, int]  # first column and row in the working picture [px]
+    corner: tuple[int, int]  # first column and row in the working image [px]
 
 
 class PictureFrame:
-    """Windows around the teeth in one camera's pictures."""
+    """Windows around the teeth in one camera's images."""
 
     def __init__(self, source: Camera, centre_world: Array, px_per_mm: float) -> None:
-        """Choose the working size by the resolution at the teeth, centre_world (3,) [mm], without upsampling."""
+        """Choose the working size from the resolution at the teeth, centre_world (3,) [mm], without upsampling."""
         recorded = float(np.sqrt(source.K[0, 0] * source.K[1, 1]) / source.depth(centre_world))
         scale = min(1.0, px_per_mm / recorded)
         self.px_per_mm = recorded * scale
@@ -46,7 +46,7 @@ class PictureFrame:
         self._back = _positions(source, self._working.camera)
 
     def window(self, image: ColourPicture, points_world: Array, margin_mm: float) -> Window | None:
-        """Return the window around world points (N, 3) [mm] in a recorded picture (H, W, 3), None if out of view."""
+        """Return the window around world points (N, 3) [mm] in a recorded image (H, W, 3), None if out of view."""
         camera = self._working.camera
         seen = camera.project_pinhole(points_world[camera.depth(points_world) > 0])
         if not len(seen):
@@ -94,35 +94,35 @@ def _positions(source: Camera, working: Camera) -> NDArray[np.float32]:
 
 
 class ColourFootage:
-    """Pictures of all cameras, readable in both directions."""
+    """Images of all cameras, readable in both directions."""
 
     def __init__(self, videos: Mapping[str, Clip], offsets: Mapping[str, int]) -> None:
-        """Open with the videos and, by the same names, reference frame minus own frame number."""
+        """Open the videos; `offsets` are reference frame minus own frame number, by the same names."""
         self._videos, self._offsets = dict(videos), dict(offsets)
 
     def own(self, name: str, frame: int) -> int | None:
-        """Return the picture index of a camera at a frame of the reference camera; None if it has none."""
+        """Return a camera's image index at a frame of the reference camera; None if the camera has no image then."""
         return self._videos[name].timeline.picture(frame - self._offsets[name])
 
     def number(self, name: str, frame: int) -> int | None:
-        """Return the file number of a camera's picture at a frame of the reference camera, as used by masks."""
+        """Return the number of a camera's mask file at a frame of the reference camera; None without an image."""
         return self._videos[name].timeline.number(frame - self._offsets[name])
 
     def range(self) -> tuple[int, int]:
-        """Return the first frame shown by two cameras, and one past the last."""
+        """Return the first frame with images of two cameras, and one past the last."""
         starts = sorted(self._offsets[name] for name in self._videos)
         stops = sorted(self._offsets[name] + video.timeline.count for name, video in self._videos.items())
         return max(0, starts[min(1, len(starts) - 1)]), stops[-min(2, len(stops))]
 
     def at(self, frame: int) -> Pictures:
-        """Return the RGB pictures (H, W, 3) of one frame of the reference camera, None for a missing one."""
+        """Return the RGB images (H, W, 3) of one frame of the reference camera, None for a missing one."""
         return next(self.walk(range(frame, frame + 1)))[1]
 
     def walk(self, frames: _Frames) -> Iterator[tuple[int, Pictures]]:
-        """Yield frames with their pictures; a descending range is read forwards in chunks.
+        """Yield frames with their images; a descending range is read forwards in chunks.
 
         Raises:
-            CaptureError: a picture cannot be decoded.
+            CaptureError: an image cannot be decoded.
         """
         if frames.step > 0:
             yield from self._forwards(frames)

@@ -1,6 +1,6 @@
-"""Find both rows of teeth in a picture without prior knowledge, to initialise a search.
+"""Find both rows of teeth in an image without prior knowledge, to initialise a search.
 
-Teeth are brighter and less red than their surroundings; the gap between open rows is dark or red.
+Teeth are brighter and less red than their surroundings; the gap between the rows of an open mouth is dark or red.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from scipy import ndimage
 from jawusd.base.arrays import Array, Mask
 
 _WIDTH_PX = 480  # working width
-# Teeth are found by thresholding lightness minus redness, CIELAB L* - 2.5 a*: weight of a*, thresholds to try as
-# percentiles of the picture, and the percentile that counts as white.
+# Teeth are found by thresholding lightness minus redness, CIELAB L* - 2.5 a*: weight of a*, thresholds to try, as
+# percentiles of the image, and the percentile that counts as white.
 _REDNESS, _LEVELS, _BRIGHTEST = 2.5, (40, 55, 65, 72, 78, 83, 87, 90, 92, 94, 96), 99.5
-# Fraction of the surroundings that must be redder by a difference of a*, or darker by a factor.
+# Fraction of the surroundings that must be redder than teeth, by this difference of a*, or darker, by this factor.
 _UNLIKE, _REDDER, _DARKER = 0.6, 3.0, 0.3
-_LEAST_AREA, _MOST_AREA = 0.0015, 0.2  # limits of the picture area covered by teeth
+_LEAST_AREA, _MOST_AREA = 0.0015, 0.2  # limits of the image fraction covered by teeth
 _CLOSE_PX, _NEAR_PX, _FAR_PX = 4, 3, 12  # closing radius, and ring around teeth used as surroundings
-# Largest distance of the rows in row widths; smallest area of a part relative to a row; and, relative to the teeth
-# found first, the smallest brightness and contrast of a part, which wet lips and chins do not reach.
+# Largest distance between the rows, in row widths; smallest area of a part relative to a row; and smallest brightness
+# and contrast of a part relative to the teeth found first, which wet lips and chins do not reach.
 _ROWS_APART, _LEAST_PART, _AS_BRIGHT, _LIKE = 1.0, 0.02, 0.65, 0.5
-# Lines between the rows: tilts relative to half the width, sags relative to the height, and the smallest fraction of
-# the teeth on either side.
+# Candidate lines between the rows: tilts relative to half the width, sags relative to the height, and the smallest
+# fraction of the teeth on either side of a line.
 _TILTS, _SAGS, _LEAST_SHARE = np.linspace(-0.3, 0.3, 21), np.linspace(-0.4, 0.4, 13), 0.2
-_LINE_PX = (-1, 0, 1)  # pixel rows around a line that should be gap
+_LINE_PX = (-1, 0, 1)  # pixel rows around a line that should belong to the gap
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Both rows of teeth in a picture.
+    """Both rows of teeth in an image.
 
     Attributes:
         masks: upper and lower row, 0 or 255, shape (2, H, W).
-        bridged: fraction of the line between them that is not gap, 0 .. 1; 0 for open rows.
+        bridged: fraction of the line between the rows that is not in a gap, 0 .. 1; 0 if the rows are apart.
     """
 
     masks: NDArray[np.uint8]
@@ -46,7 +46,7 @@ class Rows:
 
 
 def tooth_rows(rgb: NDArray[np.uint8]) -> Rows | None:
-    """Return the rows of teeth in an upright RGB picture (H, W, 3); None if nothing looks like teeth."""
+    """Return the rows of teeth in an upright RGB image (H, W, 3); None if no teeth are found."""
     height, width = rgb.shape[:2]
     small = cv2.resize(rgb, (_WIDTH_PX, max(8, round(height * _WIDTH_PX / width))), interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(small, (0, 0), 1.0).astype(np.float32)
@@ -84,7 +84,7 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
     if best is None:
         return None
     _, inside, outside, group = best
-    level = (inside + outside) / 2  # highlights on lips exceed the lower threshold
+    level = (inside + outside) / 2  # above the lower of both, since highlights on lips exceed that
     parts, count = ndimage.label(toothlike > level)
     like = ndimage.median(toothlike, parts, np.arange(count + 1)) > outside + _AS_BRIGHT * (inside - outside)
     own = np.bincount(parts.ravel(), group.ravel(), count + 1) > 0.5 * np.bincount(parts.ravel())
@@ -108,7 +108,7 @@ def _distance(away: Mask) -> NDArray[np.float32]:
 
 
 def _closed(mask: Mask) -> Mask:
-    """Return a mask with small gaps closed; pixels outside the picture count as background."""
+    """Return a mask with small gaps closed; pixels outside the image count as background."""
     grown = np.pad(_distance(~mask) <= _CLOSE_PX, 1)
     return (_distance(grown) > _CLOSE_PX)[1:-1, 1:-1]
 
@@ -125,7 +125,7 @@ def _group_contrast(
     toothlike: Array,
     redness: Array,
 ) -> tuple[float, float]:
-    """Return the contrast of a group and its ring; None if the ring is neither redder nor darker."""
+    """Return brightness inside and around a group of teeth; zeros if its ring is neither redder nor darker."""
     rows, columns = box
     around = (
         slice(max(rows.start - _FAR_PX, 0), rows.stop + _FAR_PX),
@@ -158,7 +158,7 @@ def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
 
 
 def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None:
-    """Split teeth into upper and lower row (2, h, w) at the line with most gap; also return its bridged fraction."""
+    """Split teeth into upper and lower row (2, h, w) at the least bridged line; also return its bridged fraction."""
     rows, columns = np.nonzero(teeth)
     first, last, top, bottom = columns.min(), columns.max(), rows.min(), rows.max()
     lines = top + _lines(int(last - first + 1), int(bottom - top + 1))  # (N, width)
@@ -171,7 +171,7 @@ def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None
     if not len(fair):
         return None
     lines = lines[fair]
-    near = np.mean([np.roll(bright, -k, axis=0) for k in _LINE_PX], axis=0)  # mean over the rows around each pixel
+    near = np.mean([np.roll(bright, -k, axis=0) for k in _LINE_PX], axis=0)  # mean over pixel rows around each pixel
     bridged = near[lines[:, taken], across[taken]].mean(1)
     best = int(bridged.argmin())
     below = np.zeros(teeth.shape, bool)

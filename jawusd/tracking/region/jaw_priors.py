@@ -82,7 +82,7 @@ class CondyleMotion:
     def expected(self, incisor: Array) -> tuple[Array, Array, Array]:
         """Predict the condyles' motion from that of the incisal point: mean (6,), derivative (6, 3), variance (6,).
 
-        In anatomical axes [mm]; left condyle first.
+        In anatomical axes [mm], left condyle first; `incisor` has shape (3,).
         """
         features, slopes = _features(incisor)
         means = np.linalg.solve(self._precision, self._sums[..., None])[..., 0]
