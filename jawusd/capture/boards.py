@@ -45,7 +45,7 @@ def board_points(boards: Boards) -> Array:
 def board_symmetries(boards: Boards) -> list[NDArray[np.int64]]:
     """Return the orders in which a detector may list the corners of a board, as permutations of shape (N,).
 
-    A chessboard has a two-fold symmetry, a square one a four-fold symmetry; the corners of a ChArUco board are numbered.
+    A chessboard has a two-fold symmetry, a square one a four-fold symmetry; ChArUco corners are numbered.
     """
     grid = np.arange(boards.cols * boards.rows).reshape(boards.rows, boards.cols)
     if boards.pattern == "charuco":
