@@ -1,4 +1,4 @@
 """Scans and bones: reading, crown labels, rasterisation, solids, collision and contact.
 
-May not import `media`, `capture` or `tracking`.
+This package must not import `media`, `capture` or `tracking`.
 """

@@ -23,18 +23,18 @@ STEP_MM = 0.25
 
 _SAMPLE_MM = 0.5  # largest spacing of surface samples
 _BOXES_MM = (4.8, 2.4, 1.2, 0.6)  # edge lengths of nested boxes
-_PARTS = 16  # chunks of poses, for threads
+_PARTS = 16  # number of chunks into which poses are split for threads
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points of a surface in a tree of boxes, so that distant points are skipped together.
+    """Points of a surface in a tree of boxes, so that all points of a distant box are skipped at once.
 
     Attributes:
-        points: in order of the smallest boxes [mm], shape (P, 3).
-        balls: bounding spheres of the boxes' points, centre and radius [mm], shape (B, 4); in depth-first order.
-        nodes: per box the range of its points (first, one past the last; 0, 0 for boxes with children), and the next
-            box outside it, shape (B, 3).
+        points: the points, sorted by the smallest boxes [mm], shape (P, 3).
+        balls: bounding sphere of each box's points, centre and radius [mm], shape (B, 4); boxes in depth-first order.
+        nodes: for each box, the range of its points (first, one past the last; 0, 0 for boxes with children), and the
+            index of the next box that is not inside it, shape (B, 3).
     """
 
     points: Array
@@ -61,13 +61,13 @@ class Pair:
     def depth(self, T_upper_lower: Array) -> Array:
         """Return the penetration depth of the surfaces [mm], shape (n,), in poses (n, 4, 4).
 
-        This is the largest distance to the surface of a solid, over the points of the other surface inside it.
-        Negative, down to -`FARTHEST_MM`, for separate surfaces.
+        It is the largest distance to the surface of one solid over all points of the other surface inside it. For
+        separate surfaces it is negative, down to -`FARTHEST_MM`.
         """
         return self._deepest(T_upper_lower, -FARTHEST_MM, np.inf)
 
     def is_deeper(self, T_upper_lower: Array, limit_mm: float) -> Mask:
-        """Return where `depth` exceeds a limit, shape (n,), faster than by computing it."""
+        """Return where `depth` exceeds a limit, shape (n,), faster than by computing the depth."""
         return self._deepest(T_upper_lower, max(limit_mm, -FARTHEST_MM), limit_mm) > limit_mm
 
     def _deepest(self, T_upper_lower: Array, least: float, enough: float) -> Array:
@@ -113,17 +113,17 @@ def solid(corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> So
         corners: triangles counter-clockwise seen from outside [mm], shape (F, 3, 3), y vertical.
         up: see `outer_faces`.
         box: where the solid matters, rows low and high [mm], shape (2, 3).
-        step_mm: between its distances, which are linear in between.
+        step_mm: step of the distance grid, which is interpolated linearly.
     """
     outer, entering = outer_faces(corners, up)
-    # Interpolation is exact up to FARTHEST_MM if values extend one cell diagonal beyond.
+    # Interpolation uses exact values up to FARTHEST_MM if they extend one cell diagonal beyond it.
     grid = distance_grid(corners, outer, box, step_mm, up, FARTHEST_MM + 3.0**0.5 * step_mm)
     near = ((corners <= box[1]) & (corners >= box[0])).all(axis=2).any(axis=1)
     return Solid(grid, in_boxes(surface_points(corners[outer & near], _SAMPLE_MM)), entering)
 
 
 def surface_points(corners: Array, apart_mm: float) -> Array:
-    """Sample triangles (F, 3, 3) with a largest spacing; return points (P, 3) [mm], including corners."""
+    """Sample triangles (F, 3, 3) at most `apart_mm` apart; return points (P, 3) [mm], including corners."""
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     parts = np.maximum(np.ceil(longest / apart_mm), 1).astype(int)
     found = [np.empty((0, 3))]
@@ -150,7 +150,7 @@ def in_boxes(points: Array) -> Samples:
 
 
 def _firsts(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the indices where the rows (P, k) change, and P."""
+    """Return the indices of rows (P, k) that differ from the row before, followed by P."""
     changes = np.ones(len(keys), dtype=bool)
     changes[1:] = (keys[1:] != keys[:-1]).any(axis=1)
     return np.append(np.flatnonzero(changes), len(keys))
@@ -167,7 +167,7 @@ def _balls(points: Array, start: NDArray[np.int64]) -> Array:
 
 
 class _Field(NamedTuple):
-    """A distance grid for compiled functions: flat values, number along each axis, origin, 1/step."""
+    """A distance grid for compiled functions: flattened values, count along each axis, origin, 1/step."""
 
     values: NDArray[np.float32]
     nx: int
@@ -237,7 +237,7 @@ def _deepest_of(field: _Field, M: Array, points: Array, first: int, end: int, be
 def _deepen(
     depth: Array, T: Array, enough: float, field: _Field, points: Array, balls: Array, nodes: NDArray[np.int64]
 ) -> None:
-    """Raise each depth to that of the deepest point under T[i], or to any value above `enough`."""
+    """Raise each depth[i] to that of the deepest point under T[i], or to any value above `enough`."""
     last = 0
     for i in range(len(T) if len(nodes) else 0):
         M = T[i]

@@ -18,23 +18,24 @@ from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.meshes.collision import FARTHEST_MM, STEP_MM, Pair, Solid, distances, solid, tips_box
 
 _CROWN_MM = 14.0  # largest height of crowns above the gum
-_LEAST_WOUND = 0.6  # share of lines that enter a scan at the first crossing; 0.93 and more for consistent winding
+# fraction of lines that must enter a scan at their first crossing; it is 0.93 and more for consistent winding
+_LEAST_WOUND = 0.6
 _WIDEST_GAP_MM = 1.0
 _DEEPEST_MM = 2.5
 _COARSEST_MM = 1.5
 
-_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # field step and largest opening for teeth
-_CLOSE_MM = 1.0  # larger clearances use the coarse field; twice the clearance up to which errors are measured
-_BEYOND_MM = 1.0  # margin sampled outside the bound
-_FREE_MM = 0.8  # the field ends at the opening from which all valid poses have this clearance
-_ERROR_SAMPLES = 30000  # over the whole field; one in twenty is a valid pose with close teeth
+_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # grid step and largest opening of the field of the teeth
+_CLOSE_MM = 1.0  # larger clearances come from the coarse field; twice the clearance up to which errors are measured
+_BEYOND_MM = 1.0  # width of the margin outside the bound that is also sampled
+_FREE_MM = 0.8  # the field ends at the opening beyond which all valid poses have at least this clearance
+_ERROR_SAMPLES = 30000  # random samples over the whole field; one in twenty is a valid pose with close teeth
 _CAPTURED_QUANTILE = 0.01
 _LARGEST_LIMIT_MM = 1.0
 Picture = NDArray[np.uint8]
 
 _ENAMEL, _PAPER = np.array([236.0, 229.0, 212.0]), 255
 _LIGHT = np.array([0.3, 0.87, -0.4])
-_FLOOR_MM = 11.0  # depth below the tips that is shown; deeper is gum or nothing
+_FLOOR_MM = 11.0  # depth below the tips up to which surfaces are drawn; deeper ones are gum
 
 
 class NoContact(Exception):
@@ -69,7 +70,7 @@ class Teeth:
     T_rest: Array
 
     def clearances(self, T_skull_mandible: Array) -> Array:
-        """Return the clearance [mm], shape (n,), of poses (n, 4, 4): depth of the closed bite minus theirs."""
+        """Return the clearance [mm], shape (n,), of poses (n, 4, 4): depth of the closed bite minus that of each."""
         A = self.T_anatomical_skull
         return self.closed_mm - self.pair.depth(A @ T_skull_mandible @ se3_inverse(A @ self.T_rest))
 
@@ -129,7 +130,7 @@ def sample_field(
         surfaces: The opposing surfaces.
         rig: The rig.
         step_mm: Grid step; twice this where the surfaces are apart.
-        most_opening_mm: Largest opening of the field, if the surfaces have not separated before.
+        most_opening_mm: Largest opening of the field, unless the surfaces separate at a smaller one.
     """
     box = _box(surfaces, rig, step_mm, most_opening_mm)
     field = _sampled(surfaces, rig, box, step_mm, _sampled(surfaces, rig, box, 2.0 * step_mm))
@@ -142,9 +143,9 @@ def sample_field(
 def _sampled(
     surfaces: Surfaces, rig: JawRig, box: Array, step_mm: float, coarse: ContactField | None = None
 ) -> ContactField:
-    """Sample the clearance over a box (3, 2) [mm]; with a coarse field, resample only where it shows close surfaces.
+    """Sample the clearance over a box (3, 2) [mm]; given a coarse field, only where its clearances are small.
 
-    0 is one of the values along every axis, so that the closed bite is exact.
+    Every axis has a grid point at 0, so that the closed bite is exact.
     """
     ends = [(np.floor(low / step_mm), np.ceil(high / step_mm)) for low, high in box]
     axes = [step_mm * np.arange(first, last + 1) for first, last in ends]
@@ -164,7 +165,7 @@ def _sampled(
 
 
 def _box(surfaces: Surfaces, rig: JawRig, step_mm: float, most_opening_mm: float) -> Array:
-    """Return the parameter range (3, 2) [mm] of the field: near the bound, where surfaces are close."""
+    """Return the parameter range (3, 2) [mm] of the field, which covers the bound where surfaces are close."""
     wide = rig.d_range + np.array([-_BEYOND_MM, _BEYOND_MM])
     wide[0, 1] = min(wide[0, 1], most_opening_mm)
     axes = [np.linspace(low, high, n) for (low, high), n in zip(wide, (33, 9, 7))]
@@ -242,7 +243,7 @@ class ContactMap:
 
 
 def _arch(solid: Solid, up: float) -> _Arch:
-    """Return the first intersections of a solid with vertical lines from the other jaw."""
+    """Return the surface points at which vertical lines from the other jaw first meet a solid."""
     grid = solid.grid
     values = grid.values if up > 0 else grid.values[:, ::-1]
     inside = values < 0
@@ -250,7 +251,7 @@ def _arch(solid: Solid, up: float) -> _Arch:
     i, k = np.nonzero(inside.any(axis=1) & (layer > 0))
     j = layer[i, k]
     before, after = values[i, j - 1, k].astype(float), values[i, j, k].astype(float)
-    place = j - after / (after - before)  # position of the surface, in layers
+    place = j - after / (after - before)  # position of the surface, in grid layers
     row = place if up > 0 else values.shape[1] - 1 - place
     height = np.full(values.shape[::2], np.nan)
     height[i, k] = place * grid.step_mm

@@ -1,6 +1,6 @@
-"""Condyles and fossae of a subject: bone of mandible and skull around both joints as solids.
+"""Condyles and fossae of a subject: the bone of mandible and skull around both joints, as solids.
 
-In a joint, cartilage and disc separate the bones and are not in the scans, and tracking and model errors are largest at
+Cartilage and disc separate the bones of a joint but are not in the scans, and tracking and model errors are largest at
 the condyles. Clearances are therefore reported, but never used to reject poses.
 """
 
@@ -21,13 +21,13 @@ from jawusd.meshes.contact import NoContact, wound_solid
 #: Step of sampled clearances [mm].
 STEP_MM = 0.8
 
-_GRID_MM = 0.5  # step of the distance grid; clearances differ from those at 0.25 by at most 0.014 mm
+_GRID_MM = 0.5  # step of the distance grid; with a step of 0.25 mm, clearances differ by at most 0.014 mm
 _CONDYLES = [index for index, name in enumerate(LANDMARKS) if name.startswith("condyle")]  # left, right
 _CONDYLE_MM = 10.0  # radius around the landmark that contains the condylar head but not the coronoid process
-_REACH_MM = 26.0  # largest translation of the head, forward beyond the eminence
-_COARSEST_MM = 4.0  # largest edge; a condyle is about 8 mm deep
+_REACH_MM = 26.0  # largest translation of the condylar head, forward beyond the eminence
+_COARSEST_MM = 4.0  # largest median edge length; a condyle is about 8 mm deep
 _FEWEST_FACES = 30
-_DEEPEST_MM, _WIDEST_MM = 2.5, 8.0  # largest penetration of and distance to the skull in the closed bite
+_DEEPEST_MM, _WIDEST_MM = 2.5, 8.0  # largest penetration into the skull, and largest distance to it, in the closed bite
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +53,9 @@ class Joints:
         return float(self.closed.max())
 
     def clearances(self, T_skull_mandible: Array) -> Array:
-        """Return the smaller clearance of both condyles [mm], shape (n,), in poses (n, 4, 4).
+        """Return the smaller clearance of the two condyles [mm], shape (n,), in poses (n, 4, 4).
 
-        Below 0 where one penetrates the skull deeper than in the closed bite.
+        It is negative where a condyle penetrates the skull deeper than in the closed bite.
         """
         A = self.T_anatomical_skull
         T = A @ T_skull_mandible @ se3_inverse(A @ self.T_rest)
@@ -72,7 +72,8 @@ def find_joints(skull: Mesh, mandible: Mesh, landmarks: Array, T_anatomical_skul
         landmarks: `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3).
 
     Raises:
-        NoContact: There is no bone at the condyles or around them, it is too coarse, or both are one.
+        NoContact: Bone is missing at the condyles or around them, a mesh is too coarse, or a condyle is too far from
+            the skull or penetrates it too deeply.
     """
     closed_bite = T_anatomical_skull @ T_rest
     above = transform_points(T_anatomical_skull, skull.vertices)[skull.faces]

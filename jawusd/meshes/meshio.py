@@ -27,7 +27,8 @@ from jawusd.geometry.points import welded
 __all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]
 
 _NO_FACES = "Export the surface, not a point cloud, with the suffix of its format."
-# Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch has about 80, a mandible 165, a skull 290.
+# Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch measures about 80, a mandible 165, a skull
+# 290.
 _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
 
@@ -88,7 +89,7 @@ _READERS = {".ply": read_ply, ".stl": read_stl, ".obj": read_obj, ".dcm": _read_
 def _texture_colors(
     texture: bytes | None, corners: Array | None, faces: NDArray[np.int64], count: int
 ) -> NDArray[np.uint8] | None:
-    """Return vertex colours sampled from a texture (JPEG) at the last corner of each vertex (u right, v up)."""
+    """Return vertex colours sampled from a JPEG texture at the last texture coordinates of each vertex (v up)."""
     if texture is None or corners is None or len(corners) != faces.size:
         return None
     image = cv2.imdecode(np.frombuffer(texture, np.uint8), cv2.IMREAD_COLOR)

@@ -1,11 +1,11 @@
 """Rasterise projected triangle meshes on the CPU: silhouettes as bit rows, depth as 1/z.
 
 The compiled functions release the GIL and have no state, so threads may call them concurrently. The compiled code is
-cached on disk; argument types are fixed (C-contiguous float32 / int32 / uint64 arrays), so that another dtype is a
-TypeError instead of a second compilation.
+cached on disk; argument types are fixed (C-contiguous float32 / int32 / uint64 arrays), so that another dtype raises a
+TypeError instead of triggering a second compilation.
 
-Conventions: OpenCV pixels, the centre of the top left pixel of the image is (0, 0). A *region* buffer starts at image
-pixel (x0, y0) and its own shape is its size. A silhouette is a (h, words) uint64 array, bit ``x & 63`` of word
+Conventions: OpenCV pixels, the centre of the top left pixel of the image is (0, 0). A buffer covers a *region* of the
+image of its own shape that starts at pixel (x0, y0). A silhouette is a (h, words) uint64 array; bit ``x & 63`` of word
 ``x >> 6`` is pixel x of the region; bits beyond the width stay zero.
 
 Edge rule: a pixel is covered iff its centre lies inside a projected triangle or on its border. Every edge is evaluated
@@ -25,7 +25,7 @@ from jawusd.base.arrays import Mask
 _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _ONE = np.uint64(1)
 _LOW6 = 63
-_MIN_DEPTH = np.float32(1e-3)  # mm; a triangles with a corner nearer than this, or behind the camera, are not drawn
+_MIN_DEPTH = np.float32(1e-3)  # [mm] triangles with a corner closer than this, or behind the camera, are not drawn
 
 
 def _array(dtype: types.Type, mutable: bool = False) -> types.Array:
@@ -50,7 +50,7 @@ def project(vertices: Singles, matrix: Singles, out: Singles) -> None:
     """Project vertices with a 3x4 matrix.
 
     Args:
-        vertices: (V, 3) float32, mm, in the frame the matrix takes.
+        vertices: (V, 3) float32, mm, in the source frame of the matrix.
         matrix: (3, 4) float32, K [R | t] @ T; maps homogeneous mm to (u z, v z, z).
         out: (V, 3) float32, receives u [px], v [px], depth z [mm]. u, v are undefined where z <= 0.
     """
@@ -67,9 +67,9 @@ def project(vertices: Singles, matrix: Singles, out: Singles) -> None:
 
 @numba.njit(nogil=True, cache=True)
 def _hidden(points: Singles, a: int, b: int, c: int, cull: bool) -> bool:
-    """Tell whether a triangle is not drawn: it touches the camera plane or, with `cull`, is a back face.
+    """Return whether a triangle is skipped: it touches the camera plane or, with `cull`, is a back face.
 
-    With y down an outward counter-clockwise face seen from the front has negative signed area.
+    With y down, an outward counter-clockwise face seen from the front has a negative signed area.
     """
     if not (points[a, 2] > _MIN_DEPTH and points[b, 2] > _MIN_DEPTH and points[c, 2] > _MIN_DEPTH):
         return True
@@ -106,7 +106,7 @@ def _edges(points: Singles, a: int, b: int, c: int) -> _Edges:
 def _interval(low: float, high: float, first: int, last: int) -> tuple[int, int]:
     """Return the integers of [low, high] within [first, last] as (i, j); i > j if there are none, or for NaN.
 
-    Clamped as floats first: casting a NaN or a huge coordinate to an integer is undefined.
+    Values are clamped as floats first, since casting a NaN or a huge coordinate to an integer is undefined.
     """
     i = np.ceil(low)
     j = np.floor(high)
@@ -121,9 +121,9 @@ def _interval(low: float, high: float, first: int, last: int) -> tuple[int, int]
 
 @numba.njit(nogil=True, cache=True)
 def _span(edges: _Edges, y: int, first: int, last: int) -> tuple[int, int]:
-    """Return the covered pixels (i, j), inclusive, of image row y between two columns."""
+    """Return the first and last covered pixel (i, j) of image row y within the columns [first, last]."""
     ax, ay, bx, by, cx, cy, slope_ac, slope_ab, slope_bc = edges
-    if ay == cy:  # a line seen edge-on along the row
+    if ay == cy:  # a degenerate triangle, seen edge-on along the row
         return _interval(min(ax, bx, cx), max(ax, bx, cx), first, last)
     left = ax + (y - ay) * slope_ac
     right = ax + (y - ay) * slope_ab if y < by else bx + (y - by) * slope_bc
@@ -159,7 +159,7 @@ def draw_silhouette(
         faces: (F, 3) int32, valid indices into points (not checked).
         x0, y0: image pixel at the buffer's top left corner.
         width: pixels per row; bits.shape[1] must be at least words_for(width).
-        cull: skip back faces; only for closed meshes with outward winding, where it changes nothing.
+        cull: whether to skip back faces; only for closed meshes with outward winding, where the result is the same.
         bits: (h, words) uint64; clear it before the first call.
 
     Raises:
@@ -218,8 +218,8 @@ def draw_depth_labels(
 
     Args:
         points, faces, x0, y0, cull: as for `draw_silhouette`.
-        inverse_depth: (h, w) float32, 1/z [1/mm], 0 = empty; clear it before the first call; ties keep it.
-        labels: (h, w) uint8, receives label where the mesh is nearest; an empty (0, 0) array disables this.
+        inverse_depth: (h, w) float32, 1/z [1/mm], 0 = empty; clear it before the first call. A tie keeps the old value.
+        labels: (h, w) uint8, receives `label` where the mesh is nearest; an empty (0, 0) array disables this.
 
     Raises:
         ValueError: labels is neither empty nor as large as inverse_depth.
@@ -241,7 +241,7 @@ def draw_depth_labels(
             row = inverse_depth[y - y0]
             start = corner + dv * (y - points[a, 1])
             for x in range(i, j + 1):
-                # Clamped: on slivers the gradient is ill-conditioned and would put spikes outside the triangle.
+                # Clamp, since on slivers the gradient is ill-conditioned and would extrapolate beyond the corners.
                 value = np.float32(min(max(start + du * (x - points[a, 0]), low), high))
                 if value > row[x - x0]:
                     row[x - x0] = value
@@ -285,7 +285,7 @@ def count_and_not(first: Bits, second: Bits) -> np.int64:
 
 
 def words_for(width: int) -> int:
-    """Return how many 64-bit words a row of width pixels takes."""
+    """Return the number of 64-bit words in a row of ``width`` pixels."""
     return (width + 63) // 64
 
 

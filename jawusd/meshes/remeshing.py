@@ -13,8 +13,8 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import GUM, TOOTH, Mesh, crown_face_mask
 from jawusd.geometry.points import welded
 
-# Offset between parts of a surface that touch in a single point [mm]: validators report coincident points as unmerged
-# seams.
+# Offset between parts of a surface that touch in a single point [mm], since validators report coincident points as
+# unmerged seams.
 _APART_MM = 1e-3
 
 
@@ -36,8 +36,8 @@ def decimated(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Ar
 def proxy_of(mesh: Mesh, count: int) -> Mesh:
     """Return a mesh of about `count` faces, plus one per border edge; crowns and gum stay separate.
 
-    Borders are preserved, including the one between crown and gum. The result has labels of crown and gum, without
-    colours and texture coordinates.
+    Borders are preserved, including the one between crown and gum. The result has labels of crown and gum, but no
+    colours or texture coordinates.
     """
     crown = crown_face_mask(mesh)
     parts = []
@@ -81,8 +81,8 @@ def decimated_scan(
 def manifold(mesh: Mesh) -> Mesh:
     """Return a surface repaired to a manifold.
 
-    Coincident points are merged, degenerate and duplicate faces dropped; at edges of more than two faces, the smallest
-    are removed; connected faces are wound consistently; parts that touch in a single point get separate points.
+    Coincident points are merged, degenerate and duplicate faces dropped; at edges with more than two faces, only the
+    two largest are kept; connected faces are wound consistently; parts that touch in one point get separate points.
     """
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     surface.merge_vertices()
@@ -95,7 +95,7 @@ def manifold(mesh: Mesh) -> Mesh:
 
 
 def _surplus_faces(surface: trimesh.Trimesh) -> Mask:
-    """Return the smallest faces of every edge that has more than two, shape (F,)."""
+    """Return which faces are neither the largest nor the second largest at one of their edges, shape (F,)."""
     _, edge, count = np.unique(surface.edges_sorted, axis=0, return_inverse=True, return_counts=True)
     owner = np.repeat(np.arange(len(surface.faces)), 3)
     out = np.zeros(len(surface.faces), dtype=bool)

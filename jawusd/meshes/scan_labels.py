@@ -18,32 +18,34 @@ from jawusd.meshes.scan_surface import ScanSurface
 from jawusd.meshes.scan_tops import Tops, biting_direction, topped_by, tops
 from jawusd.meshes.scan_walk import CreaseWalk
 
-# Bounding box diagonal: crowns, including scanned root and gum, are smaller; the gum of an arch or quadrant is larger
-# [mm].
+# Bounding box diagonal [mm]: that of a crown, including scanned root and gum, is smaller; that of the gum of an arch or
+# quadrant is larger.
 _TOOTH_MM = 30.0
 _FEWEST_FACES = 100  # fewer faces cannot be labelled or tracked
-# Bounding box diagonal of the smallest crown; smaller components are scraps and brackets, which take the label of their
-# neighbours [mm].
+# Bounding box diagonal of the smallest crown [mm]; smaller components are scraps and brackets, which take the label of
+# their neighbours.
 _CROWN_MM = 4.0
-# Lowest part of a component, used as gum seeds if there are no better ones [share of height].
+# Lowest part of a component that is used as gum seeds if there are no better ones [fraction of its height].
 _LOWEST = 0.12
-# Rate at which walks leave a crown top for the gum, per mm of its outline [1/mm]: 0.003 (median) to 0.030 at crowns,
-# 0.026 to 0.074 at ridges without teeth, which are mostly below the hull of the arch (40 scans of one surface).
+# Largest rate at which walks leave a crown top for the gum, per mm of its outline [1/mm]; it is divided by a factor
+# that grows with the depth of the top below the hull of the arch. Rates on 40 scans of one surface: 0.003 (median) to
+# 0.030 at crowns, 0.026 to 0.074 at ridges without teeth, which are mostly below the hull.
 _LEAVING, _DOUBT_PER_MM, _MOST_DOUBT_MM = 0.06, 3.0, 0.6
-# Share of a component's border without a crease, median over an arch: 0.02 to 0.162 for crowns with a collar of gum (58
-# scans of synthetic subjects with 5,000 faces and more), 0.8 to 1.0 for plain synthetic crowns, 0.24 to 0.34 for real
-# ones, and 0.167 in one scan seen from the roots, whose grooves and necks resemble short creases.
+# Fraction of a component's crown-gum border without a crease, median over an arch, up to which the components contain
+# gum: 0.02 to 0.162 for crowns with a collar of gum (58 scans of synthetic subjects with 5,000 faces and more), 0.8 to
+# 1.0 for plain synthetic crowns, 0.24 to 0.34 for real ones, and 0.167 in one scan seen from the roots, whose grooves
+# and necks resemble short creases.
 _MOST_WEAK = 0.165
-_COARSE_MM = 1.2  # edge length that hides a gum line: apparent crowns may contain gum
+_COARSE_MM = 1.2  # edge length above which creases at the gum line are lost, so that apparent crowns may contain gum
 # Components that start this far above the lower end of the adjacent crown are attached to it (brackets), not gum
-# [share of the crown's height].
+# [fraction of the crown's height].
 _ON_CROWN = 0.2
-# Least difference in redness between the highest points and points far from them, in standard deviations, for colours
-# to be used; stone casts and untextured scans stay below.
+# Smallest difference in redness between the highest points and points far below them, in standard deviations, for which
+# colours are used; stone casts and untextured scans stay below it.
 _LEAST_CONTRAST = 4.0
 _FAR_BELOW_MM = 9.0  # depth below the highest point nearby, beyond most crowns
-_FEWEST = 50  # vertices of either kind
-_GRAIN = 0.003  # of 8 bit colours
+_FEWEST = 50  # smallest number of vertices that are certainly crown, and of those certainly gum, to use colours
+_GRAIN = 0.003  # standard deviation of redness due to 8-bit quantisation
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +54,8 @@ class Labelling:
 
     labels: NDArray[np.uint8]  # GUM or TOOTH per vertex of the scan, shape (V,)
     up: Array  # the direction in which the crowns point, shape (3,)
-    # share of the crown-gum border that does not follow a crease, 0 .. 1; 0 without a border, 1 if the faces are too
-    # large to show creases
+    # fraction of the crown-gum border that does not follow a crease, 0 .. 1; 0 without a border, 1 if the faces are too
+    # large to resolve creases
     weak_share: float
 
 
@@ -83,7 +85,7 @@ def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
 
 
 def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) -> tuple[Mask, float]:
-    """Return which vertices are crown, shape (v,), and the weak share of the border on mixed components."""
+    """Return which vertices are crown, shape (v,), and the fraction of mixed components' borders without a crease."""
     piece, extent = surface.piece, _extent_mm(surface)
     small = extent < _TOOTH_MM
     starts = np.bincount(piece, seen.crown, len(extent))
@@ -161,7 +163,7 @@ def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
 
 
 def crown_by_colour(colors: NDArray[np.uint8], surface: ScanSurface, seen: Tops) -> Array | None:
-    """Return the probability that each vertex of the surface is crown by its colour, 0 .. 1, shape (v,).
+    """Return each vertex's probability of being crown, judged by its colour, 0 .. 1, shape (v,).
 
     None if the colours are not informative.
 

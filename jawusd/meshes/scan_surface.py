@@ -13,12 +13,12 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array, Indices
 from jawusd.formats.mesh import Mesh
 
-# Normals are averaged over this length before computing curvature [mm]: scanners round creases by some tenths of a
+# Length over which normals are averaged before curvature is computed [mm]: scanners round creases by some tenths of a
 # millimetre and leave ripples of some hundredths.
 _SCALE_MM = 0.35
 _MOST_ROUNDS = 12
 _FINE_MM = 0.4  # edges up to this length use vertex normals for creases, edges of twice this use face angles [mm]
-_SEEN_MM = 0.75  # cell size for visibility from above
+_SEEN_MM = 0.75  # cell size of the test for visibility from above
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,8 @@ class ScanSurface:
 
     vertices: Array  # [mm], shape (v, 3)
     faces: NDArray[np.int64]  # shape (f, 3)
-    of_vertex: Indices  # surface vertex of every scan vertex, shape (V,)
-    piece: Indices  # connected component of every vertex, shape (v,)
+    of_vertex: Indices  # index of the surface vertex for every scan vertex, shape (V,)
+    piece: Indices  # index of the connected component of every vertex, shape (v,)
     merged: int  # number of coincident scan vertices
     empty: int  # number of dropped degenerate faces
     repeated: int  # number of dropped duplicate faces
@@ -118,9 +118,9 @@ class ScanSurface:
     def creases(self, edges: Indices) -> Array:
         """Return the inward curvature at every vertex [1/mm], shape (v,), >= 0.
 
-        This is minus the smaller principal curvature, where that is negative, by Taubin's tensor of the normal
+        It is the negated smaller principal curvature, where that is negative, from Taubin's tensor of the normal
         curvatures along the edges ("Estimating the tensor of curvature of a surface from a polyhedral approximation",
-        ICCV 1995), taken from averaged normals; where edges are too long for that, the fold between faces.
+        ICCV 1995), computed with averaged normals. Where edges are too long for that, folds between faces are used.
         """
         n = len(self.vertices)
         normals = self.normals()

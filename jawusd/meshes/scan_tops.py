@@ -10,24 +10,24 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jawusd.base.arrays import Array, Indices, Mask
 
-_CELL_MM = 0.75
-# Largest distance in plan of a crown's points from its highest point: half of a wide molar.
+_CELL_MM = 0.75  # cell size of the height map
+# Largest distance in plan view of a crown's points from its highest point: half the width of a wide molar.
 _REACH_MM = 4.5
 # Points up to this depth below the highest point nearby are crown: even worn crowns protrude by 3 mm.
 _BAND_MM = 1.5
 # Largest depth of crown tops below the hull of the arch: a curve of Spee or an open bite causes 3 to 4 mm; ridges
 # without teeth are deeper.
 _UNDER_HULL_MM = 4.5
-# Points farther than this from every crown top in plan, or deeper, are not crown.
+# Points farther than the first from every crown top in plan view, or deeper below it than the second, are not crown.
 _ASIDE_MM, _DEEP_MM = 5.0, 13.0
 _LEVEL = 0.95  # cosine of the steepest slope of the hull between teeth
 _ROUNDS = 3
-_MIDDLE_CELLS = 2  # cells around a component's centre in plan
+_MIDDLE_CELLS = 2  # cells around a component's centre, in plan view, that are searched for components above it
 
 
 @dataclass(frozen=True, eq=False)
 class Tops:
-    """Position of the vertices of an arch relative to its highest points."""
+    """Depth of an arch's vertices below its highest points, and vertices that are certainly crown or gum."""
 
     below: Array  # depth below the highest point nearby [mm], shape (v,)
     top_depth: Array  # depth of that point below the hull of the arch [mm], shape (v,)
@@ -47,7 +47,7 @@ def biting_direction(points: Array, towards: Array | None) -> Array:
     _, size, axes = np.linalg.svd(points - middle, full_matrices=False)
     if towards is not None and np.linalg.norm(towards - middle) > _BAND_MM:
         away = (towards - middle) / np.linalg.norm(towards - middle)
-        # Project onto the thin directions, since an overjet also displaces the arches along the occlusal plane.
+        # Prefer directions in which the arch is thin, since an overjet also displaces arches along the occlusal plane.
         nearest = axes[(np.abs(axes @ away) / np.maximum(size, 1e-9)).argmax()]
         up = nearest * np.sign(nearest @ away)
     else:

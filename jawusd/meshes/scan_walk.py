@@ -1,7 +1,7 @@
-"""Find the line between crown and gum on one surface: a random walker that rarely crosses creases.
+"""Find the line between crown and gum on one surface by random walks that rarely cross creases.
 
-Seeds of the walker (Grady, "Random walks for image segmentation", PAMI 2006) are certainly crown or gum; a vertex is
-crown if a walk from it is more likely to reach crown first.
+Seeds of the walks (Grady, "Random walks for image segmentation", PAMI 2006) are certainly crown or gum; a vertex is
+crown if a walk from it is more likely to reach a crown seed before a gum seed.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.meshes.scan_surface import ScanSurface
 
-# Decay of step weights with inward curvature, exp(-_CREASE_DECAY_MM * curvature).
+# Step weights decay with inward curvature like exp(-_CREASE_DECAY_MM * curvature).
 _CREASE_DECAY_MM = 2.5
-_SHARPEST = 3.0  # upper limit of curvature [1/mm]
-# Share of steps that end in crown or gum according to the local colour.
+_SHARPEST = 3.0  # upper limit of the curvature in this decay [1/mm]
+# Fraction of steps after which a walk ends in crown or gum at random, with the probability given by the local colour.
 _COLOUR_WEIGHT = 0.02
-_COLOUR_STEP = 0.3  # difference of crown probability between neighbours that supports a border
+_COLOUR_STEP = 0.3  # difference in crown probability between neighbours above which colour supports a border
 _TOLERANCE, _STEPS = 1e-3, 600
-# Borders along weaker creases count as weak.
-_EVIDENCE, _EVIDENCE_REACH_MM = 0.6, 0.5  # [1/mm], [mm]
+# Borders count as weak if no crease of at least this curvature [1/mm] lies within this distance [mm].
+_EVIDENCE, _EVIDENCE_REACH_MM = 0.6, 0.5
 
 
 class CreaseWalk:
@@ -42,7 +42,8 @@ class CreaseWalk:
         Args:
             up, down: seeds of crown and gum, shape (v,).
             most_leaving: largest rate at which walks leave a part of `up` for the gum, per mm of its outline [1/mm],
-                shape (v,). Parts above it have no crease around them: they are gum ridges and discarded as seeds.
+                shape (v,). Parts with a higher rate have no crease around them: they are gum ridges and are discarded
+                as seeds.
         """
         share = self._meeting(up, down)
         leaking = self._leaking(share, up, most_leaving)
@@ -52,7 +53,7 @@ class CreaseWalk:
         return self._without_islands(share > 0.5, up, down)
 
     def weak(self, crown: Mask) -> tuple[Indices, Mask]:
-        """Return the border edges of a labelling, shape (n, 2), and which of them have no crease near, shape (n,)."""
+        """Return the border edges of a labelling, shape (n, 2), and which of them have no crease nearby, shape (n,)."""
         across = self.edges[crown[self.edges[:, 0]] != crown[self.edges[:, 1]]]
         supported = self.crease > _EVIDENCE
         if self.by_colour is not None:
@@ -71,7 +72,7 @@ class CreaseWalk:
             i, j = surface.faces[:, (k + 1) % 3], surface.faces[:, (k + 2) % 3]
             one, two = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
             area = np.maximum(np.linalg.norm(np.cross(one, two), axis=1), 1e-9)
-            # Clamp the weights of slivers.
+            # Clamp the cotangents of slivers.
             weight = np.clip(np.einsum("ij,ij->i", one, two) / area, 0.05, 3.0) / 2
             weight *= np.exp(-_CREASE_DECAY_MM * np.minimum(0.5 * (crease[i] + crease[j]), _SHARPEST))
             parts.append((i, j, weight))
@@ -97,7 +98,7 @@ class CreaseWalk:
         return share
 
     def _leaking(self, share: Array, up: Mask, most_leaving: Array) -> Mask:
-        """Return the seeds in connected parts that walks leave for the gum too often, shape (v,)."""
+        """Return which seeds are in connected parts that walks leave for the gum too often, shape (v,)."""
         part = parts(self.edges, up)
         count = int(part.max(initial=-1)) + 1
         steps = coo_array(self._weights)
@@ -105,7 +106,7 @@ class CreaseWalk:
         leaving = (part[inside] >= 0) & (part[outside] < 0)
         i, j = inside[leaving], outside[leaving]
         flow = np.bincount(part[i], steps.data[leaving] * (1.0 - share[j]), count)
-        # A step crosses about its own length of outline.
+        # An edge across the outline accounts for about its own length of outline.
         length = np.linalg.norm(self._surface.vertices[i] - self._surface.vertices[j], axis=1)
         outline = np.maximum(np.bincount(part[i], length, count), 1e-9)
         number = np.maximum(np.bincount(part[i], minlength=count), 1)
@@ -113,7 +114,7 @@ class CreaseWalk:
         return np.asarray((part >= 0) & (flow / outline > most)[part])
 
     def _without_islands(self, crown: Mask, up: Mask, down: Mask) -> Mask:
-        """Return the crowns without islands: parts of either label without seeds get the other label."""
+        """Return the crowns without islands: connected parts of either label without seeds get the other label."""
         for label, start in ((True, up), (False, down)):
             part = parts(self.edges, crown == label)
             started = np.zeros(int(part.max(initial=-1)) + 2, dtype=bool)

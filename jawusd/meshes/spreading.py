@@ -1,7 +1,7 @@
-"""Feature transform: assign every cell of a grid the label of the nearest labelled cell, and its distance.
+"""Feature transform: assign every cell of a grid the number of the nearest numbered cell, and its distance.
 
-Maurer et al. (2003), IEEE TPAMI 25:265, axis by axis; in integers and in place, for a fraction of the time and memory
-of scipy's transform, which stores three coordinates per cell.
+The method of Maurer et al. (2003), IEEE TPAMI 25:265, axis by axis. Working in integers and in place, it takes a
+fraction of the time and memory of scipy's transform, which stores three coordinates per cell.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 @numba.njit(nogil=True, cache=True)
 def spread(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Assign cells below 0 the number of the nearest numbered cell, in place; ties use the first in order.
+    """Assign cells with numbers below 0 that of the nearest other cell, in place; ties use the first in order.
 
     Args:
         numbers: numbers of the cells, shape (nx, ny, nz).
 
     Returns:
-        The squared distances to the nearest cells [cells^2], shape (nx, ny, nz); larger than any distance in the grid
-        if there are no numbers.
+        The squared distances to these cells [cells^2], shape (nx, ny, nz); larger than any distance in the grid if all
+        numbers are below 0.
     """
     nx, ny, nz = numbers.shape
     away = np.empty((nx, ny, nz), np.int32)
@@ -68,7 +68,7 @@ def _along_line(
     """Propagate numbers along a line of cells with known squared distances across it.
 
     Args:
-        numbers, away: of the cells of the line, shape (n,).
+        numbers, away: numbers and squared distances of the cells of the line, shape (n,).
         before, squared, site: work arrays of at least this length.
     """
     last = -1
