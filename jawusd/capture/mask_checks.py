@@ -106,8 +106,8 @@ def width_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -
         yield Finding(
             "teeth_size",
             "warning",
-            f"by this calibration the masks show teeth {width:.3g} mm wide, {_SEEN_MM[0]:g} to {_SEEN_MM[1]:g} mm is "
-            "plausible",
+            f"with this calibration, the teeth in the masks are {width:.3g} mm wide; {_SEEN_MM[0]:g} to "
+            f"{_SEEN_MM[1]:g} mm is plausible",
             width,
             _SEEN_MM[width > _SEEN_MM[1]],
             hint="Check calibration_unit_mm, the board's square size, and that the masks belong to this calibration.",

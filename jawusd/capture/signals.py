@@ -224,7 +224,7 @@ def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
         SyncError: a recording is silent, the sounds do not match, or the delay is ambiguous.
     """
     if not (np.ptp(sound.samples) > 0 and np.ptp(reference.samples) > 0):
-        raise SyncError("the sound is silent.")
+        raise SyncError("the recording is silent.")
     count = len(sound.samples) + len(reference.samples)
     size = next_fast_len(count, real=True)
     cross = rfft(reference.samples, size) * np.conj(rfft(sound.samples, size))

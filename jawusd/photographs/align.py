@@ -173,7 +173,7 @@ def _findings(photos: Sequence[AlignedPhoto]) -> tuple[Finding, ...]:
     for photo in photos:
         if photo.misfit > _MOST_MISFIT:
             message = f"the crowns do not fit the drawn lines (misfit {photo.misfit:.2f}, allowed {_MOST_MISFIT})"
-            hint = "Check that the scans are of this person and up to date, and that the teeth are closed."
+            hint = "Check that the scans are recent ones of this subject, and that the teeth are closed."
             out.append(
                 Finding("photo_unfit", "error", message, photo.misfit, _MOST_MISFIT, camera=photo.name, hint=hint)
             )

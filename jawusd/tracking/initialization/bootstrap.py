@@ -232,7 +232,7 @@ def _sighting(number: int, pick: Pick, vertices: Array, cameras: Mapping[str, Ca
         width, height = camera.size_px
         if not (-0.5 <= view.x <= width - 0.5 and -0.5 <= view.y <= height - 0.5):
             raise TrackingError(
-                f"{where} lies at ({view.x:g}, {view.y:g}) px in {view.camera}, outside its {width} x {height} picture"
+                f"{where} lies at ({view.x:g}, {view.y:g}) px in {view.camera}, outside its {width} x {height} image"
             )
         matrices.append(camera.projection_matrix())
         pixels.append(camera.undistort_pixels([view.x, view.y]))

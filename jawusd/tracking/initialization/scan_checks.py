@@ -36,7 +36,7 @@ _AXES_OFF_DEG = 30.0
 
 _EXPORT = "Export both scans in one coordinate frame, with the teeth in occlusion (closed bite)."
 _UNITS = "Check units and scale of both scan files: lengths must be in mm."
-_LOOK = "View both scans together, and correct them if this is not the person's bite."
+_LOOK = "View both scans together, and correct them if this is not the subject's bite."
 
 
 def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:

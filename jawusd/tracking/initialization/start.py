@@ -268,7 +268,7 @@ def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mappin
         off = float(np.linalg.norm(transform_point(found, scan.centre) - transform_point(picked, scan.centre)))
         if off > max(_PICKS_OFF_MM, 4.0 * sigma_mm[scan.name]):
             message = f"the picks of the {scan.name} teeth are {off:.1f} mm off the position that the masks show"
-            hint = "The masks were used. Check the picked vertices and pixels."
+            hint = "The pose from the masks was used. Check the picked vertices and pixels."
             limit = _PICKS_OFF_MM
             out.append(Finding("picks_off", "warning", message, round(off, 2), limit, frame=start.frame, hint=hint))
     return tuple(out)

@@ -248,7 +248,7 @@ def raise_for_unmatched_arch(fits: Mapping[int, Array]) -> None:
         f"the {name} scan does not fit its own masks on any frame where the {other} one does: {fit[1 - good]:.2f} of "
         f"its contour against {fit[good]:.2f}, less what stays uncovered; at least {EXPLAINS:g} is needed",
         frame=frame,
-        hint=f"Check that the {name} scan is this person's, of this time, and that its masks show the {name} teeth.",
+        hint=f"Check that the {name} scan is a recent one of this subject, and that its masks show the {name} teeth.",
     )
 
 

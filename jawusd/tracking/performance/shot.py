@@ -115,7 +115,7 @@ class _Take:
             raise TrackingError(
                 "the teeth posed by the rig do not fit the masks of the start frame",
                 frame=start,
-                hint="Check that the rig is of this person, and the masks and calibration at this frame.",
+                hint="Check that the rig is of this subject, and check the masks and calibration at this frame.",
             )
         self.fits[start] = begun
         for frames in (range(start + 1, stop), range(start - 1, first - 1, -1)):

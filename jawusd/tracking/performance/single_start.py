@@ -119,7 +119,7 @@ class SingleStart:
             raise TrackingError(
                 f"the teeth were not found in the masks of the single camera; {len(frames)} frames were tried "
                 f"({', '.join(map(str, frames))})",
-                hint="Check that the rig is of this person, and check focal length and masks; start the shot with the "
+                hint="Check that the rig is of this subject, and check focal length and masks; start the shot with the "
                 "teeth visible, or add a second camera.",
             )
         return best

@@ -226,7 +226,7 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
                     f"{rough[other]:.1f} px. Its poses are unreliable.",
                     value=round(100 * float(share[r]), 1),
                     limit=round(100 * _FITS_LESS * float(share[other]), 1),
-                    hint=f"Check that the {name} scan is this person's, of this time, and that its masks show the "
+                    hint=f"Check that the {name} scan is a recent one of this subject, and that its masks show the "
                     f"{name} teeth.",
                 )
             )

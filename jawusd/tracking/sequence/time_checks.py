@@ -303,7 +303,7 @@ def _late(names: Sequence[str], frames: Mapping[int, float]) -> list[Finding]:
         Finding(
             "camera_late",
             "warning",
-            f"its pictures are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its offset; "
+            f"its images are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its offset implies; "
             f"below {_LATE_FRAMES} frames is usual.",
             value=round(late, 2),
             limit=_LATE_FRAMES,
@@ -340,5 +340,5 @@ def _dropped(name: str, step: float, frame: int) -> Finding:
         limit=_STEP_FRAMES,
         camera=name,
         frame=frame,
-        hint="Export the clip again at a constant frame rate, or cut the take there.",
+        hint="Export the clip again at a constant frame rate, or split the take there.",
     )
