@@ -51,7 +51,7 @@ class RigArrays:
 
     @property
     def actor(self) -> str:
-        """The person's name, empty if the rig has none."""
+        """The subject's name, empty if the rig has none."""
         return str(self.meta.get("actor") or "")
 
     @property
@@ -61,7 +61,7 @@ class RigArrays:
 
     @property
     def inferred(self) -> tuple[str, ...]:
-        """Descriptions of the parts that were inferred, not measured on this person."""
+        """Descriptions of the parts that were inferred, not measured on this subject."""
         found = self.meta.get("inferred")
         return tuple(str(each) for each in found) if isinstance(found, list | tuple) else ()
 

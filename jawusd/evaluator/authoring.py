@@ -96,7 +96,7 @@ class RigAuthoring(RigArrays):
         return Ranges(*(end.reshape(batch) for pair in ends for end in pair))
 
     def normalized(self, d: ArrayLike) -> Array:
-        """Return d as fractions of this person's ranges, for retargeting to another person.
+        """Return d as fractions of this subject's ranges, for retargeting to another subject.
 
         The opening is divided by the full opening, d2 and d3 by the range on their side of the habitual path at that
         opening (at least 0.5 mm).

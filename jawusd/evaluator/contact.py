@@ -54,7 +54,7 @@ class ContactField:
         values: Clearances [mm], shape (n1, n2, n3).
         closed_mm: Penetration depth of the scans in the closed bite; negative for a gap.
         error_mm: Largest interpolation error at random valid parameters with a clearance below `NEAR_MM`, or 0.
-        limit_mm: Smallest clearance of the captured poses, at most 0; teeth count as colliding in measured poses below.
+        limit_mm: Smallest clearance of the captured poses, at most 0; measured poses with a smaller one collide.
     """
 
     first_mm: Array

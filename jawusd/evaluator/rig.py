@@ -34,7 +34,7 @@ _SINGLE_LIMIT_MM = 1e4  # beyond this, float functions may raise where array fun
 
 
 class JawRig(RigClearance, RigAuthoring):
-    """One person's jaw: pure functions from d = (opening, laterotrusion, protrusion) [mm] to poses and back.
+    """One subject's jaw: pure functions from d = (opening, laterotrusion, protrusion) [mm] to poses and back.
 
     ``pose(d) = A^-1 M(d) A rest`` with A = T_anatomical_skull and rest = T_skull_mandible of the closed bite;
     ``twist(d) = log(pose(d) rest^-1)``, skull frame, (omega [rad], v [mm]).

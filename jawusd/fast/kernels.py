@@ -159,7 +159,7 @@ class CompiledKernels(NumpyKernels):
         return out
 
     def jacobians(self, d: Array) -> Array:
-        """Return the derivatives (n, 6, 3) of the twists by d (n, 3) [mm]."""
+        """Return the derivatives (n, 6, 3) of the twists with respect to d (n, 3) [mm]."""
         out = np.empty((len(d), 6, 3))
         jacobians(self._packed_model, _owned(d), out)
         return out
@@ -171,7 +171,7 @@ class CompiledKernels(NumpyKernels):
         return out
 
     def margin_gradients(self, d: Array) -> Array:
-        """Return the derivatives (n, 3) of the margins by d (n, 3) [mm]."""
+        """Return the derivatives (n, 3) of the margins with respect to d (n, 3) [mm]."""
         out = np.empty((len(d), 3))
         margin_gradients(self._packed_bound, _owned(d), out)
         return out

@@ -203,7 +203,7 @@ def bound_not_reached(gaps: tuple[Array, Array], shares: tuple[float, float]) ->
 
     Args:
         gaps: points (d1, d2) and (d1, d3) in gaps [mm], each (G, 2).
-        shares: of all points of the bound in that plane.
+        shares: fraction of the bound's points in each plane that lie in gaps.
     """
     found = []
     for name, far, places, share in zip(PARAMETERS[1:], FAR_MM[1:], gaps, shares, strict=True):

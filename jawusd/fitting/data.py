@@ -39,7 +39,7 @@ REASON = "far from the other poses' smooth motion"
 
 @dataclass(frozen=True)
 class SubjectAnatomy:
-    """Landmarks and measured points of a person's jaw, and the coordinate frames of its poses."""
+    """Landmarks and measured points of a subject's jaw, and the coordinate frames of its poses."""
 
     T_anatomical_skull: Array  # skull (scan) frame to anatomical frame, shape (4, 4)
     landmarks: Array  # `geometry.LANDMARKS` in mandible coordinates [mm], shape (5, 3)

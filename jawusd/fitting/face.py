@@ -1,4 +1,4 @@
-"""Mapping from the ARKit jaw weights of a face capture to one person's jaw, learned from a simultaneous jaw take."""
+"""Mapping from the ARKit jaw weights of a face capture to one subject's jaw, learned from a simultaneous jaw take."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ROUNDS = 2
 _COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # coarse and fine step of the offset search, fine steps to each side
 _BLOCKS = 5  # contiguous blocks for cross-validation
 _LEAST_SECONDS = 10.0
-_LEAST_REACH = 0.4  # fraction of the person's range that a take must reach in each direction
+_LEAST_REACH = 0.4  # fraction of the subject's range that a take must reach in each direction
 _LEAST_FOLLOWING = 0.7  # smallest correlation of JawOpen with the opening; mismatched takes stay below
 _DIRECTIONS = ("opening", "movement to the left", "movement to the right", "movement forward")
 
@@ -29,7 +29,7 @@ class ArkitFit:
 
     mapping: ArkitMapping
     error_mm: float  # mean error of the incisal point on held-out parts
-    shares_error_mm: float  # the same if weights are used as fixed fractions of the person's ranges
+    shares_error_mm: float  # the same if weights are used as fixed fractions of the subject's ranges
     offset_s: float  # clock of the jaw minus clock of the face, each counted from its first frame
     frames: int  # jaw frames that the mapping was learned from
 
@@ -47,7 +47,7 @@ def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s
             by correlating the weights with opening and laterotrusion.
 
     Raises:
-        FittingError: the takes overlap too little, some direction is not exercised, or fixed shares do as well.
+        FittingError: the takes overlap too little, some direction is not exercised, or fixed fractions are as accurate.
     """
     known = np.isfinite(d).all(axis=1)
     times_s, d = times_s[known], d[known]
@@ -110,7 +110,7 @@ def _weights_at(face_s: Array, weights: Array, times_s: Array) -> Array:
 def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
     """Return the offset [s] at which weights correlate best with opening and side, of those that overlap half a take.
 
-    The opening alone is ambiguous if the person opens rhythmically.
+    The opening alone is ambiguous if the subject opens rhythmically.
     """
     shorter = min(face_s[-1], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
     if shorter < _LEAST_SECONDS:

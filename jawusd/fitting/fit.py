@@ -112,7 +112,7 @@ def fit_model(
     forms: Mapping[str, FormFitter] = FORMS,
     progress: Progress | None = None,
 ) -> JawModel:
-    """Fit a person's jaw model.
+    """Fit a subject's jaw model.
 
     Args:
         source: tracks, whose raw poses are used, or frame numbers and poses.

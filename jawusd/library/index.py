@@ -41,11 +41,11 @@ class Entry:
     """The index entry of one rig."""
 
     path: str  # file of the rig, relative to the folder, with slashes
-    actor: str  # name of the person
+    actor: str  # name of the subject
     kind: str  # kind of the model
     content: str  # SHA-256 of the rig's files
     ranges_mm: dict[str, list[float]]  # lowest and highest value of each parameter
-    # landmarks by name, in the person's own landmark frame (occlusal plane, origin at the lower incisal point)
+    # landmarks by name, in the subject's own landmark frame (occlusal plane, origin at the lower incisal point)
     landmarks_mm: dict[str, list[float]]
     condylar_distance_mm: float  # distance between the condyle centres
     condyle_incisor_mm: float  # distance from the midpoint of the condyles to the incisal point
@@ -67,7 +67,7 @@ class Library:
     reread: int  # number of new or changed rigs
 
     def find(self, name: str) -> Entry:
-        """Return the rig of a person, by name or path.
+        """Return the rig of a subject, by name or path.
 
         Raises:
             FormatError: no rig matches, or several do.
@@ -89,7 +89,7 @@ class Library:
 def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
     """Scan a folder and update its index.
 
-    Every subfolder with a `model.npz`, or else an `actor.usda`, is one person. Links out of the folder are not
+    Every subfolder with a `model.npz`, or else an `actor.usda`, is one subject. Links out of the folder are not
     followed.
 
     Raises:
@@ -119,7 +119,7 @@ def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
 
 
 def load_donors(library: Library, load: Loader) -> list[Donor]:
-    """Read the rigs of all persons whose captures include every movement, named by their paths.
+    """Read the rigs of all subjects whose captures include every movement, named by their paths.
 
     Raises:
         JawusdError: a rig has become unreadable since the scan.

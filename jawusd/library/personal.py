@@ -1,11 +1,11 @@
-"""Motion for a person without a capture: the motion of the library's persons, transferred and averaged.
+"""Motion for a subject without a capture: the motion of the library's subjects, transferred and averaged.
 
 Motion is transferred by the five landmarks. The displacement of each landmark is scaled laterally by the ratio of the
-two persons' condylar distances, and in the sagittal plane by the ratio of their distances from the condyles to the
+two subjects' condylar distances, and in the sagittal plane by the ratio of their distances from the condyles to the
 incisal point. The pose is the rigid motion that best fits the displaced landmarks.
 
-The weight of a library person decreases with the distance between the landmarks. The bandwidth and the expected error
-come from leave-one-out validation: each person of the library is predicted from the others.
+The weight of a library subject decreases with the distance between the landmarks. The bandwidth and the expected error
+come from leave-one-out validation: each subject of the library is predicted from the others.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from jawusd.geometry import LANDMARKS, landmark_frame, rigid_fit, transform_poin
 
 @dataclass(frozen=True, eq=False)
 class Donor:
-    """One person of a library."""
+    """One subject of a library."""
 
-    name: str  # name of the person, for reports
-    rig: JawRig  # the person's rig
+    name: str  # name of the subject, for reports
+    rig: JawRig  # the subject's rig
 
     @property
     def landmarks(self) -> Array:
@@ -46,7 +46,7 @@ def condyle_incisor_mm(landmarks: Array) -> float:
 
 
 def landmark_distance_mm(a: Array, b: Array) -> float:
-    """Return the rms distance [mm] between two persons' landmarks (5, 3) [mm] after a rigid fit."""
+    """Return the rms distance [mm] between two subjects' landmarks (5, 3) [mm] after a rigid fit."""
     left = transform_points(rigid_fit(a, b), a) - b
     return float(np.sqrt((left**2).sum(axis=1).mean()))
 
@@ -55,7 +55,7 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
     """Return the target's landmark displacements for a donor's motion, target's frame [mm], shape (K, 5, 3).
 
     Args:
-        target: Landmarks of the target person with the teeth together [mm], shape (5, 3).
+        target: Landmarks of the target subject with the teeth together [mm], shape (5, 3).
         shares: Parameters as fractions of the ranges, see `JawRig.normalized`, shape (K, 3).
     """
     rest = donor.landmarks
@@ -71,24 +71,24 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
 # Candidate bandwidths [mm]: landmark distance at which a weight falls to exp(-1/2); inf means equal weights.
 BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)
 _POSES = 1600  # number of predicted poses
-_POSES_LEFT_OUT = 120  # poses per person in leave-one-out validation
-_MIN_DONORS = 2  # smallest number of persons for leave-one-out validation
+_POSES_LEFT_OUT = 120  # poses per subject in leave-one-out validation
+_MIN_DONORS = 2  # smallest number of subjects for leave-one-out validation
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
     """Leave-one-out errors."""
 
-    # landmark errors [mm], shape (K, 5), by name of the person left out; predicted and true poses are compared at equal
-    # fractions of the ranges, so that errors of the ranges are included
+    # landmark errors [mm], shape (K, 5), by name of the subject left out; predicted and true poses are compared at
+    # equal fractions of the ranges, so that errors of the ranges are included
     errors_mm: dict[str, Array]
 
     def pooled(self) -> Array:
-        """Return the errors of all persons [mm], shape (N, 5)."""
+        """Return the errors of all subjects [mm], shape (N, 5)."""
         return np.concatenate(list(self.errors_mm.values()))
 
     def summary(self) -> dict[str, object]:
-        """Return mean, 95 % quantile and largest error over landmarks [mm], and the mean by person."""
+        """Return mean, 95 % quantile and largest error over landmarks [mm], and the mean by subject."""
         errors = self.pooled()
         return {
             "measured": "leave-one-out over the library, at the landmarks, at equal shares of the ranges",
@@ -116,27 +116,27 @@ class Expected:
 class Learned:
     """Result of leave-one-out over a library."""
 
-    # landmark distance at which a weight falls to exp(-1/2), inf for equal weights; None if only the closest person is
+    # landmark distance at which a weight falls to exp(-1/2), inf for equal weights; None if only the closest subject is
     # used
     bandwidth_mm: float | None
-    expected: Expected | None  # None if the library has a single person
+    expected: Expected | None  # None if the library has a single subject
 
 
 @dataclass(frozen=True, eq=False)
 class PersonalMotion:
-    """The motion predicted for a person."""
+    """The motion predicted for a subject."""
 
     # T_skull_mandible in the landmark frame, the identity with the teeth together, shape (N, 4, 4)
     poses: Array
-    weights: dict[str, float]  # weights of the library's persons, by name; they sum to 1
+    weights: dict[str, float]  # weights of the library's subjects, by name; they sum to 1
     learned: Learned  # the bandwidth from which the weights follow, and the expected error
 
 
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
-    """Predict every person of a library from the others, and choose the bandwidth of the weights.
+    """Predict every subject of a library from the others, and choose the bandwidth of the weights.
 
     Args:
-        closest: Use only the person with the most similar landmarks instead of an average.
+        closest: Whether to use only the subject with the most similar landmarks instead of an average.
 
     Raises:
         FittingError: no donors.
@@ -163,10 +163,10 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
 
 
 def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) -> PersonalMotion:
-    """Predict the motion of a person from landmarks and a library.
+    """Predict the motion of a subject from landmarks and a library.
 
     Args:
-        target: Landmarks of the person with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
+        target: Landmarks of the subject with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
         learned: Result of `leave_one_out` for these donors.
     """
     weights = _weights(donors, target, learned.bandwidth_mm)
@@ -179,14 +179,14 @@ def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) ->
 
 
 def _captured_shares(donor: Donor, count: int) -> Array:
-    """Return about `count` of a person's captured poses, in time order, as fractions of the ranges."""
+    """Return about `count` of a subject's captured poses, in time order, as fractions of the ranges."""
     codes = donor.rig.captured_d
     step = -(-len(codes) // max(count, 1))
     return donor.rig.normalized(codes[::step])
 
 
 def _weights(donors: Sequence[Donor], target: Array, bandwidth_mm: float | None) -> Array:
-    """Return the weights (n,), which sum to 1; without a bandwidth, only the closest person counts."""
+    """Return the weights (n,), which sum to 1; without a bandwidth, only the closest subject counts."""
     distance = np.array([landmark_distance_mm(donor.landmarks, target) for donor in donors])
     if bandwidth_mm is None:
         return (np.arange(len(donors)) == distance.argmin()).astype(np.float64)

@@ -71,7 +71,7 @@ class Pair:
         return self._deepest(T_upper_lower, max(limit_mm, -FARTHEST_MM), limit_mm) > limit_mm
 
     def _deepest(self, T_upper_lower: Array, least: float, enough: float) -> Array:
-        """Return the depths [mm], shape (n,), at least `least`; values above `enough` are not exact."""
+        """Return the depths [mm], shape (n,), with `least` as lower limit; values above `enough` are not exact."""
         there = np.ascontiguousarray(T_upper_lower)
         back = np.ascontiguousarray(se3_inverse(there))
         found = np.full(len(there), least)

@@ -1,4 +1,4 @@
-"""How the teeth of a person meet: both scans as solids, the clearance of poses, and images of the contacts."""
+"""How the teeth of a subject meet: both scans as solids, the clearance of poses, and images of the contacts."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
 
 
 def _carried(surface: ScanSurface, up: Array, crowns: Mask, others: Mask) -> Mask:
-    """Return which other components (P,) sit on a crown that is a separate component, shape (P,)."""
+    """Return which other components (P,) are attached to a crown that is a separate component, shape (P,)."""
     out = np.zeros(len(others), dtype=bool)
     if not crowns.any() or not others.any():
         return out

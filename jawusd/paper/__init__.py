@@ -1,4 +1,4 @@
 """The method of Yang et al. (2019) as published: energy, renderers, NLPCA model, experiments and figures.
 
-The only layer besides `solvers` that imports torch, and only in `nlpca`. Imported by `pipeline` alone.
+Besides `solvers`, this is the only layer that imports torch, and only in `nlpca`. It is imported by `pipeline` alone.
 """

@@ -103,7 +103,7 @@ def _draw_path(axis: Axes, path: CondylePath, captured: Array) -> None:
 
 
 def _frame(axis: Axes, found: Experiments, around_mm: float) -> None:
-    """Show the same square in every panel: captured condyles and all paths with a margin."""
+    """Set the same square limits in every panel, which contain the captured condyles and all paths with a margin."""
     drawn = [found.captured_condyles[0], *(path.points[0] for path in found.condyle_paths)]
     points = np.concatenate(drawn)[:, [2, 1]]
     middle = 0.5 * (points.min(0) + points.max(0))

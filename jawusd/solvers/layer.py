@@ -229,7 +229,7 @@ class JawLayer(nn.Module):
     def loss(self, T_skull_mandible: Tensor) -> Tensor:
         """Return a prior on jaw poses (..., 4, 4) [mm^2]: squared residual plus `penalty` of the nearest parameters.
 
-        It is zero for every pose of this person's jaw and grows with the distance to the model and to the bound. It
+        It is zero for every pose of this subject's jaw and grows with the distance to the model and to the bound. It
         replaces the usual regularisation towards the closed mouth. Shape (...), smooth everywhere.
         """
         return self.residuals(T_skull_mandible).square().sum(dim=-1)

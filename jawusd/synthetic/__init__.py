@@ -1,4 +1,4 @@
-"""Synthetic persons: jaw motion, anatomy, and rendered captures with ground truth.
+"""Synthetic subjects: jaw motion, anatomy, and rendered captures with ground truth.
 
-The kinematics share nothing with the models that jawusd fits; imports no other stage.
+The kinematics are independent of the models that jawusd fits. This package imports no other stage.
 """

@@ -1,4 +1,4 @@
-"""Bones and teeth of a synthetic person that match the person's joint; teeth are in occlusion at the identity pose."""
+"""Bones and teeth of a synthetic subject that match the subject's joint; at the identity pose, teeth occlude."""
 
 from __future__ import annotations
 
@@ -71,9 +71,9 @@ class PersonAnatomy:
 
 
 def build_anatomy(person: Person) -> PersonAnatomy:
-    """Build the teeth and bones of a person.
+    """Build the teeth and bones of a subject.
 
-    The person's overbite and overjet determine the lower front teeth; the lower back teeth are raised until they touch
+    The subject's overbite and overjet determine the lower front teeth; the lower back teeth are raised until they touch
     the upper ones.
     """
     rng = np.random.default_rng([person.seed, 0xA1A7])

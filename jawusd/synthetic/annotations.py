@@ -131,7 +131,7 @@ def choose_picks(
 
 
 def _tips(arch: DentalArch) -> NDArray[np.int64]:
-    """Return vertices at the occlusal end of the crowns on the facial side, where a person would click."""
+    """Return vertices at the occlusal end of the crowns on the facial side, where an annotator would click."""
     vertices = arch.mesh.vertices
     up = 1.0 if vertices[arch.tooth == 0, 1].mean() < vertices[arch.tooth != 0, 1].mean() else -1.0
     chosen = []

@@ -1,6 +1,6 @@
 """The mandible and the adjacent parts of the skull: fossa and eminence, cheekbone, upper jaw bone; without teeth.
 
-The joint surfaces follow from the person's kinematics: condyles that slide along them trace the paths of
+The joint surfaces follow from the subject's kinematics: condyles that slide along them trace the paths of
 `jawusd.synthetic.kinematics`. Everything is in the scan frame [mm], in the closed bite.
 """
 

@@ -40,7 +40,7 @@ from jawusd.synthetic.take import (
 
 Progress = Callable[[int, int], None]
 
-# Frame k of a camera shows the instant of frame k + offset of the first one.
+# Frame k of a camera was exposed at the same instant as frame k + offset of the first camera.
 _OFFSETS = (0, 5, -3)
 _SCANS = ("upper_teeth", "lower_teeth", "mandible", "skull")
 _PICKS = 4
@@ -56,7 +56,7 @@ _NOISE_PATTERNS = 5
 class DemoConfig:
     """Seed, size and quality of a synthetic capture."""
 
-    seed: int = 0  # seed of the person and the performance
+    seed: int = 0  # seed of the subject and the performance
     frames: int = 240  # number of tracked frames, at 24 per second
     size_px: tuple[int, int] = (1280, 720)  # width and height of the images
     boards: int = 24  # number of poses of the calibration board
@@ -72,7 +72,7 @@ class DemoConfig:
 
 
 def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Progress | None = None) -> Path:
-    """Record a synthetic person to a capture folder, overwriting existing files; return the path of capture.toml.
+    """Record a synthetic subject to a capture folder, overwriting existing files; return the path of capture.toml.
 
     Progress is reported as the number of images done and the total.
 

@@ -1,4 +1,4 @@
-"""Jaw exercises as control curves, and recordings of a person performing them.
+"""Jaw exercises as control curves, and recordings of a subject performing them.
 
 Speeds and amplitudes follow chewing and clinical exercise data: chewing cycles of 0.6 to 1 s and 15 to 20 mm, border
 movements of 3 to 4 s, all at 24 frames per second.
@@ -36,7 +36,7 @@ _SCHEDULES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Recording:
-    """Recorded exercises of a person; poses are T_skull_mandible, shape (F, 4, 4)."""
+    """Recorded exercises of a subject; poses are T_skull_mandible, shape (F, 4, 4)."""
 
     controls: Array  # opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3)
     phase: NDArray[np.str_]  # name of the exercise of each frame, shape (F,)
@@ -46,7 +46,7 @@ class Recording:
 
 
 def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", noise_scale: float = 1.0) -> Recording:
-    """Record the exercises of a person at 24 frames per second.
+    """Record the exercises of a subject at 24 frames per second.
 
     Args:
         n_frames: number of frames; the paper trained on 833.

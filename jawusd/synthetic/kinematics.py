@@ -4,7 +4,7 @@ Frame: scan frame (x to the subject's left, y up, z anterior, mm), teeth in occl
 joint coordinates: the pitch about the condylar axis, the forward slide of each condyle, and the side shift. The heights
 of the condyles follow from the eminences, and their lateral positions from the constant distance between them, so both
 condyles stay on their slopes in every pose. Joint surfaces, guidance and ranges follow textbook TMJ mechanics
-(Posselt 1952, Okeson 2019) and share nothing with the models that jawusd fits.
+(Posselt 1952, Okeson 2019) and are independent of the models that jawusd fits.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _CUSP_ROUNDING_MM = 0.3
 
 @dataclass(frozen=True)
 class Joint:
-    """Parameters of one person's joint; pairs are (left, right), lengths mm, angles rad."""
+    """Parameters of one subject's joint; pairs are (left, right), lengths mm, angles rad."""
 
     condyles: Array  # centres of the condyles at rest, shape (2, 3)
     incisor: Array  # lower incisal point at rest, shape (3,)

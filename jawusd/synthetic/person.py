@@ -1,9 +1,9 @@
-"""A synthetic person: seeded joint parameters within human ranges, poses, and the set of possible poses.
+"""A synthetic subject: seeded joint parameters within human ranges, poses, and the set of possible poses.
 
 Ranges: opening and excursions after Hirsch et al. 2006 and Travers et al. 2000, condylar inclination and Bennett angle
 after Johnson and Winstanley 1997 and Cadiax studies, condylar travel after Muto and Kanazawa 1996.
 
-A pose is possible if it lies on the person's three-parameter manifold with controls inside their ranges. The nearest
+A pose is possible if it lies on the subject's three-parameter manifold with controls inside their ranges. The nearest
 possible pose is found by bounded Gauss-Newton steps from the best node of a coarse grid, on distances of mandible
 points.
 """
@@ -36,7 +36,7 @@ EnvelopeKind = Literal["box", "competing"]
 
 
 class Envelope:
-    """Set of possible controls of one person, with projection onto it."""
+    """Set of possible controls of one subject, with projection onto it."""
 
     def __init__(self, pose: PoseFunction, points: Array, exponent: float | None) -> None:
         """Prepare the grid of start values.
@@ -134,7 +134,7 @@ def _asymmetric(rng: np.random.Generator, value: float, relative: float) -> Arra
 
 
 def draw_joint(rng: np.random.Generator) -> Joint:
-    """Draw the joint of one person."""
+    """Draw the joint of one subject."""
     u = rng.uniform
     half_distance, middle_x = u(47.0, 53.0), u(-0.7, 0.7)
     height, depth = u(41.0, 47.0), u(86.0, 92.0)
@@ -181,7 +181,7 @@ class Noise:
 
 
 class Person:
-    """One synthetic person, with all parameters drawn from the seed.
+    """One synthetic subject, with all parameters drawn from the seed.
 
     Attributes:
         landmarks: `jawusd.geometry.LANDMARKS` on the mandible, scan frame [mm], shape (5, 3).
@@ -189,7 +189,7 @@ class Person:
     """
 
     def __init__(self, seed: int, envelope: EnvelopeKind = "box") -> None:
-        """Draw a person.
+        """Draw a subject.
 
         Args:
             envelope: "box": lateral and protrusive range are independent; "competing": a wide lateral movement reduces
@@ -210,7 +210,7 @@ class Person:
         self._envelope = Envelope(self.pose, self.mandible_points, exponent=1.3 if envelope == "competing" else None)
 
     def pose(self, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike) -> Array:
-        """Return mandible poses (..., 4, 4) on the person's three-parameter manifold, see `controlled_pose`."""
+        """Return mandible poses (..., 4, 4) on the subject's three-parameter manifold, see `controlled_pose`."""
         return controlled_pose(self.joint, opening, lateral, protrusion)
 
     def pose_with_extra(self, controls: ArrayLike, extra_mm: ArrayLike) -> Array:

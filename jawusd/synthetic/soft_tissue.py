@@ -69,7 +69,7 @@ class Surface:
 
 
 class Face:
-    """Face, lips and mouth lining of one person as a grid of rings around the mouth."""
+    """Face, lips and mouth lining of one subject as a grid of rings around the mouth."""
 
     def __init__(self, lower_incisor: Array) -> None:
         """Build the grid for a lower incisal point (3,) in occlusion, scan frame [mm]."""

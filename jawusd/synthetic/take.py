@@ -1,7 +1,7 @@
 """The studio, a performance in front of its cameras, and the scene at any instant.
 
 A studio has three cameras about 200 mm from the mouth and a chessboard. A take samples jaw, head, lips, tongue and
-light over time; the scene poses the person's surfaces at an instant and renders them.
+light over time; the scene poses the subject's surfaces at an instant and renders them.
 """
 
 from __future__ import annotations
@@ -122,11 +122,11 @@ class Take:
 
 
 def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[int, ...], seed: int) -> Take:
-    """Return a take of a person performing exercises.
+    """Return a take of a subject performing exercises.
 
     Args:
         occlusion: tooth contacts, which guide closed movements.
-        frames: number of tracked frames, more than the two holds at the start.
+        frames: number of tracked frames, more than the two holds at the start take.
         offsets: camera offsets; the take covers the frames of all cameras.
         seed: seed of exercises, head motion, lips and tongue.
     """
@@ -213,10 +213,10 @@ def _tongue(controls: Array, rng: np.random.Generator) -> Array:
 
 
 class Scene:
-    """All surfaces of one person, ready to render."""
+    """All surfaces of one subject, ready to render."""
 
     def __init__(self, person: Person, anatomy: PersonAnatomy, renderer: Renderer) -> None:
-        """Add the person's surfaces to the renderer."""
+        """Add the subject's surfaces to the renderer."""
         self._renderer = renderer
         self.anatomy = anatomy
         self._face = Face(person.joint.incisor)
