@@ -107,7 +107,7 @@ class ShapeError:
     mean: float  # mean absolute error
     p95: float  # 95th percentile of the absolute error
     max: float  # largest error
-    distances: int  # number of distances compared; 0 if no corner near the mouth was seen by two cameras
+    distances: int  # number of distances compared; 0 if no corner near the mouth was visible to two cameras
 
 
 def mouth_centre(cameras: list[Camera], bootstrap: Bootstrap | None, T_world_board: Array) -> tuple[Array, str]:

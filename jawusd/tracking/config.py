@@ -90,11 +90,11 @@ class TrackingConfig:
     suspect_coverage: float = 0.04
     # Multiple of the arch's recent median residual above which the mask of one view is suspect [-].
     uneven_residual: float = 1.6
-    # Fraction of its recent median score below which a mask shows something other than the arch [-].
+    # Fraction of its recent median score below which a mask is of something other than the arch [-].
     dead_score: float = 0.03
     # Penalty per uncovered mask pixel, in px of contour [1/px]: rejects wrong local minima where few edges are visible.
     uncovered_price: float = 0.5
-    # Gain in the objective of the other masks, relative to their score, that shows an excluded mask to be wrong [-].
+    # Gain in the objective of the other masks, relative to their score, that proves an excluded mask wrong [-].
     conflict_gain: float = 0.15
     # Gain in the objective over the first attempt, relative to the score, that marks a frame as recovered [-].
     recovery_gain: float = 0.05
@@ -161,6 +161,6 @@ class TrackingConfig:
 #: For takes of several cameras: scans are rendered half as often. Searches with a single camera need the default.
 FOR_TAKES = TrackingConfig(redraw_px=2.0)
 
-#: For masks made by jawusd. They vary more between frames than drawn ones, and get rougher as lips close, so the limits
-#: for lost arches are wider. Their errors are correlated along whole teeth, hence the larger `tile_factor`.
+#: For masks made by jawusd. They vary more between frames than hand-drawn ones, and become rougher as lips close, so
+#: the limits for lost arches are wider. Their errors are correlated along whole teeth, hence the larger `tile_factor`.
 FOR_AUTO_MASKS = replace(FOR_TAKES, suspect_residual=3.0, suspect_score=0.25, tile_factor=20.0)

@@ -20,8 +20,8 @@ def crown_gum_segments(
 ) -> tuple[Array, Array]:
     """Return the segments in which crown triangles intersect gum triangles, and directions across them on the crown.
 
-    End points [mm] have shape (S, 2, 3). The unit vectors across lie in the crown triangles and are perpendicular to
-    the segments, shape (S, 3). Segments shorter than 1 um are dropped.
+    End points [mm] have shape (S, 2, 3). The unit vectors across them lie in the crown triangles and are perpendicular
+    to the segments, shape (S, 3). Segments shorter than 1 um are dropped.
     """
     if not len(crown_faces) or not len(gum_faces):
         return np.zeros((0, 2, 3)), np.zeros((0, 3))

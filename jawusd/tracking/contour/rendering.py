@@ -120,7 +120,7 @@ class Drawing:
             self._contours[contour] = contour.samples(self._matrix, self._eye, self._labels, self._inverse_depth)
 
     def samples(self, contour: Contour, matrix: Array, shape: tuple[int, int], turned_rad: float) -> _Kept:
-        """Return the samples of a contour at a pose close to the one last shown.
+        """Return the samples of a contour at a pose close to that of the last `show`.
 
         Args:
             contour: of this arch; the drawing may be of a scan with fewer faces.
@@ -241,7 +241,7 @@ class Rendering:
             views: of the instant.
             contours: of the upper and lower arch, sampled while drawing.
             drawings: cache shared between instants.
-            redraw_px: motion after which an arch is drawn again.
+            redraw_px: motion after which an arch is rendered again.
             map: distributes the drawing among threads.
         """
         self._contours, self._drawings, self._redraw_px, self._map = contours, drawings, redraw_px, map

@@ -345,7 +345,7 @@ def _gingival_margin(
         up, vp, wp = _pixel(matrix, p[0], p[1], p[2])
         uq, vq, wq = _pixel(matrix, q[0], q[1], q[2])
         length = np.sqrt((uq - up) ** 2 + (vq - vp) ** 2)
-        if length < 0.05:  # px: seen end-on, no direction
+        if length < 0.05:  # px: viewed end-on, the direction is undefined
             continue
         nx = reach * (vq - vp) / length
         ny = reach * (up - uq) / length

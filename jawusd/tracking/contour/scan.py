@@ -24,7 +24,7 @@ Faces = NDArray[np.int32]
 
 ARCHES = (0, 1)
 ARCH_NAMES = ("upper", "lower")
-CROWN, GUM = 1, 2  # labels of a drawn scan; 0 is empty
+CROWN, GUM = 1, 2  # labels of a rendered scan; 0 is empty
 
 _PROBES = 300  # vertices: enough for means over the crowns that are accurate to one per cent
 # Crown faces above which most steps use a decimated scan, and crown faces of the decimated scan: the loss of accuracy

@@ -45,10 +45,10 @@ class EdgeSearch(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Both arches as drawn in an image."""
+    """Both arches as rendered in an image."""
 
     own: NDArray[np.uint8]  # labels of the arch alone: CROWN, GUM or 0, shape (h, w)
-    other: NDArray[np.uint8]  # the same of the other arch
+    other: NDArray[np.uint8]  # labels of the other arch, shape (h, w)
     other_inverse_depth: NDArray[np.float32]  # [1/mm], 0 = empty, shape (h, w)
 
 

@@ -32,7 +32,7 @@ class Footage:
     cameras: Mapping[str, Camera]
     offsets: Mapping[str, int]
     frames: tuple[int, int] | None
-    fewest: int = FEWEST_CAMERAS  # cameras that must show both arches
+    fewest: int = FEWEST_CAMERAS  # minimum number of cameras with masks of both arches
 
     def survey(self, frames: tuple[int, int] | None, count: int) -> MaskSurvey:
         """Measure the masks of `count` evenly spaced frames, by default from the whole footage."""
@@ -62,7 +62,7 @@ class MaskSurvey:
     areas_px: Array  # area of every mask, shape (F, 2, C); 0 without a mask
     matrices: Array  # world [mm] to homogeneous px of the survey images, shape (C, 3, 4)
     eyes: Array  # camera centres in the world [mm], shape (C, 3)
-    fewest: int = FEWEST_CAMERAS  # cameras that must show both arches
+    fewest: int = FEWEST_CAMERAS  # minimum number of cameras with masks of both arches
 
     def places(self) -> Array:
         """Return the triangulated mask centres in the world [mm], NaN with fewer than two masks, shape (F, 2, 3)."""
@@ -74,7 +74,7 @@ class MaskSurvey:
         return out
 
     def promising(self, count: int) -> NDArray[np.int64]:
-        """Return at most `count` frames that show large masks of both arches in all cameras, the best first.
+        """Return at most `count` frames with large masks of both arches in all cameras, the best first.
 
         Areas are clipped at their 90 % quantile, since larger masks may be wrong. Neighbouring frames are redundant, so
         they come after all others.
@@ -101,7 +101,7 @@ def survey_masks(
     """Measure the masks of at most `count` evenly spaced frames; other arguments as in `Footage`.
 
     Raises:
-        TrackingError: no frame shows both arches in enough cameras.
+        TrackingError: no frame has masks of both arches in enough cameras.
         CaptureError: a mask cannot be read.
     """
     with ExitStack() as stack:

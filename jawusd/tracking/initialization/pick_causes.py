@@ -112,7 +112,7 @@ def _exchanges(given: Setting) -> Iterator[Mistake]:
         )
         yield Mistake(
             "picks_cameras_exchanged",
-            f"cameras {a} and {b} are exchanged in the picks",
+            f"the picks have cameras {a} and {b} exchanged",
             "Exchange these names in [bootstrap].",
             replace(given, picks=_with_views(given, partial(_renamed, other))),
         )

@@ -22,7 +22,7 @@ PRIOR_LOG_FOCAL = 0.1
 
 
 class Views(Protocol):
-    """Source of the views of all cameras at instants of the reference camera, such as `MaskViews`."""
+    """Source of one view per camera at instants of the reference camera, such as `MaskViews`."""
 
     def at(self, frame: int) -> list[View]:
         """Return one view per camera."""

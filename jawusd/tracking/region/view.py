@@ -52,7 +52,7 @@ def choose_tables(
     for s in range(len(samples)):
         sample = samples[s]
         kind = 1
-        if s < count:  # a silhouette in front of its own gum looks like a gum line
+        if s < count:  # a silhouette in front of its own gum has the edge of a gum line
             i = min(max(pixel_of(sample[U] + _AHEAD_PX * sample[NX]), 0), width - 1)
             j = min(max(pixel_of(sample[V] + _AHEAD_PX * sample[NY]), 0), height - 1)
             kind = 1 if labels[j, i] == GUM else 0

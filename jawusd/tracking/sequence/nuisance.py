@@ -21,7 +21,8 @@ class Nuisances:
     """Nuisance parameters common to all frames of a take.
 
     Attributes:
-        delays: camera c shows the instant of frame + delays[c], in frames; 0 for the first camera, shape (C,).
+        delays: images of camera c were taken at the instant frame + delays[c], in frames; 0 for the first camera, shape
+            (C,).
         habits: outward mask bias, per arch and camera, shape (2, C, 3): at free edges and at the gum line [px
             at working resolution], and along the gum surface [mm]; see `OutlineSums`.
         shift_px: the resulting mean shift of edges and gum line, shape (2, C, 2).
@@ -99,8 +100,8 @@ class AnnotatorPrior:
 #: For an annotator who draws masks.
 DRAWN = AnnotatorPrior(edge_px=0.5, gum_px=0.4, gum_mm=0.1, arch_px=0.15, arch_mm=0.05, camera_px=0.1, frames=1.5)
 
-#: The same for scans without gum. Outlines at the neck of a tooth are then classified by their direction, with some
-#: errors that recur in every frame.
+#: Prior of hand-drawn masks for scans without gum. Without gum, outlines at the neck of a tooth are classified by their
+#: direction, with some errors that recur in every frame.
 DRAWN_BESIDE_CROWNS = replace(DRAWN, frames=0.75)
 
 

@@ -79,7 +79,7 @@ class Passes:
             self._progress(len(self.records), self._stop - self._first)
 
     def track_back_to(self, start: int) -> None:
-        """Track to the first frame from a well-seen one, and past it until both directions agree.
+        """Track to the first frame from one with a good fit, and past it until both directions agree.
 
         The first frame was aligned without knowing the usual fit of this take, and its neighbours were tracked from it.
         """
@@ -162,8 +162,8 @@ def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
     return [(a, b) for a, b in runs]
 
 
-# Minimum score and largest residual of a well-seen frame, relative to the medians of the take. They only determine
-# where tracking back to the first frame begins.
+# Minimum score and largest residual of a frame with a good fit, relative to the medians of the take. They only
+# determine where tracking back to the first frame begins.
 _LEAST_SCORE, _MOST_RESIDUAL = 0.8, 1.2
 # Matched fraction of the visible contour, and residual, both relative to the medians of the take: an arch beyond both
 # limits was matched with lip edges instead of teeth. Last, the number of frames needed for the medians. False-alarm

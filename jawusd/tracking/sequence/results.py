@@ -115,7 +115,7 @@ def _columns(records: Mapping[int, FrameRecord], frames: NDArray[np.int64]) -> l
     rows = (_figures(records[frame]) for frame in frames.tolist())
     first = next(rows)
     columns = [np.empty((len(frames), *value.shape)) for value in first]
-    for k, row in enumerate(chain([first], rows)):  # frame by frame, since a list would hold all records of a long take
+    for k, row in enumerate(chain([first], rows)):  # one at a time: all records of a long take need much memory
         for column, value in zip(columns, row, strict=True):
             column[k] = value
     return columns

@@ -56,7 +56,7 @@ def track_capture(
     threads: int = 2,
     progress: Progress | None = None,
 ) -> Tracks:
-    """Track both arches through a capture.
+    """Track both arches in a capture.
 
     Args:
         capture: provides masks, frame range and bootstrap picks; without picks, the first pose is searched for.
@@ -128,7 +128,8 @@ class _Take(Passes):
     def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
         """Estimate delays, habits and camera poses; if they matter, align all frames again with them corrected.
 
-        Camera poses are corrected only if `may_move`, since wrong lenses or scan sizes look like moved cameras.
+        Camera poses are corrected only if `may_move`, since wrong lenses or scan sizes have similar effects as moved
+        cameras.
         """
         c = self._config
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())

@@ -53,7 +53,7 @@ _MOST_BEND = 0.015
 # Motion of a camera since its calibration that causes a warning after its correction.
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
 _KNOCKED_MORE = 1.5  # minimum ratio of the motion of a knocked camera to that of any other
-_TELLING_CAMERAS = 3  # cameras needed to tell which is wrong: of two that differ, it may be either
+_TELLING_CAMERAS = 3  # cameras needed to identify the wrong one: if two differ, either may be
 # Matched fraction of the visible contour, and residual, each relative to the other scan: a scan beyond both limits
 # belongs to another subject. Last, the number of frames needed for the decision. False-alarm rate: at most 14 %.
 _FITS_LESS, _FITS_ROUGHER, _TELLING_FRAMES = 0.35, 1.5, 3

@@ -42,7 +42,7 @@ _BETTER_FIT = 0.15
 
 
 class Shift(NamedTuple):
-    """A camera whose masks show a wrong instant.
+    """A camera whose masks are of the wrong instant.
 
     Attributes:
         camera: its index.
@@ -69,7 +69,7 @@ class FrameShifts:
     fit: Array
 
     def clearest(self) -> Shift | None:
-        """Return the most significant shift; None if all cameras show the correct instant.
+        """Return the most significant shift; None if the masks of all cameras are of the correct instant.
 
         The shift of one camera biases the poses that the other cameras are compared with, so they seem to be shifted as
         well.
@@ -78,7 +78,7 @@ class FrameShifts:
         return max(found, key=lambda entry: entry[0])[1] if found else None
 
     def is_timely(self, camera: int) -> bool:
-        """Return whether a camera clearly shows the correct instant."""
+        """Return whether a camera's masks are clearly of the correct instant."""
         return _agree(self._conclusive(camera)[1][:, SHIFTS.index(0)])
 
     def _conclusive(self, c: int) -> tuple[NDArray[np.int_], Array]:
@@ -125,7 +125,7 @@ def _agree(leads: Array, above: Array | None = None) -> bool:
 def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: ContourSolver) -> FrameShifts:
     """Compare the masks of some frames with fast jaw motion with those of their neighbours.
 
-    If all cameras show the correct instant at both ends of the take, the frames between are skipped: a step there would
+    If all masks are of the correct instant at both ends of the take, the frames between are skipped: a step there would
     have to be followed by its opposite.
 
     Args:
@@ -276,7 +276,7 @@ def time_findings(
         names: of the cameras.
         records: of all frames.
         nuisances, extrinsics, config: of the take.
-        shifts: instants shown by the masks; without masks, steps are found from delays below a frame.
+        shifts: fit of the masks of neighbouring frames; without masks, steps are found from delays below a frame.
 
     Kinds: "camera_late" [frames], "frame_dropped" [frames].
     """
