@@ -39,7 +39,7 @@ class Bundle:
     corners_px: Array  # corners used, NaN elsewhere, shape (C, V, N, 2)
     residuals_px: Array  # projected minus observed, NaN where not used, shape (C, V, N, 2)
     parameters: Array  # the camera parameters, see `camera_from`, shape (12 C - 6,)
-    covariance: Array  # of these parameters, shape (12 C - 6, 12 C - 6)
+    covariance: Array  # covariance of the camera parameters, shape (12 C - 6, 12 C - 6)
 
 
 def adjust(start: InitialGuess, points_mm: Array) -> Bundle:

@@ -37,7 +37,7 @@ class Outlines:
     """Points on the visible outlines of all teeth in one image.
 
     Attributes:
-        points: on the crowns, scan coordinates of their own arch [mm], shape (N, 3).
+        points: points on the crowns, scan coordinates of their own arch [mm], shape (N, 3).
         arch: 0 upper, 1 lower, shape (N,).
         tooth: number of the piece, from 1, continuing from the upper to the lower arch, shape (N,).
         pixels: image positions [px], shape (N, 2).

@@ -72,7 +72,7 @@ class TypicalBite:
 
 
 def typical_bites(scans: Sequence[Scan]) -> list[TypicalBite]:
-    """Return the possible typical bites of two arches.
+    """Return the typical bites in which two arches may meet.
 
     The plane and forward direction of an arch follow from its shape, and its vertical direction from its gum. Without
     gum, both vertical directions are returned.
@@ -216,7 +216,7 @@ class PhotoStart:
     misfit: float  # misfit of its lines, see `Aligner.misfit` [-]
     other_misfit: float  # misfit with the opposite choice of mirroring
     mirrored: bool
-    bite: Bite  # of this photograph alone, at reduced size
+    bite: Bite  # pose and bite from this photograph alone, at reduced size
     rows: ArchPair
 
 

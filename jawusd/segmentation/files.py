@@ -23,7 +23,7 @@ from jawusd.media.pictures import read_gray
 ARCHES = ("upper", "lower")
 PATTERN = "%06d.png"
 _UNKNOWN = 128  # gray value of pixels without annotation
-_STROKES_UNKNOWN = 0.5  # fraction of such pixels from which an image contains strokes
+_STROKES_UNKNOWN = 0.5  # fraction of pixels without annotation from which an image counts as strokes
 _COLUMNS = 3
 _TILE_PX = (480, 270)
 _MARGIN = 0.15  # margin of a tile, relative to the extent of the teeth

@@ -94,7 +94,7 @@ def search_edges(
 
     Args:
         samples: shape (n, COLUMNS).
-        mask, other_mask: of this arch and of the other, 255 = teeth, shape (h, w).
+        mask, other_mask: masks of this arch and of the other one, 255 = teeth, shape (h, w).
         other_inverse_depth: rendered inverse depth of the other arch's scan [1/mm], 0 = empty, shape (h, w).
         reach_px: search distance in both directions.
         tolerance_mm: depth difference from which one arch hides the other.

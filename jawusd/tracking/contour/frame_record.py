@@ -37,7 +37,7 @@ class FrameRecord:
     """The result of one frame."""
 
     solution: Solution  # the alignment; poses of lost arches are invalid
-    status: NDArray[np.int8]  # of both arches, as in `Tracks`, shape (2,)
+    status: NDArray[np.int8]  # status of both arches, as in `Tracks`, shape (2,)
     used: Mask  # masks used, shape (2, C)
     coverage: Array  # E_SP over mask pixels, shape (2, C); NaN without a mask
     losses: tuple[Loss, Loss] = (NO_LOSS, NO_LOSS)  # why each arch is lost

@@ -55,7 +55,7 @@ def _weight_and_square(solution: Solution) -> tuple[Array, Array]:
 def uncovered_px(
     scans: Sequence[Scan], poses: Array, views: Sequence[View], in_threads: Mapper = map
 ) -> tuple[Array, Array]:
-    """Return E_SP of eq. 8 of the paper, the mask pixels not covered by the projected crowns, and all mask pixels.
+    """Return E_SP (eq. 8 of the paper), the mask pixels not covered by the projected crowns, and all mask pixels.
 
     Both are counts per arch and view, shape (2, C).
     """
@@ -121,7 +121,7 @@ def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, c
 
     Args:
         prior: a further constraint on the two poses, as log-likelihood.
-        sigma_px, correlation_px: as for `twist_covariance`, the former per arch, shape (2,).
+        sigma_px, correlation_px: as for `twist_covariance`; `sigma_px` per arch, shape (2,).
     """
     equations = NormalEquations()
     prior.accumulate(replace(solution, centres=np.zeros((2, 3))), equations)

@@ -50,10 +50,10 @@ class Drawing:
         """Draw the scan.
 
         Args:
-            scan: of one arch.
+            scan: the scan of one arch.
             matrix: projection from scan coordinates [mm] to homogeneous px of a window, shape (3, 4).
             eye: camera centre in scan coordinates [mm], shape (3,).
-            shape: of the window (h, w).
+            shape: size (h, w) of the window.
         """
         self._scan, self._eye = scan, eye
         self._matrix = _shifted(matrix, _AROUND_PX)
@@ -123,7 +123,7 @@ class Drawing:
         """Return the samples of a contour at a pose close to that of the last `show`.
 
         Args:
-            contour: of this arch; the drawing may be of a scan with fewer faces.
+            contour: contour of this arch; the drawing may be of a scan with fewer faces.
             matrix, shape: as for the constructor, at that pose.
             turned_rad: result of `show`.
 
@@ -158,7 +158,7 @@ class Drawings:
             camera: camera centre in the world [mm], shape (3,).
             T_world_scan: the pose, shape (4, 4).
             matrix: projection from scan coordinates [mm] to homogeneous px of the window, shape (3, 4).
-            shape: of the window (h, w).
+            shape: size (h, w) of the window.
         """
         eye = T_world_scan[:3, :3].T @ (camera - T_world_scan[:3, 3])
         key = (arch, view, camera.tobytes())
@@ -238,8 +238,8 @@ class Rendering:
         """Start without drawings.
 
         Args:
-            views: of the instant.
-            contours: of the upper and lower arch, sampled while drawing.
+            views: the views of the instant.
+            contours: contours of the upper and lower arch, sampled while drawing.
             drawings: cache shared between instants.
             redraw_px: motion after which an arch is rendered again.
             map: distributes the drawing among threads.
@@ -267,7 +267,7 @@ class Rendering:
         """Return the samples of a contour in a view, moved to a pose close to the drawn one.
 
         Args:
-            contour: of the arch; the drawing may be of a scan with fewer faces.
+            contour: contour of the arch; the drawing may be of a scan with fewer faces.
             r, c: arch and view.
             pose: T_world_arch at the view's instant, shape (4, 4).
 

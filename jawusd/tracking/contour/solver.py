@@ -110,7 +110,7 @@ class ContourSolver:
             use: masks to use, shape (2, C); default: all present ones.
             terms: further constraints on the poses.
             outline_weight: as in `NormalEquations`; needed if the terms are log-likelihoods.
-            rendering: of these views by this solver, shared with other alignments.
+            rendering: rendering of these views by this solver, shared with other alignments.
         """
         use = present_masks(views) if use is None else use
         if self.thin is None or not gates_px:
@@ -169,7 +169,7 @@ class ContourSolver:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
             views, use: one view per camera, and the masks to use, shape (2, C).
             gate: residual beyond which a sample has no weight [px].
-            rendering: of these views, shared by all steps at an instant.
+            rendering: rendering of these views, shared by all steps at an instant.
             final: also compute the sums for the covariance.
             matched: receives the samples that were summed.
         """

@@ -58,7 +58,7 @@ class View:
 
     matrix: Array  # world [mm] to homogeneous px of this image, shape (3, 4)
     eye: Array  # camera centre in the world [mm], shape (3,)
-    # of the upper and the lower arch, uint8, 255 = teeth, shape (2, h, w); zeros without a mask
+    # masks of the upper and lower arch, uint8, 255 = teeth, shape (2, h, w); zeros without a mask
     masks: NDArray[np.uint8]
     present: Mask  # whether each of the two masks exists, shape (2,)
     # world motion of the arches from the reference instant to this camera's own, shape (2, 4, 4)

@@ -32,7 +32,7 @@ class Setting:
 
     Attributes:
         picks: those on the upper and on the lower arch.
-        vertices: of both scans, as the picks index them [mm].
+        vertices: vertices of both scans, as indexed by the picks [mm].
         crowns: some points of both scans' crowns [mm].
         cameras: by name.
         sources: the camera whose masks are used for each camera; by default its own.

@@ -126,7 +126,7 @@ def search_arch(
     Args:
         scan: the arch, coarse.
         arch: 0 upper, 1 lower.
-        views: of one instant; those without a mask of the arch are ignored.
+        views: views of one instant; those without a mask of the arch are ignored.
         px_per_mm: their resolution at the teeth.
         base: guessed T_world_axes with (left, up, front) axes of the arch at the centre of rotation, shape (4, 4).
         hinge: T_axes_scan to the same axes, shape (4, 4).

@@ -33,7 +33,7 @@ _SMALLEST, _LARGEST = 0.5, 2.0
 _SURVEYED, _FRAMES_TRIED = 24, 2
 # Maximum number of evaluations of a hill climb: the whole range in the widest steps, plus the finer steps.
 _MOST_SIZES = 64
-_CLEAR_FIT = 0.3  # as for the start of a take: wrong poses have fits below 0.1 for one arch
+_CLEAR_FIT = 0.3  # minimum fit, as for the start of a take: wrong poses have fits below 0.1 for one arch
 
 
 def seen_size(

@@ -56,7 +56,7 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
     both fit clearly with a mistake undone, that mistake is an error.
 
     Args:
-        search: of the scans.
+        search: search for the scans.
         footage: the masks.
         suspects: hint texts of the mistakes that the scans suggest.
         explain: whether to look for a mistake if no frame fits, which takes several times as long.

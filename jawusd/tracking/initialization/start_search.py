@@ -74,7 +74,7 @@ class StartSearch:
 
         Args:
             meshes: upper and lower teeth scans in one frame, in occlusion [mm].
-            solver: for the same scans.
+            solver: solver with the same scans.
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
             map_: distributes the search among threads.
         """
@@ -205,7 +205,7 @@ def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:
     """Return T_upper_lower of a closed jaw and of pure hinge openings, shape (4, 4) each.
 
     Args:
-        crowns: of the lower teeth, scan coordinates [mm], shape (N, 3).
+        crowns: crown vertices of the lower teeth, scan coordinates [mm], shape (N, 3).
         T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
     """
     points = transform_points(T_anatomical_scan, crowns)

@@ -26,7 +26,7 @@ class Expected:
     """Prior of head and jaw at an instant."""
 
     pose: Pose
-    precision: Array  # of the step from the expected pose, shape (9,)
+    precision: Array  # inverse variances of the step from the expected pose, shape (9,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class InstantSolver:
             gates_px: residual gate of every step.
             expected: the prior.
             outline_weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
-            rendering: of these views; default: a new one.
+            rendering: rendering of these views; default: a new one.
         """
         rendering = rendering or self.solver.rendering(views)
         pose, left, moved_mm = start, tuple(gates_px), np.inf

@@ -18,7 +18,7 @@ from jawusd.tracking.performance.instant import Expected
 _MISS = np.r_[[0.01] * 3, [0.7] * 3, [0.7] * 3]
 #: Factors on the standard deviations of a head that hardly moves relative to the cameras, and of a known head pose.
 STEADY, KNOWN = 0.05, 1e-4
-_DAMPING = 0.8  # of the velocity per frame
+_DAMPING = 0.8  # factor on the velocity per frame
 
 # Variance of the prior relative to the measured mean square [-]: motion is mostly smooth, with abrupt changes.
 _LOOSE = 4.0
@@ -86,7 +86,7 @@ def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask,
     """Return the variances of a take's motion, or those of the take the rig was fitted to if too few frames are good.
 
     Args:
-        poses: of consecutive frames.
+        poses: poses of consecutive frames.
         good: frames in which both arches were found, shape (N,).
         fps: frames per second.
     """

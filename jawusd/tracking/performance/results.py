@@ -33,7 +33,7 @@ def performance_of(
     Args:
         jaw: the subject's rig.
         pivot: point of the upper scan the head turns about [mm], shape (3,).
-        frames: of the reference camera, in the order of the fits.
+        frames: frame numbers of the reference camera, in the order of the fits.
         smoothed: the take after the second pass.
         camera_names: in view order.
         fps: frames per second.

@@ -63,7 +63,7 @@ class Smoother:
             instants: solver of single instants.
             views: source of the views; None if the outlines of the fits are to be used as matched, in which case fits
                 with a fixed head share its pose.
-            frames: in temporal order.
+            frames: frame numbers in temporal order.
             fps: frames per second.
             cameras: number of cameras.
             fixed_head: the head pose is constant.
@@ -87,7 +87,7 @@ class Smoother:
         """Return the most likely take.
 
         Args:
-            fits: of the first pass, in frame order.
+            fits: fits of the first pass, in frame order.
             done: called with the number of frames matched and the total.
         """
         config, fits = self._instants.config, list(fits)

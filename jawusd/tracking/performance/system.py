@@ -16,9 +16,9 @@ class TakeCovariance(NamedTuple):
     """Covariance of the solution.
 
     Attributes:
-        own: of each frame's unknowns, conditional on those of the take, shape (N, L, L).
+        own: covariance of each frame's unknowns, conditional on those of the take, shape (N, L, L).
         response: derivative of each frame's unknowns with respect to those of the take, shape (N, L, G).
-        shared: of the unknowns of the take, shape (G, G).
+        shared: covariance of the unknowns of the take, shape (G, G).
     """
 
     own: Array
@@ -28,8 +28,8 @@ class TakeCovariance(NamedTuple):
 
 class _Eliminated(NamedTuple):
     sides: Array  # solved, shape (N, L, S)
-    inverse_pivots: Array  # of pairs of frames, shape (M, 2 L, 2 L)
-    coupling: Array  # of pairs with the next ones, shape (M - 1, 2 L, 2 L)
+    inverse_pivots: Array  # one per pair of frames, shape (M, 2 L, 2 L)
+    coupling: Array  # blocks that couple each pair with the next one, shape (M - 1, 2 L, 2 L)
 
 
 class TakeSystem:
@@ -41,7 +41,8 @@ class TakeSystem:
     def __init__(self, frames: int, local: int, shared: int) -> None:
         """Start with zero equations."""
         self.frames, self.local, self.shared = frames, local, shared
-        self._blocks = [np.zeros((max(frames - k, 0), local, local)) for k in range(3)]  # frame with frame + k
+        # Entry k has the blocks that couple each frame with frame + k.
+        self._blocks = [np.zeros((max(frames - k, 0), local, local)) for k in range(3)]
         self._right = np.zeros((frames, local))
         self._cross = np.zeros((frames, local, shared))
         self._corner, self._corner_right = np.zeros((shared, shared)), np.zeros(shared)

@@ -43,7 +43,7 @@ DRAWN = HabitPrior((0.15, 0.15, 0.05), 1.5)
 class TakeState:
     """Current estimate of the unknowns of a take."""
 
-    habits: Array  # of both arches, shape (2, 3): see `View.habits`
+    habits: Array  # mask biases of both arches, shape (2, 3): see `View.habits`
     log_focal: Array  # logarithm of true over calibrated focal length, shape (C,)
 
     @classmethod

@@ -63,7 +63,7 @@ class LearnedColours:
 
         Args:
             scans: upper and lower, in one frame.
-            cameras: in image order.
+            cameras: cameras in the order of the images.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
         """
         self._scans, self._cameras, self.axes = tuple(scans), tuple(cameras), axes
@@ -124,7 +124,7 @@ class LearnedColours:
         """Update the colours beside matched borders, and the offset of the gum line.
 
         Args:
-            views: of the images, with the counts of one alignment.
+            views: views of the images, with the counts of one alignment.
             pictures, poses: images and poses of this instant.
             rates: learning rates of tooth and background colours, 0 .. 1.
         """

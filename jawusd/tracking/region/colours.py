@@ -51,7 +51,7 @@ class Areas:
     """Pixels of an image for training the initial model, each of shape (h, w)."""
 
     crowns: Mask  # well inside projected crowns
-    ring: Mask  # around them, within reach of the search
+    ring: Mask  # around projected crowns, within reach of the search
     gum: Mask  # under projected gum, away from crowns
     far: Mask  # away from the teeth: skin and lips
 
@@ -114,9 +114,9 @@ def _write_ratios(
 
     Args:
         local_tooth, local_outside: histograms by table, empty where nothing was learned, shape (T, B).
-        tooth: of all teeth, shape (B,).
+        tooth: histogram of all teeth, shape (B,).
         outside: histogram of the background next to borders of each kind, shape (KINDS, B).
-        lips: of skin and lips, shape (B,).
+        lips: histogram of skin and lips, shape (B,).
         out: result, shape (T, B).
     """
     for t in range(len(out)):

@@ -30,7 +30,7 @@ def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) ->
     Args:
         motion: untrained.
         relative: T_upper_lower, shape (F, 4, 4).
-        covariance: of their left twists about the skull origin, shape (F, 6, 6).
+        covariance: covariance of their left twists about the skull origin, shape (F, 6, 6).
     """
     for pose, spread in zip(relative, covariance, strict=True):
         motion.learn(pose, spread)
@@ -79,7 +79,7 @@ class CondyleFusion:
 
         Args:
             poses: T_world_upper and T_world_lower, NaN where lost, shape (F, 2, 4, 4).
-            covariance: of their left twists about the world origin, shape (F, 2, 6, 6).
+            covariance: covariance of their left twists about the world origin, shape (F, 2, 6, 6).
             between: covariance of the left twist of T_upper_lower about the skull origin, shape (F, 6, 6).
         """
         poses, covariance, between = poses.copy(), covariance.copy(), between.copy()
@@ -114,7 +114,7 @@ def _shared(poses: Array, covariance: Array, twist: Array, gained: Array) -> tup
 
     Args:
         poses: T_world_upper and T_world_lower, shape (2, 4, 4).
-        covariance: of their left twists about the world origin, shape (2, 6, 6).
+        covariance: covariance of their left twists about the world origin, shape (2, 6, 6).
         twist: left twist about the skull origin, shape (6,).
         gained: reduction of the covariance of that twist, shape (6, 6).
     """

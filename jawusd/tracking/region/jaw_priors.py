@@ -64,7 +64,7 @@ class CondyleMotion:
         first = np.repeat(1.0 / spread[:, None] ** 2, mean.shape[1], axis=1)
         first[:, 0] = 1.0 / _CONSTANT_MM**2
         first[:, 4:] /= _PRODUCTS**2
-        self._precision = first[:, :, None] * np.eye(mean.shape[1])  # of the coefficients, shape (6, K, K)
+        self._precision = first[:, :, None] * np.eye(mean.shape[1])  # precision of the coefficients, shape (6, K, K)
         self._sums = first * mean  # precision times mean, shape (6, K)
 
     def learn(self, relative: Array, covariance: Array) -> None:
@@ -152,7 +152,7 @@ class BiteTerm:
     """Penalise lower teeth above the closed bite of the scans.
 
     Attributes:
-        points: of the lower teeth, in scan coordinates [mm], shape (N, 3).
+        points: points on the lower teeth, in scan coordinates [mm], shape (N, 3).
         up: bite normal, scan coordinates, shape (3,).
         noise_px3: variance of border errors times their correlation length.
     """

@@ -49,7 +49,7 @@ class LiveTake:
             jaw: the subject's rig.
             scans: upper and lower teeth, prepared.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-            cameras: in image order.
+            cameras: cameras in the order of the images.
             fixed_head: the cameras are head-mounted, so the head hardly moves relative to them.
             executor: thread pool that matches the contours of all cameras in parallel.
         """

@@ -52,8 +52,8 @@ class PictureShot:
 
     Attributes:
         cuts: crops the images.
-        cameras: in image order.
-        frames: of the reference camera.
+        cameras: cameras in the order of the images.
+        frames: frame numbers of the reference camera.
         fps: frames per second.
         fixed_head: the cameras are head-mounted, so the head pose is constant.
         free_focal: estimate the focal lengths.
@@ -212,7 +212,7 @@ def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, rang
     frames later.
 
     Args:
-        fits: by frame, updated in place. Backward tracking starts at each frame that is more trusted than its
+        fits: fits by frame, updated in place. Backward tracking starts at each frame that is more trusted than its
             predecessor, and ends when the teeth are lost or when a trusted frame is not fitted clearly better.
         way: frames in tracking order.
         back: yields the fits of a range of frames, tracked from a given frame.

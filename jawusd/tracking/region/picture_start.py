@@ -77,7 +77,7 @@ class ArchStart:
         Args:
             sources: two or more cameras with masks of that frame.
             cameras, offsets: by camera name; an offset is reference minus own frame number.
-            frame: of the reference camera.
+            frame: frame number of the reference camera.
         """
         masked = masked_sources(sources, cameras, offsets, 2)
         try:
@@ -131,7 +131,7 @@ class PictureStart:
         Args:
             sources: cameras with masks of that frame.
             cameras, offsets: by camera name; an offset is reference minus own frame number.
-            frame: of the reference camera.
+            frame: frame number of the reference camera.
         """
         if len(sources) > 1:
             poses = self._rows.at(sources, cameras, offsets, frame)

@@ -28,7 +28,7 @@ from jawusd.tracking.region.search import fitting_share, head_shifts, rank_by_co
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _LAST_GATES_PX = (2.0,)
-_TRIAL_GATES_PX = (8.0, 6.0)  # for the many candidates of a search
+_TRIAL_GATES_PX = (8.0, 6.0)  # gates for the many candidates of a search
 # Time since the last step, in frames, up to which no frame counts as dropped, and up to which motion is extrapolated.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
 _FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of a millimetre
@@ -259,7 +259,7 @@ class _InstantImages:
         self._colours.learn(self._counting, self._pictures, self._instants.coordinates.arches(pose), rates)
 
     def fit(self, found: Aligned, trusted: Mask, free_focal: bool) -> FrameFit:
-        """Return the fit of the frame with the trusted arches, shape (2,)."""
+        """Return the frame fit, of which only the trusted arches, shape (2,), are used."""
         use = self.use & trusted[:, None]
         unknown = np.full(use.shape, np.nan)
         if not free_focal or not trusted.any():

@@ -88,7 +88,7 @@ def rank_by_colour(
 
     Args:
         places: the poses.
-        taken: by view, pixels (h, w) of the other arch, which are ignored; empty if unknown.
+        taken: for each view, the pixels (h, w) of the other arch, which are ignored; empty if unknown.
     """
     points = scans[arch].crown_vertices(_POINTS)
     scores = np.zeros(len(places))

@@ -37,7 +37,7 @@ class RegionPose:
 
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4); predictions for arches not found
     found: Mask  # shape (2,)
-    covariance: Array  # of their left twists about the world origin, NaN for arches not found, shape (2, 6, 6)
+    covariance: Array  # covariance of their left twists about the world origin, NaN if not found, shape (2, 6, 6)
     objective_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
     solution: Solution | None = None  # the alignment; None for poses read from a file
     usual: Array = field(default_factory=lambda: np.ones(2))  # matched fraction relative to the usual one, shape (2,)
@@ -60,7 +60,7 @@ class RegionTracker:
 
         Args:
             scans: upper and lower, in one frame, in occlusion.
-            cameras: in image order.
+            cameras: cameras in the order of the images.
             landmarks, axes: as in `CondyleMotion`.
         """
         self._search = PoseSearch(scans, landmarks, axes, config, executor)

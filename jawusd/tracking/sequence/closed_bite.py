@@ -96,7 +96,7 @@ def _moved_mm(one: Array, other: Array, probes: Array) -> float:
 # and lever arm that converts it to a rotation [mm].
 _BITE_MM = 0.03
 _ARCH_MM = 25.0
-_DEGREES_OF_FREEDOM = 4.0  # of the Student distribution: about one registration in a hundred is off by ten sigmas
+_DEGREES_OF_FREEDOM = 4.0  # of that Student distribution: about one registration in a hundred is off by ten sigmas
 #: Fraction of the outline error variance that is constant over a take, in addition to annotator habits [-]: if it were
 #: larger, noise in a few closed frames would shift the whole take.
 STEADY = 0.3

@@ -62,7 +62,7 @@ def interpolation_errors(records: Mapping[int, FrameRecord], frame: int, arch: i
     steps = [twist_between(here, there, centre) for here, there in zip(poses[:-1], poses[1:], strict=True)]
     third = steps[2] - 2.0 * steps[1] + steps[0]
     offset = frame - first
-    nodes = np.array([0, 1, 2] if offset < 2 else [1, 2, 3])  # of the parabola
+    nodes = np.array([0, 1, 2] if offset < 2 else [1, 2, 3])  # interpolation nodes of the parabola
     share = np.prod(delays[:, None] + (offset - nodes), axis=1) / 6.0
     return np.asarray(share[:, None] * third, np.float64)
 

@@ -101,7 +101,7 @@ class GuidedTracker:
         """Yield frames with their records; lost arches get the poses of the guide.
 
         Args:
-            frames: in either direction, starting next to a frame in `past`.
+            frames: frame numbers in either direction, starting next to a frame in `past`.
             guide: T_world_upper and T_world_lower by frame, as found by colour, shape (2, 4, 4).
             past: the frames tracked before, from the first aligned one to the neighbour of `frames`.
         """

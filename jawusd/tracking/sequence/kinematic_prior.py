@@ -81,7 +81,7 @@ def weigh_with_model(tracks: Tracks, jaw: JawRig) -> Tracks:
     remain as measured. The meta data store the width of the prior as `prior_spread_mm`.
 
     Args:
-        tracks: from colours, without a model.
+        tracks: tracks from colours, fitted without a model.
         jaw: the model fitted to them.
     """
     known = np.isfinite(tracks.raw_T_upper_lower).all((1, 2)) & np.isfinite(tracks.T_upper_lower).all((1, 2))

@@ -29,7 +29,7 @@ class Nuisances:
         sigma_delays, sigma_habits, sigma_shift_px: their standard deviations.
         twists, sigma_twists: corrections of the camera poses as in `Extrinsics`, shape (C, 6).
         contour_px: rms contour shift by the twists that poses of the teeth cannot compensate.
-        covariance: of all unknowns in the order of `TakeEquations`, zero where not estimated, shape (U, U).
+        covariance: covariance of all unknowns in the order of `TakeEquations`, zero where not estimated, shape (U, U).
     """
 
     delays: Array
@@ -163,7 +163,7 @@ class TakeEquations:
         """Sum over the given frames, by default all; lost arches and frames without both neighbours are skipped.
 
         Args:
-            records: by frame.
+            records: records by frame.
             variance_px3: outline variance times correlation length per arch [px^3], shape (2,).
             extrinsics: the camera poses used for the alignment.
             annotator: prior of the mask biases.

@@ -43,7 +43,7 @@ def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, cen
     Args:
         frames: frame numbers, shape (F,).
         poses: measured poses, NaN where lost, shape (F, 4, 4).
-        covariance: of their left twists about the world origin, shape (F, 6, 6).
+        covariance: covariance of their left twists about the world origin, shape (F, 6, 6).
         centre: the fixed point, near the moving points [mm], shape (3,).
     """
     to = make_transform(np.eye(3), -np.asarray(centre))
@@ -69,7 +69,7 @@ def _corrections(poses: Array, covariance: Array) -> Array:
     """Return the twists from one run of poses to the smooth ones, shape (N, 6)."""
     count = len(poses)
     steps = se3_log(poses[1:] @ se3_inverse(poses[:-1]))
-    bend = np.diff(steps, axis=0)  # of frames 1 .. N-2
+    bend = np.diff(steps, axis=0)  # second differences at frames 1 .. N-2
     variance = np.einsum("nii->ni", covariance)
     noise = variance[:-2] + 4 * variance[1:-1] + variance[2:]
     process_noise = uniform_filter1d(bend**2 - noise, 2 * _WINDOW + 1, axis=0, mode="nearest")
@@ -100,7 +100,7 @@ def combine(tracks: Tracks, poses: Array, covariance: Array, landmarks: Array) -
     Args:
         tracks: the first measurement; their raw poses are combined and smoothed again.
         poses: T_world_upper and T_world_lower, NaN where they were not found, shape (F, 2, 4, 4).
-        covariance: of their left world twists, shape (F, 2, 6, 6).
+        covariance: covariance of their left world twists, shape (F, 2, 6, 6).
         landmarks: points whose uncertainty is reported, mandible coordinates [mm], shape (5, 3).
     """
     raw, spread, status = [], [], tracks.status.copy()

@@ -28,7 +28,7 @@ from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
 from jawusd.tracking.sequence.results import outline_variance
 
 SHIFTS = (-1, 0, 1)  # frames
-_CHECKED_FRAMES = 18  # of a take, at a tenth of a second each
+_CHECKED_FRAMES = 18  # checked frames per take, which take a tenth of a second each
 _FEWEST = 3  # conclusive frames needed on either side of a step, since two masks in a row may be wrong
 # Minimum margin by which a shift must fit better than others, and value to which margins are clipped, as fractions of
 # the visible contour.
@@ -129,9 +129,9 @@ def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: C
     have to be followed by its opposite.
 
     Args:
-        records: of all frames of the take.
-        masks: of the take.
-        solver: of its scans.
+        records: records of all frames of the take.
+        masks: masks of the take.
+        solver: solver with the scans.
     """
     frames = _fast_frames(records)
     fit = np.full((len(frames), len(masks.cameras), len(SHIFTS)), np.nan)
@@ -222,7 +222,7 @@ def delay_steps(
 
     Args:
         records, variance_px3, extrinsics: as for `TakeEquations`.
-        frames: in which both arches are tracked, in order.
+        frames: frames in which both arches are tracked, in order.
     """
     if len(frames) < 2 * _LEAST_FRAMES:
         return []
@@ -273,9 +273,9 @@ def time_findings(
     """Return warnings about cameras that are a frame late or early, from the start or from some frame on.
 
     Args:
-        names: of the cameras.
-        records: of all frames.
-        nuisances, extrinsics, config: of the take.
+        names: names of the cameras.
+        records: records of all frames.
+        nuisances, extrinsics, config: estimates and settings of the take.
         shifts: fit of the masks of neighbouring frames; without masks, steps are found from delays below a frame.
 
     Kinds: "camera_late" [frames], "frame_dropped" [frames].
