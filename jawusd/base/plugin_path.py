@@ -6,7 +6,7 @@ import os
 import sys
 from pathlib import Path
 
-#: The environment variable that holds OpenUSD's plugin path.
+#: The environment variable with OpenUSD's plugin path.
 VARIABLE = "PXR_PLUGINPATH_NAME"
 
 _PACKAGE = Path(__file__).parents[1]
@@ -15,7 +15,7 @@ _FOLDERS = (_PACKAGE / "rig" / "schemas", _PACKAGE.parent / "schemas")
 
 
 def schema_folder() -> Path | None:
-    """Return the folder that holds plugInfo.json and generatedSchema.usda, or None if they are not installed."""
+    """Return the folder with plugInfo.json and generatedSchema.usda, or None if they are not installed."""
     return next((folder for folder in _FOLDERS if (folder / "plugInfo.json").is_file()), None)
 
 

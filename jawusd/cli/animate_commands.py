@@ -1,4 +1,4 @@
-"""Commands that make an animation layer, or learn and tabulate ARKit weights."""
+"""Commands that write an animation layer, and fit or tabulate mappings of ARKit weights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Rate = Annotated[
     float | None,
     typer.Option(
         min=0.001,
-        help="Frames per second: of --arkit, the output rate. Default: from the keys or time codes, or the rig's.",
+        help="Frames per second; with --arkit, of the output. Default: from the keys or time codes, else from the rig.",
     ),
 ]
 RetargetFrom = Annotated[
@@ -41,7 +41,7 @@ def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) ->
 
     if not holds_stage(source):
         return read_motion(loaded, source)
-    own = None if source.suffix.lower() in USD_SUFFIXES else prim  # the prim path in a stage may differ
+    own = None if source.suffix.lower() in USD_SUFFIXES else prim  # a stage may have another prim path
     found = read_stage_motion(loaded, rig, source, own, None, None, None)
     return AuthoredMotion(found.frames, found.d, found.fps)
 
@@ -165,7 +165,7 @@ def animate(
     emit_motion(out, rate, motion, changes, as_json)
 
 
-_CLAMPED_MM = 0.005  # less would print as 0.00
+_CLAMPED_MM = 0.005  # smaller values would be printed as 0.00
 
 
 def arkit_fit(
@@ -195,9 +195,9 @@ def arkit_fit(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Learn what a subject's ARKit jaw weights mean from face and jaw captured together, for `animate --mapping`.
+    """Fit the mapping from a subject's ARKit jaw weights to d, from face and jaw captured together; for `animate`.
 
-    The performance must open wide and move to both sides and forward.
+    The subject must open the jaw wide, and move it to both sides and forward.
     """
     import jawusd
     from jawusd.fitting.face import fit_arkit
@@ -237,7 +237,7 @@ def arkit_table(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Write the jaw joint's offset for each ARKit shape at half and full weight, for rigs that add joint deltas.
+    """Write the jaw joint's offset for each ARKit shape at half and full weight, for rigs that sum joint deltas.
 
     Millimetres and degrees relative to the neutral face, about the point midway between the condyles, skull axes.
     """
@@ -285,13 +285,13 @@ def _rate_of(rig: Path, prim: str | None) -> float:
 def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None) -> AuthoredMotion:
     """Read the jaw of an ARKit face capture, by the subject's mapping or as fractions of the subject's ranges.
 
-    As shares, JawOpen 1 is the full opening; JawLeft minus JawRight, and JawForward, are fractions of the range at that
-    opening. Left is the subject's left.
+    As fractions, JawOpen 1 is the full opening; JawLeft minus JawRight, and JawForward, are fractions of the ranges at
+    that opening. Left is the subject's left.
 
     Args:
         source: CSV of Live Link Face.
         fps: frame rate of the motion, None for the rate of the time codes.
-        mapping: file of `jawusd arkit-fit`, None for shares.
+        mapping: file written by `jawusd arkit-fit`; None for fractions of the ranges.
 
     Raises:
         FormatError: the file is invalid or has no row with a face, or the mapping belongs to another subject.

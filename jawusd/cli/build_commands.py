@@ -1,4 +1,4 @@
-"""Commands from a capture to a rig: build, of one capture or many, and its single stages."""
+"""Commands from a capture to a rig: builds of one or many captures, and the stages of a build."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def sync(
             else:
                 result = sync_videos(videos, reference or next(iter(videos)), report)
         except SyncError as error:
-            failure = error  # after the curves, which show the reason, are written
+            failure = error  # raised later, after the curves are written, in which the reason is visible
         found = light_curves(videos, report) if curves is not None or plot is not None else {}
         if curves is not None:
             write_light_curves(curves, found)
@@ -167,7 +167,7 @@ def segment(
 
 
 def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
-    """Refuse a folder that is not empty, unless forced: its masks may be hand-drawn.
+    """Check that a folder is empty, unless forced: its masks may be hand-drawn.
 
     Raises:
         OutputError: the folder is not empty.

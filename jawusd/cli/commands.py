@@ -1,4 +1,4 @@
-"""The commands by name, loaded when first used, and what they share: -h, vectors, and handling of Ctrl+C."""
+"""The commands by name, loaded when first used, and their common behaviour: -h, vectors, and handling of Ctrl+C."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SUMMARIES = {
     "validate": "Check a rig, or poses against a rig.",
     "ik": "Find the d that move a point to a target.",
     "animate": "Write an animation of a rig from keys, poses or ARKit.",
-    "arkit-fit": "Learn the meaning of a person's ARKit jaw weights.",
+    "arkit-fit": "Fit the mapping from a subject's ARKit jaw weights to d.",
     "arkit-table": "Write the jaw joint's offset per ARKit shape.",
     "rebake": "Make d and mandible of an edited stage agree.",
     "publish": "Copy a rig under unique names, or pack a shot.",
@@ -60,15 +60,16 @@ EXIT_CODES = (
 )
 
 
-#: Exit code of a run stopped with Ctrl+C, as shells report it.
+#: Exit code of a command stopped with Ctrl+C, as reported by shells.
 INTERRUPTED = 130
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
-_WORDS = "jawusd.words"  # context key of the arguments of a command
+_WORDS = "jawusd.words"  # context key of a command's arguments
 _VECTOR = re.compile(r" *[-+]?[\d.eE+-]+((, *| +)[-+]?[\d.eE+-]+){2} *")
 _VECTORS = ("--d", "--point", "--target", "--start")
 
-# What is kept of an interrupted command, and how to resume; other commands write complete files at their end.
+# Which results of an interrupted command are kept, and how to resume it; other commands write complete files at the
+# end.
 _KEPT = {
     "build": "finished stages are kept; resume with the same command and --resume, start over with --fresh",
     "build-many": "finished captures and stages are kept; resume with the same command and --resume",
@@ -86,12 +87,12 @@ class Command(TyperCommand):
     # typer passes its public Context to both methods; the base class declares that of its private copy of click.
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]  # click has its own Context
-        """Accept vectors as `--d 20,2,1`, and keep the arguments for `command_line`."""
+        """Accept vectors such as `--d 20,2,1`, and store the arguments for `command_line`."""
         ctx.meta[_WORDS] = list(args)
         return super().parse_args(ctx, with_vectors_split(args))
 
     def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]  # as above
-        """Run; on Ctrl+C, print what is kept."""
+        """Run the command; on Ctrl+C, print which results are kept."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as stop:
@@ -126,7 +127,7 @@ class _StoppedError(KeyboardInterrupt):
 
     def __init__(self, number: int) -> None:
         super().__init__()
-        self.exit_code = 128 + number  # as shells report it
+        self.exit_code = 128 + number  # as reported by shells
 
 
 @contextlib.contextmanager
@@ -150,7 +151,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def interrupted(command: str, exit_code: int = INTERRUPTED) -> NoReturn:
-    """Print that a command was stopped and what is kept, and exit with the code of the signal."""
+    """Print that a command was stopped and which results are kept; exit with the signal's code."""
     say(f"jawusd {command}: stopped; {_KEPT.get(command, _ELSE)}.", err=True)
     raise typer.Exit(exit_code)
 

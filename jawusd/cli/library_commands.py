@@ -40,9 +40,9 @@ def retarget(
         Path | None, typer.Option("--library", help="With --landmarks: folder of rigs to learn from.")
     ] = None,
     use: Annotated[
-        Use, typer.Option(help="With --landmarks: average the library, or use the closest person.")
+        Use, typer.Option(help="With --landmarks: average the library, or use the closest subject.")
     ] = Use.average,
-    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second. Default: of the motion.")] = None,
+    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second. Default: as in the motion.")] = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", help="Layer of the motion (retargeted.usdc) or model of the person (model.npz)."),
@@ -113,7 +113,7 @@ def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, a
 
 
 def library(
-    folder: Annotated[Path, typer.Argument(help="Folder with a subfolder per person.", show_default=False)],
+    folder: Annotated[Path, typer.Argument(help="Folder with a subfolder per subject.", show_default=False)],
     search: Annotated[str | None, typer.Option(help="List only names and paths that contain this text.")] = None,
     like: Annotated[Path | None, typer.Option(help="Sort by similarity to these landmarks (JSON).")] = None,
     compare: Annotated[tuple[str, str] | None, typer.Option(help="Compare two persons side by side.")] = None,

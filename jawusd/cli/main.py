@@ -1,4 +1,4 @@
-"""The program `jawusd`: its commands, and one place that turns errors into messages and exit codes."""
+"""The program `jawusd`: its commands, and the conversion of errors to messages and exit codes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _root(
 
         say(f"jawusd {__version__}")
         raise typer.Exit
-    global _verbose  # main prints errors outside the context
+    global _verbose  # main prints errors after the context has ended
     _verbose = verbose
     if verbose:
         import faulthandler
@@ -59,13 +59,13 @@ _verbose = False
 
 
 def main() -> None:
-    """Run the command line and exit: 0 success, 1 a negative result, 2 usage, 3 and up one per error family."""
-    if "PXR_WORK_THREAD_LIMIT" not in os.environ:  # before OpenUSD is loaded: rigs are small
+    """Run the command line and exit: 0 success, 1 negative result, 2 wrong usage, 3 and above by error family."""
+    if "PXR_WORK_THREAD_LIMIT" not in os.environ:  # before OpenUSD is loaded; rigs are too small to gain from threads
         os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
-    # Before numpy is loaded: multi-threaded sums differ in their last bits between machines, which moves fits by
+    # Before numpy is loaded: multi-threaded sums differ in their last bits between machines, which changes fits by
     # micrometres. The matrices are too small to gain from threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for stream in (sys.stdout, sys.stderr):  # for characters that the terminal cannot encode
+    for stream in (sys.stdout, sys.stderr):  # escape characters that the terminal cannot encode
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
@@ -76,7 +76,7 @@ def main() -> None:
     except MemoryError as error:
         sys.exit(_report(out_of_memory(), error))
     except BrokenPipeError:
-        # The reader of the pipe (head, less) closed it.
+        # The reader of the pipe (head, less) has closed it.
         sys.stderr.close()
         sys.exit(0)
     except (OSError, RuntimeError) as error:

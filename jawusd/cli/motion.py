@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 
 _MOVED_MM = 1e-6
 _FINE = 10  # samples of a curve per frame
-_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # tolerance and refinements of a piecewise linear curve
+_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # tolerance and most refinements of a piecewise linear approximation
 
 
 @dataclass(frozen=True, eq=False)
 class AuthoredMotion:
-    """A motion as it was read."""
+    """A motion as read from its source."""
 
     frames: Array  # frame numbers (F,), increasing
     d: Array  # parameters (F, 3) [mm], NaN in frames without parameters
     fps: float | None  # frames per second, None if the source does not state it
-    keys: Keys | None = None  # keys that it was interpolated from
+    keys: Keys | None = None  # keys from which the motion was interpolated
 
     def __post_init__(self) -> None:
         """Validate frames and parameters."""
@@ -93,10 +93,10 @@ def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes made to a motion."""
+    """Summary of the changes made to a motion."""
 
-    figures: dict[str, float]  # counts and sizes [mm]
-    lines: list[str]  # as text; the first continues the line with the file name
+    figures: dict[str, float]  # counts, and distances [mm]
+    lines: list[str]  # as text; the first line is appended to that with the file name
 
 
 def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes, as_json: bool) -> None:
@@ -110,7 +110,7 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
     """Project a motion into the bound, see `JawRig.keep_inside`; frames without parameters are kept.
 
-    If it suffices, only the keys of a smooth motion are projected, and stay connected by curves.
+    Of a smooth motion only the keys are projected if that suffices, so that keys remain connected by curves.
     """
     known = np.isfinite(motion.d).all(axis=1)
     lost = int((~known).sum())
@@ -146,7 +146,7 @@ def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Ch
 
 
 def _valid_keys(rig: JawRig, motion: AuthoredMotion) -> Keys | None:
-    """Return the keys of a smooth motion projected into the bound; None if curves through them leave it."""
+    """Return the keys of a smooth motion projected into the bound; None if curves through the keys leave the bound."""
     if motion.keys is None or motion.keys.interpolation != "smooth":
         return None
     frames, d = motion.keys.arrays()
@@ -165,7 +165,7 @@ class Knots(NamedTuple):
     frames: Array  # shape (K,)
     d: Array  # [mm], shape (K, 3)
     slopes: Array  # tangents [mm per frame], shape (K, 3)
-    curved: Mask  # cubic segments, shape (K - 1,)
+    curved: Mask  # which segments are cubic, shape (K - 1,)
 
 
 def knots_of(rig: JawRig, motion: AuthoredMotion) -> Knots:
@@ -246,7 +246,7 @@ def _lost_line(lost: int) -> list[str]:
 
 
 def _motion_of(rig: JawRig, path: Path, prim: str | None) -> AuthoredMotion:
-    """Return a motion of a rig: d of a stage, or else its transforms, or a table."""
+    """Return a motion of a rig from a stage, by d or, without d, by its transforms; or from a table."""
     from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
     from jawusd.rig.read import open_stage
 
@@ -263,8 +263,8 @@ def _motion_of(rig: JawRig, path: Path, prim: str | None) -> AuthoredMotion:
 def resampled(rig: JawRig, motion: AuthoredMotion, source_fps: float, fps: float) -> AuthoredMotion:
     """Resample a motion at the whole frames of another rate; frame 0 stays frame 0.
 
-    Samples are interpolated by cubics with finite-difference slopes; keys are moved and keep their curves. A frame is
-    lost if the nearest sample is.
+    Samples are interpolated by cubics with finite-difference slopes; keys are shifted in time and keep their curves.
+    A frame is lost if the nearest sample is lost.
 
     Args:
         source_fps: frame rate of the motion.

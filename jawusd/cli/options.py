@@ -1,4 +1,4 @@
-"""Arguments and options shared by several commands."""
+"""Arguments and options used by several commands."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
-Outside = Annotated[bool, typer.Option("--allow-outside", help="Let paths in the capture leave its folder.")]
-CaptureArg = Annotated[Path, typer.Argument(help="capture.toml, or the folder that holds it.", show_default=False)]
+Outside = Annotated[bool, typer.Option("--allow-outside", help="Allow paths that point outside the capture's folder.")]
+CaptureArg = Annotated[Path, typer.Argument(help="capture.toml or its folder.", show_default=False)]
 
 
 def _allow(folders: list[Path] | None) -> list[Path] | None:
@@ -77,7 +77,7 @@ PrimName = Annotated[
 
 
 def rig_of_folder(rig: Path | None) -> Path | None:
-    """Return the rig's file if the folder of a build is given; callback of all rig arguments."""
+    """Return the rig's file if the path is the folder of a build; callback of all rig arguments."""
     from jawusd.rig.layout import actor_in_folder
 
     return None if rig is None else actor_in_folder(rig)
@@ -118,7 +118,7 @@ OptionalRigArg = Annotated[
 
 
 def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig:
-    """Load a rig; `--prim` refers to the stage given besides, or else to the rig's own file.
+    """Load a rig; `--prim` refers to the stage if one is given, otherwise to the rig's own file.
 
     Raises:
         JawusdError: the file is not a rig.

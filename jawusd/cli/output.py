@@ -1,4 +1,4 @@
-"""What commands print: results on stdout, as text or JSON, and progress on stderr; and the log of a run."""
+"""Output of commands: results on stdout, as text or JSON, progress on stderr, and the log of a run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def say(line: object, err: bool = False) -> None:
 
 
 def complain(text: object) -> None:
-    """Print a message on stderr, possibly of several lines, after the program's name."""
+    """Print the program's name and a message, possibly of several lines, on stderr."""
     for line in f"jawusd: {text}".split("\n"):
         say(line, err=True)
 
@@ -94,7 +94,7 @@ def progress() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def _plain_progress(console: Console) -> Callable[[str, int, int], None]:
-    """Return a progress callback for log files: a line per stage and per tenth of it."""
+    """Return a progress callback for log files: a line per stage and per tenth of a stage."""
     last: dict[str, int] = {}
 
     def report(stage: str, done: int, total: int) -> None:

@@ -1,4 +1,4 @@
-"""The command `rebake`: make d and mandible of edited jaws in a shot agree, in one layer."""
+"""The command `rebake`: write one layer that makes d and mandible of the edited jaws in a shot agree."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def rebake(
 
 @dataclass(frozen=True)
 class _BakedRig:
-    """Motion of one rig of a shot: as read, projected into the bound, and the changes."""
+    """Motion of one rig of a shot: as read, as projected into the bound, and the changes."""
 
     rig: JawRig
     found: StageMotion
@@ -96,7 +96,7 @@ class _BakedRig:
 
 
 def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str | None]:
-    """Return the prims to bake: those given, or else all of a shot; None for the only one, or that of RIG."""
+    """Return the prims to bake: those given, otherwise all of the shot; None stands for the only rig, or RIG."""
     if stage is not None and len(prims or ()) > 1:
         raise typer.BadParameter("RIG STAGE bakes one rig; several are baked with the shot alone.", param_hint="--prim")
     if prims or stage is not None:
@@ -137,7 +137,7 @@ def _write_baked(
     motion = first.motion
     if (
         first.found.fitted and prim is not None and shot.suffix.lower() not in USD_SUFFIXES
-    ):  # otherwise the prim is in the shot
+    ):  # otherwise `prim` is a path in the shot
         write_over(out, rig, first.rig, motion.frames, motion.d, first.found.fps, prim)
     elif first.found.fitted:
         write_animation(out, rig, motion.frames, motion.d, first.found.fps, rig=first.rig)

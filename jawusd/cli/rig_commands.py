@@ -1,4 +1,4 @@
-"""Commands on a finished rig: info, pose, validate, ik. They need only the base install."""
+"""Commands on a finished rig: info, pose, validate, ik. They need only the base dependencies."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Triple = tuple[float, float, float]
 
-#: Exit code of a negative result: an invalid pose, a rig with errors.
+#: Exit code for a negative result: an invalid pose, a rig with errors.
 NO = 1
 
 

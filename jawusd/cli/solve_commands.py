@@ -1,4 +1,4 @@
-"""Commands on a subject whose rig exists: solve a take, or follow a live feed."""
+"""Commands on a subject with a rig: solve a performance, or track live video."""
 
 from __future__ import annotations
 
@@ -32,9 +32,7 @@ class Focal(StrEnum):
     free = "free"
 
 
-ShotArg = Annotated[
-    Path, typer.Argument(help="capture.toml of the shot, or the folder that holds it.", show_default=False)
-]
+ShotArg = Annotated[Path, typer.Argument(help="capture.toml of the shot, or its folder.", show_default=False)]
 
 
 def solve(

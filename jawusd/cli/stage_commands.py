@@ -1,4 +1,4 @@
-"""Commands on rigs in stages: encode edited stages as d, publish rigs under unique names."""
+"""Commands on rigs in stages: encode poses of edited stages as d, publish rigs under unique names."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def publish(
     emit({"files": files}, as_json, lambda: files)
 
 
-_STILL_MM = 0.01  # ten times the rounding of single precision for a jaw at rest
+_STILL_MM = 0.01  # largest motion of a jaw at rest; ten times the rounding error in single precision
 
 
 def read_stage_motion(
@@ -124,7 +124,7 @@ def read_stage_motion(
     skull: str | None,
     origin: Literal["d", "mandible"] | None,
 ) -> StageMotion:
-    """Read the motion of a jaw from a stage: of the rig in it, or else by fitting the rig's meshes.
+    """Read the motion of a jaw from a stage: from the rig in it or, without a rig, by fitting the rig's meshes.
 
     Args:
         loaded, rig: the rig and its file.

@@ -1,4 +1,4 @@
-"""What the commands of a build print: builds, plans, tracks, models."""
+"""Output of the commands of a build: builds, plans, tracks, models."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def track_lines(summary: TrackSummary) -> list[str]:
 
 
 def _take_lines(summary: TrackSummary) -> list[str]:
-    """Return the estimates from the whole take: offsets of outlines, and the registration of the scans."""
+    """Return the estimates from the whole take as text: offsets of outlines, and the registration of the scans."""
     lines = []
     reaches = (("free edges", summary.get("outline_bias_px")), ("gum line", summary.get("gum_bias_px")))
     for what, found in reaches:
@@ -186,7 +186,7 @@ def fit_lines(summary: FitSummary) -> list[str]:
 
 
 def contact_words(contact: object) -> str:
-    """Return a `ContactSummary` as text; files of other origin may contain anything."""
+    """Return a `ContactSummary` as text; in files from other programs it may be any value."""
     found = contact if isinstance(contact, dict) else {}
     closed, error = found.get("closed_mm"), found.get("error_mm")
     if not isinstance(closed, float) or not isinstance(error, float):
@@ -195,7 +195,7 @@ def contact_words(contact: object) -> str:
     return f"{meet} in the closed bite; clearances to {error:.2f} mm"
 
 
-_FARTHEST_MM = 1.5  # largest measured distance, see `meshes.collision`
+_FARTHEST_MM = 1.5  # largest distance that is measured, see `meshes.collision`
 
 
 def joint_words(joints: object) -> str:
@@ -211,7 +211,7 @@ def joint_words(joints: object) -> str:
     )
     if closed <= -_FARTHEST_MM:
         where = f"more than {_FARTHEST_MM:g} mm from the bone of the skull"
-    if error == 0.0:  # nothing to measure within that distance
+    if error == 0.0:  # no surface is within that distance
         return f"{where} in the closed bite, and not within {NEAR_MM:g} mm of it anywhere inside the bound"
     deeper = f"up to {-limit:.2f} mm into it in captured poses; " if limit < -AUTHORED_MM else ""
     return f"{where} in the closed bite; {deeper}clearances to {error:.2f} mm, not used to reject poses"

@@ -1,4 +1,4 @@
-"""What the commands on captures and cameras print."""
+"""Output of the commands on captures and cameras."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def check_lines(findings: Sequence[Finding]) -> list[str]:
     return [*(finding.line() for finding in findings), counted]
 
 
-_LISTED = 10  # images per camera
+_LISTED = 10  # most images listed per camera
 _LISTED_MASKS = 12
 
 
@@ -121,14 +121,14 @@ def start_lines(start: CaptureStart) -> list[str]:
     return [*lines, f"next: jawusd check {folder}"]
 
 
-_LEAST_APART_MM = 10.0  # the same as in `capture.camera_checks`, which rejects such a capture
+_LEAST_APART_MM = 10.0  # as in `capture.camera_checks`, which rejects captures below
 
 
 def camera_lines(cameras: list[Camera], files: list[Path]) -> list[str]:
     """Return cameras as text."""
     lines = []
     for camera in cameras:
-        where = ", ".join(f"{value:.1f}" for value in np.round(camera.centre_world(), 1) + 0.0)  # not -0.0
+        where = ", ".join(f"{value:.1f}" for value in np.round(camera.centre_world(), 1) + 0.0)  # -0.0 becomes 0.0
         lens = f"{camera.distortion.size} coefficients" if camera.distortion.size else "no distortion"
         width, height = camera.size_px
         lines.append(f"{camera.name}: {width} x {height} px, f {camera.K[0, 0]:.1f} px, {lens}, at {where} mm")

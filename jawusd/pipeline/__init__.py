@@ -1,4 +1,4 @@
-"""Build, track, fit, solve, report and view: each from its inputs to its files.
+"""Build, track, fit, solve, report and view: each from input to output files.
 
-The algorithms live in the packages below; nothing here prints, and nothing here imports `cli`.
+The algorithms are in lower-level packages. This package does not print, and does not import `cli`.
 """

@@ -1,4 +1,4 @@
-"""From a capture to a rig: the stages in order, each reused when nothing it reads has changed."""
+"""From a capture to a rig: the stages in order, each reused if none of its inputs has changed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
 from jawusd.pipeline.workspace import DryWorkspace, Stage, StageMissing, Workspace, check_folder, opened
 
-OLD_MASKS = "masks"  # version 0.1 wrote masks here if the capture named none
+OLD_MASKS = "masks"  # version 0.1 wrote masks to this folder if the capture named none
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class BuildOptions:
     Attributes:
         model: "anchored", "additive", "paper" or "pca".
         solver: "contour" or "paper".
-        backend: where the paper's solver draws, "cpu" or "gl".
+        backend: renderer of the paper's solver, "cpu" or "gl".
         jobs: threads of the tracker; the result does not depend on it.
         resume: continue an earlier build in the folder.
         fresh: delete an earlier build in the folder first.
-        allow_outside: let paths in the capture leave its folder.
+        allow_outside: allow paths in the capture that point outside its folder.
         prim_name: name of the actor's prim; None: derived from the name of the capture.
         command: command line of the build, recorded in the report.
     """
@@ -71,7 +71,7 @@ class BuildSummary(TypedDict):
 
     Attributes:
         files: names of all files written, relative to the folder.
-        seconds: by stage; for a reused one, of its last run.
+        seconds: duration by stage; of a reused stage, that of its last run.
         reused: stages reused from an earlier build.
         findings: `Finding.as_json` of the check before the first stage.
         calibrate: None if the capture names a calibration.
@@ -113,14 +113,14 @@ def build(
     """Build a rig from a capture.
 
     Args:
-        capture: the capture, its capture.toml or the folder that holds it.
+        capture: the capture, its capture.toml or the folder of that file.
         out: the rig's folder.
         progress: called with (stage, done, total) as work proceeds.
-        tell: called, before any work, with every finding of the check of the capture.
+        tell: called with every finding of the capture's check, before any work.
 
     Raises:
-        CaptureError: the check found errors, all of which the message lists; or inputs changed while a stage ran.
-        JawusdError: one of its kinds; stages finished before stay valid for `resume`.
+        CaptureError: the check found errors, which the message lists; or inputs changed while a stage ran.
+        JawusdError: one of its subclasses; finished stages stay valid for `resume`.
     """
 
     def read() -> Capture:
@@ -136,8 +136,8 @@ def build(
 def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], None] | None) -> BuildSummary:
     """Run the stages of a build in order, or reuse them.
 
-    Each call names the parts of the capture and the settings that a stage depends on. Contents are hashed, not paths,
-    so that a capture may be moved.
+    Each stage is declared with the parts of the capture and the settings that it depends on. Contents are hashed, not
+    paths, so that a capture may be moved.
     """
     capture, videos = run.capture, run.hashes(["videos"])
     names = [camera.name for camera in capture.cameras]
@@ -193,7 +193,7 @@ def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], 
 
 
 def _labelled(run: Workspace) -> StageRecord[dict[str, str]]:
-    """Label crown and gum of scans without paint and without a file of labels."""
+    """Label crown and gum of scans that have neither paint nor a label file."""
     folder = run.folder / LABELS
     none: dict[str, str] = {}
     record = run.run(SCANS, ["teeth"], [], lambda: (store_labels(run.capture, folder), none))
@@ -206,7 +206,7 @@ def _calibrated(run: Workspace) -> StageRecord[CalibrationSummary]:
     capture, path = run.capture, run.folder / CALIBRATION
     boards = capture.boards.model_dump(mode="json", exclude={"videos"}) if capture.boards else None
     picks = capture.bootstrap.model_dump(mode="json") if capture.bootstrap else None
-    # Without picks, the masks verify the stated size of the squares.
+    # Without picks, the board's stated square size is verified with the masks.
     parts = ["boards", "teeth", *([] if picks else ["masks", "videos"])]
     settings = [boards, picks, [camera.name for camera in capture.cameras]]
     record = run.run(CALIBRATE, parts, settings, lambda: ([path], calibrate_boards(capture, path, run.progress)))
@@ -215,7 +215,7 @@ def _calibrated(run: Workspace) -> StageRecord[CalibrationSummary]:
 
 
 def _check(run: Workspace) -> tuple[list[Path], CheckResult]:
-    """Check the capture before any work, and reject it with all errors at once."""
+    """Check the capture before any work; raise one error with all problems."""
     findings = check_capture(run.capture, run.folder, progress=run.progress)
     refuse_errors(findings, run.capture)
     return [], {"findings": [finding.as_json() for finding in findings]}
@@ -260,7 +260,7 @@ def _bake(run: Workspace, options: BuildOptions) -> tuple[list[Path], dict[str, 
 def _report(run: Workspace, options: BuildOptions, missing: str | None) -> tuple[list[Path], ReportSummary]:
     place, origin = relative_capture_path(run.capture, run.folder), origin_now(options.command)
     if missing is not None:
-        # The rig is complete without it; the summary names the missing packages.
+        # The rig is complete without a report; the summary lists the missing packages.
         return [], {"capture": place, "origin": asdict(origin), "missing": missing}
     path, verdict = write_build_report(run.folder, BuildFacts(run.state, run.capture, origin), run.progress)
     return [path], {"capture": place, "origin": asdict(origin), "file": path.name, "verdict": verdict}

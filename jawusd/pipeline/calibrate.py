@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 PLOT_SUFFIXES = (".png", ".svg")
 
-_SIZE_SIGMA = 0.005  # standard deviation of the scale estimated from masks
+_SIZE_SIGMA = 0.005  # standard deviation of the scale estimated from masks, as a fraction
 
 
 class CameraReport(TypedDict):
@@ -55,7 +55,7 @@ class CalibrationSummary(TypedDict):
 
 
 class SyncResult(TypedDict):
-    """Frame offset of every camera to the reference camera [frames], with the method's own figures."""
+    """Frame offset of every camera to the reference camera [frames], with figures specific to the method."""
 
     offsets: dict[str, Frames]
     method: str
@@ -125,7 +125,7 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
     if capture.sync.offsets is not None:
         result = SyncResult(offsets=dict(capture.sync.offsets), method="given in the capture")
     elif len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
-        # Masks show no flash: equal frame numbers are assumed to be simultaneous, and the report says so.
+        # Flashes are not visible in masks: equal frame numbers are assumed to be simultaneous, as the report states.
         result = SyncResult(offsets={camera.name: 0 for camera in capture.cameras}, method="taken as simultaneous")
     else:
         from jawusd.capture.sync import estimate_offsets

@@ -1,4 +1,4 @@
-"""Cameras and footage of a capture: calibrations of any program, at the recorded size, and the clips."""
+"""Cameras and footage of a capture: calibrations from any program, scaled to the recorded size, and the clips."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".abc")
 
 
 def read_calibration(path: Path, unit_mm: float, sizes: Callable[[], Mapping[str, Size]]) -> list[Camera]:
-    """Read cameras of any known kind of file, stages of OpenUSD among them [mm].
+    """Read cameras from any supported file, including OpenUSD stages; lengths in mm.
 
     Args:
         path: the file or folder.
-        unit_mm: length of its unit; ignored for stages, which state theirs.
-        sizes: returns (width, height) [px] of the images by camera; called only if the file does not state them.
+        unit_mm: the file's unit of length [mm]; ignored for stages, which state theirs.
+        sizes: callback that returns (width, height) [px] of the images by camera; used if the file does not state them.
 
     Raises:
         CalibrationError, FormatError, RigError: the file contains no usable cameras.
@@ -66,12 +66,13 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
 
     Args:
         source: see `cameras.files.load_cameras_file`; or a stage.
-        out: what to write.
-        unit_mm: length of the source's unit.
+        out: file or folder to write.
+        unit_mm: the source's unit of length [mm].
         size: (width, height) [px] of the images, for formats that do not state it.
 
     Raises:
-        CalibrationError, FormatError, RigError: the source contains no usable cameras, or OUT cannot represent them.
+        CalibrationError, FormatError, RigError: the source contains no usable cameras, or the output format cannot
+            represent them.
         OutputError: the file cannot be written, or has another suffix.
     """
     cameras = read_calibration(source, unit_mm, lambda: SameSize(size))
@@ -94,7 +95,7 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
 
 @explain_missing_packages()
 def load_cameras(capture: Capture) -> list[Camera]:
-    """Return the calibrated cameras in the capture's order, at the size the images were recorded in.
+    """Return the calibrated cameras in the capture's order, scaled to the recorded size.
 
     A calibration at another size of the same aspect ratio is scaled; see `rescaled_cameras`.
 
@@ -107,7 +108,7 @@ def load_cameras(capture: Capture) -> list[Camera]:
 
 
 def rescaled_cameras(capture: Capture) -> dict[str, tuple[Size, Size]]:
-    """Return the sizes (width, height) [px] calibrated and recorded, by the name of each camera where they differ.
+    """Return calibrated and recorded size (width, height) [px] by camera, for cameras for which they differ.
 
     Raises:
         CalibrationError, CaptureError: as `load_cameras`.
@@ -125,7 +126,7 @@ def _size(camera: Camera) -> Size:
 
 
 def tracked_cameras(cameras: Sequence[Camera], tracks: Tracks) -> list[Camera]:
-    """Return the calibrated cameras with the corrections estimated while tracking, to which the poses refer."""
+    """Return the calibrated cameras with the corrections estimated in tracking; the poses refer to these cameras."""
     from jawusd.tracking.sequence.extrinsics import corrected_cameras
 
     return corrected_cameras(cameras, tracks.meta)
@@ -174,8 +175,8 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     width, height = _size(camera)
     if tuple(recorded) == (width, height):
         return camera
-    # The tolerance of one pixel allows for rounding of a scaled height.
-    # An anamorphic image is stored narrower (or, as DV, wider) than it is shown, and may be calibrated either way.
+    # The tolerance of one pixel allows for rounding of a scaled height. Anamorphic images are stored narrower (or, as
+    # DV, wider) than displayed, and may be calibrated as stored or as displayed.
     if min(abs(recorded[0] * share * height / width - recorded[1]) for share in (1.0, aspect)) > 1.0:
         raise CalibrationError(
             f"calibrated for pictures of {width} x {height} px, but {path.name} has "
@@ -244,7 +245,7 @@ def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Ba
 
 
 def check_same_cameras(capture: Capture, tracks: Tracks) -> None:
-    """Check that the cameras of tracks exist in a capture, some of whose cameras may be unused.
+    """Check that a capture has all cameras of tracks; it may have others.
 
     Raises:
         FormatError: the capture lacks a camera.

@@ -1,4 +1,4 @@
-"""Open a capture, and list and hash the files behind its parts."""
+"""Open a capture, and list and hash its input files by part."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def open_capture(capture: Capture | str | os.PathLike[str], *, allow_outside: bo
     """Return a capture, loading it from capture.toml or its folder if needed; see `formats.capture.load_capture`.
 
     Args:
-        allow_outside: let paths in the capture leave its folder.
+        allow_outside: allow paths in the capture that point outside its folder.
     """
     return capture if isinstance(capture, Capture) else load_capture(capture, allow_outside=allow_outside)
 
 
 def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]:
-    """Return the files behind parts of a capture, for hashing, by part.
+    """Return the input files of a capture by part, for hashing.
 
     Args:
         names: any of "teeth", "mandible", "skull", "boards", "calibration", "masks", "videos".
@@ -68,7 +68,7 @@ def input_hashes(
         found = {part: hashed(files) for part, files in input_files(capture, names).items()}
     except OSError as error:
         raise CaptureError(f"cannot be read: {error.strerror}.", path=error.filename) from error
-    if "videos" in names:  # settings that change how footage is decoded
+    if "videos" in names:  # hash also the settings that change how footage is decoded
         keys = {"timecode", "start_frame", "fps", "colour_space", "pixel_aspect"}
         found["footage as read"] = hash_value([camera.model_dump(include=keys) for camera in capture.cameras])
         if capture.colour_config is not None:
@@ -112,5 +112,5 @@ def _sequence_files(path: Path) -> list[Path]:
         return [path]
     try:
         return list(numbered_files(path).values())
-    except CaptureError:  # reported by its reader
+    except CaptureError:  # the reader of the clip reports it
         return []

@@ -1,4 +1,4 @@
-"""Check a capture in seconds, before any work: a few images of each file, no tracking."""
+"""Check a capture in seconds, before any work: with a few images of each file, and without tracking."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jawusd.pipeline.state import Progress, no_progress
 # Packages required by the stages, and those that only the report needs.
 _NEEDED = ("av", "cv2", "numba", "scipy", "torch", "onnx", "shapely", "trimesh", "pyfqmr", "PIL")
 _FOR_REPORT = ("matplotlib", "jinja2")
-# Disk space for rig, tracks and report, and the minimum to start [MB].
+# Disk space for rig, tracks and report, and the least free space to start a build [MB].
 _RIG_MB, _LEAST_MB = 200.0, 20.0
 
 
@@ -35,7 +35,7 @@ class CheckSummary(TypedDict):
 
 @dataclass(frozen=True)
 class _Check:
-    """One check: its subject, the parts it needs, and the function."""
+    """One check: what it checks, the parts it needs, and the function."""
 
     what: str
     needs: tuple[str, ...]
@@ -91,9 +91,9 @@ def check_capture(
     Problems with the capture are returned, not raised. A check whose inputs are unreadable is skipped with a note.
 
     Args:
-        capture: the capture, its capture.toml or the folder that holds it.
-        out: future folder of the rig, whose disk space is checked; the capture's folder by default.
-        allow_outside: let paths in the capture leave its folder.
+        capture: the capture, its capture.toml or the folder of that file.
+        out: future folder of the rig, for the check of disk space; the capture's folder by default.
+        allow_outside: allow paths in the capture that point outside its folder.
         progress: called with (stage, done, total) as work proceeds.
     """
     progress = progress or no_progress

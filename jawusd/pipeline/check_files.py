@@ -1,4 +1,4 @@
-"""Checks of the files of a capture, each by itself: scans, bones, clips, calibration, boards."""
+"""Checks of individual files of a capture: scans, bones, clips, calibration, boards."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class Parts:
     """The parts of a capture that the checks have loaded; empty if unreadable. A context manager that closes masks."""
 
     capture: Capture | None
-    out: Path  # folder whose disk the rig will fill
+    out: Path  # future folder of the rig
     allow_outside: bool
     meshes: dict[str, Mesh] = field(default_factory=dict)
-    scans: tuple[Scan, ...] = ()  # upper and lower, if both can be used
+    scans: tuple[Scan, ...] = ()  # upper and lower, if both are usable
     videos: dict[str, Clip] = field(default_factory=dict)
     cameras: dict[str, Camera] = field(default_factory=dict)
     samples: dict[str, MaskSamples] = field(default_factory=dict)
@@ -53,7 +53,7 @@ class Parts:
 
     @property
     def given(self) -> Capture:
-        """Return the capture, for checks that need it.
+        """Return the capture.
 
         Raises:
             ValueError: it could not be read.
@@ -72,11 +72,11 @@ class Parts:
             return False
 
     def clip_read(self, camera: CameraSource) -> bool:
-        """Return whether the clip of a camera could be opened; true without a clip."""
+        """Return whether the clip of a camera could be opened; true if it has no clip."""
         return camera.video is None or camera.name in self.videos
 
     def offsets(self) -> Mapping[str, int] | None:
-        """Return the frame offsets if `sync_cameras` needs no clips to find them, else None."""
+        """Return the frame offsets if they are known without the clips, otherwise None."""
         capture = self.given
         if capture.sync.offsets is not None:
             return capture.sync.offsets
@@ -112,7 +112,7 @@ def found_error(kind: str, error: JawusdError, severity: Literal["error", "warni
     )
 
 
-# Median distance of crown vertices from their bone: larger ones mean another coordinate frame [mm].
+# Largest median distance of crown vertices from their bone [mm]; larger ones indicate another coordinate frame.
 _TEETH_TO_BONE_MM = 20.0
 _CONDYLES_MM = (75.0, 140.0)  # plausible distance of the condyle centres; adults have about 100
 
@@ -228,7 +228,7 @@ def calibration(parts: Parts) -> Iterator[Finding]:
             yield Finding("no_calibration", "error", message, path=parts.description, hint=hint)
         return
     if not parts.usable(capture.calibration) or not all(parts.clip_read(camera) for camera in capture.cameras):
-        return  # the recorded size of a camera is unknown without its clip
+        return  # a camera's recorded size is unknown, because its clip cannot be read
     if len(capture.cameras) < 2:
         message = "has one camera; tracking in 3-D needs at least two"
         yield Finding("one_camera", "error", message, 1, 2, path=parts.description)
@@ -238,7 +238,7 @@ def calibration(parts: Parts) -> Iterator[Finding]:
 
 
 def _rescaled(parts: Parts) -> Iterator[Finding]:
-    """Report calibrations at another image size; if only some cameras differ, it is likely a mistake."""
+    """Report calibrations for another image size; if only some cameras differ, it is probably a mistake."""
     found = rescaled_cameras(parts.given)
     for name, (was, now) in found.items():
         every = len(found) == len(parts.cameras)

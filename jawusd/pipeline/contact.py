@@ -1,4 +1,4 @@
-"""Contact of teeth and condyles in a jaw model: clearances measured on the scans, and images of the contacts."""
+"""Contact of teeth and condyles in a jaw model: clearances measured on the meshes, and images of the contacts."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from jawusd.meshes.contact import Teeth
     from jawusd.meshes.joints import Joints
 
-_QUALITY = 88  # of JPEG images
+_QUALITY = 88  # JPEG quality of the images
 
 
 class ContactSummary(TypedDict, total=False):
     """Contact of the teeth, or of the condyles."""
 
-    missing: str  # reason if it was not measured
+    missing: str  # why it was not measured
     closed_mm: float  # penetration of the scans in the closed bite
     error_mm: float  # largest error of the clearances
-    limit_mm: float  # smallest clearance of captured poses; the teeth of poses below it collide
+    limit_mm: float  # smallest clearance of captured poses; poses with a smaller one count as collisions
 
 
 def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture, ...]:
@@ -85,7 +85,7 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
 
 
 def tooth_solids(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: Array) -> Teeth | str:
-    """Return both arches as solids, or the reason if that fails; axes and rest pose as in `Subject`.
+    """Return both arches as solids, or why that failed; axes and rest pose as in `Subject`.
 
     Args:
         meshes: scans and bones, registered like the poses.
@@ -103,7 +103,7 @@ def tooth_solids(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: 
 def condyle_solids(
     meshes: Mapping[str, Mesh], T_anatomical_skull: Array, landmarks: Array, T_rest: Array
 ) -> Joints | str:
-    """Return condyles and skull as solids, or the reason if that fails; see `tooth_solids`."""
+    """Return condyles and skull as solids, or why that failed; see `tooth_solids`."""
     from jawusd.meshes.contact import NoContact
     from jawusd.meshes.joints import find_joints
 
@@ -118,11 +118,11 @@ def condyle_solids(
 def with_tooth_contact(
     model: JawModel, teeth: Teeth | str, progress: Progress = no_progress, *, regauge: bool = True
 ) -> JawModel:
-    """Return a model with the clearances of the teeth, summed up in ``meta["contact"]``.
+    """Return a model with the clearances of the teeth, summarised in ``meta["contact"]``.
 
     Args:
         teeth: result of `tooth_solids`.
-        regauge: set d1 = 0 where the teeth touch, and limit the bound there.
+        regauge: shift d1 so that the teeth touch at d1 = 0, and limit the bound there.
     """
     from jawusd.fitting.glide import follow_teeth
     from jawusd.meshes.contact import sample_field
@@ -139,7 +139,7 @@ def with_tooth_contact(
 
 
 def with_condyle_contact(model: JawModel, joints: Joints | str, progress: Progress = no_progress) -> JawModel:
-    """Return a model with the clearances of the condyles, summed up in ``meta["joints"]``.
+    """Return a model with the clearances of the condyles, summarised in ``meta["joints"]``.
 
     Args:
         joints: result of `condyle_solids`.

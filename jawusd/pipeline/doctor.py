@@ -1,4 +1,4 @@
-"""Installed packages, and whether they work."""
+"""Check of the installation: packages, OpenGL, codecs and limits."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Examined(TypedDict):
         versions: by package; "" if not installed.
         extras: missing packages of each extra.
         graphics: OpenGL version, or why there is none.
-        codecs: whether each can be decoded.
-        memory_limit_gb: limit of a command, 0 for none.
+        codecs: whether each codec can be decoded.
+        memory_limit_gb: memory limit of a command, 0 for none.
         problems: reasons why a build would fail.
     """
 
@@ -129,7 +129,7 @@ def _codecs() -> dict[str, bool]:
 
 
 def _cache() -> str:
-    """Return where numba caches compiled functions."""
+    """Return the folder in which numba caches compiled functions, in words."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     if named:
         return f"{named}{'' if os.access(named, os.W_OK) else ' (not writable: every start compiles again)'}"

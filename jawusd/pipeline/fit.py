@@ -1,6 +1,6 @@
-"""Fit a jaw model to tracks, or to poses and markers of other programs, converted to T_skull_mandible [mm].
+"""Fit a jaw model to tracks, or to poses and markers from other programs, converted to T_skull_mandible [mm].
 
-Poses of jaw-tracking-system (PyPI `jaw-tracking-system`, Mueller et al.), an optical marker system, come as HDF5.
+Poses from jaw-tracking-system (PyPI `jaw-tracking-system`, Mueller et al.), an optical marker system, are HDF5 files.
 Layout, as its `store_transformations` writes it (version 1.1): one group per trajectory, by default
 `T_model_origin_mand_landmark_t` and, smoothed, `T_model_origin_mand_landmark_t_smooth`, with the data sets
 `translations` (N, 3) and `rotations`, scalar-first quaternions (N, 4) or matrices (N, 3, 3), and the attributes `unit`
@@ -59,15 +59,15 @@ _MOST_NUMBERS = 16_000_000  # a million 4 x 4 matrices
 class TrajectoryOptions:
     """Conventions of a file of poses."""
 
-    # our column names to the file's, see `formats.poses.read_poses`; tables only
+    # jawusd's column names to those of the file, see `formats.poses.read_poses`; for tables only
     columns: Mapping[str, str] = field(default_factory=dict)
-    length_unit: str = "mm"  # a key of `LENGTH_UNITS_MM`, for files that do not name theirs
+    length_unit: str = "mm"  # a key of `LENGTH_UNITS_MM`, for files that do not state their unit
     invert: bool = False  # the poses map skull to mandible
-    # a frame with the teeth in occlusion: poses are taken relative to it, for any mandible frame in the file; None: the
-    # poses are identity in occlusion
+    # a frame with the teeth in occlusion: poses are made relative to it, so that the file may use any mandible frame;
+    # None: the poses in the file are identity in occlusion
     rest_frame: int | None = None
     group: str | None = None  # trajectory of an HDF5 file; None: the raw one
-    # the rigid bodies of a table of markers, see `pipeline.markers.marker_poses`; empty: the file contains poses
+    # rigid bodies in a table of markers, see `pipeline.markers.marker_poses`; empty if the file contains poses
     rigid: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -96,7 +96,7 @@ def fit_subject(
     """Fit the jaw model of a subject.
 
     Args:
-        fps: frame rate stated by the file of poses; None for that of the subject.
+        fps: frame rate of the poses; None: that of the subject.
         method: "anchored", "additive", "paper" or "pca".
 
     Raises:
@@ -119,7 +119,7 @@ def fit_subject(
             landmarks=subject.landmarks,
             mandible_vertices=subject.measured_points(),
             T_rest=rest,
-            config=FittingConfig(method=cast("Method", method)),  # checked there
+            config=FittingConfig(method=cast("Method", method)),  # checked by FittingConfig
             actor=subject.name,
             forms=FORMS,
             progress=partial(progress, "fit"),
@@ -229,7 +229,7 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
             name = _chosen(groups, group, path)
             held = {key: _data(file[name], key, name, path) for key in ("translations", "rotations", "transformations")}
             unit = file[name].attrs.get("unit", "mm")
-    # h5py raises many kinds of errors for corrupt files.
+    # h5py raises exceptions of many types for corrupt files.
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
         raise FormatError(f"is not a readable HDF5 file ({error!s:.200}).", path=path) from error
     unit = unit.decode(errors="replace") if isinstance(unit, bytes) else str(unit)
@@ -268,7 +268,7 @@ def _data(group: h5py.Group, key: str, name: str, path: Path) -> Array | None:
 
 
 def _poses(held: dict[str, Array | None], name: str, path: Path) -> Array:
-    """Return the poses (F, 4, 4) of the data sets, translations in the file's unit."""
+    """Return the poses (F, 4, 4) from the data sets, translations in the file's unit."""
     whole, t, rotations = held["transformations"], held["translations"], held["rotations"]
     if whole is not None:
         if whole.ndim != 3 or whole.shape[1:] != (4, 4):

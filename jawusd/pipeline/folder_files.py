@@ -13,7 +13,7 @@ from jawusd.formats.capture_template import CameraSketch
 from jawusd.formats.file_names import MESHES, PICTURES, VIDEOS, groups
 
 _CALIBRATIONS = (".toml", ".json", ".xml", ".csv", ".yaml", ".yml", ".txt", ".usda", ".usdc", ".usd", ".nk")
-_FEWEST_PICTURES = 5  # minimum length of an image sequence
+_FEWEST_PICTURES = 5  # least number of images of a sequence
 _DEPTH = 4
 
 _BOARD = {"board", "boards", "calib", "calibration", "calibrate", "checker", "checkerboard", "chess", "chessboard"}
@@ -22,14 +22,15 @@ _MASK = {"mask", "masks", "matte", "mattes", "roto", "segmentation", "seg"}
 _UPPER = {"upper", "maxilla", "maxillary", "maxillar", "maxillaire", "maxilar", "oberkiefer", "oben", "superior"}
 _UPPER |= {"superiore", "superieur"}
 _LOWER = {"lower", "mandibular", "mandibulaire", "unterkiefer", "unten", "inferior", "inferiore", "inferieur"}
-# Ambiguous words for upper and lower ("u" may mean "unten"): accepted only if two names differ in nothing else.
+# Ambiguous words for upper and lower ("u" may also mean "unten", German for lower): accepted only if two names are
+# otherwise equal.
 _PAIRS = [("u", "l"), ("o", "u"), ("ok", "uk"), ("uj", "lj"), ("max", "mand"), ("mx", "md"), ("sup", "inf")]
 _PAIRS += [("top", "bottom"), ("haut", "bas")]
 _MANDIBLE = {"mandible", "mandibula", "jawbone"}
 _SKULL = {"skull", "cranium", "schaedel", "head"}
 _TEETH = {"teeth", "tooth", "scan", "arch", "dentition", "row", "crowns"}
 _BONE = {"bone", "bones", "jawbone", "knochen"}
-# Parts of compound words, longest first: UPPERJAWSCAN, maxillaryscan.
+# Parts of compound words, longest first, for names such as UPPERJAWSCAN and maxillaryscan.
 _PARTS = _UPPER | _LOWER | _MANDIBLE | _TEETH | {word for pair in _PAIRS for word in pair if len(word) > 2}
 _PARTS |= {"jaw", "scan", "model", "cast", "ok", "uk", "ios", "impression", "anatomy", "export"}
 _PART = "|".join(sorted(_PARTS, key=len, reverse=True))
@@ -83,7 +84,7 @@ def find_files(folder: Path) -> FoundFiles:
             out.calibrations.append(path)
     scans = out.scans
     if not scans["lower_teeth"] and scans["upper_teeth"] and len(scans["mandible"]) == 1:
-        # Clinics name a pair of scans maxilla.stl and mandible.stl.
+        # In clinics, teeth scans are often called maxilla.stl and mandible.stl.
         scans["lower_teeth"] = scans.pop("mandible")
     return out
 
@@ -116,7 +117,7 @@ def _arch(own_words: set[str]) -> str:
 
 
 def _paired(paths: Sequence[PurePath]) -> dict[PurePath, str]:
-    """Return the arches of files whose names differ only in one word of a pair."""
+    """Return the arches of files whose names differ only in a pair of ambiguous words."""
     spelt = {tuple(_split_words(path)): path for path in paths}
     pairs = [
         (path, spelt[other])
@@ -135,7 +136,7 @@ def _part(path: PurePath, paired: str) -> str:
 
     Args:
         path: the mesh.
-        paired: its arch by an ambiguous word, see `_paired`.
+        paired: its arch according to an ambiguous word, see `_paired`; "" if unknown.
     """
     own, all_words = set(_split_words(PurePath(path.name))), set(_split_words(path))
     for own_words, arch in ((own, ""), (all_words, ""), (all_words, paired)):
@@ -169,12 +170,12 @@ def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
     if len(set(out.values())) < len(paths) or any(len(name) > 40 for name in out.values()):
         out = {path: f"{name or 'cam'}_{number}" for number, (path, name) in enumerate(zip(paths, plain))}
     elif all(sorted(words(PurePath(name))) == sorted(words(PurePath(out[path]))) for path, name in zip(paths, plain)):
-        out = dict(zip(paths, plain))  # the spelling of the file name, if the words are the same
+        out = dict(zip(paths, plain))  # keep the spelling of the file name if the words are the same
     return out
 
 
 def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dict[PurePath, PurePath], bool]:
-    """Match other files with clips; the flag is true if by name, false if by order.
+    """Match other files with clips; the flag is true if matched by name, false if by order.
 
     Args:
         names: camera names by clip.

@@ -55,7 +55,7 @@ class Cutter:
         self._probes = [scan.probes for scan in scans]
 
     def cut(self, pictures: Pictures) -> Cut:
-        """Return a function that crops the images of an instant around poses."""
+        """Return a function that crops the images of one instant around given poses."""
 
         def cut(poses: Array) -> list[Picture | None]:
             around = np.concatenate([transform_points(T, own) for T, own in zip(poses, self._probes, strict=True)])
@@ -64,7 +64,7 @@ class Cutter:
         return cut
 
     def walk(self, footage: ColourFootage, frames: range) -> Iterator[Cut]:
-        """Yield such a function for each frame.
+        """Yield the function of `cut` for each frame.
 
         Raises:
             CaptureError: an image cannot be decoded.
@@ -79,10 +79,10 @@ class Cutter:
         return None if window is None else Picture(window.camera, window.rgb)
 
 
-# Second difference of the jaw's motion [mm] above which the preceding frames are tracked again backwards, and distance
-# below which two poses count as equal. Speech and chewing reach 1 mm at 24 fps; a false alarm costs one frame.
+# Second difference of the jaw's motion [mm] above which the preceding frames are tracked again, backwards; and distance
+# below which two poses count as equal. Speech and chewing reach 1 mm at 24 fps; a false positive costs one frame.
 _JUMP_MM, _SAME_MM = 0.8, 0.15
-_SAMPLED_VIEWS = 10  # number of frames whose views are kept: a few MB
+_SAMPLED_VIEWS = 10  # most frames whose views are kept: a few MB
 STAGE = "follow"
 
 
@@ -91,7 +91,7 @@ class Follower:
 
     Attributes:
         cameras: calibrated, those that have a video, by name.
-        sampled_views: poses and views of frames sampled evenly over the last run.
+        sampled_views: poses and views of frames, evenly sampled from the last run.
     """
 
     def __init__(
@@ -116,9 +116,9 @@ class Follower:
         self.sampled_views: list[tuple[Array, list[View]]] = []
 
     def start_at(self, frame: int, poses: Array) -> tuple[RegionPose, float]:
-        """Refine T_world_upper, T_world_lower (2, 4, 4) on a frame, from which `run` starts; return also the fit.
+        """Refine T_world_upper, T_world_lower (2, 4, 4) on a frame, from which `run` then starts; return pose and fit.
 
-        The fit is the fraction of the visible contour that matches the colours, 0 .. 1, of the worse arch.
+        The fit is that of the worse arch: the fraction of the visible contour that matches the colours, 0 .. 1.
 
         Raises:
             CaptureError: an image cannot be decoded.
@@ -159,7 +159,7 @@ class Follower:
 
 
 class _Latest(Iterator["Cut"]):
-    """An iterator that remembers its last item; `itertools.tee` would keep up to 57 of them."""
+    """An iterator that stores its last item; `itertools.tee` would keep up to 57 items."""
 
     def __init__(self, cuts: Iterator[Cut]) -> None:
         self._cuts = cuts
@@ -186,7 +186,7 @@ def _jumps(way: range, known: Mapping[int, RegionPose], points: Array) -> list[i
 def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, RegionPose], points: Array) -> None:
     """Replace poses by those tracked backwards, as long as they differ and more of the contour fits.
 
-    A jump means that the tracker recovered from an error; the wrong frames before it look plausible one by one.
+    A jump means that the tracker recovered from an error; each of the wrong poses before it is plausible by itself.
     """
     for frame, found in zip(back, again, strict=False):
         apart_mm = np.linalg.norm(_places(found, points) - _places(known[frame], points), axis=-1).mean()
@@ -297,5 +297,5 @@ def searched_start(
 
     search = PictureSearch(capture, footage, len(follower.cameras), near, judged)
     begin = search.run(frames, progress)
-    follower.start_at(begin.frame, begin.pose)  # the search may have tried other frames since
+    follower.start_at(begin.frame, begin.pose)  # again, as the search may have tried other frames since
     return begin

@@ -1,4 +1,4 @@
-"""A library of actors; retargeting of motion between them, and rigs from landmarks alone."""
+"""Libraries of actors, retargeting of motion between actors, and rigs made from landmarks alone."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from jawusd.pipeline.fit import fit_summary
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_landmarks
 
-# Smallest step of a retargeted motion, relative to the source's step scaled by the ratio of the ranges.
+# Least step of a retargeted motion, relative to the source's step times the ratio of the ranges.
 _SLOWEST = 0.1
-_ROUNDS = 400  # alternations of timing and bound; most motions need fewer than 40
+_ROUNDS = 400  # most iterations of timing and projection into the bound; most motions need fewer than 40
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 @explain_missing_packages()
 def load_any_rig(path: Path) -> JawRig:
-    """Read a rig from `model.npz` with numpy alone, or from any USD layer that carries it.
+    """Read a rig from `model.npz` with numpy alone, or from any USD layer that contains it.
 
     Raises:
         JawusdError: the file is not a rig.
@@ -72,7 +72,7 @@ def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, forc
             hint="Give --name.",
         )
     place = Path(folder) / called
-    # A symbolic link could lead out of the library.
+    # A symbolic link could point outside the library.
     if place.is_symlink() or (place / MODEL_FILE).is_symlink():
         raise OutputError("is a symbolic link; rigs are stored in the library itself.", path=place)
     refuse_existing(place / MODEL_FILE, force)
@@ -112,8 +112,8 @@ class PersonalRig:
     """A rig made from landmarks."""
 
     model: JawModel  # the fitted model
-    motion: PersonalMotion  # what it was fitted to
-    left_out: tuple[str, ...]  # library subjects not used, as their captures lack a movement
+    motion: PersonalMotion  # the motion to which the model was fitted
+    left_out: tuple[str, ...]  # subjects of the library that were not used, because their captures lack a movement
     header: Mapping[str, object]  # provenance stored in the model's header
 
 
@@ -157,7 +157,7 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         (np.arange(len(motion.poses)), motion.poses),
         T_anatomical_skull=subject.T_anatomical_skull,
         landmarks=subject.landmarks,
-        config=FittingConfig(holdout_folds=0),  # held-out frames would be poses of the library, not of this subject
+        config=FittingConfig(holdout_folds=0),  # held-out frames would be those of other subjects
         actor=subject.name,
         progress=partial(progress, "fit"),
     )
@@ -169,14 +169,14 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         "expected_error_mm": None if expected is None else expected.summary(),
         "fit_to_carried_motion_mm": model.meta["errors"],
     }
-    # The training error says nothing about the subject, whose motion was not measured.
+    # The training error is meaningless for the subject, whose motion was not measured.
     model.meta["errors"] = {} if expected is None else {"expected": expected.table()}
     caution = {"code": "personal", "message": _caution(motion)}
     model.meta["warnings"] = [*fit_summary(model)["warnings"], caution]
     if expected is not None:
         limit = np.maximum(model.arrays["residual_limit_mm"], expected.pooled().mean())
         model.arrays["residual_limit_mm"] = limit
-    # Transferred poses are not a take of this person: the file gets no captured motion.
+    # Transferred poses are not a take of this subject, so the file gets no captured motion.
     none = np.zeros(0)
     return replace(model, frames=none.astype(np.int64), d=np.zeros((0, 3)), residual_mm=none, trained=none.astype(bool))
 
@@ -201,7 +201,7 @@ class Retargeted:
     frames: Array  # frame numbers, shape (G,)
     d: Array  # parameters of the target [mm], inside its bound, NaN where the motion is lost, shape (G, 3)
     outside: Mask  # samples at which equal fractions of the ranges would leave the bound, shape (G,)
-    moved_mm: Array  # distance of each sample from equal shares, in d, NaN where lost, shape (G,)
+    moved_mm: Array  # distance in d of each sample from equal fractions of the ranges, NaN where lost, shape (G,)
 
 
 def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retargeted:

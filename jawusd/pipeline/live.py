@@ -1,4 +1,4 @@
-"""Follow the jaw of a subject whose rig exists in live video, and send it as OSC: `jawusd live`."""
+"""Track the jaw of a subject with a rig in live video, and send it as OSC: `jawusd live`."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from jawusd.tracking.performance.coordinates import Pose
 
 
-_PATIENCE_S = 2.0  # time without teeth before a new search
+_PATIENCE_S = 2.0  # time without teeth after which a new search begins
 _WAIT_S = 0.25
 _MOST_BEHIND_S = 0.15  # lag behind the newest images above which frames are dropped
-_BEFORE = 6  # frames followed before a file is played, to estimate the motion
+_BEFORE = 6  # frames tracked before playback of a file, to estimate the motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class LiveFrame:
         d, sigma: jaw parameters and their standard deviations [mm], shape (3,).
         margin_mm: signed distance to the rig's bound, > 0 inside.
         verdict: verdict of the rig on the pose.
-        state: solved or carried.
+        state: `SolveState`, solved or carried.
         latency_ms: time since the images were captured.
         dropped: number of instants dropped since the last one.
     """
@@ -96,19 +96,19 @@ def live(
 
     Args:
         rig: `actor.usda`, another layer of it, or `model.npz`.
-        shot: a capture with the calibration of the cameras and the scans of the rig; without sources, its videos are
-            played in real time.
+        shot: a capture with the calibration of the cameras and the rig's scans; without sources, its videos are played
+            in real time.
         sources: device, address or file by camera name.
         prim: path of the rig's prim, if a stage has several.
         fixed_head: the cameras are head-mounted.
         jobs: number of threads.
         seconds: stop after this time; None: when the sources end.
         silence_s: longest time without an image from a device or stream [s].
-        allow_outside: let paths in the capture leave its folder.
+        allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
         FormatError, RigError: the rig cannot be read.
-        CaptureError, CalibrationError, SyncError: shot or sources cannot be read.
+        CaptureError, CalibrationError, SyncError: the shot or a source cannot be read.
         TrackingError: the scans are not in occlusion.
     """
     capture = open_capture(shot, allow_outside=allow_outside)
@@ -121,10 +121,10 @@ def live(
 
 
 def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:
-    """Return the next instant to process, None if some source has no image of it yet.
+    """Return the time of the next instant to process, None if a source has no image of it yet.
 
-    It is the first one that is not too old: a search takes as long as several frames, and tracking, which is faster
-    than real time, catches up.
+    This is the first instant that is not too old. A search takes as long as several frames; tracking is faster than
+    real time and catches up.
 
     Args:
         times_s: increasing times of the buffered images of each source.
@@ -138,7 +138,7 @@ def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | 
 
 
 def _with_sources(capture: Capture, sources: Mapping[str, str]) -> tuple[Capture, dict[str, str]]:
-    """Return the capture restricted to cameras with a source, and the sources; source files replace the videos."""
+    """Return the capture restricted to cameras with a source, and the sources; files replace the capture's videos."""
     names = [camera.name for camera in capture.cameras]
     if unknown := sorted(set(sources) - set(names)):
         raise CaptureError(
@@ -163,7 +163,7 @@ def _with_sources(capture: Capture, sources: Mapping[str, str]) -> tuple[Capture
 
 
 class _Follower:
-    """Follow the teeth in live sources."""
+    """Tracker of the teeth in live sources."""
 
     def __init__(
         self, capture: Capture, jaw: JawRig, sources: Mapping[str, str], fixed_head: bool, pool: Executor
@@ -275,7 +275,7 @@ class _Follower:
             self._learn(pictures, near)
 
     def _next(self, last: float, silence_s: float) -> float | None:
-        """Wait for the next instant that all sources have; return its time, None at the end."""
+        """Wait for the next instant of which all sources have an image; return its time, None at the end."""
         after = last + 0.5 * self._period_s
         while True:
             at = next_instant([source.times_s() for source in self._sources.values()], after)
@@ -293,10 +293,10 @@ class _Follower:
 
 
 class OscSender:
-    """Sends an OSC bundle per instant over UDP.
+    """Sender of an OSC bundle per instant over UDP.
 
-    /jaw/d and /jaw/sigma carry three floats [mm], /jaw/margin one [mm], /jaw/time one [s], and /jaw/state 1 for solved
-    or 2 for carried, as `SolveState`.
+    The arguments of /jaw/d and /jaw/sigma are three floats [mm], of /jaw/margin one [mm], of /jaw/time one [s], and of
+    /jaw/state 1 for solved or 2 for carried, as in `SolveState`.
     """
 
     @explain_missing_packages()

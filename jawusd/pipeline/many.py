@@ -1,4 +1,4 @@
-"""Build many captures, on worker processes or a Dask cluster, with one table of the outcomes."""
+"""Build many captures, in worker processes or on a Dask cluster, with one table of outcomes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from jawusd.pipeline.workspace import check_folder
 SUMMARY_JSON, SUMMARY_CSV = "builds.json", "builds.csv"
 BUILT, KEPT, FAILED, STOPPED = "built", "kept", "failed", "stopped"
 
-#: Called with one line of text about every event.
+#: Callback for events, with one line of text each.
 Notify = Callable[[str], None]
 
 _NOTIFY_SECONDS = 10.0  # least interval between two lines about the same stage of a capture
@@ -51,7 +51,7 @@ _STOP_SECONDS = 15.0  # time for running builds to stop
 CONNECT_SECONDS = 10
 _LOOPBACK = "127.0.0.1"
 
-# Cancelled runs; a worker may serve several.
+# Ids of cancelled runs; a worker may serve several runs.
 _cancelled: set[str] = set()
 
 
@@ -61,7 +61,7 @@ class _CancelledError(Exception):
 
 @dataclass(frozen=True)
 class ManyOptions:
-    """Options of building many captures.
+    """Options for building many captures.
 
     Attributes:
         build: options of each build.
@@ -87,7 +87,7 @@ class Outcome:
         frames, tracked: number of frames, and of those with both arches tracked.
         model_mm: mean over frames of the largest error of a mandible vertex.
         holdout_mm: the same for held-out frames.
-        sigma_incisor_mm: median expected tracking error at the incisal point.
+        sigma_incisor_mm: median standard deviation of the tracked incisal point.
         seconds: total duration of the stages.
         error: reason of a failure.
     """
@@ -147,7 +147,7 @@ def _run(
 ) -> Iterator[Outcome]:
     """Yield outcomes as builds end; on an interrupt, cancel the running builds."""
     run = uuid.uuid4().hex
-    # A retry after the death of a worker finds the stages that were finished before.
+    # When a worker has died, the retry reuses the stages that it finished.
     options = options if options.fresh else replace(options, resume=True)
     with _listening(client, run, notify):
         items = {
@@ -245,7 +245,7 @@ def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
 class _IgnoreInterrupt(WorkerPlugin):
     """Ignore signals that a terminal or service sends to all processes; the parent handles them.
 
-    A worker that such a signal ended would be replaced, and the new one would continue the build.
+    If such a signal ended a worker, its replacement would continue the build.
     """
 
     def setup(self, worker: Worker) -> None:
@@ -265,7 +265,7 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
     """
     settings = {
         "distributed.scheduler.allowed-failures": retries,
-        # Without a dashboard nothing shows the profile, which costs 2 to 3 % of the time.
+        # Only a dashboard displays the profile, which takes 2 to 3 % of the time.
         "distributed.worker.profile.enabled": False,
     }
     with (
@@ -276,10 +276,10 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
             threads_per_worker=1,
             processes=True,
             host=_LOOPBACK,
-            # Port 0: without an address, the dashboard's server would require its fixed port.
+            # Any free port: without an address, the server of the dashboard would require its default port.
             dashboard_address=f"{_LOOPBACK}:0",
             scheduler_kwargs={"dashboard": False},
-            memory_limit=0,  # no limit per worker; the system limits memory
+            memory_limit=0,  # no limit per worker
             silence_logs=logging.CRITICAL,
             local_directory=scratch,
         ) as cluster,

@@ -20,9 +20,9 @@ BODIES = ("head", "jaw")
 LENGTH_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 _MOST_C3D_FRAMES = 65_535  # the frame counter has 16 bits
 _BLOCK, _C3D_KEY = 512, 0x50
-#: Byte order, and offset of the scale's sign byte in the header, by processor type: Intel, DEC, MIPS.
+#: Byte order, and header offset of the byte with the scale's sign, by processor type: Intel, DEC, MIPS.
 _BYTE_ORDERS = {b"T": ("<", 15), b"U": ("<", 13), b"V": (">", 12)}
-_LABELS = ("LABELS", *(f"LABELS{k}" for k in range(2, 9)))  # of 255 points each
+_LABELS = ("LABELS", *(f"LABELS{k}" for k in range(2, 9)))  # parameters with the labels of up to 255 points each
 
 # RMS residual of a rigid body [mm] above which a frame has no pose: a marker jumped or was mislabelled. The largest of
 # 6,400 fits to recorded speech and clenching is 0.18 mm. Four markers with 0.3 mm of noise per axis exceed the limit
@@ -39,8 +39,8 @@ def marker_poses(
         path: the table, see `formats.markers.read_markers`, or C3D.
         rigid: descriptions of the rigid bodies "head" and "jaw", see `formats.rigid_bodies.read_body`; without "head",
             the table is in head coordinates.
-        rest_frame: frame that defines the shape of rigid bodies given only by their markers.
-        unit: of the rigid bodies, and of tables that do not state theirs; a key of `LENGTH_UNITS_MM`.
+        rest_frame: frame that defines the shape of rigid bodies for which only the markers are named.
+        unit: unit of the rigid bodies, and of tables that do not state theirs; a key of `LENGTH_UNITS_MM`.
 
     Raises:
         FormatError: a rigid body is unknown, missing or does not fit the markers; the rest frame is missing or lacks a
@@ -106,7 +106,7 @@ def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
 
 
 def _check_length(path: Path) -> None:
-    """Check that a C3D file is not truncated: ezc3d would invent the missing frames, or hang."""
+    """Check that a C3D file is not truncated: ezc3d would return arbitrary frames, or hang."""
     with open(path, "rb") as file:
         head = file.read(_BLOCK)
         file.seek((max(head[0], 1) - 1) * _BLOCK + 3 if head else 0)
@@ -115,7 +115,7 @@ def _check_length(path: Path) -> None:
         raise FormatError("is not a readable C3D file (invalid header).", path=path)
     points, analog, first, last = struct.unpack(f"{order[0]}4H", head[2:10])
     start = struct.unpack(f"{order[0]}H", head[16:18])[0]
-    size = 4 if head[order[1]] & 0x80 else 2  # the sign of the scale: floating point, or integers
+    size = 4 if head[order[1]] & 0x80 else 2  # bytes per coordinate: floating point if the scale is negative
     needed = (start - 1) * _BLOCK + (last - first + 1) * (4 * points + analog) * size
     found = path.stat().st_size
     if found < needed:
@@ -123,7 +123,7 @@ def _check_length(path: Path) -> None:
 
 
 def _columns(body: RigidBody, names: tuple[str, ...], count: int, called: str, path: Path) -> list[int]:
-    """Return the columns of the markers of a rigid body; names may omit the subject before a colon."""
+    """Return the columns of a rigid body's markers; names may omit the prefix "SUBJECT:" of the table's names."""
     own = [name.rpartition(":")[2] for name in names]
     found = []
     for marker in body.markers:

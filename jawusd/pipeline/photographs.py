@@ -1,4 +1,4 @@
-"""Register two scans in occlusion from photographs of the bite, and estimate each camera pose."""
+"""Register two scans in occlusion using photographs of the bite, and estimate the pose of each photograph."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from jawusd.pipeline.state import Progress, no_progress
 
 RESULT = "photos.json"
 _COLOURS = np.array([[60, 220, 60], [60, 160, 255]], np.uint8)  # upper, lower; red, green, blue
-# Fraction of bright pixels above which an image is taken to show filled areas: 4 px lines around 20 teeth cover 4 %.
+# Fraction of bright pixels above which a drawing counts as filled areas: 4 px lines around 20 teeth cover 4 %.
 _FILLED = 0.08
 
 
@@ -47,7 +47,7 @@ def align_photograph_files(
     """Align scans with outlines drawn in photographs, and write poses, lenses, bite and overlays.
 
     Args:
-        outlines: an image per photograph, all of one bite and one camera: tooth outlines as bright lines on black, or
+        outlines: a drawing per photograph, all of one bite and one camera: tooth outlines as bright lines on black, or
             filled teeth with one gray value each.
         upper_teeth, lower_teeth: scans, each in any frame.
         out: folder of photos.json and an overlay per photograph.
@@ -79,10 +79,10 @@ def align_photograph_files(
 
 
 def read_drawing(picture: NDArray[np.uint8], name: str) -> Drawing:
-    """Return the lines of a gray image (h, w), or the borders of its areas if it shows areas.
+    """Return the lines of a gray drawing (h, w), or the borders of its areas if teeth are filled.
 
     Raises:
-        TrackingError: the image shows too few outlines.
+        TrackingError: the drawing has too few outlines.
     """
     if np.count_nonzero(picture) > _FILLED * picture.size:
         border = np.zeros(picture.shape, bool)

@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Start(Generic[T]):
-    """A start: frame, pose, fraction of the contour that fits, and how it was found."""
+    """A start of tracking: frame, pose, fraction of the contour that fits, and how it was found."""
 
     frame: int
     pose: T
@@ -47,14 +47,14 @@ class Start(Generic[T]):
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """Arches detected by the cameras on a frame."""
+    """Arches detected in the cameras' images of a frame."""
 
     frame: int
     rows: Mapping[str, Rows]
 
     @property
     def bridged(self) -> float:
-        """Share of the line between the arches without a gap, in the worst camera."""
+        """Fraction of the line between the arches without a gap, in the worst camera."""
         return max(rows.bridged for rows in self.rows.values())
 
 
@@ -65,8 +65,9 @@ class PictureSearch(Generic[T]):
     Attributes:
         capture, footage: the capture, and the images of its cameras with a video.
         cameras: number of these cameras.
-        near: estimates a pose on a frame from cameras with rough masks; None if that fails.
-        judged: refines a pose on a frame, and returns the fraction of the visible contour that fits, 0 .. 1.
+        near: function that estimates a pose on a frame from cameras with rough masks; returns None if that fails.
+        judged: function that refines a pose on a frame, and returns the fraction of the visible contour that fits, 0 ..
+            1.
     """
 
     capture: Capture
@@ -76,7 +77,7 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress) -> Start[T]:
-        """Return the first start that fits clearly, or the best one of a part of the take.
+        """Return the first start with a clear fit, or the best of a part of the take.
 
         Raises:
             TrackingError: no start fits.
@@ -106,7 +107,7 @@ class PictureSearch(Generic[T]):
         )
 
     def _candidates(self, part: range, progress: Progress) -> list[_Candidate]:
-        """Return the frames of a part of the take on which enough cameras show the arches apart."""
+        """Return the frames of a part of the take on which the arches are apart in enough cameras."""
         from jawusd.segmentation.rows import tooth_rows
 
         out, chosen = [], part[::_EVERY]
@@ -156,7 +157,7 @@ def masked_cameras(
 
 
 def picks_mismatch(frame: int, fit: float, least: float = LEAST_FIT) -> TrackingError:
-    """Return the error for picks on a frame where too small a fraction of the visible contour fits, 0 .. 1."""
+    """Return the error for picks on a frame if the fraction of the visible contour that fits, 0 .. 1, is too small."""
     return TrackingError(
         f"the picks do not match the pictures: {fit:.0%} of the visible contour fits the colours, at least "
         f"{least:.0%} is needed",

@@ -32,15 +32,15 @@ if TYPE_CHECKING:
     from jawusd.media.side_by_side import CameraWall
 
 
-_UNCOVERED, _UNCERTAIN = 3, 2  # frames shown for each reason, besides a typical one for comparison
+_UNCOVERED, _UNCERTAIN = 3, 2  # frames drawn for each reason, in addition to a typical frame for comparison
 _MOST_CAMERAS = 4
 _REPORT_TILE_PX = (400, 225)
 _QUALITY = 82
-_MOST_FACES = 6000  # per mesh in the report
+_MOST_FACES = 6000  # per mesh of the report's replay
 
 
 def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> tuple[Overlay, ...]:
-    """Draw the scans over the footage in the worst frames, the worst first, and in a typical one.
+    """Draw the scans over the footage in the worst frames, worst first, and in a typical frame.
 
     Args:
         offsets: frame offset by camera.
@@ -178,9 +178,9 @@ SHEET = "contact_sheet.png"
 #: Suffix of a video of all cameras.
 VIDEO = ".mp4"
 _SHEET_FRAMES = 6
-_CRF = 20  # H.264 quality for viewing, encoded in half the time of archive quality
+_CRF = 20  # H.264 quality for viewing; archive quality takes twice the time to encode
 TILE_PX = (640, 480)
-_FILL = 0.12  # opacity of the crowns; low, so that outlines stay visible
+_FILL = 0.12  # opacity of the crowns, low enough for outlines to remain visible
 
 
 def overlay_files(capture: Capture, path: Path) -> list[Path]:
@@ -194,11 +194,11 @@ def overlay_files(capture: Capture, path: Path) -> list[Path]:
 def write_overlay(
     capture: Capture, offsets: Mapping[str, int], tracks: Tracks, path: Path, progress: Progress
 ) -> list[Path]:
-    """Write H.264 video of the tracked frames with both scans drawn over them. Returns `overlay_files`.
+    """Write H.264 video of the tracked frames with both scans drawn over them; return `overlay_files`.
 
-    A folder gets a contact sheet, and for each camera with footage a synchronised video of whole images, gray where a
-    image is missing. An .mp4 file shows all cameras side by side, cropped to the teeth; cameras without footage show
-    their masks. Existing files are overwritten.
+    If `path` is a folder, a contact sheet and, for each camera with footage, a synchronised video of whole images are
+    written, with gray for missing images. If it is an .mp4 file, all cameras are placed side by side, cropped to the
+    teeth, with masks for cameras without footage. Existing files are overwritten.
 
     Args:
         offsets: frame offset by camera.

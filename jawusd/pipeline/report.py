@@ -58,7 +58,7 @@ class CheckResult(TypedDict):
 
 
 class ReportSummary(TypedDict):
-    """Path of the capture relative to the rig, `Origin`, and the report's file or the missing package."""
+    """Path of the capture relative to the rig, `Origin`, and the report's file name or the missing packages."""
 
     capture: NotRequired[str]
     origin: NotRequired[dict[str, object]]
@@ -74,7 +74,7 @@ class BuildFacts:
     state: BuildState
     capture: Capture | None  # None if not available
     origin: Origin
-    why_not: str = ""  # reason for a missing capture
+    why_not: str = ""  # why the capture is not available
 
 
 @explain_missing_packages()
@@ -91,7 +91,7 @@ def write_build_report(
         FormatError, RigError: a file of the build is corrupt.
         OutputError: the file cannot be written.
     """
-    # fail before the work if they are not installed
+    # raises an error before any work if they are not installed
     from jawusd.paper.figures import inline_figures
     from jawusd.report.document import draw_figures, write_document
 
@@ -164,7 +164,7 @@ def report_build(
     Args:
         capture: capture.toml or its folder; None: as recorded in the build.
         experiments: as for `write_build_report`.
-        allow_outside: let paths in the capture leave its folder.
+        allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
         FormatError: not the folder of a build, or its files are corrupt or were modified.
@@ -220,7 +220,7 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
 
     Args:
         capture: None: use the path recorded in the build.
-        allow_outside: let paths in the capture leave its folder.
+        allow_outside: allow paths in the capture that point outside its folder.
     """
     record = state.stages.get("report")
     origin = recorded_origin(record.result if record else {})

@@ -32,11 +32,11 @@ class ScanSummary(TypedDict):
     labels_file: str | None  # None if none was read or written
     faces: int
     pieces: int
-    merged_vertices: int  # duplicates of another vertex
+    merged_vertices: int  # number of vertices that coincide with another one
     empty_faces: int
     repeated_faces: int
-    crown_percent: float  # of the vertices
-    weak_border_percent: float | None  # fraction of the crown border without a crease
+    crown_percent: float  # percentage of the vertices
+    weak_border_percent: float | None  # percentage of the crown border without a crease
     findings: list[dict[str, str | float | int]]
 
 

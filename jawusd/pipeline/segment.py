@@ -44,7 +44,7 @@ ARCHES = ("upper", "lower")
 class SegmentOptions:
     """Options of the segmentation."""
 
-    keys: Path | None = None  # folder with hand-drawn masks or strokes for some frames
+    keys: Path | None = None  # folder with hand-drawn masks or strokes of some frames
     resume: bool = False  # keep finished frames
     jobs: int = 2  # threads
 
@@ -74,7 +74,7 @@ def segment_teeth(
 
 @dataclass(eq=False)
 class _OpenFrame:
-    """A frame being tracked: its images, and the latest masks by camera, None without an image."""
+    """A frame being tracked: its images, and the latest masks by camera, None if there is no image."""
 
     pictures: Pictures
     segments: dict[str, Segment | None] = field(default_factory=dict)
@@ -158,7 +158,7 @@ class _Segmentation:
         save_guide(self._folder, self._guide_inputs, self._guide)
 
     def _find_start(self) -> tuple[int, Array]:
-        """Return the start frame and the poses there, shape (2, 4, 4), by picks or else by search.
+        """Return the start frame and its poses, shape (2, 4, 4), from picks or, without picks, from a search.
 
         Raises:
             TrackingError: the picks are inconsistent, or the teeth were not found.
@@ -229,7 +229,7 @@ class _Segmentation:
             known = {name: model.counts() for name, model in colours.items()}
             with self._opened(frame, pictures) as shown:
                 _, record = next(follow)
-            if (record.status == LOST).any():  # do not learn colours from a wrong place
+            if (record.status == LOST).any():  # do not learn colours from the wrong region
                 for name, model in colours.items():
                     model.restore(*known[name])
             state.save(frame, step)
@@ -262,7 +262,7 @@ class _Segmentation:
         ]
 
     def _learn_and_repeat(self, keyed: Sequence[int]) -> None:
-        """Learn colours and parameters from drawn masks, and segment all frames again at the known poses."""
+        """Learn colours and parameters from drawn masks, then segment all frames again at the known poses."""
         from jawusd.segmentation.learn import learn_numbers
 
         self._new_segmenters(self._journal.known(self._start)[0])
@@ -298,7 +298,7 @@ class _Segmentation:
             if image is None or own is None:
                 return None
             found = self._segmenters[name].segment(image, poses, turn, self._keys.of(name, own))
-            # Skip arches that colours do not show: a mask there would confirm a wrong pose.
+            # Skip arches that were not found by colour: a mask would confirm the wrong pose.
             return None if found is None else found.only(self._guide[frame].found)
 
         shown.segments = dict(zip(self._cameras, self._pool.map(one, self._cameras), strict=True))

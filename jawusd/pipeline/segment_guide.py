@@ -1,4 +1,4 @@
-"""Poses tracked by colour alone, stored beside the masks that were made around them, and compared with tracks."""
+"""Poses tracked by colour alone: stored beside the masks that were segmented around them, and compared with tracks."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ from jawusd.pipeline.subject import registration_of
 if TYPE_CHECKING:
     from jawusd.tracking.region.tracker import RegionPose
 
-# Distance between jaw poses by masks and by colours above which one must be wrong [mm]; correct ones of three takes
-# differed by at most 0.9. Fractions of such or lost frames above which a take is questionable, and unusable.
+# Distance between jaw poses from masks and from colours above which one of them must be wrong [mm]; correct poses of
+# three takes differed by at most 0.9. Fractions of wrong or lost frames above which a take is partly unreliable, and
+# unusable.
 _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 
@@ -78,9 +79,10 @@ def _read(path: Path) -> tuple[dict[int, RegionPose], str]:
 def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[Tracks, list[Finding]]:
     """Combine tracks of automatic masks with the poses tracked by colour; return also findings on their agreement.
 
-    Tracks of other masks are returned as they are. Masks made around a wrong pose confirm it, but colour edges have
-    independent errors, so a disagreement reveals it. Findings: "footage_doubtful" [%] for frames that are lost or in
-    which both differ by more than a millimetre, "footage_unchecked" if there are no such poses.
+    Tracks of other masks are returned unchanged. Masks segmented around a wrong pose confirm that pose; colour edges
+    have independent errors, so the wrong pose is detected as a disagreement. Findings: "footage_doubtful" [%] for
+    frames that are lost or in which the poses differ by more than a millimetre, "footage_unchecked" if there are no
+    poses tracked by colour.
 
     Args:
         landmarks: lower teeth, then condyles, mandible coordinates [mm], shape (5, 3).

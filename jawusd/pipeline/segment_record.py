@@ -29,7 +29,7 @@ FORMAT = "jawusd-segment/1"
 _MAX_LEARNED_BYTES = 1 << 20
 # Masks below this confidence need inspection.
 _DOUBTFUL = 0.5
-# Symptoms of a bad mask, with the sign of worse; each is compared with its median over the take.
+# Symptoms of a bad mask, with the sign of the direction that is worse; each is compared with its median over the take.
 _SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
 _LEAST_SPREAD = {"contrast": 0.03, "unexpected": 0.01, "residual_px": 0.05, "uncovered": 0.01}
 _USUAL_OFF = 3.0  # deviation, in robust sigmas, at which a single symptom halves the confidence
@@ -241,7 +241,7 @@ def _outline_doubt(found: Sequence[CameraEntry]) -> Array:
 
 
 def _off(values: Array, groups: NDArray[np.str_], least_spread: float) -> Array:
-    """Return by how many robust sigmas values (N, 2) exceed the median of their group and arch, shape (N, 2)."""
+    """Return how many robust sigmas values (N, 2) are above the median of their group and arch, shape (N, 2)."""
     out = np.zeros_like(values)
     for group in np.unique(groups):
         of = groups == group
@@ -289,7 +289,7 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
 
 
 def _learned(path: Path) -> Learned | None:
-    """Return the result of learning from drawn masks, None without."""
+    """Return the result of learning from drawn masks, None if there are none."""
     if not path.exists():
         return None
     try:
@@ -314,7 +314,7 @@ def delete_masks(folder: Path) -> None:
     for path in (*state_files(folder), *(folder / name for name in (RECORD, SUMMARY, SHEET, LEARNED))):
         path.unlink(missing_ok=True)
     for path in [*folder.glob("*/upper/*.png"), *folder.glob("*/lower/*.png")]:
-        # Symbolic links may lead out of the folder.
+        # Symbolic links may point outside the folder.
         if path.stem.isdigit() and path.resolve().is_relative_to(folder.resolve()):
             path.unlink()
     for path in [*folder.glob("*/upper"), *folder.glob("*/lower"), *folder.glob("*"), folder]:

@@ -1,4 +1,4 @@
-"""Solve the performance of a subject whose rig exists, and write it: `jawusd solve`."""
+"""Solve a performance of a subject with a rig, and write it: `jawusd solve`."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ class VideoShot:
 
     Attributes:
         cameras: calibrated cameras with a video, by name.
-        footage: their images.
-        take: follows the teeth.
+        footage: the images of these cameras.
+        take: tracks the teeth.
     """
 
     def __init__(
@@ -179,8 +179,8 @@ class SolveSummary(TypedDict):
 
     frames: int
     solved: int
-    carried: list[tuple[int, int]]  # runs of frames, first and last, in which an arch is occluded
-    lost: list[tuple[int, int]]  # runs in which no pose fits the images
+    carried: list[tuple[int, int]]  # runs of frames (first, last) in which an arch is occluded
+    lost: list[tuple[int, int]]  # runs of frames in which no pose fits the images
     within_tolerance: int  # outside the bound, within the tolerance of measured poses
     outside: int  # beyond the tolerance
     cameras: list[str]
@@ -189,7 +189,7 @@ class SolveSummary(TypedDict):
     limits: str  # what limits the accuracy, in words
     focal: NotRequired[
         dict[str, tuple[float, float]]
-    ]  # ratio of estimated to calibrated focal length, with sigma, by camera
+    ]  # estimated over calibrated focal length, and its sigma, by camera
     findings: NotRequired[list[dict[str, str | float | int]]]
 
 
@@ -217,11 +217,11 @@ def solve(
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
         prim: path of the rig's prim, if a stage has several; an animation layer then targets the stage.
         overlay: video to write (.mp4) of the solved scans over all cameras side by side.
-        report: page to write (.html): d with sigma, unseen frames, verdicts, findings and images.
+        report: page to write (.html): d with sigma, frames in which an arch is hidden, verdicts, findings and images.
         fixed_head: the cameras are head-mounted.
-        free_focal: estimate focal lengths; those of the calibration are good to 10 %.
+        free_focal: estimate focal lengths; those of the calibration may be off by 10 %.
         jobs: number of threads; the result does not depend on it.
-        allow_outside: let paths in the capture leave its folder.
+        allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
         FormatError, RigError: the rig cannot be read.
@@ -285,7 +285,7 @@ def write_solved(
 
     Raises:
         OutputError: the file cannot be written.
-        RigError: the rig cannot carry an animation layer.
+        RigError: an animation layer of the rig cannot be written.
     """
     suffix = Path(out).suffix.lower()
     if suffix == ".csv":

@@ -22,7 +22,7 @@ from jawusd.pipeline.report import attempt, camera_facts
 from jawusd.pipeline.state import Progress, make_folder, package_versions
 
 PAGE = ".html"
-_MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # frames shown for each reason, besides a typical one
+_MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # frames drawn for each reason, in addition to a typical frame
 
 
 @explain_missing_packages()
@@ -48,7 +48,7 @@ def report_solve(
         tracks: the .npz that `solve` wrote.
         capture: the shot, its capture.toml or folder; None: a report without images and cameras.
         page: file to write.
-        allow_outside: let paths in the capture leave its folder.
+        allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
         FormatError: the tracks do not come from a solve.
@@ -135,7 +135,7 @@ def _overlays(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> t
 
 
 def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return rows of frames to inspect, each with the reason: unseen, outside, uncertain, or typical.
+    """Return rows of frames to inspect, each with the reason: an arch hidden or lost, outside, uncertain, or typical.
 
     Raises:
         ValueError: the tracks do not come from a solve.

@@ -1,4 +1,4 @@
-"""What a build has finished: `build.json`, content hashes, and the lock of the output folder."""
+"""State of a build: finished stages in `build.json`, content hashes, and the lock of the output folder."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from jawusd.formats.text import parse_json, read_text
 FAMILY, VERSION = "jawusd-build", 1
 BUILD_FILE = "build.json"
 LOCK_FILE = ".jawusd-lock"
-CALIBRATION = "calibration.toml"  # made from the boards when the capture names none
+CALIBRATION = "calibration.toml"  # made from the boards if the capture names no calibration
 LABELS = "labels"  # folder of the labels of scans that are neither painted nor labelled
-FIRST_PASS = "first_pass.npz"  # tracks without the model's help: what the model is fitted to
+FIRST_PASS = "first_pass.npz"  # tracks without the model as a prior, to which the model is fitted
 _CHUNK_BYTES = 1 << 20
-_ENDING_S = 2.0  # a killed build keeps its lock until the system has freed its memory
-_MOST_BYTES = 64 << 20  # of build.json, which names the masks of the longest takes
+_ENDING_S = 2.0  # time to wait for a lock: a killed build keeps it until the system has freed its memory
+_MOST_BYTES = 64 << 20  # of build.json, which lists every mask file of a take
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-# Error numbers of a lock held by another process; any other means that the file system has no locks.
+# Error numbers if another process holds the lock; others mean that the file system does not support locks.
 _HELD = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
 _MAKE_AGAIN = "Run `jawusd build ... --resume` to make it again, or restore the file that the build wrote."
 _AGAIN = "Delete it, or build with --fresh into a new folder."
@@ -78,7 +78,7 @@ R_co = TypeVar("R_co", bound=Mapping[str, object], covariant=True)
 class StageRecord(Generic[R_co]):
     """One finished stage."""
 
-    inputs: str  # hash of everything the stage read: files, configuration, results of earlier stages
+    inputs: str  # hash of all inputs of the stage: files, configuration, results of earlier stages
     outputs: dict[str, str]  # hash by file name, relative to the folder
     seconds: float
     result: R_co  # small results that later stages or reports need
@@ -129,7 +129,7 @@ class BuildState:
         Raises:
             FormatError: it has another type.
         """
-        from jawusd.formats.text import of_kind  # rarely needed
+        from jawusd.formats.text import of_kind  # imported here, as it is rarely needed
 
         record = self.stages.get(stage)
         return None if record is None else of_kind(record.result, kind, stage, self.folder / BUILD_FILE, _AGAIN)
@@ -153,7 +153,7 @@ class BuildState:
         for record in self.stages.values():
             for name in record.outputs:
                 target = (self.folder / name).resolve()
-                # build.json is only a file: never follow a name out of the folder.
+                # build.json may have been edited: never follow a path out of the folder.
                 if target.is_relative_to(self.folder.resolve()):
                     target.unlink(missing_ok=True)
         (self.folder / BUILD_FILE).unlink(missing_ok=True)
@@ -196,10 +196,10 @@ def changed_files(folder: Path) -> list[Finding]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that may exist.
+    """Create a folder unless it exists.
 
     Raises:
-        OutputError: it cannot be made, or OpenUSD could not follow its path.
+        OutputError: it cannot be created, or OpenUSD could not open files at its path.
     """
     check_path(path, OutputError)
     try:
@@ -212,7 +212,7 @@ def make_folder(path: Path) -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Lock the output folder for one build; the system releases the lock when the process ends, even if it is killed.
 
-    Temporary files of a killed build are deleted. A file system without locks gets a warning.
+    Temporary files of a killed build are deleted. If the file system does not support locks, a warning is issued.
 
     Raises:
         OutputError: the folder cannot be written, another build holds the lock, or its labels folder is a link.

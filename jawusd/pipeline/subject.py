@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 TEETH = {"upper": "upper_teeth", "lower": "lower_teeth"}
 
 # Fraction of the crown border without a crease above which the labels need review. Of 58 synthetic scans, all 51 with a
-# mean border error below 0.3 mm are below it; plaster casts of patients have 0.07 to 0.11, a toothless one 0.77.
+# mean border error below 0.3 mm are below it; plaster casts of patients have 0.07 to 0.11, one without teeth 0.77.
 _WEAK_SHARE = 0.15
 
 Origin = Literal["file", "paint", "shape"]
@@ -42,8 +42,8 @@ class LabelledScan:
     path: Path  # file of the scan
     mesh: Mesh  # with labels, unless painted
     origin: Origin
-    labels: ScanLabels | None  # None for paint
-    shape: Labelling | None  # labelling by shape, if it was needed
+    labels: ScanLabels | None  # None if the scan is painted
+    shape: Labelling | None  # labelling by shape, if there were neither paint nor labels
     findings: tuple[Finding, ...]
 
 
@@ -54,7 +54,7 @@ def label_teeth(
 
     Args:
         meshes: by the names in `MESHES`.
-        files: their files.
+        files: mesh files by the same names.
         folder: of the label files; None: beside the scans.
         ignore_files: ignore existing label files.
 
@@ -132,7 +132,7 @@ MESHES = ("upper_teeth", "lower_teeth", *BONES)
 def load_meshes(capture: Capture) -> dict[str, Mesh]:
     """Read the scans and bones of a capture, by the names in `MESHES` [mm, scan frame]; bones may be missing.
 
-    The teeth scans carry labels unless they are painted.
+    The teeth scans have labels unless they are painted.
 
     Raises:
         CaptureError: a mesh is corrupt, or its size is implausible in mm.
@@ -201,7 +201,7 @@ def registration_of(meta: Mapping[str, object]) -> Array | None:
 class Subject:
     """A person: anatomical axes, landmarks and meshes, for fitting and reports."""
 
-    name: str  # of the subject or the capture
+    name: str  # name of the subject or the capture
     T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
     landmarks: Array  # `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3)
     meshes: Mapping[str, Mesh]  # by the names in `MESHES`, scan frame [mm]; may be empty
@@ -210,7 +210,7 @@ class Subject:
     inferred: tuple[str, ...] = ()  # quantities derived from the meshes instead of given
 
     def measured_points(self) -> Array | None:
-        """Return the points for which errors are measured [mm], shape (V, 3): mandible, else lower teeth, else None."""
+        """Return the points at which errors are measured [mm], shape (V, 3): of mandible, or lower teeth, or None."""
         for name in ("mandible", "lower_teeth"):
             if name in self.meshes:
                 return self.meshes[name].vertices

@@ -56,7 +56,7 @@ class TrackSummary(TakeNotes):
 
 
 class ArchSummary(TypedDict):
-    """Tracking of one arch in a frame; of a lost arch also the figure that failed, and its limit."""
+    """Tracking of one arch in a frame; for a lost arch also the quantity that failed its check, and the limit."""
 
     status: str
     masks_used: list[str]
@@ -89,20 +89,20 @@ def track(
     allow_outside: bool = False,
     progress: Progress | None = None,
 ) -> Tracks:
-    """Track both arches of a capture, by its masks or else its videos, and optionally write the tracks.
+    """Track both arches of a capture, in its masks or, without masks, in its videos; optionally write the tracks.
 
     Args:
         capture: the capture, its capture.toml or its folder.
         out: `tracks.npz` to write.
         solver: "contour", or "paper" for the paper's method, for comparison.
-        backend: where the paper's method draws, "cpu" or "gl".
+        backend: renderer of the paper's method, "cpu" or "gl".
         model: jaw model of this subject, used as a prior to track uncertain frames again.
         overlay: folder, or .mp4 file, for videos with the tracked scans over the footage; see `write_overlay`.
         jobs: number of threads; the result does not depend on it.
-        allow_outside: let paths in the capture leave its folder.
+        allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
-        FormatError, CaptureError: the capture cannot be read, or a mask or video in it.
+        FormatError, CaptureError: the capture, or one of its masks or videos, cannot be read.
         SyncError: the cameras cannot be aligned in time.
         TrackingError: the teeth are not found.
         OutputError: a file cannot be written.
@@ -177,7 +177,7 @@ def first_pass(
 def model_pass(
     capture: Capture, offsets: dict[str, int], tracks: Tracks, model: JawModel, jobs: int, progress: Progress
 ) -> Tracks:
-    """Track uncertain frames again with the fitted model as a prior, or combine colour-tracked poses with it.
+    """Track uncertain frames again with the fitted model as a prior; combine poses tracked by colour with the prior.
 
     Parameters and errors as `track`.
 
@@ -238,7 +238,7 @@ def track_summary(tracks: Tracks) -> TrackSummary:
 
 
 def lost_reasons(tracks: Tracks) -> dict[str, dict[str, int]]:
-    """Return how many frames each arch lost for each recorded reason."""
+    """Return the number of lost frames by arch and recorded reason."""
     out = {}
     for arch, name in enumerate(("upper", "lower")):
         reasons = tracks.lost_reason[tracks.status[:, arch] == LOST, arch]

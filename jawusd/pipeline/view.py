@@ -31,7 +31,7 @@ CAPTURED = "captured take"
 
 _TRACKS = "tracks.npz"
 _ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
-_MOST_FACES = 8_000  # per mesh; smooth in a browser without a graphics card
+_MOST_FACES = 8_000  # per mesh; renders smoothly in a browser without a GPU
 
 
 @explain_missing_packages()
@@ -81,7 +81,7 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
 
 
 class ContactView:
-    """Draws the contacts of a rig's teeth; the scans are loaded with the first image."""
+    """Renderer of the contacts of a rig's teeth; the scans are loaded for the first image."""
 
     def __init__(self, path: Path, rig: JawRig, prim: str) -> None:
         self._path, self._rig, self._prim = path, rig, prim

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 CAPTURE_FILE = "capture.toml"
 _TRACKS = "tracks.npz"
 _SPECKS_PERCENT = 0.5
-_TILE_PX = (480, 360)  # size of each camera's tile; three fill the width of the page
+_TILE_PX = (480, 360)  # size of each camera's tile; three tiles fill the width of the page
 _FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
 
 
@@ -74,7 +74,7 @@ def viewed_capture(
     Args:
         path: capture.toml or its folder.
         tracks: folder of a build of the capture, or tracks.npz; None: the footage alone.
-        allow_outside: let paths in the capture leave its folder.
+        allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
         FormatError: the capture or the tracks cannot be read, or the tracks belong to other cameras.

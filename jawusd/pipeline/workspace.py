@@ -34,8 +34,8 @@ class Stage(Generic[R_co]):
     """One stage of a build.
 
     Attributes:
-        name: in build.json and in progress.
-        result: type of its result in build.json.
+        name: name in build.json and in progress messages.
+        result: type of the stage's result in build.json.
         seconds, seconds_per_picture: estimate for `--dry-run` on one core of 2.5 GHz, measured on two captures of three
             cameras at 1280 x 720 and 1920 x 1080.
     """
@@ -47,18 +47,18 @@ class Stage(Generic[R_co]):
 
 
 class StageMissing(Exception):
-    """Signal that a stage of a dry run would have to run."""
+    """Raised by a dry run when a stage would have to run."""
 
 
 class Workspace:
     """Run stages over one capture and record them; stages whose inputs have not changed are reused.
 
     Attributes:
-        capture: with the scan labels and the calibration that earlier stages have made.
-        folder: of the build.
+        capture: the capture, with the scan labels and the calibration from earlier stages.
+        folder: folder of the build.
         state: the record of finished stages, build.json.
         progress: called with (stage, done, total).
-        reused: names of the stages that did not have to run.
+        reused: names of the stages that were reused.
     """
 
     def __init__(
@@ -90,9 +90,10 @@ class Workspace:
         """Run a stage, or reuse its record.
 
         Args:
-            parts: of the capture that it reads, by the names of `capture_inputs.input_files`.
-            settings: everything else its result depends on: options, and the inputs and outputs of earlier stages.
-            work: returns the files written, inside the folder, and the result for build.json.
+            parts: parts of the capture that it reads, by the names of `capture_inputs.input_files`.
+            settings: all else on which its result depends: options, and inputs and outputs of earlier stages.
+            work: function that runs the stage; returns the files written, inside the folder, and the result for
+                build.json.
 
         Raises:
             CaptureError: an input changed while the stage ran; it is not recorded.
@@ -114,14 +115,14 @@ class Workspace:
         return self.state.finish(stage.name, inputs, outputs, time.perf_counter() - start, result)
 
     def _refuse_changes(self, stage: str) -> None:
-        """Refuse to record a stage whose inputs were edited while it ran, as the version it read is unknown.
+        """Raise an error if inputs of a stage were edited while it ran, as it is unknown which version it read.
 
         Edits of capture.toml that change no value are ignored.
         """
         changed = self._watch.changed()
         try:
             same = self._read_capture() == self._opened
-        except JawusdError:  # an editor is saving it
+        except JawusdError:  # an editor may be saving the file
             same = False
         if changed or not same:
             raise CaptureError(
@@ -146,7 +147,7 @@ def opened(
     """Open the folder of a build and hold its lock.
 
     Args:
-        read_capture: reads the capture, before the folder is made and again after each stage.
+        read_capture: function that reads the capture, before the folder is created and again after each stage.
         resume: continue an earlier build in the folder.
         fresh: delete an earlier build in the folder first.
 

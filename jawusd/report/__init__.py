@@ -1,4 +1,5 @@
 """The HTML reports of builds and solves, with their verdicts and figures.
 
-Reads `formats` and `evaluator` objects; imports no other stage, and no drawing code outside `style` and `figures`.
+Its inputs are `formats` and `evaluator` objects. It imports no other stage, and drawing code only in `style` and
+`figures`.
 """

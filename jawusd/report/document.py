@@ -37,8 +37,8 @@ def write_document(
     """Write the report to an HTML file; return its summary.
 
     Args:
-        figures: plots by their slot on the page, by default those of `draw_figures`. The experiments' plots come from
-            `paper.figures.inline_figures`.
+        figures: plots by their slot on the page; by default those of `draw_figures`. Plots of the experiments are made
+            by `paper.figures.inline_figures`.
 
     Raises:
         OutputError: the file cannot be written.
@@ -86,7 +86,7 @@ def page_environment() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda value: shown(value) if type(value) is str else value,  # our own HTML is Markup
+        finalize=lambda value: shown(value) if type(value) is str else value,  # this package's HTML is of type Markup
     )
     environment.filters |= {"worded": worded, "figure": figure}
     return environment
@@ -94,7 +94,7 @@ def page_environment() -> jinja2.Environment:
 
 def worded(text: str) -> Markup:
     """Return a sentence as HTML, with text in backticks as code."""
-    parts = re.split(r"`([^`]*)`", shown(text))  # odd elements are code
+    parts = re.split(r"`([^`]*)`", shown(text))  # elements with odd indices are code
     return Markup().join(Markup("<code>{}</code>").format(p) if k % 2 else escape(p) for k, p in enumerate(parts))
 
 
@@ -222,7 +222,7 @@ def _drawn(meta: TracksMeta, camera: str) -> str:
 
 
 def _bite(data: ReportData) -> str:
-    """Return what the take shows about the annotated gum line and about the closed bite."""
+    """Return what was estimated from the take about the annotated gum line and the closed bite."""
     meta, said = data.tracks.meta, []
     if "gum_line_mm" in meta:
         upper, lower = meta["gum_line_mm"]

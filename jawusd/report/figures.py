@@ -36,14 +36,14 @@ from jawusd.report.style import (
 )
 from jawusd.report.verdicts import GOOD, LOOK
 
-_COLUMNS = 1200  # most points per curve; longer takes show the extreme of every few frames
+_COLUMNS = 1200  # most points per curve; of longer takes, the extreme of every few frames is drawn
 _LANES = ("tracked", "recovered", "without a camera", "lost", "regularised")
 _LANE_COLORS = (GREEN, SKY, ORANGE, VERMILION, BLUE)
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, BLACK, GREY)
-_AROUND_FRAMES = 12  # frames shown before and after a flash
-_APART_FRAMES = 48  # steps farther apart are separate flashes
-_QUANTILE = 99.5  # per cent; robust to single outliers
-_NEAR_CLOSED_MM = 5.0  # protrusion is measured at smaller openings, as clinicians do
+_AROUND_FRAMES = 12  # frames drawn before and after a flash
+_APART_FRAMES = 48  # light steps farther apart than this are separate flashes
+_QUANTILE = 99.5  # percentile that is robust to single outliers
+_NEAR_CLOSED_MM = 5.0  # largest opening at which protrusion is measured, as in clinical practice
 
 
 RANGES = "ranges"  # file name of the figure of several actors
@@ -54,7 +54,7 @@ _PARAMETERS = {
     "protrusion": ("protrusion d3, + forward", SKY),
 }
 _ROW_IN, _MARGINS_IN = 0.22, 0.9
-_MOST_ROWS = 400  # programs cannot open taller images
+_MOST_ROWS = 400  # most actors drawn; common programs cannot open taller images
 
 
 def tracking_figure(tracks: Tracks) -> Figure:
@@ -164,8 +164,8 @@ def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | Non
     """Plot the brightness of all clips to a PNG or SVG file: whole clips, and around the first and last flash.
 
     Args:
-        offsets: frame k of a camera shows the instant of frame k + offset of the reference camera; None plots the
-            clips only as recorded.
+        offsets: frame k of a camera is simultaneous with frame k + offset of the reference camera; None: plot the clips
+            only as recorded.
 
     Raises:
         OutputError: the file cannot be written.
@@ -226,7 +226,7 @@ def _flashes(curves: Mapping[str, LightCurve], shifts: Mapping[str, int]) -> lis
 
 @dataclass(frozen=True)
 class RangeRow:
-    """Range of one movement compared with that of about 95 % of people; the grade is "good" or "look"."""
+    """Range of one movement, compared with the range of about 95 % of people; the grade is "good" or "look"."""
 
     name: str
     found: str
@@ -236,7 +236,7 @@ class RangeRow:
     grade: str
 
 
-# Lowest and highest usual value: mean -+ 2 SD, over both sexes if published separately.
+# Lowest and highest usual value: mean -+ 2 SD; the extremes over both sexes where they were published separately.
 _REFERENCE = {
     "opening at the incisors": (
         36.0,

@@ -35,7 +35,7 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
     fitted = np.full((len(rows), 4, 4), np.nan)
     known = np.all(np.isfinite(d), axis=1)
     fitted[known] = JawRig(model.arrays, model.meta).pose(d[known])
-    # The view is framed on the jaw without the skull.
+    # The camera is fitted to the jaw without the skull.
     jaw = [part.mesh.vertices for part in data.parts if part.name != "skull"] or [data.parts[0].mesh.vertices]
     low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
     A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]

@@ -26,12 +26,12 @@ from jawusd.report.document import package_file, page_environment
 from jawusd.report.figures import larger_magnitude, legend_beside, runs, thinned
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, VERMILION, inline_svg, new_figure
 
-#: Colours of the states: close to those in the images, and legible on light and dark pages.
+#: Colours of the states: close to those in the images, but legible on light and dark pages.
 STATE_INKS = {SolveState.SOLVED: GREEN, SolveState.CARRIED: ORANGE, SolveState.LOST: MAGENTA}
 _NAMES = ("d1 opening", "d2 laterotrusion,\nleft is positive", "d3 protrusion,\nforward is positive")
 _INKS = (BLACK, BLUE, VERMILION)
 _STYLES = ("-", "--", ":")
-_BAND = 2.0  # sigmas: 95 % of normal errors
+_BAND = 2.0  # half width of the band [sigma]: 95 % of normally distributed errors
 _UNOBSERVED = (SolveState.CARRIED, SolveState.LOST)
 _LISTED = 60  # most runs listed
 
@@ -225,7 +225,7 @@ def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
 
 
 def _sentence(solved: SolvedJaw, doubts: bool) -> str:
-    """Return a summary of what to inspect; it applies no limits of its own."""
+    """Return a sentence on what to inspect, based on existing verdicts only."""
     said = []
     if (solved.state == SolveState.LOST).any():
         said.append("some frames are lost: inspect their masks")

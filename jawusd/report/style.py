@@ -34,7 +34,7 @@ SETTINGS: dict[RcKeyType, object] = {
 }
 DPI, _INLINE_DPI = 150, 110
 _PX_PER_PT = 4 / 3
-# Colours replaced by variables of the page's style sheet; white is the background of text.
+# Colours that are replaced by variables of the page's style sheet; white is the background behind text.
 _THEMED = {
     BLACK: "ink",
     "#ffffff": "paper",
@@ -81,7 +81,7 @@ def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = Fal
     """Return a figure encoded as a file type, without dates and versions, so that equal figures give equal bytes."""
     drawn = io.BytesIO()
     metadata = {"Software": None} if kind == "png" else {"Date": None}
-    for text in figure.findobj(Text):  # show names literally: no control characters, no $ as math
+    for text in figure.findobj(Text):  # draw names literally: without control characters, and with $ not parsed as math
         text.set_text("\n".join(map(shown, text.get_text().split("\n"))))
         text.set_parse_math("$" not in text.get_text())
     with matplotlib.rc_context(SETTINGS):
@@ -96,7 +96,7 @@ def inline_svg(figure: Figure, key: str, words: str) -> Markup:
     """
     text = figure_bytes(figure, "svg", _INLINE_DPI, transparent=True).decode()
     text = text[text.index("<svg") :]
-    # Remove elements not needed in a page; the style would also apply outside the figure.
+    # Remove elements that a page does not need; the style would also apply outside the figure.
     text = re.sub(r"<metadata>.*?</metadata>|<style[^>]*>.*?</style>", "", text, flags=re.DOTALL)
     head, body = text.split(">", 1)
     width = float(head.split('width="', 1)[1].split('pt"', 1)[0])

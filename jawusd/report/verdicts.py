@@ -14,7 +14,7 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks, used_coverage
 
-#: Grades, best first; "open" means that there is nothing to judge.
+#: Grades, best first; "open" means that there are no data to judge.
 GOOD, LOOK, BAD, OPEN = "good", "look", "bad", "open"
 WORDS = {GOOD: "good", LOOK: "needs review", BAD: "poor", OPEN: "not judged"}
 MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
@@ -23,7 +23,7 @@ MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
 _PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
 _UNKNOWN = "not known"
 _EXERCISES = "full opening, slides to both sides and protrusion, closed and half open"
-# Names of findings of tracks.
+# Kinds of findings in tracks.
 _UNUSED = {"camera_without_masks", "masks_black", "camera_not_used", "camera_rarely_used"}
 _WRONG_SCANS = {"scan_misfit", "scans_mirrored"}
 _LACKING = {"take_lacks", "not_shown"}  # fit warnings about movements that are missing or too small
@@ -59,7 +59,7 @@ _SENTENCES = {
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one check: the value with unit, the limits of good and acceptable, and a grade of `WORDS`."""
+    """Result of one check: the value with unit, the limits for good and acceptable, and a grade of `WORDS`."""
 
     name: str
     found: str
@@ -178,7 +178,8 @@ def _track(tracks: Tracks) -> Verdict:
     wrong = [one.message for one in found if one.kind in _WRONG_SCANS]
     if wrong:
         checks.append(Check("scans", " ".join(wrong), "match the masks", BAD))
-    # False alarms: 7 of 30 valid subjects (`population.py --persons 30 --seed 9500`), 3 of them with a true underbite.
+    # False positives: 7 of 30 valid subjects (`population.py --persons 30 --seed 9500`), 3 of them with a true
+    # underbite.
     others = [one.line() for one in found if one.severity == "warning" and one.kind not in _UNUSED | _WRONG_SCANS]
     if others:
         checks.append(Check("warnings", " ".join(others), "none", LOOK))
@@ -242,7 +243,7 @@ def _bounds(data: ReportData) -> Verdict:
                 "times",
             )
         )
-    # Use the experiments' numbers, so that the verdict agrees with the plot.
+    # Use the values of the experiments, so that the verdict agrees with the plot.
     warned = [w["message"] for w in meta.get("warnings", []) if w["code"] in _LACKING]
     lacks = data.experiments.coverage.sentences if data.experiments else warned
     checks += [Check("captured movements", sentence, _EXERCISES, LOOK) for sentence in lacks]
@@ -252,7 +253,7 @@ def _bounds(data: ReportData) -> Verdict:
     return _verdict("bounds", checks)
 
 
-# Limits of the pose table's error [mm]. The worst vertex of rigs of 11 subjects was off by 0.007 to 0.136 mm
+# Limits of the pose table's error [mm]. The largest vertex errors of rigs of 11 subjects were 0.007 to 0.136 mm
 # (`tests/benchmarks/contact.py`).
 _TABLE_MM = (0.06, 0.5)
 

@@ -1,5 +1,6 @@
 """The browser viewer: pose, drag and key a jaw rig; inspect a capture's footage and poses, and set its picks.
 
 `session`, `motion`, `readouts`, `plots`, `take_plots`, `viewed` and `picking` do not depend on viser; `scene`, the
-panels, the pages and `server` do. The viewer never imports another stage: `viewed` holds the functions it calls.
+panels, the pages and `server` do. The viewer does not import other stages: the functions that it calls are passed in
+through `viewed`.
 """

@@ -23,9 +23,9 @@ from jawusd.viewer.viewed import Region, ViewedCapture
 from jawusd.viewer.widgets import begin_panel, errors_shown, guarded, limit_uploads
 
 _PANEL_PX = 370
-_SLOW_S = 0.3  # show "loading" when an image takes longer
-_USUAL_MM, _USUAL_WEIGHT = 250.0, 1e-3  # prior on the distance from a camera to the mouth
-_SPACE_SIDE = (0.9, -0.7, 0.0)  # offset of the 3-D view direction from that of the first camera
+_SLOW_S = 0.3  # time after which "loading" is displayed
+_USUAL_MM, _USUAL_WEIGHT = 250.0, 1e-3  # mean and weight of the prior on the distance from a camera to the mouth
+_SPACE_SIDE = (0.9, -0.7, 0.0)  # offset of the 3-D view's direction from that of the first camera
 
 
 class CapturePage:
@@ -33,9 +33,9 @@ class CapturePage:
 
     Attributes:
         footage, picks, labels: the panels.
-        layout: layout of the image shown; None before the first one.
-        poses: T_page_scan (4, 4) of the scans shown, by arch.
-        drawn: number of the last state drawn.
+        layout: layout of the current image; None before the first one.
+        poses: T_page_scan (4, 4) of the displayed scans, by arch.
+        drawn: number of the state drawn last.
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
@@ -159,7 +159,7 @@ class CapturePage:
         if aspect < PHONE:
             points = np.vstack(
                 [points, points - np.ptp(points @ UP) * np.array(UP)]
-            )  # leave the lower half to a phone's panel
+            )  # on a phone, the panel covers the lower half
         self.scene.look(*fit_view(points, away, UP, aspect))
 
     def _poses_at(self, frame: int) -> tuple[Array, Array] | None:
@@ -220,7 +220,7 @@ class CapturePage:
         axes = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
         across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
         centres = np.stack([camera.centre_world() for camera in cameras])
-        # Nearly parallel axes do not determine the distance; a weak prior at the usual distance does.
+        # A weak prior determines the distance if the axes are nearly parallel.
         usual = centres[0] + _USUAL_MM * axes[0]
         A = across.sum(axis=0) + _USUAL_WEIGHT * np.eye(3)
         met = np.linalg.solve(A, np.einsum("nij,nj->i", across, centres) + _USUAL_WEIGHT * usual)

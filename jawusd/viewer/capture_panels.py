@@ -43,7 +43,7 @@ class FootagePanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Add the widgets to the current container; call `turned` for another view, `changed` for other changes."""
+        """Add the widgets to the current container; call `turned` after a change of view, `changed` after others."""
         self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
         self._loading = False
         self.view = next(iter(capture.sizes_px))
@@ -87,12 +87,12 @@ class FootagePanel:
 
     @property
     def on_wall(self) -> bool:
-        """Return whether the view shows all cameras side by side."""
+        """Return whether the view is that of all cameras side by side."""
         return self.view == ALL
 
     @property
     def look(self) -> Look:
-        """Return what is drawn into the images."""
+        """Return the options for drawing the scans into the images."""
         return _LOOKS[self._look.value]
 
     def _draw_plot(self, tracks: Tracks) -> Plot:
@@ -119,7 +119,7 @@ class FootagePanel:
             self.refresh()
 
     def follow(self, frame: int) -> None:
-        """During playback, update the widgets to the frame just drawn, so that they never run ahead of the image."""
+        """During playback, set the widgets to the frame just drawn, so that they are never ahead of the image."""
         if self.player.playing:
             self._show(frame)
 
@@ -159,7 +159,7 @@ class FootagePanel:
         self.player.start(float(self.frame), self._capture.fps, span, lambda: bool(self.loop.value))
 
     def _play_to(self, frame: float) -> None:
-        """Show the frame of a playback time; the page draws as many frames as it can."""
+        """Show the frame of a playback time; frames are skipped if the page cannot draw all."""
         shown = min(int(frame), self._capture.frames[1])
         if shown != self.frame:
             self.frame = shown
@@ -191,7 +191,7 @@ class PicksPanel:
     Attributes:
         book: the picks.
         side: side of the scans facing the viewer, one of `picking.SIDES`.
-        scans_shown: whether there are scans in front of the image.
+        scans_shown: whether scans are drawn in front of the image.
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class PicksPanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Add the widgets to the current container; call `turned` for another side, `changed` for other picks."""
+        """Add the widgets to the current container; call `turned` after a change of side, `changed` after others."""
         self._client, self._capture, self._footage = client, capture, footage
         self._turned, self._changed = turned, changed
         self.book, self.side = PickBook(capture.picks), "front"

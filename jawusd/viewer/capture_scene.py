@@ -19,8 +19,8 @@ ENAMEL, GUM, BASE = (236, 229, 212), (196, 112, 108), (120, 135, 165)
 ARCH_COLORS, SELECTED = {"upper": (255, 170, 0), "lower": (0, 200, 255)}, (255, 60, 200)
 #: Up direction of the page.
 UP = (0.0, -1.0, 0.0)
-_MOST_FACES = 7_000  # drawn per part of an arch; clicks are tested against the full scan
-_MOST_PAINTED_FACES = 25_000  # the same while labels are edited
+_MOST_FACES = 7_000  # faces drawn per part of an arch; clicks are tested with the full scan
+_MOST_PAINTED_FACES = 25_000  # the same while labels are being edited
 _JPEG_QUALITY = 88
 _THUMB_PX = 480
 _FRUSTUM_MM = 60.0  # distance from a camera's centre to its image
@@ -35,7 +35,8 @@ class CaptureScene:
     """3-D scene of a capture in one page.
 
     Attributes:
-        T_page_world: the page has the axes of the first camera, so that images are upright, shape (4, 4).
+        T_page_world: world to page frame, which has the axes of the first camera, so that images are upright, shape (4,
+            4).
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
@@ -63,7 +64,7 @@ class CaptureScene:
             f"/space/{name}",
             fov=float(2 * np.arctan(y)),
             aspect=width / height,
-            scale=float(_FRUSTUM_MM * np.cbrt(y * y * width / height / 3)),  # viser's scale fixes the volume
+            scale=float(_FRUSTUM_MM * np.cbrt(y * y * width / height / 3)),  # viser's scale sets the frustum's volume
             thickness=0.6,
             color=_FRUSTUM_COLOR,
             wxyz=wxyz_from_matrix(T[:3, :3]),

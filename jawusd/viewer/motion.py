@@ -1,4 +1,4 @@
-"""Motion on a timeline: clips of parameters over frames, the keys they are made of, and playback."""
+"""Motion on a timeline: clips of parameters over frames, the keys of clips, and playback."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jawusd.formats.keys import Key
 #: Keys of an animation, in the order of their frames.
 KeyTrack = tuple[Key, ...]
 
-_MOST_PER_S = 30.0  # updates per second; limits network load
+_MOST_PER_S = 30.0  # most updates per second, to limit network load
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def at_frames(keys: KeyTrack, frames: Sequence[float]) -> KeyTrack:
     """Return the keys moved to other frames, in the same order.
 
     Raises:
-        FormatError: the numbers of frames and keys differ, or two keys would share a frame.
+        FormatError: the numbers of frames and keys differ, or two keys would have the same frame.
     """
     if len(frames) != len(keys) or len(set(frames)) != len(keys):
         raise FormatError(f"{len(set(frames))} frames for {len(keys)} keys: every key needs its own frame.")

@@ -22,7 +22,7 @@ from jawusd.viewer.widgets import Choice, assign, guarded, limit_uploads, notify
 
 KEYS = "keys"
 _LENGTH = 100
-_MOST_THUMBS = 40  # no multi-slider for more keys than this
+_MOST_THUMBS = 40  # most keys for which there is a multi-slider
 
 
 class MotionPanel:
@@ -127,7 +127,7 @@ class MotionPanel:
             except Exception:
                 assign(self.source, KEYS)
                 raise
-        if self.source.value == name:  # another one may have been selected while the file was read
+        if self.source.value == name:  # another motion may have been selected while the file was read
             self._begin(self.clip())
 
     def _begin(self, clip: Clip | None) -> None:
@@ -268,7 +268,7 @@ class FilePanel:
 
 
 def _written(write: Callable[[Path], None], name: str) -> bytes:
-    """Return the bytes a function writes to a file."""
+    """Return the bytes that a function writes to a file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         write(path)

@@ -30,7 +30,7 @@ _PLOT_HELP = (
 
 
 class StaticPlots:
-    """Static parts of a rig's plots, drawn once for all pages."""
+    """The static parts of a rig's plots, drawn once for all pages."""
 
     def __init__(self, rig: JawRig) -> None:
         """Draw the four plots of a rig."""
@@ -40,7 +40,7 @@ class StaticPlots:
 
 
 class PlotPanel:
-    """Plots of one page that follow the jaw: bounds and Posselt's figures."""
+    """Plots of one page in which the current pose is marked: bounds and Posselt's figures."""
 
     def __init__(self, client: viser.ClientHandle, rig: JawRig, static: StaticPlots) -> None:
         """Add the panel, docked on the left."""

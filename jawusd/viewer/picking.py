@@ -1,7 +1,7 @@
 """Picks of one visitor, and the layout of image and scans in which they are made.
 
 The layout frame has x to the right, y down and z away from the camera, in mm. The image lies in z = 0, centred on the
-origin, scaled so that its teeth are about as large as the scans.
+origin, and is scaled so that its teeth are about as large as the scans.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.viewed import Region
 
 ARCHES = ("upper", "lower")
-_FEWEST, _FEWEST_VIEWS = 3, 2  # picks per arch, views per pick
+_FEWEST, _FEWEST_VIEWS = 3, 2  # least number of picks per arch, and of views per pick
 FOV_RAD = 0.35
-#: Rotation of the scans about the subject's vertical and transverse axis [deg] by the side facing the viewer.
+#: Rotation of the scans about the subject's vertical and transverse axis [deg], by the side that faces the viewer.
 SIDES = {"front": (0.0, 0.0), "left": (-60.0, 0.0), "right": (60.0, 0.0), "biting side": (0.0, 65.0)}
 _TEETH_MM = 60.0  # width of a region around the teeth in the layout
 _GAP_MM = 5.0
-_EDGE = 1e-9  # tolerance, so that no ray slips between two faces
+_EDGE = 1e-9  # tolerance, so that rays cannot pass between adjacent faces
 _MARGIN = 1.05
 
 
@@ -45,7 +45,7 @@ class PickBook:
 
     Attributes:
         picks: the picks in the order they were made.
-        frame: frame of the reference camera that all pixels belong to; None before the first pixel.
+        frame: frame of the reference camera to which all pixels belong; None before the first pixel.
         selected: index of the pick whose pixel the next click sets; None without picks.
     """
 
@@ -116,7 +116,7 @@ class PickBook:
         self.picks, self.frame, self.selected = [], None, None
 
     def missing(self) -> str:
-        """Return what is missing before the picks can be written; "" when they are complete."""
+        """Return what is missing until the picks can be written; "" if they are complete."""
         for arch in ARCHES:
             whole = sum(len(pick.views) >= _FEWEST_VIEWS for pick in self.picks if pick.arch == arch)
             if whole < _FEWEST:
@@ -225,7 +225,7 @@ def region_around(points_px: ArrayLike, size_px: tuple[int, int]) -> Region:
 
 
 def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: ArrayLike) -> tuple[int, float] | None:
-    """Return the vertex nearest to a world ray's hit on a posed scan and the hit's distance [mm]; None if missed."""
+    """Return the vertex nearest to a world ray's hit on a posed scan, and the hit's distance [mm]; None if missed."""
     inverse = se3_inverse(T_world_scan)
     o = transform_point(inverse, np.asarray(origin, dtype=np.float64))
     d = inverse[:3, :3] @ np.asarray(direction, dtype=np.float64)

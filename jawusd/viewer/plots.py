@@ -16,7 +16,7 @@ from jawusd.evaluator import JawRig
 from jawusd.viewer.motion import Clip, KeyTrack
 from jawusd.viewer.readouts import INCISOR, border_path, captured_d, landmark_places, rest_places
 
-# Okabe and Ito's colour-blind safe palette, also used for the jaw in 3-D.
+# Okabe and Ito's colour-blind safe palette, also used for the 3-D jaw.
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"
 CURVE_COLORS = (BLUE, VERMILION, GREEN)
 
@@ -127,7 +127,7 @@ def with_playhead(plot: Plot, frame: float) -> str:
 def plot_seek(drawn: str, ends: tuple[float, float], across: tuple[float, float], slider: str) -> str:
     """Return the HTML of a plot in which a click or drag sets a frame slider to the frame under the pointer.
 
-    viser does not report clicks in a plot, so the page emulates typing into the slider's input.
+    viser does not report clicks in a plot, so the page emulates keyboard input to the slider.
 
     Args:
         drawn: SVG of the plot, one element.

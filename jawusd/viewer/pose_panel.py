@@ -24,7 +24,7 @@ from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, guarded, sm
 STEP_MM = 0.01
 NAMES = ("opening", "laterotrusion", "protrusion")
 _HINTS = (
-    "Opening d1 [mm] along this person's own path.",
+    "Opening d1 [mm] along this subject's own path.",
     "Laterotrusion d2 [mm] at the incisal point, + to the subject's left.",
     "Protrusion d3 [mm] relative to this person's opening path, which itself leads backwards: + in front, - behind.",
 )
@@ -36,7 +36,7 @@ _MARGIN_HELP = "Distance of the pose from this person's bound, in d; negative ou
 _CAPTURED_HELP = "Distance in d to the nearest captured pose: the larger it is, the more the model extrapolates."
 _VALID_HELP = "Valid range of this parameter at the current values of the others."
 _MOVED_HELP = "Displacement from the closed bite, in anatomical axes: to the subject's left, down, forward."
-# Fraction by which sliders extend beyond the ranges of the rig while poses outside are allowed.
+# Extension of the sliders beyond the rig's ranges if poses outside are allowed, as a fraction of the range.
 _BEYOND = 0.25
 _PINNABLE = tuple(name for name in LANDMARKS if not name.startswith("molar"))
 _LEGEND = "<br>".join(
@@ -119,7 +119,7 @@ class PosePanel:
         self._scene.show_paths(event.target.value)
 
     def refresh(self, readout: Readout) -> None:
-        """Update sliders, pins and numbers from the session."""
+        """Update sliders, pins and read-outs from the session."""
         session = self._session
         limits = session.limits()
         ends = slider_ends(limits, session.rig.d_range, session.keep_valid)
@@ -154,14 +154,14 @@ def _outwards(value: float, sign: int) -> float:
 
 
 def verdict_html(readout: Readout) -> str:
-    """Return HTML that says in words and colour whether a pose is inside the bound."""
+    """Return HTML that states in words and colour whether a pose is inside the bound."""
     color, verdict = (GREEN, "inside the bound") if readout.inside else (VERMILION, "OUTSIDE the bound")
     margin = f'<span title="{_MARGIN_HELP}">margin {_plain(readout.margin_mm)} mm</span>'
     return small_text(f'<b style="color:{color}">&#9679; {verdict}</b>, {margin}', "padding-top:6px")
 
 
 def reading_html(readout: Readout, d: tuple[float, float, float], limits: Array) -> str:
-    """Return the numbers of a pose as HTML."""
+    """Return the measures of a pose as HTML."""
     captured = f"{readout.captured_mm:.2f} mm" if math.isfinite(readout.captured_mm) else "no captured poses"
     rows = [
         ("incisal point moved", _moved(readout.incisor_mm), _MOVED_HELP),

@@ -16,7 +16,7 @@ INCISOR, CONDYLES = LANDMARKS.index("incisor"), (LANDMARKS.index("condyle_left")
 
 @dataclass(frozen=True)
 class Readout:
-    """The measures shown for one pose.
+    """The displayed measures of one pose.
 
     Attributes:
         incisor_mm, condyle_left_mm, condyle_right_mm: displacement of the incisal point and of the condyle centres to
@@ -74,7 +74,7 @@ def habitual_path(rig: JawRig, samples: int = 60) -> Array:
 
 def border_path(rig: JawRig, axis: int, samples: int = 40) -> Array:
     """Return a closed curve of parameters (n, 3) [mm] on the bound, over d1 and d2 (axis 1) or d1 and d3 (axis 2)."""
-    # Samples are denser at both ends, where the bound closes.
+    # Samples are denser at both ends, where the bound narrows.
     low, high = rig.d_range[0]
     opening = low + (high - low) * 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, samples)))
     ends = rig.ranges(opening)

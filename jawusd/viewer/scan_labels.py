@@ -20,7 +20,7 @@ _HELP = (
     "White: crown, red: gum, blue: base. Click on a scan to paint around the clicked point. Tracking uses only the "
     "line between crown and gum; labels below the gum have no effect."
 )
-_RADIUS_MM = (0.3, 8.0, 0.1, 1.5)  # smallest, largest, step, first
+_RADIUS_MM = (0.3, 8.0, 0.1, 1.5)  # smallest and largest radius, step, initial value
 
 
 class ScanBrush:
@@ -157,7 +157,7 @@ class ScanLabelsPanel:
         self._show_state()
 
     async def _write(self, _: object) -> None:
-        """Save both arches: an arch left unchanged counts as accepted."""
+        """Save both arches; an unchanged arch counts as accepted."""
         paths = []
         for arch, labels in self.brush.labels.items():
             paths.append(await asyncio.to_thread(self._capture.save_labels, arch, labels.copy()))

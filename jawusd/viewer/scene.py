@@ -20,7 +20,7 @@ Color = tuple[int, int, int]
 _ENAMEL, _GUM, _BONE = (236, 229, 212), (196, 112, 108), (222, 207, 178)
 _COLORS = {"upper_teeth": _ENAMEL, "lower_teeth": _ENAMEL, "upper_gum": _GUM, "lower_gum": _GUM}
 _OUTSIDE: Color = (222, 120, 90)
-_PLACEHOLDER: Color = (150, 158, 168)  # distinct from bone
+_PLACEHOLDER: Color = (150, 158, 168)  # distinct from the colour of bone
 _CLEAR = 0.45  # opacity of a translucent mandible
 _INCISOR, _CONDYLE, _PIN, _HELD = (0, 114, 178), (0, 158, 115), (230, 159, 0), (213, 94, 0)
 _SKULL_OPACITY = 0.28
@@ -41,10 +41,10 @@ PRESETS = {
 }
 #: Initial view of a page.
 FIRST_VIEW = "front"
-#: Aspect ratio (width over height) below which the screen is a phone, whose panel covers the lower half.
+#: Aspect ratio (width over height) below which a screen counts as a phone, whose lower half the panel covers.
 PHONE = 0.6
 _NARROW = 0.75  # aspect ratio below which the camera moves back, so that the jaw fits the width
-_LOWER = 0.25  # fraction of the image height by which the camera aims below the jaw on a phone
+_LOWER = 0.25  # fraction of the view's height by which the camera aims below the jaw on a phone
 _FOV_RAD, _NEAR_MM, _FAR_MM = 0.6, 1.0, 5000.0
 
 
@@ -58,7 +58,7 @@ class JawScene:
         self._T_world_skull = np.array(rig.T_anatomical_skull)
         self._rest = rest_places(rig)
         self._scene.configure_default_lights(cast_shadow=False)
-        # A hemisphere light: without a GPU, an environment map takes half of the frame time.
+        # Use a hemisphere light: without a GPU, an environment map takes half of the frame time.
         self._scene.configure_environment_map(None)
         self._scene.add_light_hemisphere("/light", ground_color=_GROUND, intensity=_AMBIENT)
         for name in STILL:
@@ -87,7 +87,7 @@ class JawScene:
         self.show_pins({})
 
     def _add_mesh(self, name: str, mesh: Mesh, color: Color, opacity: float | None) -> viser.MeshHandle:
-        # Two-sided faces cost twice as much; only open meshes need them.
+        # Two-sided faces take twice as long to render; only open meshes need them.
         side: Literal["front", "double"] = "front" if is_solid(mesh) else "double"
         return self._scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=color, opacity=opacity, side=side)
 

@@ -27,7 +27,7 @@ from jawusd.viewer.widgets import set_theme
 
 log = logging.getLogger(__name__)
 
-# Without a GPU, building the panels blocks a browser for most of a second: send the jaw this much earlier [s].
+# Without a GPU, building the panels blocks a browser for most of a second: send the jaw earlier, by this time [s].
 _HEAD_START_S = 0.5
 _SHOW_EVERY_S = 0.1  # shortest interval between live poses
 
@@ -67,7 +67,7 @@ class _LocalServer(viser.ViserServer):
     """A viser server that never opens a public tunnel, which any page could request."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse to share through viser's relay."""
+        """Reject requests to share through viser's relay."""
         log.warning("refused a page's request for a public address")
         return None
 
@@ -78,7 +78,7 @@ class _Closable(Protocol):
 
 
 class PageServer(ABC):
-    """Server with one page per visitor; `pages` are the open ones by client number, `url` is the address to open."""
+    """Server with one page per visitor; `pages` are the open pages by client number, `url` is the address to open."""
 
     def __init__(self, name: str, host: str, port: int) -> None:
         """Start serving on a port; 0 means any free port, and a port in use means the next free one.
@@ -89,9 +89,9 @@ class PageServer(ABC):
         self._host = host
         self.pages: dict[int, _Closable] = {}
         _check_address(host)
-        with contextlib.redirect_stdout(sys.stderr):  # viser prints a greeting; stdout is for results
+        with contextlib.redirect_stdout(sys.stderr):  # stdout is for results, but viser prints a greeting
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
-        logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # repeated calls have no effect
+        logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # adding it again has no effect
         self._server.get_event_loop().set_exception_handler(_report_task)
         set_theme(self._server.gui)
         self._server.on_client_connect(self._connected)

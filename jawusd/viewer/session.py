@@ -19,8 +19,8 @@ from jawusd.viewer.readouts import Readout, measure_pose, triple
 
 Interpolation = Literal["linear", "smooth"]
 
-# Weight of a pinned landmark relative to the dragged point (squared distances): a pull of 5 mm moves the pin by a
-# fraction of a millimetre.
+# Weight of a pinned landmark's squared distance relative to that of the dragged point: dragging by 5 mm moves the
+# pinned landmark by a fraction of a millimetre.
 _PIN_WEIGHT = 100.0
 _MOST_UNDO = 200
 _SHARES = np.linspace(1.0, 0.0, 65)
@@ -81,9 +81,9 @@ class Session:
     def limits(self) -> Array:
         """Return the lower and upper limit of each parameter [mm], shape (3, 2).
 
-        The opening has its full range. The limits of d2 and d3 are those valid at the current opening and the current
-        value of the other one. If no value is valid there, the other one is taken as 0, and failing that both limits
-        are the current value.
+        The opening has its full range. The limits of d2 are those of valid poses at the current d1 and d3, and the
+        limits of d3 those at the current d1 and d2. If there are no valid poses, the other parameter is taken as 0; if
+        there are still none, both limits are the current value.
         """
         d = self.d
         alone = np.array(self.rig.ranges(d[0])).reshape(2, 2)
@@ -95,7 +95,8 @@ class Session:
     def set_parameter(self, index: int, value: float) -> None:
         """Set d1, d2 or d3 (index 0 .. 2) [mm] from a slider; successive moves of one slider are a single undo step.
 
-        With `keep_valid`, changing the opening scales d2 and d3 down until they are valid; d2 and d3 stop at the bound.
+        With `keep_valid`, a change of the opening scales d2 and d3 down until the pose is valid; changes of d2 and d3
+        stop at the bound.
 
         Raises:
             ValueError: the value is not finite.
@@ -128,7 +129,7 @@ class Session:
         return d if self.rig.is_inside(d) else self.rig.project(d)
 
     def _kept(self, d: Array, index: int) -> Array:
-        """Return d (3,) moved inside the bound, changing parameter `index` as little as possible."""
+        """Return d (3,) moved inside the bound, with the least change of parameter `index`."""
         if float(self.rig.margin(d)) >= 0.0:
             return d
         d = d.copy()
@@ -191,7 +192,7 @@ class Session:
         """Move the keys to other frames and show the frame `shown`; successive moves are a single undo step.
 
         Raises:
-            FormatError: the numbers of frames and keys differ, or two keys would share a frame.
+            FormatError: the numbers of frames and keys differ, or two keys would have the same frame.
         """
         self._change("move keys", replace(self.work, keys=at_frames(self.work.keys, frames)))
         clip = self.key_clip()

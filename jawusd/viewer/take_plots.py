@@ -29,7 +29,7 @@ _STATUS: dict[int, str] = {
 }
 _COLORS = (ORANGE, BLUE)  # upper, lower; same as the outlines in the images
 _NAMES = ("d1 opening", "d2 laterotrusion", "d3 protrusion")
-_BAND = 2.0  # sigmas: 95 % of normal errors
+_BAND = 2.0  # half width of the bands [sigma]: 95 % of normally distributed errors
 _MOST_SAMPLES = 400
 _STRIP_PX = 6
 

@@ -1,4 +1,4 @@
-"""Inputs of the viewer: an actor or a capture with the functions that read and write its files, and display meshes."""
+"""Inputs of the viewer: an actor or a capture, with meshes for display, and functions that read and write files."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
 from jawusd.viewer.motion import Clip
 
-#: Names of meshes: the fixed ones (skull frame) and the moving ones (mandible frame).
+#: Names of the fixed meshes (skull frame) and of the moving meshes (mandible frame).
 STILL, MOVING = ("skull", "upper_teeth", "upper_gum"), ("mandible", "lower_teeth", "lower_gum")
 
 Look = Literal["outlines", "tinted", "footage"]
 #: A region of an image: left, top, right, bottom [px].
 Region = tuple[float, float, float, float]
-_STEPS, _NEAR = 8, 0.93  # iterations; stop above this fraction of the requested number of faces
+_STEPS, _NEAR = 8, 0.93  # most iterations; they end above this fraction of the requested number of faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class ViewedCapture:
     name: str
     fps: float
     frames: tuple[int, int]  # first and last frame to step through, of the reference camera, both inclusive
-    offsets: Mapping[str, int]  # frame k of a camera shows the instant of frame k + offset of the reference camera
+    offsets: Mapping[str, int]  # frame k of a camera is simultaneous with frame k + offset of the reference camera
     # (width, height) of the images of every camera with footage, in the capture's order
     sizes_px: Mapping[str, tuple[int, int]]
     cameras: Mapping[str, Camera]  # calibrated cameras by name; empty without a calibration
@@ -93,10 +93,10 @@ class ViewedCapture:
 
 
 def for_view(mesh: Mesh, most_faces: int) -> Mesh:
-    """Return a mesh decimated to at most `most_faces` faces for display; meshes that are small enough are unchanged.
+    """Return a mesh decimated to at most `most_faces` faces for display; smaller meshes are unchanged.
 
     Vertex clustering (Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993).
-    The face count is inversely proportional to the square of the cell size, which gives the next cell size to try.
+    The next cell size to try follows from the face count being inversely proportional to the square of the cell size.
     """
     if len(mesh.faces) <= most_faces:
         return mesh
@@ -126,7 +126,7 @@ def is_solid(mesh: Mesh) -> bool:
     count = len(mesh.vertices)
     closed = np.isin(starts * count + ends, ends * count + starts).all()
     corners = mesh.vertices[mesh.faces]
-    volume = np.linalg.det(corners - mesh.vertices.mean(axis=0)).sum()  # six times
+    volume = np.linalg.det(corners - mesh.vertices.mean(axis=0)).sum()  # six times the volume
     return bool(closed and volume > 0)
 
 

@@ -23,7 +23,7 @@ Value = TypeVar("Value")
 #: The event of a button group.
 Choice = viser.GuiEvent[viser.GuiButtonGroupHandle]
 MOST_BYTES = 8 << 20
-_MOST_LETTERS = 80  # of a file name in messages
+_MOST_LETTERS = 80  # longest file name in messages
 
 
 def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
@@ -31,7 +31,8 @@ def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
     gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, dark_mode=dark)
 
 
-# Sets the page title and, below viser's phone breakpoint, widens the panel, which would hide half of the image.
+# Sets the page title and, below viser's phone breakpoint, lets the panel fill the width, but at most half of the
+# height.
 _STYLE = """<style onload="document.title={title}">
 @media (max-width: 36em) {{
   .mantine-Paper-root:has(.jawusd-page) {{ width: 100% !important; max-height: 50% !important; }}
@@ -133,8 +134,8 @@ def upload_name(upload: viser.UploadedFile, suffixes: tuple[str, ...]) -> tuple[
 def limit_uploads(client: viser.ClientHandle, button: viser.GuiUploadButtonHandle | None) -> None:
     """Abort uploads that are larger than `MOST_BYTES`, concurrent, or not meant for the page's button.
 
-    viser buffers the parts of an upload without a limit, for any widget named in the message. Its handlers run
-    before these.
+    viser buffers the parts of an upload without a limit, for any widget named in the message. viser's handlers
+    run before those installed here.
     """
     gui = client.gui
     pending = gui._current_file_upload_states
@@ -154,7 +155,7 @@ def limit_uploads(client: viser.ClientHandle, button: viser.GuiUploadButtonHandl
 
     async def part_received(_: int, message: _messages.FileTransferPart) -> None:
         state = pending.get(message.transfer_uuid)
-        # A page may send more than it has announced.
+        # A page may send more bytes than announced.
         if state is not None and state["transferred_bytes"] > MOST_BYTES:
             drop(message.transfer_uuid, f"is {state['transferred_bytes']} bytes; the limit is {MOST_BYTES}.")
 
