@@ -275,7 +275,7 @@ class PolygonBound:
         )
 
     def signed_distance(self, d: Array) -> Array:
-        """Return the larger signed distance (n,) of d (n, 3) to the two outlines [mm]; negative inside."""
+        """Return the larger signed distance (n,) [mm] of d (n, 3) to either outline; negative inside both."""
         lateral = _distance_to_edges(d[:, [0, 1]], self.opening_lateral)
         return np.maximum(lateral, _distance_to_edges(d[:, [0, 2]], self.opening_protrusion))
 

@@ -22,7 +22,8 @@ _MAX_PIECES = 400  # largest number of samples in one step
 _STEEPEST = 5.0  # largest gradient norm of the margin: a step stays inside if its ends are this many step lengths deep
 _STILL_MM = 1e-12
 _TIME_SHARE = 0.998  # fraction of the available time a path may take: finer sampling makes it slightly longer
-# Lines between samples are checked at this spacing, and again more finely where the margin is below the second length.
+# Lines between samples are checked at the first spacing, and again more finely where the margin is below the second
+# length.
 _CHECK_MM, _NEAR_MM, _MAX_ROUNDS, _ROUNDING_MM = 0.03, 1e-3, 8, 1e-9
 
 _LINE_MM = 0.1  # sample spacing of shortcuts

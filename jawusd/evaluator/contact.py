@@ -1,7 +1,7 @@
 """Clearance: how far teeth, or condyles and skull, are from penetrating deeper than in the closed bite.
 
-It is sampled from the scans on a grid over d when the rig is built: the penetration depth of the closed bite minus that
-of the pose. It is trilinear between the samples; outside the grid, where the mouth is open, the nearest value is used.
+It is the penetration depth of the closed bite minus that of the pose, sampled from the scans on a grid over d when the
+rig is built. Interpolation is trilinear; outside the grid, where the mouth is open, the nearest value is used.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The two forms of the jaw model: parameters d [mm] to a rigid motion of the mandible, with exact derivatives.
 
 Everything here is in the anatomical frame (x left, y up, z anterior, mm, origin at the upper incisal point): a model
-gives the motion ``M(d)`` away from the closed bite, ``M(0) = I``. `jawusd.evaluator.rig` maps it to the skull frame.
+returns the motion ``M(d)`` away from the closed bite, ``M(0) = I``. `jawusd.evaluator.rig` maps it to the skull frame.
 All functions take rows: d has shape (n, 3); a row with a NaN gives NaN.
 
 Derivatives are *spatial*: ``S`` of shape (n, 6, 3) with ``M(d + e) = exp(S e) M(d)`` to first order; twists are

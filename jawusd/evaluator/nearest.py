@@ -1,6 +1,7 @@
 """The search of `jawusd.evaluator.solver` for one row in plain floats: faster, and part of the single-file reader.
 
-For the nearest point a step uses the full Hessian of the bound; if it fails, only the positive semidefinite part.
+In the search for the nearest point, a step first uses the full Hessian of the bound, and if that fails, only its
+positive semidefinite part.
 
 This file imports only the standard library, `curve_formula`, `formula` and `operations`: it is copied into the reader,
 which runs in Python 3.9. Symmetric matrices are six numbers: xx, xy, xz, yy, yz, zz.

@@ -71,12 +71,12 @@ class Speeds:
 
     @property
     def rms_mm_s(self) -> Array:
-        """Root mean square speed of each of d [mm/s], shape (3,)."""
+        """Root mean square speed of each parameter [mm/s], shape (3,)."""
         return np.asarray(np.sqrt(np.diag(self.velocity)))
 
     @property
     def rms_mm_s2(self) -> Array:
-        """Root mean square acceleration of each of d [mm/s^2], shape (3,)."""
+        """Root mean square acceleration of each parameter [mm/s^2], shape (3,)."""
         return np.asarray(np.sqrt(np.diag(self.acceleration)))
 
 

@@ -32,7 +32,7 @@ KNOTS = 97
 #: Directions of the incisal displacement that opening, laterotrusion and protrusion measure.
 MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
-# Share of the mandible's rms speed below which the incisal point counts as standing still or reversing.
+# Fraction of the mandible's rms speed below which the incisal point counts as standing still or reversing.
 _SLOWEST = 0.2
 _SHORTEST_MM = 0.01  # a curve that moves the incisal point less comes from a collapsed network
 

@@ -52,7 +52,7 @@ _CV_CAP_MM = 1.0
 _TAIL_RIDGE = 1e-6  # keeps the linear coefficients finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
 _TRIM_FLOOR_MM = 0.5
-_GUIDED_GRID = (9, 7, 7)  # points along opening, sideways and forward with predictions from the condylar paths
+_GUIDED_GRID = (9, 7, 7)  # number of points along opening, sideways and forward at which condylar paths predict
 _GUIDED_SHARE = 0.08  # total weight of these points relative to the frames, for paths without misfit
 
 

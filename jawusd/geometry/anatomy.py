@@ -25,7 +25,7 @@ _MOLAR_ASIDE_MM = 22.0
 _MIDLINE_MM = 4.0  # half width of the front edge
 _MIN_FRONT = 40  # smallest number of points on a front edge
 _MIN_SLABS = 4  # smallest number of coronal slabs with teeth on both sides that define a midline
-# Arches are compared by local heights in cells of this size; with fewer shared cells, by their mean heights.
+# Arches are compared by local heights in cells of this size, or by mean heights if they share fewer cells than this.
 _CELL_MM, _MIN_CELLS = 4.0, 6
 
 

@@ -171,7 +171,7 @@ def opencv_radial(K: Array, size_px: tuple[int, int], radial: Array) -> tuple[Ar
     r2 = np.linspace(0, (_RADIUS_FACTOR * float(np.linalg.norm(reach))) ** 2, _SAMPLES)[1:]
     g = 1 + sum(a * r2 ** (k + 1) for k, a in enumerate(radial))
     powers = np.stack([r2, r2**2, r2**3], axis=1)
-    # n = g d is linear in the coefficients of both; weighted by r, as pixel errors are
+    # n = g d is linear in the coefficients of n and d; the weight r makes residuals proportional to pixel errors
     weight = np.sqrt(r2)[:, None]
     found = np.linalg.lstsq(weight * np.hstack([powers, -g[:, None] * powers]), weight[:, 0] * (g - 1), rcond=None)[0]
     n, d = 1 + powers @ found[:3], 1 + powers @ found[3:]

@@ -93,7 +93,7 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
     bearing = (extent > _CROWN_MM) & (starts > 0) | alone
     high = (seen.crown | (alone & (starts == 0))[piece] & (_height_share(surface, up) > 1 - _LOWEST)) & bearing[piece]
     if (bearing & small).sum() >= 3 and high[~small[piece]].sum() < 0.2 * high.sum():
-        bearing &= small  # the others are the gum of the small ones
+        bearing &= small  # larger components are then the gum around these separate crowns
         high &= small[piece]
     low = seen.gum | ~bearing[piece]
     surely = np.bincount(piece, seen.gum, len(extent)) > 0

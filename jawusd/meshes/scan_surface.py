@@ -176,7 +176,7 @@ def merged_places(vertices: Array) -> tuple[Array, Indices]:
 
 
 def averaging(edges: Indices, count: int) -> csr_array:
-    """Return the matrix that averages the value of each of `count` vertices with the mean of its neighbours'."""
+    """Return the matrix that averages the value at each of `count` vertices with the mean value at its neighbours."""
     rows, columns = np.r_[edges[:, 0], edges[:, 1]], np.r_[edges[:, 1], edges[:, 0]]
     degree = np.maximum(np.bincount(rows, minlength=count), 1)
     own = np.arange(count)

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 @numba.njit(nogil=True, cache=True)
 def spread(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Assign cells with numbers below 0 that of the nearest other cell, in place; ties use the first in order.
+    """Replace negative numbers of cells by the number of the nearest other cell, in place; ties use the first in order.
 
     Args:
         numbers: numbers of the cells, shape (nx, ny, nz).
 
     Returns:
         The squared distances to these cells [cells^2], shape (nx, ny, nz); larger than any distance in the grid if all
-        numbers are below 0.
+        numbers are negative.
     """
     nx, ny, nz = numbers.shape
     away = np.empty((nx, ny, nz), np.int32)

@@ -15,7 +15,7 @@ from jawusd.solvers.solution import applied, attached, capturing, finished, inve
 Residual = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 _STEPS_CAPTURED = 6
-_NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # off the model, Gauss-Newton converges slowly near the minimum
+_NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # after Gauss-Newton, which converges slowly for poses off the model
 # added to the Hessian, relative to its diagonal; keeps encodings differentiable where a parameter hardly moves the
 # landmarks
 _MIN_CURVATURE = 1e-9

@@ -15,9 +15,9 @@ from jawusd.synthetic.dental_arch import ArchShape, DentalArch, build_arch
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.teeth import LOWER, UPPER
 
-# Heights of edges and cusps over the plane of the upper central incisors [mm], first incisor to second molar.
+# Heights of edges and cusps above the edges of the upper central incisors [mm], first incisor to second molar.
 _UPPER_TIPS_MM = -np.array([0.0, 0.5, 0.2, 0.3, 0.4, 0.6, 1.0])
-# Heights of the lower front teeth over the lower central incisors [mm].
+# Heights of the lower front teeth above the lower central incisors [mm].
 _LOWER_FRONT_MM = np.array([0.0, -0.2, -0.3])
 _CONTACT_GAP_MM = 0.05
 _OPENING_STEP = 0.002

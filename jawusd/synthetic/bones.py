@@ -119,7 +119,7 @@ def _ramus(joint: Joint, side: float, centre: Array) -> tuple[Array, Faces]:
 
 
 def _condyle(side: float, centre: Array) -> tuple[Array, Faces]:
-    """Neck and head of one condyle; the head is an ellipsoid about the centre."""
+    """Return neck and head of one condyle; the head is an ellipsoid about the centre."""
     neck = np.array([[-24.0, 2.5, 5.5, 2.6, 6.5], [-15.0, 1.5, 1.5, 4.0, 5.0], [-8.0, 0.5, -0.3, 5.5, 4.0]])
     neck = _spline(neck[:, 0], neck, np.linspace(-24.0, -8.0, 9))
     turn = np.linspace(-0.35 * np.pi, 0.499 * np.pi, 13)
@@ -156,7 +156,7 @@ def _column(centre: Array, side: float, rows: Array, squareness: float = 0.8) ->
 
 
 def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
-    """Fossa, eminence and the bone in front of it, as a slab over the condyle."""
+    """Return fossa, eminence and the bone in front of it, as a slab above the condyle."""
     slide = np.linspace(-7.0, 22.0, 40)
     section = articular_surface(joint, k, slide)
     behind = np.maximum(-3.0 - slide, 0.0)
@@ -189,7 +189,7 @@ def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
 
 
 def _cheekbone(joint: Joint, k: int, side: float) -> tuple[Array, Faces]:
-    """Arch from the socket forward to the cheek and inward to the upper jaw bone."""
+    """Return the arch from the socket forward to the cheek and inward to the upper jaw bone."""
     x, y, z = joint.condyles[k]
     rows = np.array(
         [

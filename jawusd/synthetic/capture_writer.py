@@ -46,8 +46,8 @@ _SCANS = ("upper_teeth", "lower_teeth", "mandible", "skull")
 _PICKS = 4
 _PICK_NOISE_PX = 1.0
 _PICTURES_PER_BOARD = 2
-# Standard deviation of the sensor noise [grey levels of 255], which shifts a few patterns randomly instead of drawing a
-# new one per image.
+# Standard deviation of the sensor noise [grey levels of 255]. Every image gets a randomly shifted copy of one of a few
+# patterns.
 _SENSOR_NOISE = 1.3
 _NOISE_PATTERNS = 5
 

@@ -168,7 +168,7 @@ def _lateral_range(joint: Joint, opening: Array, mean_mm: Array, lateral: Array)
 
 
 def _slides(mean_mm: Array, difference_mm: Array, balancing: Array) -> Array:
-    """Return the slides of the (left, right) condyle; the right condyle balances a movement to the left."""
+    """Return the slides of the (left, right) condyle; the right one is balancing in a movement to the left."""
     forward, backward = balancing * np.abs(difference_mm), (1.0 - balancing) * np.abs(difference_mm)
     to_left = difference_mm > 0
     left = mean_mm + np.where(to_left, -backward, forward)
