@@ -248,7 +248,7 @@ class AnchoredModel:
 class AdditiveModel:
     """A sum of three curves in se(3): ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang et al. 2019, eq. 5).
 
-    The constant is counted once: the sum is zero at d = 0.
+    The sum is zero at d = 0: the constant that the curves have in common is included only once.
 
     Attributes:
         curves: The three curves of twists, about the origin of the anatomical frame.

@@ -15,7 +15,7 @@ _MIN_FRAMES = 30  # smallest number of fourth differences for an estimate
 # Sums of the squared coefficients of first, second and fourth differences: the factor by which differencing multiplies
 # the variance of white noise.
 _NOISE_IN = {1: 2.0, 2: 6.0, 4: 70.0}
-_SIGMA_OF_MEDIAN = 1.4826  # standard deviation over the median absolute value, normal distribution
+_SIGMA_OF_MEDIAN = 1.4826  # ratio of standard deviation to median absolute value, normal distribution
 _MIN_SIGNAL = 0.05  # lower limit of the fraction of the observed variance that counts as motion
 _MIN_SPREAD = (
     1e-6  # smallest relative variance in any direction; keeps covariances of one-dimensional motion invertible

@@ -20,7 +20,7 @@ Source = Tracks | tuple[ArrayLike, ArrayLike]
 
 #: Names of d1, d2 and d3.
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
-#: How far real jaws deviate from a three-parameter model: smaller tracking errors hardly matter [mm].
+#: Deviation of real jaws from a three-parameter model [mm]: smaller tracking errors hardly matter.
 MODEL_SIGMA_MM = 0.3
 _LARGEST_SIGMA_MM = 2.0  # frames with a larger standard deviation (rms over the mandible) are discarded
 _RIGID = 1e-3

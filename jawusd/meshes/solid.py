@@ -42,7 +42,7 @@ class DistanceGrid:
 
 
 class _Columns(NamedTuple):
-    """Triangles by cells of the (x, z) plane: those over cell i are list[start[i]:end[i]]."""
+    """Triangles by cells of the (x, z) plane: those over cell i are ``faces[start[i] : start[i + 1]]``."""
 
     low: Array
     shape: tuple[int, int]

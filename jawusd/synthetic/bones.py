@@ -15,7 +15,7 @@ from jawusd.synthetic.surfaces import Faces, grid_faces, loft, merged, outward, 
 
 #: Half axes of a condyle [mm]: lateral, up, forward.
 CONDYLE_MM = np.array([9.0, 4.2, 4.8])
-#: Distance from the centre of a condyle to the bone of the fossa: its radius and the disc [mm].
+#: Distance from the centre of a condyle to the bone of the fossa: the condyle's radius plus the disc [mm].
 JOINT_SPACE_MM = 6.0
 _BONE = (222, 206, 178)
 _AROUND = 24

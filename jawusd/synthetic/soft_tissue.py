@@ -156,7 +156,7 @@ class Face:
 
 
 def _rounded(rings: Array) -> Array:
-    """Smooth rings (R, A, 3) along themselves with a Hann window, to avoid creases at the mouth corners."""
+    """Smooth each ring (R, A, 3) along its circumference with a Hann window, to avoid creases at the mouth corners."""
     kernel = np.hanning(13)[1:-1]
     kernel /= kernel.sum()
     return sum(k * np.roll(rings, i - 5, axis=1) for i, k in enumerate(kernel))

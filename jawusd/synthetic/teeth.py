@@ -69,12 +69,13 @@ LOWER = (
 )  # fmt: skip
 
 # Control values of Bezier profiles from the root end to the occlusal end.
-# Incisors and canines: half width relative to half the width; facial and lingual surface relative to the depth.
+# Incisors and canines: half width relative to half the crown's width; facial and lingual surface relative to its depth.
 _FRONT_WIDTH = (0.62, 0.68, 0.80, 1.02, 1.06, 0.95)
 _FRONT_FACIAL = (0.38, 0.46, 0.58, 0.50, 0.42, 0.27)
 _FRONT_LINGUAL = (-0.40, -0.52, -0.56, -0.10, 0.02, 0.11)
 _EDGE_MIDDLE = tuple(0.5 * (f + g) for f, g in zip(_FRONT_FACIAL, _FRONT_LINGUAL, strict=True))
-# Premolars and molars: half width relative to half the width; facial and lingual surface relative to half the depth.
+# Premolars and molars: half width relative to half the crown's width; facial and lingual surface relative to half its
+# depth.
 _BACK_WIDTH = (0.74, 0.80, 0.92, 1.06, 1.04, 0.84)
 _BACK_FACIAL = (0.72, 0.84, 1.06, 1.04, 0.90, 0.66)
 _BACK_LINGUAL = (-0.72, -0.82, -0.98, -1.06, -0.98, -0.68)
