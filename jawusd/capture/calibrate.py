@@ -29,7 +29,7 @@ MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 
 _ENOUGH_VIEWS = 40  # with these, the shape error is a quarter of that with 20 views
 _GOOD_RMS_PX = 0.5
-_FAR_MM = 40.0  # largest distance of the board's nearest corner from the centre of the mouth without advice
+_FAR_MM = 40.0  # distance of the board's nearest corner from the centre of the mouth above which advice is given
 _GRID = (8, 5)  # cells of the image for which coverage is computed
 _LITTLE_COVERAGE = 0.5
 _LARGE_EXPECTED_MM = 0.05  # half of the typical tracking error of 0.1 mm

@@ -31,7 +31,7 @@ _REACH_MM = 3.0  # largest penetration: deeper points are beyond the base of a c
 # held 80 to 200 mm from the teeth, macro lenses 200 to 400 mm.
 _DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02
 _LOG_FOCAL = 0.05  # standard deviation of the log focal length between photographs of one camera, due to focusing
-_BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)  # prior of the bite at the lower teeth's centre [rad, mm]
+_BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)  # bite prior, at the centre of the lower teeth [rad, mm]
 # Prior standard deviation of a step [rad, mm, log, -]: damps directions that the lines do not determine.
 _LARGEST_STEP = np.array([0.1] * 3 + [3.0, 3.0, 30.0] + [0.2, 0.02])
 # Standard deviation of a drawn line from tooth edges and from the gum line, and correlation length of its error.

@@ -97,7 +97,7 @@ class NormalEquations:
     Attributes:
         matrix: precision, arches in the order (upper, lower), shape (12, 12); `upper`, `lower` and `coupling` are
             views of its blocks.
-        right: right side, shape (12,).
+        right: right-hand side, shape (12,).
         outline_weight: weight of the outline sums per arch [1/px^3], shape (2,): 1, or the inverse of outline variance
             times correlation length if other terms are log-likelihoods.
     """

@@ -225,7 +225,7 @@ def magnified(view: View, scale: float) -> View:
 
 
 def _principal_point(matrix: Array) -> Array:
-    """Return the pixel of the optical axis of a projection (3, 4), shape (2,)."""
+    """Return the principal point of a projection (3, 4) [px], shape (2,)."""
     M = matrix[:, :3]
     return np.asarray(M[:2] @ M[2] / (M[2] @ M[2]))
 

@@ -219,7 +219,7 @@ def fitted_camera(
     sights = [_sights(own, points) for own, points in zip(picks, vertices, strict=True)]
 
     def residuals(x: Array) -> Array:
-        """Return pick errors over that of a click, and the change of the camera over its prior standard deviation."""
+        """Return pick errors and the change of the camera, each divided by its prior standard deviation."""
         table = {**cameras, name: changed(x)}
         out = [x[:2]]
         for k, (start, seen) in enumerate(zip(starts, sights, strict=True)):

@@ -18,8 +18,7 @@ from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
 from jawusd.tracking.performance.views import Growth
 
-#: Upper bounds on the standard deviations of head and jaw, reached after many frames without visible teeth [rad, mm,
-#: mm].
+#: Upper bounds on the standard deviations of head and jaw after many frames without visible teeth [rad, mm, mm].
 LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
 # Matched contour below which an arch is not accepted [px]: 2 mm of tooth edge. Tracking without a rig requires more.
 _LEAST_MATCHED_PX = 15.0

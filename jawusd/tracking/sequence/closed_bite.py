@@ -136,7 +136,7 @@ class ClosedBite:
         return np.asarray(out, np.float64)
 
     def steady_motions(self, registered: bool) -> Array:
-        """Return S of T_aligned = T_corrected @ S for both arches, shape (2, 4, 4); see `correct`."""
+        """Return the motions S in T_aligned = T_corrected @ S of both arches, shape (2, 4, 4); see `correct`."""
         motions = np.array(translation(self.point) @ se3_exp(self.steady) @ translation(-self.point), np.float64)
         if registered:
             motions[1] = self.motion() @ motions[1] @ se3_inverse(self.motion())

@@ -111,8 +111,9 @@ class MotionPredictor:
 class SearchBudget:
     """A budget of failed multi-start searches in a take.
 
-    A search takes as long as tracking ten to fifty frames, and wrong masks would trigger failing searches on every such
-    frame, forwards and backwards. Work is counted instead of time, so results do not depend on the machine.
+    A search takes as long as tracking ten to fifty frames, and wrong masks would trigger failing searches on every
+    frame that has them, forwards and backwards. Work is counted instead of time, so results do not depend on the
+    machine.
     """
 
     def __init__(self, frames: int) -> None:

@@ -53,7 +53,7 @@ class KinematicPrior:
         equations.add_joint(slope.T @ precision @ slope, -slope.T @ precision @ deviation)
 
     def deviation(self, relative: Array) -> tuple[Array, Array]:
-        """Return the twist (6,) of T_upper_lower (4, 4) from the model, at its nearest pose, and P there (6, 6)."""
+        """Return the twist (6,) from the nearest model pose to T_upper_lower (4, 4), and P there (6, 6)."""
         d = self.jaw.encode(relative)[0]
         pose = self.jaw.pose(d)
         return se3_log(relative @ se3_inverse(pose)), self._precision(d, pose)

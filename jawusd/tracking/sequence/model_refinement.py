@@ -62,8 +62,8 @@ def refine_tracks(
     is fitted to or scored on poses influenced by its prior.
 
     Args:
-        tracks: the first pass.
-        jaw: the model fitted to it.
+        tracks: result of the first pass.
+        jaw: the model fitted to them.
         capture, cameras, offsets, upper, lower, config, threads: as for `track_capture`.
         progress: called with the number of hard frames done, and their total.
 

@@ -97,7 +97,7 @@ class AnnotatorPrior:
     frames: float
 
 
-#: For an annotator who draws masks.
+#: Prior of hand-drawn masks.
 DRAWN = AnnotatorPrior(edge_px=0.5, gum_px=0.4, gum_mm=0.1, arch_px=0.15, arch_mm=0.05, camera_px=0.1, frames=1.5)
 
 #: Prior of hand-drawn masks for scans without gum. Without gum, outlines at the neck of a tooth are classified by their
@@ -196,7 +196,7 @@ class TakeEquations:
         self._seen_r -= slope.T @ precision @ deviation
 
     def normal_equations(self) -> tuple[Array, Array]:
-        """Return matrix and right side of the normal equations without priors, shapes (U, U) and (U,)."""
+        """Return matrix and right-hand side of the normal equations without priors, shapes (U, U) and (U,)."""
         return self._S, self._r
 
     def prior_covariance(self) -> Array:

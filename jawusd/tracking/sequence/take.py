@@ -128,8 +128,8 @@ class _Take(Passes):
     def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
         """Estimate delays, habits and camera poses; if they matter, align all frames again with them corrected.
 
-        Camera poses are corrected only if `may_move`, since wrong lenses or scan sizes have similar effects as moved
-        cameras.
+        Camera poses are corrected only if `may_move`, since wrong lenses or scan sizes have effects similar to those of
+        moved cameras.
         """
         c = self._config
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
