@@ -192,7 +192,7 @@ def _wait(child: int, passed: set[signal.Signals]) -> int:
             continue
         pid, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
         if pid and os.WIFSTOPPED(status):
-            os.kill(os.getpid(), signal.SIGSTOP)  # the shell then sees a stopped job
+            os.kill(os.getpid(), signal.SIGSTOP)  # so that the shell registers a stopped job
         elif pid:
             return status
 
@@ -252,7 +252,7 @@ def _run_in_subprocess() -> NoReturn:
     os._exit(code)
 
 
-_M_MMAP_THRESHOLD = -3  # of glibc's malloc.h
+_M_MMAP_THRESHOLD = -3  # parameter of mallopt, from glibc's malloc.h
 _LARGE_BYTES = 8_000_000  # mapping costs time: with a threshold of 1 MB, a report takes 10 % longer
 
 

@@ -25,7 +25,7 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
     for process substitution.
 
     Raises:
-        JawusdError: of the given class; the path is a folder, a named pipe, a device or a socket.
+        JawusdError: the path is a folder, a named pipe, a device or a socket; raised as an instance of `error`.
     """
     note_input(path)
     there = Path(os.path.realpath(path))  # "pipe:[1234]" for an anonymous pipe, which does not exist
@@ -52,7 +52,7 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
     """Check that OpenUSD can open a path: it needs UTF-8 without control characters.
 
     Raises:
-        JawusdError: of the given class; OpenUSD cannot open it.
+        JawusdError: OpenUSD cannot open it; raised as an instance of `error`.
     """
     if any(unicodedata.category(letter) == "Cc" for letter in os.path.abspath(path)):
         raise error(

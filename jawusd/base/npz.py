@@ -21,7 +21,7 @@ from jawusd.base.inputs import check_input
 UNITS = {"length": "mm", "angle": "rad"}
 TWIST_ORDER = ["omega", "v"]
 
-NamedArrays = dict[str, Array]  # of any dtype; `take` checks the arrays that are used
+NamedArrays = dict[str, Array]  # arrays of any dtype; `take` checks those that are used
 JsonObject = dict[str, object]
 
 # Ten times the largest array of a take of 20,000 frames; guards against zip bombs.
@@ -40,7 +40,7 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
 
     Args:
         family: Format name without version, e.g. ``"jawusd-tracks"``.
-        version: Newest version this reader knows.
+        version: Newest supported version.
 
     Raises:
         FormatError: not such a file, or damaged.

@@ -80,7 +80,7 @@ class Lens:
     name: str
     path: Path
     filmback_mm: tuple[float, float] | None
-    offset_mm: tuple[float, float]  # of the lens centre, x right, y up
+    offset_mm: tuple[float, float]  # offset of the lens centre, x right, y up
     model: str
     values: Mapping[str, float]
 

@@ -32,7 +32,7 @@ class NukeNode:
     """A node of a script."""
 
     kind: str  # class, such as "Camera2"
-    knobs: Mapping[str, str]  # as written
+    knobs: Mapping[str, str]  # values by knob, as written in the script
     parent: NukeNode | None  # the node connected to its first input
 
     @property

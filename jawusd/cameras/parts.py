@@ -25,7 +25,7 @@ _LARGEST_DEFECT = 1e-3
 # Tolerances between the poses of a static camera in its images: rotation [rad], and position relative to its distance
 # from the origin.
 _MOVED_RAD, _MOVED_SHARE = 1e-3, 1e-3
-_LARGEST_ERROR_PX = 0.05  # of a lens model converted to OpenCV's
+_LARGEST_ERROR_PX = 0.05  # largest error of a lens model converted to OpenCV's
 _MODEL_KEYS = ("distortion_model", "distortion_type", "lens_model", "camera_model", "model_type", "projection_model")
 _FLAG_KEYS = ("fisheye", "fisheye_model", "is_fisheye", "use_fisheye", "xi")  # xi: omnidirectional
 # Names of OpenCV's radial-tangential model with up to eight coefficients, in ROS, Kalibr, camodocal and others.

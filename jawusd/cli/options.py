@@ -232,7 +232,7 @@ def subject_given(
     """Return the subject given by a capture, both scans, or landmarks.
 
     Args:
-        name: of a subject without a capture.
+        name: name of a subject without a capture.
 
     Raises:
         typer.BadParameter: none or several of these are given.

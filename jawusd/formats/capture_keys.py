@@ -51,7 +51,7 @@ class Key:
     """Documentation of one key, in the annotation of the model's field."""
 
     meaning: str
-    example: str = ""  # as written to the right of the =
+    example: str = ""  # example value, as written in the file
     unit: str = ""
 
 

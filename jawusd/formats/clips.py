@@ -44,7 +44,7 @@ class ClipSource:
         colour_space: "display", "linear", "cineon" or a name in the OpenColorIO config; None: by file type.
         colour_config: OpenColorIO config.
         pixel_aspect: width of a pixel over its height; None: from the file.
-        timecode: of the first image; "": from the file.
+        timecode: time code of the first image; "": from the file.
     """
 
     path: Path

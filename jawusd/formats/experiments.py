@@ -82,7 +82,7 @@ class Experiments:
     coverage: Coverage  # captured part of the envelope
     # remarks: number of frames that each model excluded, models that could not be fitted, experiments not requested
     notes: tuple[str, ...]
-    parameter_paths: tuple[ParameterPath, ...] = ()  # of the linear and the default model, for each parameter
+    parameter_paths: tuple[ParameterPath, ...] = ()  # paths of the linear and the default model, for each parameter
 
     def of(self, experiment: str) -> list[Distances]:
         """Return the sets of distances of one experiment."""

@@ -52,10 +52,10 @@ class Node:
     """Surfaces that move together."""
 
     name: str
-    pose: Array  # at rest, shape (4, 4) [mm]
+    pose: Array  # pose at rest, shape (4, 4) [mm]
     surfaces: Sequence[Surface]
     times_s: Array = field(default_factory=lambda: np.empty(0))  # key times, >= 0, increasing, shape (n,)
-    poses: Array = field(default_factory=lambda: np.empty((0, 4, 4)))  # at these times, shape (n, 4, 4) [mm]
+    poses: Array = field(default_factory=lambda: np.empty((0, 4, 4)))  # poses at these times, shape (n, 4, 4) [mm]
 
 
 def save_glb(

@@ -34,7 +34,7 @@ _CORNERS = ("vertex_indices", "vertex_index")
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _PLACES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _END = re.compile(rb"(?:^|(?<=[\r\n]))end_header[ \t]*(\r\n|\n|\r)")
-_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}  # of struct
+_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}  # as in struct
 _LETTERS |= {"f2": "e", "f4": "f", "f8": "d"}
 _PLURAL = {"vertex": "vertices", "tristrips": "triangle strips"}
 

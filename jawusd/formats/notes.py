@@ -54,7 +54,7 @@ class TakeNotes(TypedDict, total=False):
     outline_bias_px: dict[str, list[float]]  # by camera: bias of the mask outlines at free edges
     gum_bias_px: dict[str, list[float]]  # by camera: the same at the gum line
     gum_line_mm: list[float]  # offset of the drawn gum line from the scans', along the surface towards the gum
-    registration: Registration  # of the lower scan, from frames with the teeth together
+    registration: Registration  # of the lower scan, estimated from frames with the teeth together
     calibration_rescaled_px: dict[str, list[list[int]]]  # by camera: (width, height) calibrated and recorded
     prior_spread_mm: float  # standard deviation of the model prior used for all final poses, if any
     findings: list[dict[str, str | float | int]]  # `Finding.as_json` of all warnings about the take

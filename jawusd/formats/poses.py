@@ -4,7 +4,7 @@ Poses:      frame, m00, m01, ... m33   (row-major T_skull_mandible [mm])
         or  frame, tx, ty, tz, qw, qx, qy, qz   (scalar-first quaternion)
 Parameters: frame, d1, d2, d3   [mm]
 
-The joint table gives the transform of the mandible joint per ARKit shape, for rigs that add joint deltas:
+The joint table contains the transform of the mandible joint per ARKit shape, for rigs that sum joint deltas:
 
     shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,qz,clamped_mm
     JawOpen,0.5,...
@@ -233,7 +233,7 @@ class JointDelta:
     shape: str  # ARKit's name
     weight: float  # 0 .. 1
     d: Array  # the pose [mm], shape (3,)
-    translation_mm: Array  # of the joint, skull axes, shape (3,)
+    translation_mm: Array  # translation of the joint, skull axes, shape (3,)
     rotation: Array  # skull axes, shape (3, 3)
     clamped_mm: float  # distance by which d was clamped to the bound
 

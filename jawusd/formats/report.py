@@ -36,8 +36,8 @@ class CameraFacts:
 class Overlay:
     """One frame of the footage with the tracked scans drawn over it, all cameras side by side."""
 
-    frame: int  # of the reference camera
-    reason: str  # why this frame is shown
+    frame: int  # frame of the reference camera
+    reason: str  # why this frame was chosen
     jpeg: bytes  # the image, a JPEG file
 
 
@@ -65,7 +65,7 @@ class RigFacts:
     """Results of checking the rig files."""
 
     table_error_mm: float  # largest vertex distance of the sampled decoder to the exact model [mm]
-    findings: tuple[str, ...]  # of the validators, "severity: message"; empty if there are none
+    findings: tuple[str, ...]  # findings of the validators, "severity: message"
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +86,8 @@ class ReportData:
     overlays: tuple[Overlay, ...]  # frames of the footage, the worst first
     parts: tuple[ReplayPart, ...]
     left_out: tuple[str, ...]  # parts omitted from the report, and why
-    findings: tuple[Finding, ...] = ()  # of the check before the first stage
-    contacts: tuple[ContactPicture, ...] = ()  # empty if the scans do not show contacts
+    findings: tuple[Finding, ...] = ()  # findings of the check before the first stage
+    contacts: tuple[ContactPicture, ...] = ()  # empty if contacts cannot be computed from the scans
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class SolveReportData:
     """Data of the report of a solved performance."""
 
     shot: str
-    tracks: Tracks  # with `solved`
+    tracks: Tracks  # with the arrays in `solved`
     fps: float  # frames per second
     limits: str  # accuracy and limits of the result, in words; "" if unknown
     cameras: tuple[CameraFacts, ...]  # empty if the shot is not available

@@ -29,7 +29,7 @@ class TrackStatus(IntEnum):
 
     LOST = 0
     TRACKED = 1
-    RECOVERED = 2  # after a loss
+    RECOVERED = 2  # tracked again after a loss
     PARTIAL = 3  # tracked without one of the cameras
 
     def __str__(self) -> str:

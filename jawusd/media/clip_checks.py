@@ -28,12 +28,12 @@ _LISTED = 5
 # `tests/benchmarks/frozen.py`, which measures false positives in static and noisy scenes.
 _MOST, _AROUND = 75, 48
 _FEWEST = 12  # images needed to estimate the usual change
-_LEAST_CHANGE = 0.1  # of 255 levels
+_LEAST_CHANGE = 0.1  # least change that counts as noise or motion, of 255 levels
 _SAME, _ALIKE = 0.05, 0.03  # for long runs; for one or two images, which a reversal of motion resembles
-_SHORT, _SOME, _LONG = 2, 5, 12  # images
+_SHORT, _SOME, _LONG = 2, 5, 12  # lengths of runs [images]
 _STOPS, _FARTHER = (0.5, 4.0), 1.25
-_FAR_BELOW = 0.2  # of the 25th percentile of changes
-_REGULAR = 0.15  # of the images
+_FAR_BELOW = 0.2  # largest change within a run, as a fraction of the 25th percentile of changes
+_REGULAR = 0.15  # fraction of repeated images above which repetition counts as regular
 _MISSING_SHARE = 0.01  # fraction of frames that may lack an image at a constant rate
 
 
@@ -104,7 +104,7 @@ def repeated_runs(changes: Array) -> list[tuple[int, int]]:
     off, the change before the run is the larger one. Scenes without a usual change are skipped.
 
     Args:
-        changes: of `picture_changes`, shape (n,).
+        changes: result of `picture_changes`, shape (n,).
     """
     known = changes[1:]
     if len(known) < _FEWEST:

@@ -18,7 +18,7 @@ from jawusd.media.video import Video
 
 _SAMPLED = 10  # sampled images per take
 _FEWEST_OF_VIDEO = 4
-_NEUTRAL = 12  # of 255: largest difference of channels in gray after lossy coding
+_NEUTRAL = 12  # largest difference of channels, of 255, in gray after lossy coding
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def mask_video(path: Path) -> Video:
     """Return a video of masks, cached, since a take opens it a dozen times.
 
     Raises:
-        CaptureError: as `Video`.
+        CaptureError: see `Video`.
     """
     if not path.is_file():
         return Video(path)  # raises the error

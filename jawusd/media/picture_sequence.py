@@ -81,7 +81,7 @@ class PictureSequence(Clip):
         """Return a floating-point image as linear light, (h, w, 3) RGB float32.
 
         Raises:
-            CaptureError: as `stored`.
+            CaptureError: see `stored`.
         """
         pixels = np.asarray(self.stored(index).pixels, np.float32)
         return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)

@@ -75,7 +75,7 @@ class BuildSummary(TypedDict):
         reused: stages reused from an earlier build.
         findings: `Finding.as_json` of the check before the first stage.
         calibrate: None if the capture names a calibration.
-        track: of the final tracks.
+        track: summary of the final tracks.
     """
 
     capture: str

@@ -111,7 +111,7 @@ def rescaled_cameras(capture: Capture) -> dict[str, tuple[Size, Size]]:
     """Return calibrated and recorded size (width, height) [px] by camera, for cameras for which they differ.
 
     Raises:
-        CalibrationError, CaptureError: as `load_cameras`.
+        CalibrationError, CaptureError: see `load_cameras`.
     """
     sizes = {
         camera.name: (_size(camera), _size(recorded))

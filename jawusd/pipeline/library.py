@@ -56,7 +56,7 @@ def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, forc
     """Copy a rig into a library, as the model file `NAME/model.npz`, and return that file.
 
     Args:
-        name: of the subject and the subfolder; None: the name in the rig.
+        name: name of the subject and the subfolder; None: the name in the rig.
         force: overwrite a subject of the same name.
 
     Raises:

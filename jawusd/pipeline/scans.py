@@ -83,7 +83,7 @@ def label_scans(
 
 
 def all_labelled(capture: Capture) -> bool:
-    """Return whether both teeth scans are labelled by paint or files; raises as `load_meshes`."""
+    """Return whether both teeth scans are labelled by paint or files; raises like `load_meshes`."""
     scans = capture.scans
     files = {name: getattr(scans, name) for name in TEETH.values()}
     open_ones = {name: path for name, path in files.items() if not labels_path(path, scans.labels).is_file()}
@@ -125,7 +125,7 @@ def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: N
     """Write reviewed labels (V,) to the label file of the capture; return the file.
 
     Args:
-        scans: of the capture.
+        scans: the scans' paths in the capture.
         meshes: the scans by arch.
 
     Raises:

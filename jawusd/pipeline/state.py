@@ -37,7 +37,7 @@ LABELS = "labels"  # folder of the labels of scans that are neither painted nor 
 FIRST_PASS = "first_pass.npz"  # tracks without the model as a prior, to which the model is fitted
 _CHUNK_BYTES = 1 << 20
 _ENDING_S = 2.0  # time to wait for a lock: a killed build keeps it until the system has freed its memory
-_MOST_BYTES = 64 << 20  # of build.json, which lists every mask file of a take
+_MOST_BYTES = 64 << 20  # largest size of build.json, which lists every mask file of a take
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 # Error numbers if another process holds the lock; others mean that the file system does not support locks.
 _HELD = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)

@@ -53,9 +53,9 @@ def label_teeth(
     """Return the teeth scans among meshes with their labels, by arch.
 
     Args:
-        meshes: by the names in `MESHES`.
+        meshes: meshes by the names in `MESHES`.
         files: mesh files by the same names.
-        folder: of the label files; None: beside the scans.
+        folder: folder of the label files; None: that of each scan.
         ignore_files: ignore existing label files.
 
     Raises:
@@ -152,7 +152,7 @@ def load_labelled(capture: Capture) -> tuple[dict[str, Mesh], list[Finding]]:
 
 
 def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
-    """Read mesh files by the names in `MESHES`; raises as `load_meshes`."""
+    """Read mesh files by the names in `MESHES`; raises like `load_meshes`."""
     meshes = read_files(files)
     return meshes | {TEETH[arch]: scan.mesh for arch, scan in label_teeth(meshes, files, None).items()}
 
@@ -172,7 +172,7 @@ def labelled_teeth(capture: Capture, folder: Path | None, *, ignore_files: bool 
         ignore_files: ignore existing label files.
 
     Raises:
-        CaptureError, FormatError: as `load_meshes`.
+        CaptureError, FormatError: see `load_meshes`.
     """
     files = {name: getattr(capture.scans, name) for name in TEETH.values()}
     return list(label_teeth(read_files(files), files, folder, ignore_files=ignore_files).values())

@@ -169,7 +169,7 @@ def _frames(
         return int(poses.frames[0]), int(poses.frames[-1])
     if capture.frames is not None:
         return capture.frames[0], capture.frames[1] - 1
-    # from the first image of any camera to the last
+    # from the first to the last image of any camera
     return (
         max(0, min(offsets[name] for name in backdrops)),
         max(offsets[name] + backdrop.count - 1 for name, backdrop in backdrops.items()),

@@ -148,7 +148,7 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     """Read the perspective cameras of a stage, named after their prims, in mm, with OpenCV axes and pixels.
 
     Prims of equal names are named after their paths. The image spans the aperture, shifted by its offsets. Its size
-    [px] is `jaw:imageSize` or that of the footage; `jaw:distortion` holds OpenCV's coefficients. Moving cameras are
+    [px] is `jaw:imageSize` or that of the footage; `jaw:distortion` contains OpenCV's coefficients. Moving cameras are
     read at their first time.
 
     Args:

@@ -23,7 +23,7 @@ FORMAT_VERSION = 2
 SCHEMA_NAME = "JawRigAPI"
 
 ACTOR, GEO, MATERIALS = "/Actor", "/Actor/geo", "/Actor/mtl"
-PROXY_SUFFIX = "WithProxies"  # of the class prim that adds the proxies next to the scans
+PROXY_SUFFIX = "WithProxies"  # suffix of the class prim that adds the proxies next to the scans
 SKULL, MANDIBLE = "/Actor/geo/Skull", "/Actor/geo/Mandible"
 
 ACTOR_FILE, RIG_FILE, GEO_FILE = "actor.usda", "rig.usdc", "geo.usdc"
@@ -83,7 +83,7 @@ def register_schema() -> bool:
     """Register the schema with OpenUSD and return whether this process knows it; may be called repeatedly.
 
     OpenUSD builds its schema registry when a process first opens a stage. Plugins registered later are ignored (OpenUSD
-    issue 3596); a warning says so.
+    issue 3596); a warning is issued then.
     """
     folder = schema_folder()
     if folder is not None:

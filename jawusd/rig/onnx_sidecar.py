@@ -150,7 +150,7 @@ def runner(graph: bytes) -> Run:
 
 
 def check_written(path: str | os.PathLike[str], rig: JawRig) -> None:
-    """Check that a written sidecar gives the results of its model.
+    """Check that a written sidecar reproduces the results of its model.
 
     Raises:
         RigError: It is too far from the model.
@@ -201,7 +201,7 @@ def load_sidecar(path: str | os.PathLike[str], rig: JawRig, recorded: str | None
     """Read a graph that was made from the model of a rig.
 
     Raises:
-        FormatError: As for `onnx_error_mm`.
+        FormatError: see `onnx_error_mm`.
     """
     check_input(path)
     try:

@@ -200,7 +200,7 @@ def write_over(
         carried: Frames whose d was inferred; see `write_animation`.
 
     Raises:
-        JawusdError: As `write_rebaked`.
+        JawusdError: see `write_rebaked`.
     """
     step = float(open_stage(stage).GetTimeCodesPerSecond()) / fps
     known, times = np.isfinite(d).all(axis=1), np.asarray(frames, dtype=np.float64) * step

@@ -92,7 +92,7 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that the ONNX files of the rig were made from this model and give its results."""
+    """Check that the ONNX files of the rig were made from this model and reproduce its results."""
     rig = _rig(prim)
     attributes = [prim.GetAttribute(name) for name in ONNX_ATTRIBUTES]
     assets = {a.Get(): a.GetCustomDataByKey(SIDECAR_HASH_KEY) for a in attributes if isinstance(a.Get(), Sdf.AssetPath)}

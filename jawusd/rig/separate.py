@@ -27,7 +27,7 @@ def load_separately(path: Path, prim: str | None = None) -> JawRig:
     """Load a rig like `jawusd.load`, but in a second Python process, which returns only the arrays.
 
     Raises:
-        JawusdError: As `jawusd.load`.
+        JawusdError: see `jawusd.load`.
         RigError: The file crashes OpenUSD or exceeds the limits, or there is no Python interpreter to start.
     """
     allowed = os.pathsep.join(map(str, allowed_folders()))

@@ -24,7 +24,7 @@ SIZES = (17, 33, 65)
 _VALID_SAMPLES = 10_000  # random valid d at which the error is measured
 _FULL_CHECKS = 200  # number of worst d that are checked at every vertex
 
-_PROBES_PER_AXIS = 41  # of the grid with which the box of valid d is found
+_PROBES_PER_AXIS = 41  # values per axis of the grid with which the box of valid d is found
 _FINE = 161  # values per axis at which the curvature is measured
 _COARSE = 13  # values along the two other axes
 _NEAR_BOUND_MM = -0.5  # smallest margin at which the curvature counts; negative, as cells extend beyond the bound

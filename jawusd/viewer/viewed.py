@@ -37,7 +37,7 @@ class ViewedActor:
     meshes: Mapping[str, Mesh]
     placeholders: frozenset[str]  # names of meshes that are placeholders, not anatomy
     fps: float  # frames per second of new animations
-    folder: Path  # of the rig; animations are written there
+    folder: Path  # folder of the rig, to which animations are written
     # returns the available motions: the captured take and the animation layers beside the rig
     clip_names: Callable[[], tuple[str, ...]]
     load_clip: Callable[[str], Clip]  # reads a motion by name; raises a JawusdError

@@ -38,7 +38,7 @@ _poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
 def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
     """Add sliders, drivers and keys to the rigs of an imported stage; return whether it has rigs.
 
-    Rigs that cannot have sliders are left as imported, and the panel shows the reason.
+    Rigs that cannot have sliders are left as imported; the panel displays the reason.
     """
     from . import vendored_usd
 
@@ -287,7 +287,7 @@ def _install(*_: object) -> None:
     _poses.clear()
     for mandible in (found for found in bpy.data.objects if _ACTOR in found):
         if _drivers(mandible, (_OLD_FUNCTION,)):
-            with contextlib.suppress(vendored.JawusdError):  # the panel shows the error
+            with contextlib.suppress(vendored.JawusdError):  # the panel displays the error
                 drive(mandible, mandible[_ACTOR])
         # Blender disables drivers whose function is missing; setting the expression makes it retry
         for curve in _drivers(mandible, (_FUNCTION,)):
