@@ -129,7 +129,7 @@ def _lower(kind: int, most: int) -> None:
 
 
 def out_of_memory(path: str | PathLike[str] | None = None) -> ResourceError:
-    """Return the out-of-memory error for a file, by default the current one, with the limit."""
+    """Return the out-of-memory error for a file, by default the one recorded last, with the limit."""
     limits = []
     if resource is not None:
         found = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_DATA, resource.RLIMIT_AS))
@@ -160,7 +160,7 @@ def current_file() -> str:
 
 @contextlib.contextmanager
 def most_cpu(seconds: int) -> Iterator[None]:
-    """Limit the processor time [s] of the work inside; do nothing outside the guarded child."""
+    """Limit the processor time [s] of the enclosed block; no effect outside the guarded child."""
     if resource is None or _current is None:
         yield
         return

@@ -127,7 +127,7 @@ def track(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Track the teeth of both jaws, by masks or else by the videos."""
+    """Track the teeth of both jaws in masks or, without masks, in the videos."""
     from jawusd.cli.text_build import track_lines
     from jawusd.formats.model import load_model
     from jawusd.pipeline import track as stage

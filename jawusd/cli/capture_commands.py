@@ -78,7 +78,7 @@ def sync(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Estimate the frame offsets between cameras from light flashes, or else from sound."""
+    """Estimate the frame offsets between cameras from light flashes or, without flashes, from sound."""
     from jawusd.base.errors import SyncError
     from jawusd.cli.text_capture import sync_lines
     from jawusd.pipeline.calibrate import (
@@ -149,7 +149,7 @@ def segment(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Make masks of the teeth of both jaws from the videos, starting from picks or else from a search."""
+    """Make masks of the teeth of both jaws from the videos, starting from picks or, without picks, from a search."""
     from jawusd.cli.text_capture import segment_lines
     from jawusd.pipeline.calibrate import sync_cameras
     from jawusd.pipeline.capture_inputs import open_capture

@@ -64,7 +64,7 @@ def solve(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Track a performance of a subject with a rig, from masks or else videos of one or more cameras."""
+    """Track a performance of a subject with a rig, from masks or, without masks, videos of one or more cameras."""
     from jawusd.pipeline import solve as stage
 
     stage.check_output(rig, out, overlay, report)

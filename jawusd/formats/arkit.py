@@ -58,7 +58,7 @@ class FaceCapture:
     """The jaw weights of a face capture."""
 
     frames: Array  # frame numbers from the first row on, increasing, possibly fractional, shape (F,)
-    # JawOpen, JawLeft, JawRight, JawForward, nominally 0 .. 1, NaN without a face, shape (F, 4); subject's left
+    # JawOpen, JawLeft, JawRight, JawForward, nominally 0 .. 1, NaN without a face, shape (F, 4); left is the subject's
     weights: Array
     fps: float  # frames per second
     timecode: str  # time code of the first row, as written
@@ -127,7 +127,7 @@ def _weights(table: TextTable, columns: list[str], jaw: list[int]) -> Array:
 
 
 def _check_weights(weights: Array, table: TextTable) -> None:
-    """Refuse weights on another scale than ARKit's 0 to 1."""
+    """Reject weights that are not on ARKit's scale of 0 to 1."""
     away = np.abs(np.nan_to_num(weights, nan=0.5) - 0.5)
     row, column = np.unravel_index(int(np.argmax(away)), away.shape)
     worst = float(weights[row, column])

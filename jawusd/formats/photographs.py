@@ -59,7 +59,7 @@ class AlignedPhotos:
     """Photographs and their common bite."""
 
     T_upper_lower: Array  # lower scan to upper scan with the teeth together, shape (4, 4)
-    gum_mm: Array  # offset of drawn gum lines from the scans' towards the gum, upper and lower, shape (2,)
+    gum_mm: Array  # offset of drawn gum lines from those of the scans, towards the gum; upper, lower; shape (2,)
     depth_mm: float  # penetration depth of the crowns
     photos: tuple[AlignedPhoto, ...]
     findings: tuple[Finding, ...]

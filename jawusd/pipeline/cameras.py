@@ -224,7 +224,7 @@ def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[s
 
 @explain_missing_packages()
 def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Backdrop]:
-    """Return the backdrops for drawn scans, by camera: footage, or else masks.
+    """Return the backdrops for drawn scans by camera: footage or, without footage, masks.
 
     Args:
         offsets: frame offset by camera.

@@ -114,7 +114,7 @@ def found_error(kind: str, error: JawusdError, severity: Literal["error", "warni
 
 # Largest median distance of crown vertices from their bone [mm]; larger ones indicate another coordinate frame.
 _TEETH_TO_BONE_MM = 20.0
-_CONDYLES_MM = (75.0, 140.0)  # plausible distance of the condyle centres; adults have about 100
+_CONDYLES_MM = (75.0, 140.0)  # plausible distance between the condyle centres; about 100 in adults
 
 
 def scans(parts: Parts) -> Iterator[Finding]:

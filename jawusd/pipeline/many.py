@@ -110,7 +110,7 @@ def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptio
     The table of outcomes is written to builds.json and builds.csv, even after an interrupt.
 
     Args:
-        root: folder of the output folders; every worker must see it under the same path.
+        root: parent of the output folders; must have the same path on every worker.
 
     Returns:
         Outcomes in the order of the captures.
@@ -322,7 +322,7 @@ async def _greet(address: str) -> None:
 
 
 def check_workers(client: Client, folder: Path) -> None:
-    """Check that every worker runs this version of jawusd and sees the output folder.
+    """Check that every worker runs this version of jawusd and can access the output folder.
 
     Raises:
         ClusterError: a worker cannot be used.

@@ -66,7 +66,7 @@ def hash_files(paths: Iterable[Path]) -> str:
 
 
 def hash_value(value: object) -> str:
-    """Return the SHA-256 of a JSON-able value, independent of key order."""
+    """Return the SHA-256 of a JSON-serialisable value, independent of key order."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
 
 

@@ -1,7 +1,8 @@
 """Animation layers: samples of d for tools that know the rig, and a baked translation and quaternion for all others.
 
 All readers interpolate d linearly between samples; the baked ops follow the model along that motion. Interpolated
-matrix samples would shear, and a product of one transform per parameter is millimetres off when parameters combine.
+matrix samples would shear, and a product of one transform per parameter is millimetres off if several parameters are
+not 0.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Files that a layer refers to, and the checksums that `actor.usda` records for the binary layers of a rig.
 
-Asset paths are reduced to files: format arguments and paths inside packages are dropped. Checksums reveal damage before
-OpenUSD parses a file.
+Asset paths are reduced to files: format arguments and paths inside packages are dropped. Checksums are compared before
+OpenUSD parses a file, which may crash on a damaged one.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def rename_actor(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name
     Args:
         layer: Changed in place, and returned.
         name: The new name.
-        before: The current name of the actor's prim. Joint names need not start with it yet.
+        before: The current name of the actor's prim. Joint names may still lack it.
         files: Pattern of asset paths: references and payloads to matching files are renamed as well.
     """
     renamed_prims = {Sdf.Path(f"/{before}{end}"): Sdf.Path(f"/{name}{end}") for end in ("", PROXY_SUFFIX)}

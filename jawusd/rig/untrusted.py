@@ -169,10 +169,10 @@ def _checked_layers(path: Path) -> list[Sdf.Layer]:
 
 
 def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
-    """Check that a stage has no layers besides those that `check_file_access` returned.
+    """Check that a stage has no layers other than those returned by `check_file_access`.
 
     Raises:
-        RigError: It has others.
+        RigError: It has other layers.
     """
     known = {file_of_layer(layer).resolve() for layer in checked}
     for layer in stage.GetUsedLayers():

@@ -163,7 +163,7 @@ class CapturePage:
         self.scene.look(*fit_view(points, away, UP, aspect))
 
     def _poses_at(self, frame: int) -> tuple[Array, Array] | None:
-        """Return T_world_upper and T_world_lower of a frame: tracked, or else fitted to that frame's picks."""
+        """Return T_world_upper and T_world_lower of a frame: tracked or, if untracked, fitted to that frame's picks."""
         tracked = self._capture.tracked_poses(frame)
         if tracked is None and self._of_picks is not None and self._of_picks[0].frame == frame:
             return self._of_picks[1]

@@ -261,7 +261,7 @@ class Session:
         return True
 
     def _change(self, gesture: str | None, work: Work) -> None:
-        """Replace the work; successive changes of one gesture are a single undo step."""
+        """Replace the undoable state; successive changes of one gesture are a single undo step."""
         if gesture is None or gesture != self._gesture:
             self._undo.append(self.work)
             del self._undo[:-_MOST_UNDO]
