@@ -274,17 +274,17 @@ def test_plain_reader_and_add_on(actor, tmp_path, monkeypatch):
     labels = _stand_in_for_blender(monkeypatch)
     monkeypatch.syspath_prepend(tmp_path)
     panel = importlib.import_module("shipped.panel")
-    carried = panel.carried.JawRig(RIG.arrays, RIG.meta)
+    vendored = panel.vendored.JawRig(RIG.arrays, RIG.meta)
 
     class Actor(dict):
         name = "someone"
 
     shown = Actor()
     monkeypatch.setattr(panel.jaw, "actors", lambda: [shown])
-    monkeypatch.setattr(panel.jaw, "rig_of", lambda _: carried)
+    monkeypatch.setattr(panel.jaw, "rig_of", lambda _: vendored)
     monkeypatch.setattr(panel.jaw, "mandible_of", lambda _: None)
     monkeypatch.setattr(panel.jaw, "is_driven", lambda _: True)
-    monkeypatch.setattr(panel.jaw, "fixed", list)
+    monkeypatch.setattr(panel.jaw, "without_sliders", list)
     drawn = panel.JAWUSD_PT_sliders()
     drawn.layout = _Layout(labels)
     render = types.SimpleNamespace(fps=FPS, fps_base=1.0)

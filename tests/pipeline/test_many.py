@@ -15,6 +15,7 @@ import psutil
 import pytest
 from distributed import LocalCluster
 from package_copy import ROOT
+from run_jawusd import heed_signals
 from short_example import results, write_short
 from typer.testing import CliRunner
 
@@ -37,16 +38,11 @@ INSIDE = {
 }
 
 
-def heed_interrupts():
-    """Restore SIGINT, which shells ignore in background programs, as these tests may be."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 def started(folder, *arguments):
     """Start the program on the list of a folder, in a new process group as in a terminal."""
     command = [sys.executable, "-m", "jawusd", "build-many", str(folder / "list.txt"), "-o", str(folder / "out")]
     how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
-    return subprocess.Popen([*command, *arguments], **how, preexec_fn=heed_interrupts)
+    return subprocess.Popen([*command, *arguments], **how, preexec_fn=heed_signals)
 
 
 def worker_on(process, folder):

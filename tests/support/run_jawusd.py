@@ -1,5 +1,6 @@
 """Run the program as a user runs it, and write what it takes."""
 
+import signal
 import subprocess
 import sys
 
@@ -11,6 +12,12 @@ def run(*arguments, code=0):
     assert result.returncode == code, result.stdout + result.stderr
     assert "Traceback" not in result.stderr
     return result.stdout if code in (0, 1) else result.stderr
+
+
+def heed_signals():
+    """Restore, in a child process, the signals that tests may ignore: in the background of a shell, or under nohup."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def face_csv(path, weights, fps=30):

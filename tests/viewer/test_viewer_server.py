@@ -8,6 +8,7 @@ import sys
 import time
 
 import pytest
+from run_jawusd import heed_signals
 
 from jawusd.base.errors import OutputError
 from jawusd.viewer.server import Viewer, is_loopback, is_own_page
@@ -48,16 +49,11 @@ def test_an_address_of_another_machine_is_refused(folder):
         Viewer(viewed_actor(folder), "192.0.2.1", 0)
 
 
-def heed_interrupts():
-    """Restore interrupts, which background jobs of a shell ignore."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 def run_view(folder, *options):
     """Run `jawusd view` until it prints its address; return stdout's first line and stderr."""
     command = [sys.executable, "-m", "jawusd", "view", str(folder), "--no-browser", "--port", "0", *options]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_signals
     )
     try:
         line = process.stdout.readline()
