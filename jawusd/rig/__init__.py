@@ -46,9 +46,9 @@ _MODULES = {
     "write_splines": "jawusd.rig.animation",
 }
 
-# Disables the telemetry of onnxruntime, which reads the variable when it is loaded.
+# Disables onnxruntime's telemetry: onnxruntime reads this variable when it is loaded.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-# At import time: OpenUSD ignores schemas that are registered after the first stage was opened.
+# Registered at import time, because OpenUSD ignores schemas that are registered after the first stage was opened.
 register_schema()
 
 

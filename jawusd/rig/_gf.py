@@ -13,32 +13,32 @@ from jawusd.geometry.quaternion import continuous_wxyz
 
 
 def double_array(values: ArrayLike) -> Vt.DoubleArray:
-    """Return a flat Vt.DoubleArray of an array of any shape, row-major."""
+    """Return an array of any shape as a flat Vt.DoubleArray, row-major."""
     return Vt.DoubleArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float64).reshape(-1))
 
 
 def float_array(values: ArrayLike) -> Vt.FloatArray:
-    """Return a flat Vt.FloatArray of an array of any shape, row-major; rounds to float32."""
+    """Return an array of any shape as a flat Vt.FloatArray, row-major; rounds to float32."""
     return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
 
 
 def int_array(values: ArrayLike) -> Vt.IntArray:
-    """Return a flat Vt.IntArray of integers of any shape, row-major."""
+    """Return an integer array of any shape as a flat Vt.IntArray, row-major."""
     return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32).reshape(-1))
 
 
 def vec3f_array(values: ArrayLike) -> Vt.Vec3fArray:
-    """Return a Vt.Vec3fArray of points or normals (n, 3); rounds to float32."""
+    """Return points or normals (n, 3) as a Vt.Vec3fArray; rounds to float32."""
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
 def vec2f_array(values: ArrayLike) -> Vt.Vec2fArray:
-    """Return a Vt.Vec2fArray of pairs (n, 2); rounds to float32."""
+    """Return pairs (n, 2) as a Vt.Vec2fArray; rounds to float32."""
     return Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
 def vec2d(pair: ArrayLike) -> Gf.Vec2d:
-    """Return a Gf.Vec2d of two numbers."""
+    """Return two numbers as a Gf.Vec2d."""
     return Gf.Vec2d(*np.asarray(pair, dtype=np.float64).tolist())
 
 
@@ -48,12 +48,12 @@ def translations(T: ArrayLike) -> list[Gf.Vec3d]:
 
 
 def rotations(T: ArrayLike) -> list[Gf.Quatd]:
-    """Return the rotations of transforms (n, 4, 4) as unit quaternions, each in the half-space of its predecessor."""
+    """Return the rotations of transforms (n, 4, 4) as unit quaternions without sign flips between neighbours."""
     return [Gf.Quatd(w, x, y, z) for w, x, y, z in continuous_wxyz(np.asarray(T)[:, :3, :3]).tolist()]
 
 
 def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
-    """Return the rotations of `rotations`, each as a Vt.QuatfArray of length one: samples of a one-joint animation."""
+    """Return `rotations` as samples of a one-joint animation, each a Vt.QuatfArray of length one."""
     return [Vt.QuatfArray([Gf.Quatf(w, x, y, z)]) for w, x, y, z in continuous_wxyz(np.asarray(T)[:, :3, :3]).tolist()]
 
 

@@ -28,13 +28,12 @@ from jawusd.rig.read import load_rig, open_stage
 from jawusd.rig.skel import add_skeleton_variant
 from jawusd.rig.table import landmark_distance
 
-#: Largest landmark distance [mm] from the model between two baked samples, and the fractions of the interval that are
-#: tested.
+#: Maximum landmark distance [mm] from the model between two baked samples, tested at these fractions of the interval.
 BETWEEN_MM = 0.02
 _FRACTIONS = (0.25, 0.5, 0.75)
 _MAX_HALVINGS = 5
-_USD_LERP_BELOW = 1e-5  # GfSlerp interpolates linearly if 1 - cosine is below
-# Limits: every whole frame is baked, and an hour at 60 frames per second must fit.
+_USD_LERP_BELOW = 1e-5  # threshold of 1 - cosine below which GfSlerp interpolates linearly
+# Maximum number of baked frames, enough for an hour at 60 frames per second, and maximum absolute frame number.
 _MAX_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
 #: Keys in an animation layer's `customLayerData`: frames without d, and frames with d inferred from their neighbours.
 LOST = "lostFrames"
@@ -57,14 +56,14 @@ def write_animation(
     Args:
         out: File to write, `.usdc` or `.usda`.
         actor: The `actor.usda` it animates.
-        frames: Increasing frame numbers (F,), integers or not: all frames, or those of keys only.
-        d: Parameters (F, 3) [mm]; rows with NaN are lost frames: interpolated linearly, and listed in the layer's
-            `customLayerData["lostFrames"]`.
+        frames: Increasing frame numbers (F,), possibly fractional: all frames, or only those of the keys.
+        d: Parameters (F, 3) [mm]. Rows with NaN are lost frames, which are interpolated linearly and listed in the
+            layer's `customLayerData["lostFrames"]`.
         rig: The evaluator; read from `actor` if None.
         carried: Frames whose d was not measured but interpolated from neighbouring frames; listed in
             `customLayerData["carriedFrames"]`.
-        skinned: Paths of meshes that `actor_skel.usdc` next to the layer binds, with the same motion. If not empty, a
-            variant is added, see `add_skeleton_variant`.
+        skinned: Paths of meshes that `actor_skel.usdc`, in the same folder and with the same motion, binds. If not
+            empty, a variant is added, see `add_skeleton_variant`.
 
     Raises:
         RigError: The actor is missing, frames do not increase, no frame has d, or the frame rate is not positive.
@@ -107,7 +106,7 @@ def write_animation(
 
 
 def root_prim_of(actor: Path) -> str:
-    """Return the name of the root prim that is the rig, in an actor's file.
+    """Return the name of the root prim that is the rig in an actor's file.
 
     Raises:
         RigError: Not exactly one root prim is a rig.
@@ -124,14 +123,14 @@ def root_prim_of(actor: Path) -> str:
 
 
 def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array, Array]:
-    """Return the times (n,) of the baked samples and their poses T_skull_mandible (n, 4, 4).
+    """Return the times (n,) of the baked samples and the poses T_skull_mandible (n, 4, 4) at these times.
 
-    These are every whole frame of the span, every sample of d, and as many times between them as are needed to keep all
-    landmarks within 0.02 mm of the model.
+    The times are every whole frame of the span, every sample of d, and as many times in between as keep all landmarks
+    within 0.02 mm of the model.
 
     Args:
         frames: Times of the samples of d, increasing, shape (F,).
-        d: Their values [mm], shape (F, 3).
+        d: Values of d at these times [mm], shape (F, 3).
         span: First and last time to cover.
     """
     whole = np.arange(np.ceil(span[0]), np.floor(span[1]) + 1)
@@ -160,7 +159,7 @@ def author_motion(
 
     Args:
         frames: Times of the samples of d, increasing, shape (F,).
-        d: Their values [mm], shape (F, 3).
+        d: Values of d at these times [mm], shape (F, 3).
         span: First and last time to cover.
         paths: Prim paths of the actor and of its mandible.
     """
@@ -194,8 +193,8 @@ def _as_shown_by_usd(T_a: Array, T_b: Array, share: float) -> Array:
     """Return the transforms that OpenUSD computes between two samples, at the fraction `share` of the interval.
 
     OpenUSD interpolates quaternions by slerp (Shoemake 1985). Nearly equal ones (GfSlerp: cosine above 1 - 1e-5) are
-    interpolated linearly without normalising, and the angle is then taken from the real part alone (GfRotation). Near
-    the identity, where a closed jaw is, the error is up to 0.4 mm.
+    interpolated linearly without normalising, and the angle is then taken from the real part alone (GfRotation). For
+    rotations near the identity, as those of a closed jaw, the error is up to 0.4 mm.
     """
     q_a, q_b = wxyz_from_matrix(T_a[:, :3, :3]), wxyz_from_matrix(T_b[:, :3, :3])
     cosine = np.einsum("ij,ij->i", q_a, q_b)
@@ -221,7 +220,7 @@ def write_splines(
     slopes: ArrayLike | None = None,
     curved: ArrayLike | None = None,
 ) -> Path:
-    """Write a layer with the keys of an animation as splines; it sublayers the animation.
+    """Write a layer with the keys of an animation as splines; the layer sublayers the animation.
 
     The splines interpolate the animation's samples. Other layers of a rig contain no splines, because OpenUSD before
     25.05 ignores them or cannot parse them, and other readers reject the whole file.
@@ -262,7 +261,7 @@ def write_splines(
 
 
 def _spline(frames: Array, values: Array, slopes: Array, curved: Mask) -> Ts.Spline:
-    """Return a Bezier spline. Handles of a third of a segment make it a cubic polynomial of time."""
+    """Return a Bezier spline; handles as long as a third of a segment make it a cubic polynomial of time."""
     third = np.diff(frames) / 3.0
     before, after = np.concatenate([[0.0], third]), np.concatenate([third, [0.0]])
     cubic = np.append(curved, False)

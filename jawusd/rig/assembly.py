@@ -15,8 +15,8 @@ from jawusd.rig.layout import MOTION, SKELETON, meshes_below
 from jawusd.rig.motion_read import mandible_of, prims_between, skull_of
 from jawusd.rig.skel import bones_of
 
-_UNEVEN = 1e-3  # relative difference of the three scales; far above single precision, 0.1 mm at jaw size
-_SIZES = 0.5, 2.0  # plausible scale factors of a head; factors outside come from wrong units
+_UNEVEN = 1e-3  # maximum relative difference of the three scales: 0.1 mm at jaw size, far above rounding
+_SIZES = 0.5, 2.0  # smallest and largest plausible scale of a head; others come from wrong units
 _MM = 0.001  # a millimetre in metres
 _FIRST = Usd.TimeCode.EarliestTime()
 
@@ -56,7 +56,7 @@ def _muted(actor: Usd.Prim) -> Iterator[Fault]:
 
 
 def _units(actor: Usd.Prim) -> Iterator[Fault]:
-    """Find units and axes of the stage that differ from those of the rig's layer without a correcting transform."""
+    """Find units and axes of the stage that differ from the rig's layer and are not corrected by a transform."""
     stage, root = actor.GetStage(), actor.GetStage().GetRootLayer()
     stack = actor.GetAttribute("jaw:formatVersion").GetPropertyStack()
     own = stack[-1].layer if stack else root
@@ -137,7 +137,7 @@ def _is_visible(prim: Usd.Prim, time: Usd.TimeCode) -> bool:
 
 
 def _joints(actor: Usd.Prim, mandible: Usd.Prim) -> Iterator[Fault]:
-    """Find animated joints that the skeleton lacks; also checks the skeleton variant if it is not selected."""
+    """Find animated joints that the skeleton lacks; the skeleton variant is checked even if it is not selected."""
     bones = bones_of(mandible)
     variants = actor.GetVariantSet(MOTION)
     if bones is None and SKELETON in variants.GetVariantNames() and not actor.IsInstanceProxy():

@@ -18,13 +18,13 @@ from jawusd.base.errors import RigError
 
 
 def file_of(identifier: str) -> Path:
-    """Return the file of an asset path, without format arguments; for a layer inside a package, the package."""
+    """Return the file of an asset path, without format arguments; for a layer inside a package, return the package."""
     path = Sdf.Layer.SplitIdentifier(identifier)[0]
     return Path(Ar.SplitPackageRelativePathOuter(path)[0] if Ar.IsPackageRelativePath(path) else path)
 
 
 def file_of_layer(layer: Sdf.Layer) -> Path:
-    """Return the file that a layer was read from. Identifiers found by search path are not full paths."""
+    """Return the file that a layer was read from; its identifier may be a search path instead of a full path."""
     return file_of(layer.realPath or layer.identifier)
 
 
@@ -72,7 +72,7 @@ def asset_paths(layer: Sdf.Layer) -> list[str]:
         return asset
 
     edited = layer.dirty
-    silent = UsdUtils.CoalescingDiagnosticDelegate()  # hides a warning: anonymous copies have no folder of clips
+    silent = UsdUtils.CoalescingDiagnosticDelegate()  # hides the warning that an anonymous copy has no folder
     UsdUtils.ModifyAssetPaths(layer, note)
     del silent
     if layer.dirty and not edited and not layer.anonymous:
@@ -97,7 +97,7 @@ def clip_templates(layer: Sdf.Layer) -> list[str]:
 
 
 def _evaluated_text(layer: Sdf.Layer, text: str) -> str:
-    """Return a text, evaluated with the layer's variables if it is an expression."""
+    """Return a string, evaluated with the layer's variables if it is an expression."""
     if not Sdf.VariableExpression.IsExpression(text):
         return text
     return str(Sdf.VariableExpression(text).Evaluate(layer.expressionVariables).value or "")

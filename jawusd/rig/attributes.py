@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _TYPES = Sdf.ValueTypeNames
 
-#: Largest number of elements of an array that is read: the face corners of the largest accepted mesh.
+#: Maximum number of elements in an array: the number of face corners of the largest accepted mesh.
 MAX_VALUES = 30_000_000
 
 
@@ -113,11 +113,11 @@ def value_of(attribute: Usd.Attribute, where: object, time: Usd.TimeCode | None 
     return value
 
 
-MAX_FRAMES = 220_000  # an hour at 60 frames per second, the same limit as for writing
+MAX_FRAMES = 220_000  # maximum number of times: an hour at 60 frames per second, as for writing
 
 
 def key_times(attribute: Usd.Attribute) -> list[float]:
-    """Return the times of an attribute's samples; of a spline, its knots and the whole frames between them."""
+    """Return the times of an attribute's samples; for a spline, its knots and the whole frames between them."""
     spline = _spline_of(attribute)
     if spline is None:
         return list(attribute.GetTimeSamples())
@@ -158,12 +158,12 @@ def key_and_frame_times(attributes: Iterable[Usd.Attribute]) -> tuple[Array, Mas
 
 
 def time_codes(times: Array) -> list[Usd.TimeCode]:
-    """Return times as time codes; if there are none, the default time code."""
+    """Return times as time codes; without times, return the default time code."""
     return [Usd.TimeCode(time) for time in times.tolist()] or [Usd.TimeCode.Default()]
 
 
 def _upgrade_1_to_2(prim: Usd.Prim) -> None:
-    """Derive the tolerance of measured poses from the smallest valid margin, which version 1 stored instead.
+    """Derive the tolerance of measured poses; version 1 stored the smallest valid margin instead.
 
     The other additions of version 2 are optional: the glide surface table and the clearances of the teeth.
     """

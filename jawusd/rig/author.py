@@ -30,7 +30,7 @@ from jawusd.rig.table import DecoderTable, grid_points, sample_valid
 
 _TYPES = Sdf.ValueTypeNames
 _PROXY_CLASS = ACTOR + PROXY_SUFFIX
-# The interface is text and stays short; long arrays go to the binary layer.
+# Prefixes of the attributes in the text layer, which stays short; long arrays go to the binary layer.
 _INTERFACE_ARRAYS = ("jaw:landmarks:", "jaw:thresholds:")
 _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "jaw:motion:")
 
@@ -58,7 +58,8 @@ def proxy_layer(
 def _with_ordered_fields(layer: Sdf.Layer) -> Sdf.Layer:
     """Return a layer read from the text of another.
 
-    CopySpec adds fields in the order of their memory addresses, so binary layers would differ between runs.
+    Copies made by CopySpec have their fields in the order of memory addresses, so binary layers would differ between
+    runs.
     """
     ordered = Sdf.Layer.CreateAnonymous(".usda")
     ordered.ImportFromString(layer.ExportToString())
@@ -190,7 +191,7 @@ def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
 
 
 def motion_extent(rig: JawRig, meshes: Mapping[str, Mesh]) -> Array:
-    """Return a box (2, 3) [mm] around all meshes at rest and the mandible's bounding box at 500 valid parameters."""
+    """Return a box (2, 3) [mm] that contains all meshes at rest, and the mandible's meshes at 500 random valid d."""
     fixed = [extent(meshes[name].vertices) for name in ("skull", "upper_teeth") if name in meshes]
     moving = [meshes[name].vertices for name in ("mandible", "lower_teeth") if name in meshes]
     low, high = extent(np.concatenate(moving))

@@ -60,11 +60,11 @@ def bake_rig(
         folder: Output folder; created if missing.
         meshes: `upper_teeth` and optionally `skull` in the skull frame, `lower_teeth` and optionally `mandible` in the
             mandible frame [mm].
-        fps: Frames per second of the captured motion.
+        fps: Frame rate of the captured motion [frames per second].
         frames: Increasing numbers of the captured frames (F,).
         d: Parameters of the captured frames (F, 3) [mm], NaN where lost.
-        table_size: Values per axis of the sampled decoder, 17, 33 or 65.
-        proxies: Proxies of few faces for some of the meshes, by the same names; they add variants.
+        table_size: Knots per axis of the sampled decoder: 17, 33 or 65.
+        proxies: Low-polygon proxies of some of the meshes, by the same names; each adds variants.
         prim_name: Name of the actor's prim, and prefix of the joint names.
 
     Returns:

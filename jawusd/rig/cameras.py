@@ -26,16 +26,16 @@ from jawusd.rig.untrusted import raises_format_error
 
 TAKE, TAKE_CAMERAS = "/Take", "/Take/Cameras"
 
-# Undistorted images of a camera, relative to the take, numbered by time code; the second pattern is for footage in
-# linear light.
+# File patterns of undistorted images, relative to the take, numbered by time code: JPEG, and EXR for footage in linear
+# light.
 PLATE = "plates/{name}/{name}.%06d.jpg"
 LIGHT_PLATE = "plates/{name}/{name}.%06d.exr"
 
-# A sensor of 36 mm. UsdGeomCamera measures apertures and focal lengths in tenths of a scene unit.
+# Sensor width of 36 mm, in tenths of a scene unit, the unit of UsdGeomCamera's apertures and focal lengths.
 _SENSOR_WIDTH = 360.0
 _CLIPPING_MM = (1.0, 10_000.0)
 _LARGEST_SKEW = 1e-6
-# Attributes that name the lens model in Omniverse: older, and with its lens schemas.
+# Attributes that name the lens model in Omniverse, in older versions and in its lens schemas.
 _LENS_MODELS = ("cameraProjectionType", "omni:lensdistortion:model")
 # Camera and world axes are x right, y down, z forward in OpenCV, and x right, y up, z backward in USD.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -52,13 +52,13 @@ def write_cameras(
 ) -> list[Path]:
     """Write the take: one `UsdGeom.Camera` per camera, and the actor moved by the tracked head.
 
-    The cameras are pinholes, which match undistorted images. `jaw:plate` is the printf pattern of such images, by time
-    code and relative to the take. `jaw:distortion` has OpenCV's coefficients of the distorted footage, `jaw:imageSize`
-    its size. The head's motion is written to a binary layer that the take sublayers.
+    The cameras are pinholes, which match undistorted images. `jaw:plate` is the printf pattern of these images,
+    numbered by time code, relative to the take. `jaw:distortion` has OpenCV's coefficients of the distorted footage,
+    `jaw:imageSize` its size. The head's motion is written to a binary layer that the take sublayers.
 
     Args:
         out: File to write, `.usda`; the motion goes to `<name>_motion.usdc` beside it.
-        actor: The layer to show, `anim_capture.usdc` or `actor.usda`.
+        actor: The layer of the actor that the take references, `anim_capture.usdc` or `actor.usda`.
         frames: Increasing frame numbers (F,).
         T_world_skull: Poses of the skull (F, 4, 4) [mm], NaN where lost.
         fps: Frames per second.
@@ -152,8 +152,8 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     read at their first time.
 
     Args:
-        path: A stage, or an Alembic file (in cm) if OpenUSD has the plugin for it; the wheels of OpenUSD do not.
-        sizes: Callback that returns (width, height) [px] by camera, for cameras without `jaw:imageSize`.
+        path: A stage, or an Alembic file (in cm) if OpenUSD has its Alembic plugin, which the wheels lack.
+        sizes: Callback that returns (width, height) [px] of each camera; used for cameras without `jaw:imageSize`.
 
     Raises:
         RigError: The stage cannot be opened, refers to files outside its folder, or has no perspective camera.
@@ -171,7 +171,7 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     stage = open_stage(path)
     mm = UsdGeom.GetStageMetersPerUnit(stage) * 1000.0
     cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
-    # orthographic cameras are top and side views of 3-D programs
+    # skips orthographic cameras: they are the top and side views of 3-D programs
     prims = [prim for prim in cameras if UsdGeom.Camera(prim).GetProjectionAttr().Get() != "orthographic"]
     names = names_of_labels(Path(path), [str(prim.GetPath())[1:] for prim in prims])
     known: Mapping[str, tuple[int, int]] | None = None
@@ -195,7 +195,7 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
 
 
 def _check_lens(path: str | os.PathLike[str], prim: Usd.Prim) -> None:
-    """Raise CalibrationError if a camera has a fisheye or another lens model of Omniverse."""
+    """Raise CalibrationError if a camera has one of Omniverse's lens models, such as fisheye."""
     for name in _LENS_MODELS:
         model = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
         if model and str(model) != "pinhole":

@@ -59,7 +59,7 @@ def write_look(prim: UsdGeom.Mesh, mesh: Mesh, plain: tuple[float, float, float]
 
 
 def hide_look(prim: UsdGeom.Mesh, mesh: Mesh, below: Mesh) -> None:
-    """Override the primvars that only the mesh in a weaker layer, `below`, has, since the points differ."""
+    """Override the primvars that only the weaker layer's mesh `below` has, because they belong to other points."""
     if natural_colors(mesh) is None and natural_colors(below) is not None:
         prim.GetDisplayColorPrimvar().SetInterpolation(UsdGeom.Tokens.constant)
     if mesh.uv is None and below.uv is not None:
@@ -102,8 +102,9 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str |
     Args:
         meshes: `upper_teeth` and `skull` in the skull frame, `lower_teeth` and `mandible` in the mandible frame [mm];
             `skull` and `mandible` may be missing.
-        T_rest: T_skull_mandible of the closed bite, shape (4, 4), the mandible's default pose.
-        placeholder: Source of the condyles if the mandible's mesh is a placeholder, which is then marked as one.
+        T_rest: T_skull_mandible with the teeth closed, shape (4, 4): the mandible's default pose.
+        placeholder: Source of the condyle positions if the mandible mesh is a placeholder, which is then marked as one;
+            otherwise None.
 
     Raises:
         RigError: An unknown or missing mesh, or a mesh without faces or with values that are not finite.
@@ -153,7 +154,7 @@ def check_meshes(meshes: Mapping[str, Mesh]) -> None:
     """Check the meshes of a rig; raises RigError as `build_geometry` does."""
     unknown = sorted(set(meshes) - set(MESH_PATHS))
     if unknown:
-        raise RigError(f"there is no mesh called {unknown[0]!r}; allowed are {', '.join(MESH_PATHS)}.")
+        raise RigError(f"there is no mesh called {unknown[0]!r}; it must be one of {', '.join(MESH_PATHS)}.")
     for name in _REQUIRED:
         if name not in meshes:
             raise RigError(f"the {name} mesh is missing; a rig needs both teeth scans.")
@@ -213,7 +214,7 @@ def vertex_normals(mesh: Mesh) -> Array:
     for axis in range(3):
         normals[:, axis] = np.bincount(corners, np.repeat(area[:, axis], 3), minlength=len(mesh.vertices))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    # vertices with degenerate faces only get an arbitrary unit vector
+    # vertices whose faces are all degenerate get an arbitrary unit vector
     return np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
 
 

@@ -18,8 +18,8 @@ from jawusd.rig.animation import bake_times
 from jawusd.rig.geo import MATERIAL_LOOKS, MESH_PATHS, linear_from_srgb, read_geometry, read_gum, vertex_normals
 from jawusd.rig.layout import MANDIBLE, SKULL
 
-_HIGHEST_FRAME = 100_000.0  # up to this frame number, single precision resolves a hundredth of a frame
-_SCAN = "Scan"  # name of a white material, as vertex colours are multiplied by the material's colour
+_HIGHEST_FRAME = 100_000.0  # largest frame number at which single precision resolves a hundredth of a frame
+_SCAN = "Scan"  # name of the material of scans, white because vertex colours are multiplied by it
 
 
 def write_glb(
@@ -76,9 +76,9 @@ def write_glb(
 
 
 def frame_at_zero(frames: Array) -> float:
-    """Return the frame of a take, frames (F,), at 0 s of a .glb: frame 0, so that frame numbers are kept.
+    """Return the frame that is at 0 s in the .glb of a take with frames (F,): frame 0, so that frame numbers are kept.
 
-    If the first frame is negative, it is the first frame, because glTF has no times before 0; also if frame numbers are
+    The first frame is returned instead if it is negative, because glTF has no times before 0, or if frame numbers are
     too high for single precision, which glTF uses for times.
     """
     return 0.0 if frames[0] >= 0 and frames[-1] <= _HIGHEST_FRAME else float(frames[0])
@@ -102,7 +102,7 @@ def _split(faces: NDArray[np.int32], uv: Array) -> tuple[NDArray[np.int32], NDAr
     """Split vertices on texture seams, so that each has one texture coordinate.
 
     Returns:
-        Faces (F, 3), and for every new vertex the index of the old one (n,) and the texture coordinate (n, 2).
+        Faces (F, 3), and for every new vertex the index of the original vertex (n,) and the texture coordinate (n, 2).
     """
     corners = np.column_stack([faces.reshape(-1), uv.reshape(-1, 2)])
     rows, index = np.unique(corners, axis=0, return_inverse=True)

@@ -21,7 +21,7 @@ from jawusd.rig.layout import ACTOR, PROXY_SUFFIX, SCHEMA_NAME
 
 T = TypeVar("T")
 
-# Warning of OpenUSD 26.11 for every spline it writes.
+# Part of the warning that OpenUSD 26.11 issues for every spline it writes.
 _SPLINE_WARNING = "inner looping is deprecated"
 
 
@@ -45,13 +45,13 @@ def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
 
 
 def rename_actor(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name, files: str = ".*") -> Sdf.Layer:
-    """Rename the actor's prims and joints in an anonymous layer, and all paths to them.
+    """Rename the actor's prims and joints in an anonymous layer, and update all paths to them.
 
     Args:
         layer: Changed in place, and returned.
         name: The new name.
-        before: The current name of the actor's prim. Joint names may still lack it.
-        files: Pattern of asset paths: references and payloads to matching files are renamed as well.
+        before: The current name of the actor's prim; joint names may not have this prefix yet.
+        files: Pattern of asset paths; prim paths in references and payloads to matching files are renamed too.
     """
     renamed_prims = {Sdf.Path(f"/{before}{end}"): Sdf.Path(f"/{name}{end}") for end in ("", PROXY_SUFFIX)}
 
@@ -101,7 +101,7 @@ def _joint(joint: str, name: str, before: str) -> str:
 
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
-    """Return a stage on an anonymous layer, for schema classes that need one.
+    """Return a stage whose root is an anonymous layer, for schema classes that need a stage.
 
     Raises:
         RigError: OpenUSD cannot open it.
@@ -163,7 +163,7 @@ def relative_path(target: Path, layer: Path) -> str:
 
 @contextlib.contextmanager
 def without_warning(words: str) -> Iterator[None]:
-    """Suppress OpenUSD's warnings that contain these words; other warnings are issued afterwards."""
+    """Suppress OpenUSD's warnings that contain these words; other warnings are issued at the end of the block."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
@@ -186,7 +186,7 @@ def write_layer(layer: Sdf.Layer, path: Path) -> Path:
         try:
             with without_warning(_SPLINE_WARNING):
                 written = layer.Export(str(temporary))
-        except Tf.ErrorException:  # its message names a source line of OpenUSD, not the reason
+        except Tf.ErrorException:  # OpenUSD's message names a line of its source code, not the reason
             written = False
         if not written:
             raise OutputError("could not be written; is the disk full? Any previous file is unchanged.", path=path)

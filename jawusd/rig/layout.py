@@ -36,8 +36,8 @@ MOTION, TRANSFORMS, SKELETON = "motion", "transforms", "skeleton"  # variant set
 
 PARAMETERS = ("jaw:d1", "jaw:d2", "jaw:d3")
 ONNX_ATTRIBUTES = ("jaw:onnx", "jaw:onnx:encode")
-MODEL_HASH_KEY = "modelHash"  # custom data of animated parameters: hash of the model they were made with
-SIDECAR_HASH_KEY = "sha256"  # custom data of the ONNX attributes: checksum of the file
+MODEL_HASH_KEY = "modelHash"  # custom data key of animated parameters: hash of the model they were made with
+SIDECAR_HASH_KEY = "sha256"  # custom data key of the ONNX attributes: checksum of the file
 
 
 def prim_name_of(actor: str) -> str:
@@ -83,7 +83,7 @@ def register_schema() -> bool:
     """Register the schema with OpenUSD and return whether this process knows it; may be called repeatedly.
 
     OpenUSD builds its schema registry when a process first opens a stage. Plugins registered later are ignored (OpenUSD
-    issue 3596); a warning is issued then.
+    issue 3596); in that case a warning is issued.
     """
     folder = schema_folder()
     if folder is not None:

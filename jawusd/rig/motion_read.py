@@ -1,6 +1,6 @@
 """Read the motion of the mandible in a stage, from transforms, bones or samples of d.
 
-Also determines at which times and how closely a baked mandible must match its d, and whether the skull is moved.
+Also determine at which times and how closely a baked mandible must match its d, and how far the skull is moved.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from jawusd.rig.skel import SAME_MOTION, bones_of, transform_in_actor
 from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
-#: Largest distance [mm] of a baked pose from that of d.
+#: Maximum landmark distance [mm] of a baked pose from the pose given by d.
 BAKED_MM = 0.01
-_RIGID = 1e-5  # largest rigidity defect; single-precision quaternions, as written by DCCs, stay below
+_RIGID = 1e-5  # maximum rigidity defect; single-precision quaternions, as written by DCCs, stay below it
 
 
 @raises_format_error(0)
@@ -54,7 +54,7 @@ def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object
     """Return the poses of a mandible relative to the skull, from transforms or bones.
 
     Args:
-        times: Shape (F,); the default time is read if it is empty.
+        times: Times to read, shape (F,); if empty, the default time is read.
 
     Returns:
         T_skull_mandible [mm], shape (F, 4, 4), in the actor's units; relative to the actor if there is no skull.
@@ -91,7 +91,7 @@ def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode
     for k, time in enumerate(times):
         cache = UsdGeom.XformCache(time)
         for i, mover in enumerate(movers):
-            moved[i, k] = np.array(transform_in_actor(actor, mover, cache)).T  # USD multiplies rows from the left
+            moved[i, k] = np.array(transform_in_actor(actor, mover, cache)).T  # USD has row vectors
     if not np.abs(moved - moved[:1]).max() <= SAME_MOTION:
         raise FormatError(
             f"the meshes below {prim.GetPath()} move differently.",
@@ -103,7 +103,7 @@ def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode
 
 
 def moving_attributes(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Attribute]:
-    """Return the attributes that move a prim in its actor: of joints, or the ops of the prims up to the actor."""
+    """Return the attributes that move a prim in its actor: those of joints, or the ops of the prims up to the actor."""
     bones = bones_of(prim)
     if bones is not None:
         return bones.animated_attributes()
@@ -238,13 +238,13 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
 def comparison_times(actor: Usd.Prim, moving: list[Usd.Attribute], by_bones: bool) -> tuple[Array, Array]:
     """Return the times at which a mandible is compared with d, and the allowed distances.
 
-    The times are the keys of both, because a jaw of which only d is keyed does not move, and the whole frames between
-    them, because d and the mandible are interpolated differently. For bones the keys suffice: they have one at every
-    key of d.
+    The times are the keys of d and of the mandible, because a jaw does not move if only its d is keyed, and the whole
+    frames between these keys, because d and the mandible are interpolated differently. For bones the keys suffice:
+    bones have a key at every key of d.
 
     Args:
         moving: The attributes that move the mandible.
-        by_bones: Whether they belong to joints.
+        by_bones: Whether these attributes belong to joints.
 
     Returns:
         Increasing times, shape (n,), n = 0 if nothing has keys; landmark distances [mm], shape (max(n, 1),).

@@ -16,10 +16,11 @@ from jawusd.evaluator.formula import long_angle_series
 from jawusd.evaluator.operations import Symbol, triple
 from jawusd.geometry.rodrigues import Triple, angle_quotients
 
-# |B_2k|, k = 1..8: Bernoulli numbers in the series of the inverse left Jacobian
+# absolute Bernoulli numbers |B_2k|, k = 1..8, in the series of the inverse left Jacobian
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510)
 _INVERSE_SERIES = [number / factorial(2 * k) for k, number in enumerate(_BERNOULLI, start=1)]
-# Below this squared angle, the closed forms suffer from cancellation in float32; above it, the series is inaccurate.
+# Squared angle below which the series is used, as the closed forms suffer from cancellation in float32; above it, the
+# series is inaccurate.
 _SERIES_BELOW_RAD2 = 0.25
 
 _ARITHMETIC = {"Add": "Add", "Subtract": "Sub", "Multiply": "Mul", "Divide": "Div"}
@@ -29,7 +30,7 @@ FloatType = type[np.float32] | type[np.float64]
 
 @dataclass(frozen=True)
 class Value(Symbol):
-    """A value in a graph: a column (n, 1), or a wide value (n, m), see `jawusd.evaluator.operations`."""
+    """A value in a graph: a column (n, 1), or an array of m columns (n, m), see `jawusd.evaluator.operations`."""
 
     graph: Graph = field(repr=False)
     name: str
@@ -45,7 +46,7 @@ class Value(Symbol):
 
 @dataclass(eq=False)
 class Graph:
-    """A graph of one floating-point type under construction; also `Operations` on its values.
+    """A graph under construction, of one floating-point type; implements `Operations` on its values.
 
     Attributes:
         dtype: float32 or float64.
@@ -133,7 +134,7 @@ class Graph:
         return self.op("Where", small, series[3], (1.0 - a / (2.0 * b)) / far)
 
     def _near_and_far(self, squared: Value) -> tuple[Value, Value, list[Value]]:
-        """Return a mask of small squared angles, the squared angle clipped for the closed forms, and the series.
+        """Return a mask of small squared angles, angles clipped for the closed forms, and the values of the series.
 
         Both branches are evaluated everywhere and must not overflow, because infinity times 0 is NaN.
         """
@@ -142,7 +143,7 @@ class Graph:
         return self.op("Less", squared, _SERIES_BELOW_RAD2), self.op("Max", squared, _SERIES_BELOW_RAD2), series
 
     def polynomials(self, coefficients: Sequence[Sequence[float]], x: Value) -> list[Value]:
-        """Return polynomials of x, as its powers times one matrix: a third of the operators of Horner's scheme."""
+        """Return polynomials of x as its powers times a matrix, with a third as many operators as Horner's scheme."""
         degree = max(map(len, coefficients)) - 1
         powers = [x]
         while len(powers) < degree:
@@ -157,29 +158,30 @@ class Graph:
         return self._polynomials[key]
 
     def log_sum_exp(self, terms: Sequence[Value]) -> Value:
-        """Return the logarithm of the sum of exponentials without overflow."""
+        """Return the logarithm of the sum of exponentials, computed without overflow."""
         joined = self.concat(terms)
         peak = self.op("ReduceMax", joined, axes=[1], keepdims=1)
         return peak + self.op("Log", self.sum_columns(self.exp(joined - peak)))
 
     def columns(self, table: Array) -> list[tuple[Value]]:
-        """Return the columns of a table (m, k), each as one wide constant (1, m)."""
+        """Return the columns of a table (m, k), each as a constant (1, m)."""
         return [(self.constant(column[None]),) for column in table.T]
 
     def weighted_sum(self, factors: Sequence[Value], weights: Array) -> Triple[Value]:
-        """Return the sum of the rows of a table (m, 3), each times its factor, one (n, m)."""
+        """Return the sum of the rows of a table (m, 3), weighted by factors (n, m), as three columns (n, 1)."""
         return triple(self.parts(factors[0] @ weights, 3))
 
     def lookup(self, x: Value, knots: Array, tables: Sequence[Array]) -> list[tuple[Value]]:
-        """Return from each table the row (n, k) whose index is the number of knots (m, 1) at or below x.
+        """Return the row (n, k) of each table whose index is the number of knots (m, 1) at or below x.
 
-        The row is the first one plus, for each knot at or below x, the difference of two rows: a matrix product.
+        The row is computed as a matrix product: row 0 plus, for each knot at or below x, the difference of two
+        consecutive rows.
         """
         passed = self.op("Cast", self.op("GreaterOrEqual", x, self.constant(knots.T)), to=self.elem_type)
         return [(passed @ np.diff(table, axis=0) + self.constant(table[:1]),) for table in tables]
 
     def split(self, row: Sequence[Value], width: int) -> list[Value]:
-        """Return the columns (n, 1) of a wide value (n, width)."""
+        """Return the columns (n, 1) of a value (n, width)."""
         return self.parts(row[0], width)
 
 

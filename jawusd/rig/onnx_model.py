@@ -22,17 +22,17 @@ from jawusd.rig.onnx_graph import Graph, Value
 from jawusd.rig.table import grid_points, valid_box
 
 _ITERATIONS = 30
-_CONVERGED_MM = 1e-7  # a row has converged when its step is shorter; the loop ends when all rows have converged
-_STARTS = (19, 11, 11)  # grid of starts along d1, d2, d3
+_CONVERGED_MM = 1e-7  # step length below which a row has converged; the loop ends when all rows have
+_STARTS = (19, 11, 11)  # number of starts along d1, d2, d3
 _START_MARGIN_MM = 3.0  # extension of the grid beyond the bounds, for poses slightly outside
-_STEP_MM = 1e-3  # step of the central differences
+_STEP_MM = 1e-3  # step of the central differences in d
 _START_DAMPING = 1e-6
 _MIN_DAMPING = 1e-12
-_LOOP_STATE = {"d": 3, "cost": 1, "damping": 1}  # values passed between iterations, and their widths
+_LOOP_STATE = {"d": 3, "cost": 1, "damping": 1}  # numbers of columns of the values passed between iterations
 
 
 def decode_motion(g: Graph, rig: JawRig, d: Value) -> RigidMotion[Value]:
-    """Add the model to a graph: parameters d (n, 3) [mm] to a motion in the anatomical frame."""
+    """Add the model to a graph and return the motion in the anatomical frame of parameters d (n, 3) [mm]."""
     formula = MODELS[rig.kind](flat_arrays(rig.arrays))
     return formula.motion(triple(g.parts(d, 3)), _stored(formula.tables), g)
 
@@ -55,7 +55,7 @@ def add_twist(g: Graph, rig: JawRig, motion: RigidMotion[Value], name: str) -> N
 def images(g: Graph, rig: JawRig, motion: RigidMotion[Value], vectors: Array) -> Value:
     """Return homogeneous vectors (4, m) of the mandible frame transformed to the skull frame, shape (n, 3 m).
 
-    Computed as a displacement from the closed bite, so that the closed bite is exact in any precision.
+    The result is a displacement from the closed teeth, so that d = 0 is exact in any precision.
     """
     to_skull = se3_inverse(rig.T_anatomical_skull)[:3, :3]
     at_rest = rig.T_anatomical_skull @ rig.T_rest @ vectors
@@ -96,7 +96,7 @@ def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> No
 
 
 def _images_of_pose(vectors: Array) -> Array:
-    """Return the matrix (16, 12) that maps a flat pose to the images of the four vectors, vector by vector."""
+    """Return the matrix (16, 12) that maps a flat pose to the transformed four vectors, vector by vector."""
     matrix = np.zeros((4, 4, 4, 3))
     for i in range(3):
         matrix[i, :, :, i] = vectors
@@ -104,12 +104,12 @@ def _images_of_pose(vectors: Array) -> Array:
 
 
 def _images(g: Graph, rig: JawRig, vectors: Array, d: Value) -> Value:
-    """Return the images (n, 12) of the four vectors under the poses of d (n, 3)."""
+    """Return the four vectors transformed by the poses of d (n, 3), shape (n, 12)."""
     return images(g, rig, decode_motion(g, rig, d), vectors)
 
 
 def _nearest_start(g: Graph, rig: JawRig, vectors: Array, target: Value) -> tuple[Value, Value]:
-    """Return the grid point (n, 3) whose images are nearest to the target, and its squared distance (n, 1)."""
+    """Return the grid point (n, 3) whose vectors are nearest to the target, and the squared distance (n, 1)."""
     box = valid_box(rig) + np.array([-_START_MARGIN_MM, _START_MARGIN_MM])
     axes = [np.linspace(low, high, count) for (low, high), count in zip(box, _STARTS, strict=True)]
     grid = grid_points(axes)

@@ -1,4 +1,4 @@
-"""A rig whose poses, twists, margins and encoding onnxruntime computes with its sidecars, in single precision."""
+"""A rig that evaluates poses, twists, margins and encoding with onnxruntime, in single precision."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ from jawusd.evaluator.rig import load
 from jawusd.rig.onnx_sidecar import Run, load_sidecar, runner
 from jawusd.rig.read import load_rig
 
-# Within this distance of the bound, margins are recomputed in double precision, as their sign is uncertain in single.
+# Absolute margin [mm] below which margins are recomputed in double precision, because their sign is uncertain in single
+# precision.
 _NEAR_MM = 1e-3
 
 
 def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
-    """Load the rig in the folder of an ONNX file, to be evaluated by that file.
+    """Load the rig in the folder of an ONNX file; the file evaluates it.
 
     `X.onnx` decodes; `X_encode.onnx`, if it exists, encodes. The rig, `X.usda` or `model.npz` in the same folder,
     provides what the graphs lack: limits, landmarks and projection into the bound.

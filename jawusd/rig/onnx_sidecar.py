@@ -1,8 +1,8 @@
 """The ONNX sidecars of a rig: graphs of the exact model, d -> pose, twist, margin and pose -> d, residual.
 
-Decoder and encoder are separate files, because the decoder needs only arithmetic, which every runtime supports, but the
-encoder a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is installed, otherwise by the
-reference evaluator of the package onnx, which is slower.
+Decoder and encoder are separate files: the decoder needs only arithmetic, which every runtime supports, but the encoder
+needs a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is installed, otherwise by the reference
+evaluator of the package onnx, which is slower.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from jawusd.rig.table import landmark_distance, sample_valid
 
 FORMAT = "jawusd-onnx/1"
 OPSET = 17
-_IR_VERSION = 8  # released with opset 17; older runtimes reject newer versions
+_IR_VERSION = 8  # ONNX file version released with opset 17; older runtimes reject newer ones
 
-#: Largest landmark distance from the model [mm].
+#: Maximum landmark distance of a graph's poses from those of the model [mm].
 ALLOWED_MM = 0.01
-PROBES = 100  # random valid d at which graphs are compared with the model
+PROBES = 100  # number of random valid d at which graphs are compared with the model
 
 Shapes = dict[str, list[str | int]]
 Floats = NDArray[np.float32] | NDArray[np.float64]
@@ -127,7 +127,7 @@ def _metadata(rig: JawRig) -> dict[str, str]:
 
 
 def runner(graph: bytes) -> Run:
-    """Return a function that runs a serialised graph, as from `load_sidecar`, on one thread, with any float inputs."""
+    """Return a function that runs a graph from `load_sidecar` on one thread, with inputs of any float type."""
     model = onnx.load_from_string(graph)
     dtype = float_type(model)
     try:
@@ -153,7 +153,7 @@ def check_written(path: str | os.PathLike[str], rig: JawRig) -> None:
     """Check that a written sidecar reproduces the results of its model.
 
     Raises:
-        RigError: It is too far from the model.
+        RigError: Its results are too far from those of the model.
     """
     error_mm = onnx_error_mm(path, rig, sample_valid(rig, PROBES))
     if not error_mm <= ALLOWED_MM:
@@ -163,8 +163,8 @@ def check_written(path: str | os.PathLike[str], rig: JawRig) -> None:
 def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded: str | None = None) -> float:
     """Return the largest landmark distance [mm] between a graph and the model over parameters d (n, 3).
 
-    A decoder is compared by its poses. An encoder is given the model's poses of d, which are compared with the model's
-    poses of the parameters it finds.
+    For a decoder, the poses of d from the graph and from the model are compared. An encoder gets the model's poses of d
+    and returns parameters; the model's poses of these are compared with the input.
 
     Args:
         d: Parameters (n, 3) [mm].
@@ -213,10 +213,10 @@ def load_sidecar(path: str | os.PathLike[str], rig: JawRig, recorded: str | None
     try:
         model = onnx.load_from_string(content)
         onnx.checker.check_model(model)
-        convert_model_from_external_data(model)  # fails if weights are in other files, which runtimes would read
-    except Exception as error:  # the protobuf and onnx exceptions share no base
+        convert_model_from_external_data(model)  # fails if weights are in other files: a runtime would read those
+    except Exception as error:  # the exceptions of protobuf and onnx have no common base class
         raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error
-    if model.functions or model.graph.sparse_initializer:  # the check for other files does not cover these
+    if model.functions or model.graph.sparse_initializer:  # the check above does not look for other files in these
         raise FormatError("has functions or sparse weights, which graphs written by jawusd do not have.", path=path)
     properties = {entry.key: entry.value for entry in model.metadata_props}
     if properties.get("format") != FORMAT:

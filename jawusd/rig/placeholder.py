@@ -2,8 +2,8 @@
 
 It indicates roughly where bone may be; it is not anatomy, and is marked as a placeholder. The condyles are taken from
 the landmarks, or from the motion if the landmarks are only mean adult positions. In opening and in protrusion the
-condyle slides along the same path, the eminence, so its trajectories form a thinner band than those of the points
-around it (the kinematic condylar centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
+condyle slides along the same path, the eminence, so its trajectories form a thinner band than those of nearby points
+(the kinematic condylar centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
 """
 
 from __future__ import annotations
@@ -22,27 +22,28 @@ from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 _CONDYLES = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
 _INCISOR = LANDMARKS.index("incisor")
 
-# Search range and step for the point with the thinnest band of trajectories: upward and forward from the mean adult
-# position [mm].
+# Range and step [mm] of the search for the point with the thinnest band of trajectories, upward and forward from the
+# mean adult position.
 _REACH_MM = 18.0
 _STEP_MM = 1.5
 _PATH_DEGREE = 3
-# The motion is used only if the condyles travel at least this far, and if the thickness of their band of trajectories
-# is below this fraction of that at the mean position.
+# Minimum travel of the condyles [mm], and maximum thickness of their band of trajectories as a fraction of the
+# thickness at the mean position; otherwise the motion is not used.
 _LEAST_TRAVEL_MM = 5.0
 _CLEARLY_THINNER = 0.85
 _FEWEST_POSES = 30
 
-# Stations of the body below the arch, as directions from the middle of the arch's open end [rad]; 0 is the front.
+# Directions [rad] of the body's cross-sections, from the middle of the arch's open end; 0 is the front.
 _STATIONS = np.radians([75.0, 50.0, 25.0, 0.0, -25.0, -50.0, -75.0])
 _STATION_WIDTH = np.radians(9.0)
 _FEWEST_VERTICES = 10
-# Half thickness and half height of cross-sections, and depth of the body below the scan, of a mean adult mandible [mm].
+# Dimensions of a mean adult mandible [mm]: half thickness and half height of cross-sections, and depth of the body
+# below the scan.
 _BODY_MM = (5.5, 13.0)
 _BODY_BELOW_SCAN_MM = 9.0
 _HEAD_MM, _NECK_MM, _RAMUS_MM, _ANGLE_MM = (9.0, 4.5), (5.0, 4.0), (4.5, 14.0), (5.0, 13.0)
 _CORNERS = 20
-_SECTIONS = 12  # interpolated between two control sections
+_SECTIONS = 12  # number of sections interpolated between two control sections
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ class Placeholder:
 
     Attributes:
         mesh: Closed surface, mandible frame [mm].
-        condyles: Centres left and right, mandible frame [mm], shape (2, 3).
+        condyles: Centres of left and right condyle, mandible frame [mm], shape (2, 3).
         source: Source of the condyles.
     """
 
@@ -72,7 +73,8 @@ def grow_placeholder(rig: JawRig, lower_teeth: Mesh) -> Placeholder:
 def find_condyles(rig: JawRig) -> tuple[Array, str]:
     """Return the centres of left and right condyle, mandible frame [mm], shape (2, 3), and their source.
 
-    The motion determines a condyle's height and its position front to back; the landmark its distance from the midline.
+    The motion determines the height and the front-to-back position of a condyle; the landmark determines its distance
+    from the midline.
     """
     landmarks = rig.landmarks[_CONDYLES]
     inferred = [text for text in rig.inferred if text.startswith("condyle")]
@@ -190,6 +192,6 @@ def _tube_faces(rings: int) -> NDArray[np.int32]:
 
 
 def _outward(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the faces, flipped if their normals point into the volume."""
+    """Return faces whose normals point out of the volume, flipped if needed."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return faces if np.einsum("ij,ij->", a, np.cross(b, c)) > 0 else faces[:, ::-1].copy()

@@ -1,7 +1,7 @@
 """Packages for viewers (`.usdz`), and copies of a rig with unique file names.
 
-A package is an actor or a whole shot, flattened into one layer. Unique names are needed in tools that collect the files
-of several actors in one folder and confuse files of equal names.
+A package is an actor or a whole shot, flattened into one layer. Some tools collect the files of several actors in one
+folder and confuse files of equal names; unique names prevent this.
 """
 
 from __future__ import annotations
@@ -35,15 +35,16 @@ from jawusd.rig.layout import (
 )
 from jawusd.rig.read import describe, open_stage
 
-# Archives store file times; a fixed time makes packages reproducible. It is the earliest a zip can store in any time
-# zone.
+# File time in packages [s since 1970]; a fixed time makes packages reproducible. It is the earliest time that a zip can
+# store in any time zone.
 _ZIP_EPOCH = 315_619_200
 _OP = "xformOp:"
 _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 _LAYERS, _COPIED = (".usda", ".usdc", ".usd"), (".onnx",)
-_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # each file before its referrers
+_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # each before files that use it
 _NAMES_INSIDE = "actor.usdc", "shot.usdc"
-# Binary layers compress vectors of small integers, which three.js (r187) decodes as NaN. This offset avoids integers.
+# Offset that turns integers into other numbers: binary layers compress vectors of small integers, which three.js (r187)
+# decodes as NaN.
 _OFFSET = 1e-9
 
 
@@ -99,7 +100,7 @@ def _rigs_in(layer: Sdf.Layer) -> list[Sdf.Path]:
 
 
 def _avoid_integers(layer: Sdf.Layer) -> None:
-    """Offset integer-valued transforms by a nanometre's thousandth, or by the least difference in single precision."""
+    """Offset integer-valued transforms by `_OFFSET`, or in single precision to the next representable number."""
     found: list[Sdf.Path] = []
     layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if _OP in path.name else None)
     for path in found:
@@ -132,7 +133,8 @@ def publish_rig(
     Args:
         folder: The rig's folder.
         out: The folder to write.
-        prefix: Prefix of all file names; None: the actor's name, with characters that file names cannot have replaced.
+        prefix: Prefix of all file names; None: the actor's name, with characters replaced that are not allowed in file
+            names.
         prim_name: Name of the actor's prim and prefix of its joints; None: derived from the actor's name.
 
     Returns:
@@ -184,12 +186,12 @@ def _prefixed(prefix: str, name: str) -> str:
 
 
 def _copy(source: Path, target: Path, names: dict[str, str], prims: tuple[str, str]) -> Path:
-    """Copy a file and rename the files and the actor's prim (before, after) that it refers to."""
+    """Copy a file; rename the files it refers to (`names`) and the actor's prim (`prims`: before, after)."""
     if source.suffix in _COPIED:
         with atomic_path(target) as temporary:
             shutil.copyfile(source, temporary)
         return target
-    open_stage(source)  # rejects references to files outside its folder
+    open_stage(source)  # rejects references to files outside the rig's folder
     layer = Sdf.Layer.OpenAsAnonymous(str(source))
 
     def renamed(asset: str) -> str:

@@ -33,7 +33,7 @@ def load_rig(path: PathArg, prim_path: str | None = None) -> JawRig:
 
     Raises:
         FormatError: No rig, several rigs, missing or malformed values.
-        VersionError: Written by a newer version.
+        VersionError: The rig was written by a newer version.
         UnitsError: Other units or twist order.
         RigError: The stage cannot be opened, or refers to files outside its folder.
     """
@@ -117,7 +117,7 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
 
 
 def recorded_hashes(prim: Usd.Prim) -> tuple[object, object]:
-    """Return the recorded hashes of a rig's model and of the model that its motion was made with; None if missing.
+    """Return the recorded hash of a rig's model and that of the model with which its motion was made; None if missing.
 
     Both are None for a rig of an older format version, because upgraded arrays have another hash.
     """
@@ -146,7 +146,7 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
 
     Raises:
         FormatError: Values are missing or inconsistent.
-        VersionError: Written by a newer version.
+        VersionError: The rig was written by a newer version.
     """
     upgrade_rig(prim, where)
     stored_as = str(read_value(prim, "jaw:decoder:format", where))

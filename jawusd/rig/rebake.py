@@ -36,7 +36,7 @@ from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
 Origin = Literal["d", "mandible"]
-_SAME_MM = 1e-6  # keys of d that differ by less count as equal
+_SAME_MM = 1e-6  # difference below which keys of d count as equal
 
 
 class StageMotion(NamedTuple):
@@ -77,7 +77,7 @@ class Deviation(NamedTuple):
 
 @raises_format_error(0)
 def deviation(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None = None) -> Deviation | None:
-    """Return the deviation of the mandible of a stage from its d; None if d has no keys.
+    """Return the deviation of a stage's mandible from the pose given by d; None if d has no keys.
 
     Raises:
         RigError: Not a stage.
@@ -108,8 +108,8 @@ def motion_of_stage(
 
     Args:
         prim_path: The rig's prim, if the stage has several rigs.
-        origin: Source to read; None: the animated one. If both are animated and disagree, the one in the stronger
-            layer.
+        origin: Source to read; None: the animated source or, if both are animated and disagree, the source in the
+            stronger layer.
 
     Raises:
         RigError: Not a stage, or d and mandible disagree and are in the same layer.
@@ -149,7 +149,7 @@ def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, deviating: De
 
 
 def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -> Usd.Prim:
-    """Return a rig's prim in a stage: of several, the only one with the same model. Reject rigs of other subjects."""
+    """Return the stage's rig prim; among several, the only one with the same model. Rejects rigs of other subjects."""
     alike = [p for p in rig_prims(stage) if p.GetAttribute("jaw:modelHash").Get() == rig.model_hash]
     found = alike[0] if prim_path is None and len(alike) == 1 else find_rig_prim(stage, path, prim_path)
     own, other = (str(meta.get("actor") or "") for meta in (rig.meta, rig_of(found, path).meta))
@@ -163,7 +163,7 @@ def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -
 
 
 def _constant_motion(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array, float]:
-    """Return the unanimated d as a constant motion: first and last frame, d at both [mm], frames per second."""
+    """Return a d that is not animated as a constant motion: first and last frame, d at both [mm], frames per second."""
     frames = frames_of_stage(stage, path)[[0, -1]]
     d = np.array([actor.GetAttribute(name).Get() for name in PARAMETERS], dtype=np.float64)
     if not np.isfinite(d).all():
@@ -173,7 +173,7 @@ def _constant_motion(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[A
 
 
 def _rank(stage: Usd.Stage, attributes: list[Usd.Attribute]) -> float:
-    """Return how many layers are stronger than the layer with the strongest opinion about any of the attributes."""
+    """Return the number of layers stronger than the layer with the strongest opinion about any of the attributes."""
     layers = stage.GetLayerStack(includeSessionLayers=False)
     strongest = [stack[0].layer for stack in (attribute.GetPropertyStack() for attribute in attributes) if stack]
     return min((float(layers.index(layer)) for layer in strongest if layer in layers), default=np.inf)
@@ -209,7 +209,7 @@ def write_over(
 
 
 class Rebaked(NamedTuple):
-    """Motion for a rig of a stage: times (F,), d (F, 3) [mm], and the rig's prim if the stage has several."""
+    """Motion for a rig of a stage: times (F,), d (F, 3) [mm], and the rig's prim if the stage has several rigs."""
 
     rig: JawRig
     times: Array
@@ -225,7 +225,7 @@ def write_rebaked(
     *,
     root: bool = False,
 ) -> list[str]:
-    """Write a layer for a stage with d of its rigs and the matching ops of their mandibles.
+    """Write a layer for a stage with the d of its rigs and the corresponding ops of their mandibles.
 
     Instances are made editable, because their mandibles cannot be moved otherwise. Rigs with a selected skeleton are
     switched to transforms.
@@ -234,7 +234,7 @@ def write_rebaked(
         out: File to write.
         motions: The motions, one for each rig to animate.
         carried: Times whose d was inferred; see `write_animation`.
-        root: Whether the layer sublayers the stage. Otherwise it is meant to become a sublayer of the stage.
+        root: Whether the layer sublayers the stage; if not, it is meant to become a sublayer of the stage.
 
     Returns:
         Paths on which the stage's root layer has its own opinions, which are stronger than those of a sublayer.
@@ -300,7 +300,7 @@ def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) ->
 
 
 def _check_moves(layer: Sdf.Layer, prims: list[str], motions: Sequence[Rebaked], shot: str | os.PathLike[str]) -> None:
-    """Compose a layer over its stage and check that its mandibles have the poses of d in the world.
+    """Compose a layer over its stage and check that its mandibles have the poses given by d in the world.
 
     Raises:
         RigError: A mandible has another pose.
@@ -328,7 +328,7 @@ def _overridden_by_root(stage: Usd.Stage, layer: Sdf.Layer) -> list[str]:
         if path.IsPrimPropertyPath() and root.GetAttributeAtPath(path):
             times, attribute = layer.ListTimeSamplesForPath(path), stage.GetAttributeAtPath(path)
             same = not times and root.GetAttributeAtPath(path).default == layer.GetAttributeAtPath(path).default
-            if path.name in PARAMETERS:  # keys of d that are unchanged do not count
+            if path.name in PARAMETERS:  # unchanged keys of d are no conflict
                 now, then = (
                     [value(time) for time in times] for value in (attribute.Get, partial(layer.QueryTimeSample, path))
                 )

@@ -31,12 +31,12 @@ from jawusd.rig.untrusted import VALUE_ERRORS, value_error_message
 
 _TABLE_SLACK_MM = 0.01  # tolerance above the table's stated error, which was measured at other parameters
 _OPS = [("xformOp:translate", "double3"), ("xformOp:orient", "quatd")]
-_PROBES = 500  # random valid d at which the table is compared with the model
+_PROBES = 500  # number of random valid d at which the table is compared with the model
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A violation of a rule, or information.
+    """A violation of a rule, or a note.
 
     Attributes:
         severity: "error", "warning" or "info".

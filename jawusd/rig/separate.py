@@ -1,4 +1,4 @@
-"""Load a rig in a separate, limited process: for programs that open files from unknown sources."""
+"""Load a rig in a separate process with limited resources, for programs that open files from unknown sources."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from jawusd.base import errors, guard
 from jawusd.base.inputs import SETTING, allowed_folders
 from jawusd.evaluator import JawRig
 
-#: Limits of the process: memory [GB], processor time [s], wall time [s], longer for slow disks. Rigs take 0.3 GB, 1 s.
+#: Limits of the process: memory [GB], processor time [s], and wall time [s], which is longer because disks may be
+#: slow. Rigs take 0.3 GB and 1 s.
 MAX_MEMORY_GB, MAX_CPU_S, MAX_WAIT_S = 4, 10, 60
 
 _DAMAGED = "the file is damaged or malicious."
@@ -52,7 +53,7 @@ def load_separately(path: Path, prim: str | None = None) -> JawRig:
 
 
 def _python() -> str:
-    """Return a Python interpreter; `sys.executable` is not one in programs that embed Python, such as Maya."""
+    """Return a Python interpreter; in programs that embed Python, such as Maya, `sys.executable` may be none."""
     own = Path(sys.executable or sys.prefix)
     known = ("python", "mayapy", "hython")
     for program in (own, own.with_name("mayapy"), own.with_name("hython"), Path(sys.prefix, "bin", "python3")):

@@ -39,8 +39,8 @@ _TYPES = Sdf.ValueTypeNames
 JOINTS = ("skull", "skull/jaw")
 SKEL, KEYS = f"{ACTOR}/Skel", f"{ACTOR}/Skel/Motion"
 _SKEL_IN_GEO = f"{GEO}/Skel"
-# Largest difference between the matrix entries of meshes that move together [mm or 1]. Rounding to single precision,
-# 100 mm from the origin, stays far below.
+# Maximum difference between the matrix entries of meshes that move together [mm or 1]; far above single-precision
+# rounding at 100 mm from the origin.
 SAME_MOTION = 1e-4
 _BIND_RIGIDLY = "Bind every mesh of the mandible to one joint, or name meshes to be fitted with --mandible and --skull."
 
@@ -56,13 +56,13 @@ def write_skel(
 ) -> Path:
     """Write the skeleton layer next to `geo.usdc`, whose meshes it binds rigidly to two joints.
 
-    The joint `skull/jaw` is midway between the condyles and has one key per frame. The layer has neither d1, d2, d3 nor
-    bounds.
+    The joint `skull/jaw` is midway between the condyles and has one key per frame. The layer contains no d1, d2, d3 and
+    no bounds.
 
     Args:
         out: File to write, in the folder of `geo.usdc`.
         mesh_names: The meshes in `geo.usdc`, names as in `MESH_PATHS`.
-        frames: Increasing frame numbers (F,); None leaves the jaw in the closed bite.
+        frames: Increasing frame numbers (F,); None leaves the teeth closed.
         d: Parameters (F, 3) [mm]; rows with NaN get no key.
         prim_name: Name of the actor's prim, and prefix of the joint names.
 
@@ -113,7 +113,7 @@ def add_skeleton_variant(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -
 
 
 def joint_poses(rig: JawRig, d: Array) -> Array:
-    """Return the joint `skull/jaw` in skull coordinates, shape (n, 4, 4), for parameters (n, 3) [mm].
+    """Return the transforms of the joint `skull/jaw` in skull coordinates, shape (n, 4, 4), for parameters (n, 3) [mm].
 
     The joint moves by D = pose rest^-1, because a vertex bound at rest then moves to D rest p = pose p.
     """
@@ -122,7 +122,7 @@ def joint_poses(rig: JawRig, d: Array) -> Array:
 
 
 def _hinge(rig: JawRig) -> Array:
-    """Return the joint in the closed bite: midway between the condyles, with the skull's axes, shape (4, 4) [mm]."""
+    """Return the joint with closed teeth, shape (4, 4) [mm]: midway between the condyles, with the skull's axes."""
     condyles = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
     return make_transform(np.eye(3), transform_points(rig.T_rest, rig.landmarks[condyles]).mean(axis=0))
 
@@ -157,7 +157,7 @@ def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: A
 
 
 def _bind(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[Sdf.Path], skeleton: Sdf.Path, mandible: Sdf.Path) -> None:
-    """Bind meshes of the payload, which is not loaded, rigidly to the joints: those of the mandible to the jaw."""
+    """Bind the payload's meshes rigidly to the joints, those of the mandible to the jaw; the payload is not loaded."""
     # The bind transforms place the meshes. Without this order, Blender would apply the payload's ops as well.
     order = Sdf.AttributeSpec(
         Sdf.CreatePrimInLayer(layer, mandible), "xformOpOrder", _TYPES.TokenArray, Sdf.VariabilityUniform
@@ -235,7 +235,7 @@ class Bones:
     ) -> Array:
         moved = skinning.ComputeSkinnedTransform(skeleton.ComputeSkinningTransforms(time), time)
         placed = transform_in_actor(actor, skeleton.GetPrim(), UsdGeom.XformCache(time))
-        return np.array(moved * placed).T  # USD multiplies rows from the left
+        return np.array(moved * placed).T  # USD multiplies row vectors from the left
 
     def foreign_joints(self) -> list[str]:
         """Return the animated joints that no skeleton has."""
@@ -248,7 +248,7 @@ class Bones:
 
 
 def transform_in_actor(actor: Usd.Prim, prim: Usd.Prim, cache: UsdGeom.XformCache) -> Gf.Matrix4d:
-    """Return the transform of a prim in the frame of its actor, also if it resets the transform stack."""
+    """Return the transform of a prim in the frame of its actor, even if the prim resets the transform stack."""
     placed, resets = cache.ComputeRelativeTransform(prim, actor)
     if resets:
         placed = cache.GetLocalToWorldTransform(prim) * cache.GetLocalToWorldTransform(actor).GetInverse()

@@ -26,11 +26,11 @@ from jawusd.rig.motion_read import frames_of_stage
 from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.untrusted import raises_format_error
 
-_POINTS = 2000  # number of vertices of a mesh that are fitted, evenly spaced by index
-# Largest RMS distance of a fitted mesh. Exports in single precision, even in metres, stay far below; meshes that only
-# have the same number of vertices do not.
+_POINTS = 2000  # maximum number of fitted vertices per mesh, evenly spaced by index
+# Maximum RMS distance of a fitted mesh. Exports in single precision, even in metres, stay far below it; other meshes
+# that happen to have the same number of vertices exceed it.
 _MAX_MISFIT_MM = 0.5
-_SAME_POINT_MM = 0.02  # far above single precision, below the spacing of a scan's vertices
+_SAME_POINT_MM = 0.02  # points closer than this coincide; far above rounding, below a scan's vertex spacing
 _SKULL, _MANDIBLE = ("upper_teeth", "skull"), ("lower_teeth", "mandible")
 
 
@@ -41,7 +41,7 @@ class StagePoses(NamedTuple):
         frames: Frame numbers, shape (F,).
         T: T_skull_mandible [mm], shape (F, 4, 4).
         fps: Frames per second.
-        misfit_mm: RMS distance of the fitted meshes from the stage, the largest of all frames.
+        misfit_mm: RMS distance of the fitted meshes from those of the stage, maximum over frames.
         meshes: Paths of the fitted prims of skull and mandible.
     """
 
@@ -84,7 +84,7 @@ def fit_poses_of_stage(
     Args:
         path: Any stage with copies of the actor's meshes, moved by transforms, bones or time-sampled points.
         actor: The rig's own file, which defines the meshes in their frames.
-        mandible: Prim below which the lower teeth or the mandible are searched; None: everywhere.
+        mandible: Prim below which the lower teeth or the mandible are looked for; None: everywhere.
         skull: The same for the upper teeth or the skull.
         rig_prim: The rig's prim, if the file has several rigs.
 
@@ -108,7 +108,7 @@ def fit_poses_of_stage(
     if not misfit_mm <= _MAX_MISFIT_MM:
         raise FormatError(
             f"its meshes {places[0].path} and {places[1].path} are up to {misfit_mm:.2f} mm from those of the rig, "
-            f"allowed are {_MAX_MISFIT_MM} mm: they are other meshes, or deformed.",
+            f"at most {_MAX_MISFIT_MM} mm is allowed: they are other meshes, or deformed.",
             path=str(path),
             hint="Choose the prims of skull and mandible with --skull and --mandible.",
         )
@@ -117,7 +117,7 @@ def fit_poses_of_stage(
 
 
 def _spread(points: Array) -> float:
-    """Return a measure of the size of a point set: its root summed squared distance from the centroid."""
+    """Return a measure of the size of a point set: the root of the sum of squared distances from the centroid."""
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum()))
 
 
@@ -182,7 +182,7 @@ def _find(
 
 
 class _Points(NamedTuple):
-    """Points of a mesh (n, 3), indices of those used by faces, and the number of distinct positions of these."""
+    """Points of a mesh (n, 3), indices of points used by faces, and the number of distinct positions of these."""
 
     all: Array
     used: NDArray[np.int64]
@@ -215,7 +215,7 @@ def _correspondence(mesh: Mesh, found: _Points) -> tuple[NDArray[np.int64], NDAr
 
 
 def _in_order(source: Array, points: Array) -> bool:
-    """Return whether points are the vertices of a mesh in the same order, up to motion and scale."""
+    """Return whether points are the vertices of a mesh in the same order, up to a rigid motion and scale."""
     chosen = np.unique(np.linspace(0, len(source) - 1, _POINTS).astype(int))
     a, b = source[chosen], points[chosen]
     b = b * (_spread(a) / _spread(b))

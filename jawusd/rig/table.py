@@ -19,18 +19,18 @@ from jawusd.evaluator.schema import ADDITIVE
 from jawusd.evaluator.table import SampledTable
 from jawusd.geometry.se3 import se3_exp, transform_points
 
-DEFAULT_SIZE = 33  # values per axis
+DEFAULT_SIZE = 33  # knots per axis
 SIZES = (17, 33, 65)
-_VALID_SAMPLES = 10_000  # random valid d at which the error is measured
-_FULL_CHECKS = 200  # number of worst d that are checked at every vertex
+_VALID_SAMPLES = 10_000  # number of random valid d at which the error is measured
+_FULL_CHECKS = 200  # number of d, those with the largest errors, that are checked at every vertex
 
-_PROBES_PER_AXIS = 41  # values per axis of the grid with which the box of valid d is found
-_FINE = 161  # values per axis at which the curvature is measured
-_COARSE = 13  # values along the two other axes
-_NEAR_BOUND_MM = -0.5  # smallest margin at which the curvature counts; negative, as cells extend beyond the bound
+_PROBES_PER_AXIS = 41  # number of values per axis of the grid that finds the box of valid d
+_FINE = 161  # number of values per axis at which the curvature is measured
+_COARSE = 13  # number of values along each of the two other axes
+_NEAR_BOUND_MM = -0.5  # minimum margin of points whose curvature counts; negative, as cells extend beyond the bound
 _SMOOTHING = 9  # width of the window that smooths the curvature, in fine steps
 _FLOOR = 0.05  # lower limit of the curvature, as a fraction of its maximum
-_POINTS = 40  # mandible points at which the curvature is measured
+_POINTS = 40  # number of mandible points at which the curvature is measured
 
 
 def valid_box(rig: JawRig) -> Array:
@@ -53,7 +53,7 @@ def valid_box(rig: JawRig) -> Array:
 
 
 def grid_points(axes: Sequence[Array] | Array) -> Array:
-    """Return the points (n1 n2 n3, 3) of a grid with these axis values."""
+    """Return the points (n1 * n2 * n3, 3) of a grid with these axis values."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -127,7 +127,7 @@ class DecoderTable:
         axes: Values of d1, d2, d3 [mm], each array increasing.
         twists: Twists (omega [rad], v [mm]) in the skull frame, float32: (n1, n2, n3, 6), or (n1 + n2 + n3, 6).
         max_error_mm: Largest distance to the exact model found at any vertex.
-        error_samples: Number of valid d at which it was measured.
+        error_samples: Number of valid d at which `max_error_mm` was measured.
     """
 
     format: str
@@ -143,7 +143,7 @@ class DecoderTable:
             raise ValueError(f"twists of a {self.format} {counts} must have shape {wanted}, got {self.twists.shape}")
 
     def twist(self, d: ArrayLike) -> Array:
-        """Return interpolated twists, shape (n, 6), at d (n, 3) [mm], d clamped to the knots."""
+        """Return interpolated twists, shape (n, 6), at d (n, 3) [mm] clamped to the range of the knots."""
         d = np.asarray(d, dtype=np.float64)
         if self.format == "curves":
             parts = np.split(self.twists.astype(np.float64), np.cumsum([len(axis) for axis in self.axes])[:2])
@@ -171,7 +171,9 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
         RigError: An unsupported size, or bounds that allow no parameters.
     """
     if size not in SIZES:
-        raise RigError(f"a table of {size} knots per axis is not supported; allowed are {', '.join(map(str, SIZES))}.")
+        raise RigError(
+            f"a table of {size} knots per axis is not supported; it must be one of {', '.join(map(str, SIZES))}."
+        )
     axes = grid_axes(rig, valid_box(rig), vertices[extreme_vertices(vertices)], size)
     if rig.kind == ADDITIVE:
         twists = np.concatenate([rig.twist(np.outer(axis, np.eye(3)[i])) for i, axis in enumerate(axes)])
@@ -187,7 +189,7 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
 
 
 def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
-    """Return twists at the knots, shape (n1, n2, n3, 6), shifted to balance the interpolation error.
+    """Return twists at the knots, shape (n1, n2, n3, 6), shifted to balance the errors of interpolation.
 
     Interpolating exact values gives errors of one sign, largest in the middle of the cells. Half of that error,
     averaged over the two cells along each axis, is subtracted at the knots. The closed bite stays exact.
@@ -199,7 +201,7 @@ def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
         found = np.moveaxis(rig.twist(grid_points(middles)).reshape(*map(len, middles), 6), i, 0)
         knots, taken = np.moveaxis(exact, i, 0), np.moveaxis(out, i, 0)
         error = np.concatenate([[np.zeros_like(knots[0])], found - 0.5 * (knots[1:] + knots[:-1])])
-        error[0] = error[1]  # knots at the ends have one cell only
+        error[0] = error[1]  # knots at the ends of an axis belong to only one cell
         after = np.concatenate([error[1:], error[-1:]])
         taken += 0.25 * (error + after)
     closed = tuple(int(np.searchsorted(axis, 0.0)) for axis in axes)
@@ -210,8 +212,8 @@ def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
 def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> float:
     """Return the largest distance [mm] between table and model at any vertex (V, 3), over parameters d (n, 3).
 
-    The distance is a convex function of the vertex, so the worst parameters are found with the vertices that are
-    extreme in some direction, and then checked at every vertex.
+    The distance is a convex function of the vertex position, so the worst parameters are found using only the vertices
+    that are extreme in some direction. These parameters are then checked at every vertex.
     """
     exact = rig.pose(d)
     read = table.pose(d, rig.T_rest)
@@ -228,7 +230,8 @@ def landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
 def largest_distance(T_a: Array, T_b: Array, points: Array) -> Array:
     """Return the largest distance [mm], shape (n,), between points (V, 3) under two sets of poses (n, 4, 4).
 
-    |(T_a - T_b) p|^2 is a quadratic form in (p, 1): ten numbers per pose and per point, so one matrix product.
+    |(T_a - T_b) p|^2 is a quadratic form in (p, 1) with ten coefficients per pose and ten products per point, so that
+    one matrix product evaluates all.
     """
     D = (T_a - T_b)[:, :3, :]
     Q = np.swapaxes(D, 1, 2) @ D
@@ -242,7 +245,7 @@ def largest_distance(T_a: Array, T_b: Array, points: Array) -> Array:
 
 
 def extreme_vertices(vertices: Array) -> NDArray[np.int64]:
-    """Return the indices of vertices (V, 3) that are extreme in one of 400 directions."""
+    """Return the indices of those vertices (V, 3) that are extreme in one of 400 directions."""
     i = np.arange(400) + 0.5
     height, turn = 1 - 2 * i / len(i), np.pi * (1 + 5**0.5) * i  # Fibonacci sphere
     radius = np.sqrt(1 - height**2)

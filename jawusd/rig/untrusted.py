@@ -32,10 +32,10 @@ class _LayerRef(NamedTuple):
 
     Attributes:
         target: Full path of the layer.
-        rig_folder: Folder of the rig it is part of; None if it is not part of one.
-        user: The layer in another folder that refers to it, if any.
-        variables: Expression variables of the layers that refer to it.
-        is_sublayer: Whether it is a sublayer, whose own variables are ignored.
+        rig_folder: Folder of the rig that the layer is part of; None if it is not part of a rig.
+        user: A layer in another folder that refers to this layer, if any.
+        variables: Expression variables of the layers that refer to this layer.
+        is_sublayer: Whether the layer is a sublayer; a sublayer's own variables are ignored.
     """
 
     target: str
@@ -48,17 +48,17 @@ class _LayerRef(NamedTuple):
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Exceptions raised by values of an unexpected type; values in USD have whatever type their file declares.
+#: Exceptions that values of an unexpected type may raise; values in USD have whatever type their file declares.
 VALUE_ERRORS = (
     ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError, Tf.ErrorException,
 )  # fmt: skip
-#: Processor time [s] for opening a stage in a guarded process. Rigs take 0.02 s, a million prims about 5 s.
+#: Maximum processor time [s] for opening a stage in a guarded process. Rigs take 0.02 s, a million prims about 5 s.
 MAX_CPU_S = 20
 _ALLOW = "If you trust it, allow its folder with --allow or the environment variable JAWUSD_ALLOW."
 _UNREADABLE = "is not a USD file that OpenUSD can read"
-#: Limits: prims and properties in a layer, samples of an attribute.
+#: Maximum number of prims and properties in a layer, and of samples of an attribute.
 MAX_SPECS, MAX_SAMPLES = 2_000_000, 1_000_000
-_MAX_LAYER_READS = 20_000  # a layer is read once for each set of variables
+_MAX_LAYER_READS = 20_000  # maximum number of reads; a layer is read once for each set of variables
 _RIG_ATTRIBUTES = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
 
@@ -66,7 +66,7 @@ def raises_format_error(argument: int) -> Callable[[Callable[P, R]], Callable[P,
     """Return a decorator that turns errors from values of unexpected types into FormatError.
 
     Args:
-        argument: Index of the reader's positional argument that names the file.
+        argument: Index of the positional argument of the decorated function that names the file.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -121,9 +121,9 @@ def check_file_access(path: Path) -> list[Sdf.Layer]:
     """Check, before a layer or package is composed, which files its layers refer to.
 
     Layers of a rig may refer only to files in the rig's folder or below, with links resolved. Layers that use a rig
-    (animation, shots) may refer to rigs outside their folder, but to no other files there. Asset paths in values count
-    too, because their files are read (ONNX) and packed (images). Files in allowed folders are always accepted, see
-    `base.inputs`. Paths are resolved as OpenUSD does, including search paths and variable expressions.
+    (animations, shots) may refer to rigs outside their folder, but not to other files outside. Asset paths in attribute
+    values are checked too, because their files are read (ONNX) or packed (images). Files in allowed folders are always
+    accepted, see `base.inputs`. Paths are resolved as OpenUSD does, including search paths and variable expressions.
 
     Returns:
         The layers, which stay loaded as long as they are referenced.
@@ -169,7 +169,7 @@ def _checked_layers(path: Path) -> list[Sdf.Layer]:
 
 
 def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
-    """Check that a stage has no layers other than those returned by `check_file_access`.
+    """Check that a stage is composed only of layers returned by `check_file_access`.
 
     Raises:
         RigError: It has other layers.
@@ -192,7 +192,7 @@ def _referenced_layers(layer: Sdf.Layer, rig_folder: Path | None, variables: Map
     folder = rig_folder or file_of_layer(layer).resolve().parent
     read = evaluated(layer, variables)
     found: list[_LayerRef] = []
-    for template in clip_templates(read):  # first: OpenUSD lists their folders when collecting asset paths
+    for template in clip_templates(read):  # before asset_paths, in which OpenUSD lists the folders of clips
         pattern = _checked_file(layer, template, folder)
         for file in files_of_template(pattern):
             _checked_file(layer, str(file), folder)
@@ -249,7 +249,7 @@ def _layer(name: str, sums: Mapping[Path, str]) -> Sdf.Layer | None:
 
 
 def _is_intact(layer: Sdf.Layer) -> bool:
-    """Return whether a layer contains all prims and properties it lists; OpenUSD aborts the process if not.
+    """Return whether a layer contains all prims and properties it lists; OpenUSD aborts the process if one is missing.
 
     Raises:
         RigError: It exceeds the limits.

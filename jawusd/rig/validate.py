@@ -23,7 +23,7 @@ from jawusd.rig.rules import RULES, Finding, Rule
 
 try:
     from pxr import UsdValidation
-except ImportError:  # not in OpenUSD before 25.02
+except ImportError:  # not available in OpenUSD before 25.02
     UsdValidation = None
 
 PROGRAM = "nvidia_usd_validate"
@@ -113,7 +113,7 @@ def _finding(error: UsdValidation.ValidationError) -> Finding:
 
 
 def find_nvidia_validator() -> Path | None:
-    """Return NVIDIA's validator next to this Python interpreter or on PATH; None if there is none."""
+    """Return the path of NVIDIA's validator, next to this Python interpreter or on PATH; None if not installed."""
     found = shutil.which(PROGRAM, path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
     return Path(found) if found else None
 
