@@ -80,7 +80,7 @@ def memory_limit() -> int:
     with contextlib.suppress(ValueError):
         if 0 <= (limit := float(named)) < 1e6:
             return int(limit * 1e9)
-    raise ResourceError(f"{SETTING} is {named!r}, allowed is a number of GB from 0 to 1e6; 0 means no limit.")
+    raise ResourceError(f"{SETTING} is {named!r}; it must be a number of GB from 0 to 1e6, 0 for no limit.")
 
 
 def machine_memory() -> int:

@@ -65,7 +65,7 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
     except (OSError, *DAMAGED) as error:
         raise FormatError(f"is not a readable npz file ({error!s:.200}).", path=path) from error
     if "meta" not in arrays:
-        raise FormatError(f'has no "meta"; a {family} file carries its format and units there.', path=path)
+        raise FormatError(f'has no "meta"; a {family} file stores its format and units there.', path=path)
     try:
         meta = json.loads(str(arrays.pop("meta")))
     except (ValueError, RecursionError) as error:
@@ -101,9 +101,9 @@ def check_units(meta: Mapping[str, object], path: str | os.PathLike[str]) -> Non
         UnitsError: they differ from mm, rad and (omega, v), or are missing.
     """
     if meta.get("units") != UNITS:
-        raise UnitsError(f"units are {meta.get('units')}, allowed are {UNITS}.", path=path)
+        raise UnitsError(f"units are {meta.get('units')}; they must be {UNITS}.", path=path)
     if meta.get("twist_order") != TWIST_ORDER:
-        raise UnitsError(f"twist order is {meta.get('twist_order')}, allowed is {TWIST_ORDER}.", path=path)
+        raise UnitsError(f"twist order is {meta.get('twist_order')}; it must be {TWIST_ORDER}.", path=path)
 
 
 def upgraded_model(arrays: NamedArrays, path: object) -> NamedArrays:
@@ -138,7 +138,7 @@ def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: ob
         wanted = "(" + ", ".join("any" if w is None else str(w) for w in shape) + ")"
         raise FormatError(f'"{name}" has shape {value.shape}, expected {wanted}.', path=str(path))
     if value.dtype.kind not in "fiub":
-        raise FormatError(f'"{name}" holds {value.dtype}, expected numbers.', path=str(path))
+        raise FormatError(f'"{name}" has type {value.dtype}, expected numbers.', path=str(path))
     if finite and value.dtype.kind == "f" and not np.isfinite(value).all():
-        raise FormatError(f'"{name}" holds values that are not finite.', path=str(path))
+        raise FormatError(f'"{name}" has values that are not finite.', path=str(path))
     return value

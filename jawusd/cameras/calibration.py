@@ -58,7 +58,7 @@ def _numbers(path: Path, table: str, values: dict[str, object], key: str, shapes
         raise CalibrationError(f'[{table}] "{key}" is not an array of numbers.', path=path) from error
     if array.shape not in shapes:
         allowed = " or ".join(str(s) for s in shapes)
-        raise CalibrationError(f'[{table}] "{key}" has shape {array.shape}, allowed is {allowed}.', path=path)
+        raise CalibrationError(f'[{table}] "{key}" has shape {array.shape}; it must be {allowed}.', path=path)
     if not np.isfinite(array).all():
         raise CalibrationError(f'[{table}] "{key}" has a value that is not finite.', path=path)
     return array
@@ -74,7 +74,9 @@ def _camera(path: Path, table: str, values: object) -> Camera:
     translation = _numbers(path, table, values, "translation", ((3,),))
     check_lens_model(path, f"[{table}]", values)
     if (size < 16).any() or (size != np.round(size)).any():
-        raise CalibrationError(f"[{table}] size is {size.tolist()} px, allowed: whole numbers from 16.", path=path)
+        raise CalibrationError(
+            f"[{table}] size is {size.tolist()} px; it must be two whole numbers of at least 16.", path=path
+        )
     if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 0 or K[2, 2] != 1:
         raise CalibrationError(
             f"[{table}] matrix must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 px.", path=path

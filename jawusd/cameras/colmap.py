@@ -59,7 +59,7 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
         file = " ".join(row[9:])
         images.append((file, Camera(file, size, K, distortion, make_transform(matrix_from_wxyz(q), t))))
     if not images:
-        raise CalibrationError("holds no images.", path=path)
+        raise CalibrationError("has no images.", path=path)
     counted = _COUNTED.search(read_text(path, MOST_BYTES))
     if counted is not None and int(counted[1]) > len(images):
         raise CalibrationError(
@@ -130,7 +130,7 @@ def _lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Array]:
     if len(row) < 5 or row[1] not in _MODELS:
         found = row[1] if len(row) > 1 else "nothing"
         raise CalibrationError(
-            f"camera {row[0]} has the model {found}, allowed are {', '.join(_MODELS)}.",
+            f"camera {row[0]} has the model {found}; it must be one of {', '.join(_MODELS)}.",
             path=path,
             hint="Undistort the footage first, or solve again with --ImageReader.camera_model OPENCV.",
         )

@@ -86,7 +86,7 @@ def _camera(path: Path, node: NukeNode, lenses: list[FoundLens], sizes: Mapping[
     if (steady_values(path, node, "win_scale", (1.0, 1.0)) != 1).any() or steady_values(path, node, "winroll", (0.0,))[
         0
     ] != 0:
-        raise CalibrationError(f"camera {name} has win_scale or winroll set, allowed are 1 1 and 0.", path=path)
+        raise CalibrationError(f"camera {name} has win_scale or winroll set; they must be 1 1 and 0.", path=path)
     shift = steady_values(path, node, "win_translate", (0.0, 0.0))
     offset = (-float(shift[0]) * back[0] / 2, -float(shift[1]) * back[1] / 2)
     lens = _lens_of(path, name, lenses)

@@ -123,7 +123,7 @@ def _node_lens(path: Path, node: NukeNode, name: str) -> Lens:
         if abs(value(f"field_of_view_{side}_unit", whole) - whole) > 1e-6:
             raise CalibrationError(
                 f"lens {node.name} has a field of view other than the whole picture (field_of_view_{side}_unit), "
-                "allowed are 0, 1, 0, 1.",
+                "which must be 0, 1, 0, 1 (xa, xb, ya, yb).",
                 path=path,
                 hint="Set the camera's field of view to the whole picture in 3DEqualizer.",
             )
@@ -178,7 +178,7 @@ def _text_lens(path: Path, lines: list[str]) -> Lens:
         raise _unread(path, model)
     if mode not in _STATIC:
         raise CalibrationError(
-            f'lens {lines[0]} has an animated distortion ("{mode}"), allowed is {" or ".join(_STATIC)}.',
+            f'lens {lines[0]} has an animated distortion ("{mode}"); it must be {" or ".join(_STATIC)}.',
             path=path,
             hint="Make the lens static in 3DEqualizer, and export it again.",
         )
@@ -195,7 +195,7 @@ def _text_lens(path: Path, lines: list[str]) -> Lens:
     unknown = sorted(set(values) - set(_PARAMETERS[model]))
     if unknown or not np.isfinite(list(values.values())).all():
         raise CalibrationError(
-            f'{model} has no parameter "{unknown[0]}", allowed are {", ".join(_PARAMETERS[model])}.'
+            f'{model} has no parameter "{unknown[0]}"; its parameters are {", ".join(_PARAMETERS[model])}.'
             if unknown
             else "has a value that is not finite.",
             path=path,
@@ -206,7 +206,7 @@ def _text_lens(path: Path, lines: list[str]) -> Lens:
 
 def _unread(path: Path, model: str) -> CalibrationError:
     return CalibrationError(
-        f'has the distortion model "{model}", allowed are {", ".join(_PARAMETERS)}.',
+        f'has the distortion model "{model}"; it must be one of {", ".join(_PARAMETERS)}.',
         path=path,
         hint="Calibrate with one of them, or undistort the footage and remove the lens file.",
     )

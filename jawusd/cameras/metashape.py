@@ -102,7 +102,7 @@ def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
     for key in ("p3", "p4"):  # tangential coefficients of older versions
         if value(key):
             raise CalibrationError(
-                f"sensor {label} has {key} = {value(key):g}, allowed is 0.", path=path, hint=UNDISTORT
+                f"sensor {label} has {key} = {value(key):g}; it must be 0.", path=path, hint=UNDISTORT
             )
     radial = np.array([value(f"k{k}") for k in (1, 2, 3, 4)])
     return size, K, lens_with_k4(path, str(label), K, size, radial, (value("p2"), value("p1")))

@@ -36,7 +36,7 @@ def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
         raise CalibrationError('has no "frames".', path=path)
     scale = data.get("applied_scale", 1.0)
     if not isinstance(scale, int | float) or not 0 < scale < _MOST_SCALE:
-        raise CalibrationError(f'"applied_scale" is {scale!r:.50}, allowed is a number above 0.', path=path)
+        raise CalibrationError(f'"applied_scale" is {scale!r:.50}; it must be a number above 0.', path=path)
     images: list[tuple[str, Camera]] = []
     for index, frame in enumerate(frames):
         where = f"frames[{index}]"
@@ -72,7 +72,7 @@ def _lens(path: Path, values: dict[str, object], where: str) -> tuple[tuple[int,
         found[key] = float(value)
     if found["k4"] != 0:
         # nerfstudio's k4 multiplies r^8; OpenCV's fourth coefficient is in a denominator.
-        raise CalibrationError(f"{where} has k4 = {found['k4']:g}, allowed is 0.", path=path)
+        raise CalibrationError(f"{where} has k4 = {found['k4']:g}; it must be 0.", path=path)
     K = corner_matrix(path, where, found["fl_x"], found["fl_y"], found["cx"], found["cy"])
     lens = np.array([found[key] for key in ("k1", "k2", "p1", "p2", "k3")])
     return (int(found["w"]), int(found["h"])), K, lens

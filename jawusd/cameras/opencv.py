@@ -174,7 +174,7 @@ def _camera(path: Path, name: str, parts: Mapping[str, Array], sizes: Mapping[st
         sides = np.array([parts["width"], parts["height"]], np.float64).ravel()
         if sides.size != 2 or not ((sides >= 1) & (sides <= _MOST_PX)).all():
             raise CalibrationError(
-                f"camera {name} has image size {sides.tolist()} px, allowed is 1 to 1e6 px.", path=path
+                f"camera {name} has image size {sides.tolist()} px; both must be 1 to 1e6 px.", path=path
             )
         size = (int(sides[0]), int(sides[1]))
     elif name in sizes or plain_name(name) in sizes:

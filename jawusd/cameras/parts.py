@@ -113,7 +113,7 @@ def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> No
         # "camera_model" may be a product name
         if flag or (named and (key.lower().startswith("distortion") or _OTHER_MODELS.search(said))):
             raise CalibrationError(
-                f"{where} has {key} = {value}, a lens model that is not supported; allowed is OpenCV's "
+                f"{where} has {key} = {value}, a lens model that is not supported; use OpenCV's "
                 "radial-tangential model (plumb_bob, rational_polynomial).",
                 path=path,
                 hint=UNDISTORT,

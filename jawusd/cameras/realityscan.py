@@ -78,7 +78,7 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
         for key, square in (("Skew", 0.0), ("AspectRatio", 1.0)):
             if abs(numbers(path, values.get(key, str(square)), 1, key)[0] - square) > _LARGEST_SKEW:
                 raise CalibrationError(
-                    f"has {key} {values[key]}, allowed is {square:g}.", path=path, hint="Align with square pixels."
+                    f"has {key} {values[key]}; it must be {square:g}.", path=path, hint="Align with square pixels."
                 )
         K, lens = _lens(path, path.stem, size, f35, (principal[0], principal[1]), terms)
         rotation = numbers(path, values["Rotation"], 9, "Rotation").reshape(3, 3)
@@ -104,7 +104,7 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
     header = [word.lstrip("#").strip().lower() for word in table.header]
     lacking = [key for key in _NEEDED if key not in header]
     if lacking:
-        raise CalibrationError(f"has no column {lacking[0]}; required are {', '.join(_NEEDED)}.", path=path)
+        raise CalibrationError(f"has no column {lacking[0]}; required: {', '.join(_NEEDED)}.", path=path)
     columns = [k for k, key in enumerate(header) if key in (*_NEEDED[1:], *_LENS)]
     column = header.index("name")
     names = names_of_labels(path, [row[column] for row in table.rows])

@@ -88,7 +88,7 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
     for name in (_TIME, *JAW_COLUMNS):
         if columns.count(name) != 1:
             raise FormatError(
-                f'has the column "{name}" {columns.count(name)} times, expected once.',
+                f'has {columns.count(name)} columns named "{name}", expected one.',
                 path=path,
                 hint="Live Link Face exports Timecode, JawOpen, JawLeft, JawRight and JawForward.",
             )
@@ -139,8 +139,8 @@ def _check_weights(weights: Array, table: TextTable) -> None:
         else ("Export the weights as recorded, not normalised or scaled.")
     )
     raise FormatError(
-        f'{table.places[row]}, column "{JAW_COLUMNS[column]}" is {worst:g}; ARKit weights range from 0 to 1, allowed '
-        f"is {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g}.",
+        f'{table.places[row]}, column "{JAW_COLUMNS[column]}" is {worst:g}; ARKit weights range from 0 to 1; values '
+        f"from {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g} are accepted.",
         path=table.path,
         hint=hint,
     )
@@ -211,8 +211,8 @@ def _numbers_per_second(
     if highest >= found or not fits:
         counted = "" if highest >= found else f", and the codes count {found} frames per second"
         raise FormatError(
-            f"{table.named(top, column)} has frame number {highest}{counted}; at {fps:g} frames per second allowed is "
-            f"0 .. {given - 1}.",
+            f"{table.named(top, column)} has frame number {highest}{counted}; at {fps:g} frames per second, frame "
+            f"numbers must be 0 .. {given - 1}.",
             path=table.path,
             hint="Omit --fps; --resample changes the rate of the motion." if counted else None,
         )

@@ -259,7 +259,7 @@ def write_npz_atomic(path: str | os.PathLike[str], arrays: Mapping[str, ArrayLik
     rows = {name: np.asarray(value, order="C") for name, value in arrays.items()}
     for name, array in rows.items():
         if array.dtype.hasobject:
-            raise ValueError(f"{name} holds Python objects; only plain arrays can be written")
+            raise ValueError(f"{name} contains Python objects; only plain arrays can be written")
     # numpy stamps every member with 1980-01-01, so equal content gives equal bytes.
     (np.savez_compressed if packed else np.savez)(buffer, allow_pickle=False, **rows)
     write_bytes_atomic(path, buffer.getvalue())

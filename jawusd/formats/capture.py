@@ -190,12 +190,12 @@ class Capture(Strict):
             unknown = [name for name in found if name not in names]
             if unknown:
                 raise ValueError(
-                    f'{key} names camera "{unknown[0]}", allowed are {listed}. Use the name from its [[camera]] table'
+                    f'{key} names camera "{unknown[0]}", cameras are {listed}. Use the name from its [[camera]] table'
                 )
         missing = [name for name in names if self.sync.offsets is not None and name not in self.sync.offsets]
         if missing:
             raise ValueError(
-                f"[sync] offsets has no entry for {missing[0]}, needed are {listed}. "
+                f"[sync] offsets has no entry for {missing[0]}; required: {listed}. "
                 f"Add it as {missing[0]} = 0, in frames; the offset of the reference camera is 0"
             )
 
@@ -288,7 +288,9 @@ def read_capture(
     units = data.pop("units", "mm")
     if units != "mm":
         return None, [
-            UnitsError(f'units are "{units}", allowed is "mm".', path=path, hint='Scale to mm, and write units = "mm".')
+            UnitsError(
+                f'units are "{units}"; they must be "mm".', path=path, hint='Scale to mm, and write units = "mm".'
+            )
         ]
     folder = path.resolve().parent
     data["folder"] = folder

@@ -28,7 +28,7 @@ _WORDS = {
     "less_than": "must be less than {lt:g}",
     "less_than_equal": "must be {le:g} or less",
     "literal_error": "must be {expected}",
-    "string_pattern_mismatch": "is empty or has characters that are not allowed; allowed are {signs}",
+    "string_pattern_mismatch": "is empty or has characters that are not allowed; use only {signs}",
     "string_too_short": "is empty",
     "too_short": "has {actual_length} entries, at least {min_length} are needed",
     "too_long": "has {actual_length} entries, at most {max_length} are allowed",
@@ -238,7 +238,7 @@ def _unknown_key(key: str, table: Location, model: type[BaseModel], where: str) 
     else:
         advice = "`jawusd init --reference` lists all keys."
     listed = ", ".join(allowed if table else ["format", "units", *allowed])
-    return f'{inside}unknown key "{key}"; allowed are {listed[:_ALLOWED_SHOWN]}.', advice
+    return f'{inside}unknown key "{key}"; allowed keys: {listed[:_ALLOWED_SHOWN]}.', advice
 
 
 def _wrong_value(

@@ -73,8 +73,7 @@ def _listed(line: str, folder: Path, path: Path, number: int) -> ListedCapture:
     name = cells[1] if len(cells) == 2 else _default_name(capture)
     if not _NAME.fullmatch(name) or name.endswith((".", " ")):
         raise FormatError(
-            f'line {number}: "{name}" is not a valid folder name; allowed are letters, digits, "_", "-", "." and '
-            "spaces.",
+            f'line {number}: "{name}" is not a valid folder name; use only letters, digits, "_", "-", "." and spaces.',
             path=path,
             hint="Add a name after a comma: PATH, NAME.",
         )

@@ -49,7 +49,7 @@ class Keys(BaseModel):
         frames = [key.frame for key in self.keys]
         if frames[-1] - frames[0] > MOST_FRAMES or max(abs(frames[0]), abs(frames[-1])) > FARTHEST_FRAME:
             found = f"frames {frames[0]:g} to {frames[-1]:g}"
-            raise ValueError(f"{found}: allowed are {MOST_FRAMES} frames within +-{FARTHEST_FRAME:g}")
+            raise ValueError(f"{found}: they must span at most {MOST_FRAMES} frames within +-{FARTHEST_FRAME:g}")
         for before, after in zip(frames, frames[1:], strict=False):
             if after <= before:
                 raise ValueError(f"frames must increase, but frame {after:g} follows {before:g}")

@@ -50,11 +50,11 @@ def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
         raise FormatError("must be a JSON object.", path=path)
     check_format(data.get("format"), FAMILY, VERSION, path)
     if data.get("units") != "mm":
-        raise UnitsError(f'units are "{data.get("units")}", allowed is "mm".', path=path)
+        raise UnitsError(f'units are "{data.get("units")}"; they must be "mm".', path=path)
     unknown = sorted(set(data) - {"format", "units", "landmarks", "T_anatomical_skull"})
     if unknown:
         raise FormatError(
-            f'unknown key "{unknown[0]}"; allowed are format, units, landmarks and T_anatomical_skull.', path=path
+            f'unknown key "{unknown[0]}"; allowed keys: format, units, landmarks, T_anatomical_skull.', path=path
         )
     named = data.get("landmarks")
     if not isinstance(named, dict) or set(named) != set(LANDMARKS):

@@ -117,7 +117,7 @@ def _read_table(path: Path) -> MarkerTable:
         raise FormatError(f"is {kind}, not a supported marker table.", path=path, hint=READ)
     rows, separator = split_rows(read_text(path, _MAX_BYTES), path, blank_rows=True)
     if not rows:
-        raise FormatError("holds no frames.", path=path)
+        raise FormatError("has no frames.", path=path)
     if max(len(row) for _, row in rows) == 1:  # separated by spaces only
         rows = [(line, row[0].split()) for line, row in rows]
     keys = [row[0].strip().lower() for _, row in rows]
@@ -144,7 +144,7 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
     else:
         width = len(rows[0][1])
     if not rows:
-        raise FormatError("holds no frames.", path=path)
+        raise FormatError("has no frames.", path=path)
     if any(re.match(r"[^\W\d_]", cell.strip()) and cell.strip().lower() != "nan" for cell in rows[0][1]):
         shown = " ".join(rows[0][1])[:60]
         raise FormatError(f'is not a table of marker positions: line {rows[0][0]} is "{shown}".', path=path, hint=READ)
@@ -303,7 +303,7 @@ def length_unit(unit: str, path: Path) -> str | None:
     """
     unit = unit.strip()
     if unit and unit.lower() not in _LENGTHS:
-        raise UnitsError(f'lengths are in "{unit}", allowed are {", ".join(_LENGTHS)}.', path=path)
+        raise UnitsError(f'lengths are in "{unit}"; the unit must be one of {", ".join(_LENGTHS)}.', path=path)
     return unit.lower() or None
 
 

@@ -88,7 +88,7 @@ def load_scan_labels(path: str | os.PathLike[str], mesh: Mesh) -> ScanLabels:
         raise FormatError(f'"labels" must be 0 to {BASE}, found {labels.max():g}.', path=path)
     source, weak = meta.get("source"), meta.get("weak_share", 0.0)
     if source != "automatic" and source != "reviewed":
-        raise FormatError(f'source is "{source}", allowed are automatic and reviewed.', path=path)
+        raise FormatError(f'source is "{source}"; it must be "automatic" or "reviewed".', path=path)
     if isinstance(weak, bool) or not isinstance(weak, int | float) or not 0 <= weak <= 1:
-        raise FormatError(f'weak_share is "{weak}", allowed is 0 to 1.', path=path)
+        raise FormatError(f'weak_share is "{weak}"; it must be a number from 0 to 1.', path=path)
     return ScanLabels(labels.astype(np.uint8), source, float(weak))

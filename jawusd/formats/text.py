@@ -118,7 +118,7 @@ def _fault(error: ValidationError, model: type[BaseModel]) -> str:
     if kind == "value_error":
         return str(problem["ctx"]["error"])
     if kind == "extra_forbidden" and above is not None:
-        return f'{where}unknown key "{name}"; allowed are {", ".join(above.model_fields)}'
+        return f'{where}unknown key "{name}"; allowed keys: {", ".join(above.model_fields)}'
     found = "" if isinstance(given, dict | list) else f", found {json.dumps(given, default=str):.80}"
     return f"{where}{name} needs {needed}{found}"
 

@@ -84,7 +84,7 @@ class _Processor(Protocol):
 def _by_config(values: NDArray[np.float32], space: str, config: Path | None) -> NDArray[np.uint8]:
     if config is None:
         raise CaptureError(
-            f'the colour space "{space}" is unknown; allowed are {", ".join(SPACES)}, and names in an OpenColorIO '
+            f'the colour space "{space}" is unknown; it must be {", ".join(SPACES)}, or a name in an OpenColorIO '
             "config.",
             hint='Set the config at the top of capture.toml: colour_config = "config.ocio".',
         )

@@ -177,8 +177,8 @@ def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> T
     if video.is_numbered:
         if not source.numbers & set(video.stored.tolist()):
             raise CaptureError(
-                f"the masks are numbered {min(source.numbers)} to {max(source.numbers)}, but the camera's pictures "
-                f"{video.stored[0]} to {video.stored[-1]}.",
+                f"the masks are numbered {min(source.numbers)} to {max(source.numbers)}, but the camera's pictures are "
+                f"numbered {video.stored[0]} to {video.stored[-1]}.",
                 path=path,
                 hint="Number the masks like their pictures.",
             )
@@ -207,7 +207,7 @@ def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -
     if source.count != len(video.numbers):
         frames = f" in {video.count} frames" if video.missing else ""
         raise CaptureError(
-            f"the mask video has {source.count} pictures, but the camera's video {len(video.numbers)}{frames}.",
+            f"the mask video has {source.count} pictures, but the camera's video has {len(video.numbers)}{frames}.",
             path=path,
             hint="Export the masks again, one picture per picture of the video, from its first one on.",
         )

@@ -68,7 +68,8 @@ def turn_deg(frame: av.VideoFrame) -> int:
             "ffmpeg -display_rotation 0 -i IN -c copy OUT.",
         )
     raise CaptureError(
-        f"the display matrix in the file rotates by {frame.rotation} degrees or skews; allowed are multiples of 90.",
+        f"the display matrix in the file rotates by {frame.rotation} degrees or skews; "
+        "only multiples of 90 are supported.",
         hint="Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4.",
     )
 

@@ -149,7 +149,7 @@ def solve_page(data: SolveReportData) -> str:
     """
     solved = data.tracks.solved
     if solved is None:
-        raise FormatError("holds no solved performance.", hint="Pass the .npz written by `jawusd solve`.")
+        raise FormatError("has no solved performance.", hint="Pass the .npz written by `jawusd solve`.")
     findings = list(dict.fromkeys(Finding.from_json(one).line() for one in data.tracks.meta.get("findings", [])))
     unobserved = unobserved_runs(data, solved)
     return (

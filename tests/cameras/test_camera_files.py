@@ -77,7 +77,7 @@ def change(path, old, new):
 @pytest.mark.parametrize(
     ("file", "old", "new", "words"),
     [
-        ("cameras.txt", "PINHOLE", "OPENCV_FISHEYE", "model OPENCV_FISHEYE, allowed are SIMPLE_PINHOLE"),
+        ("cameras.txt", "PINHOLE", "OPENCV_FISHEYE", "model OPENCV_FISHEYE; it must be one of SIMPLE_PINHOLE"),
         ("cameras.txt", "900.0 910.0", "900.0", "camera 1 has 5 values, PINHOLE needs 6"),
         ("cameras.txt", "900.0", "many", "is not a list of numbers"),
         ("cameras.txt", "900.0", "-900.0", "focal lengths -900"),
@@ -96,7 +96,7 @@ def test_colmap_files_that_are_wrong_are_refused(colmap, file, old, new, words):
 
 def test_a_colmap_model_needs_both_files_and_images(colmap):
     (colmap / "images.txt").write_text("# nothing\n")
-    with pytest.raises(CalibrationError, match="holds no images"):
+    with pytest.raises(CalibrationError, match="has no images"):
         load_cameras_file(colmap)
     (colmap / "images.txt").unlink()
     with pytest.raises(CalibrationError, match=r"images\.txt: cannot be read.*cameras\.txt and images\.txt"):
@@ -160,7 +160,7 @@ def test_nerfstudio_scale_is_undone_and_frames_may_have_their_own_lens(tmp_path,
     ("changes", "words"),
     [
         ({"camera_model": "OPENCV_FISHEYE"}, "only perspective models"),
-        ({"k4": 0.1}, "k4 = 0.1, allowed is 0"),
+        ({"k4": 0.1}, "k4 = 0.1; it must be 0"),
         ({"fl_x": None}, 'has no number "fl_x"'),
         ({"fl_x": 0}, "focal lengths 0"),
         ({"frames": []}, 'has no "frames"'),

@@ -148,11 +148,11 @@ def test_lens_models_of_other_files_that_are_not_read_are_named(tmp_path):
     (tmp_path / "b.toml").write_text(plain.replace("size =", "fisheye = true\nsize =", 1))
     (tmp_path / "a.json").write_text(nerfstudio(camera_model="OPENCV_FISHEYE"))
     (tmp_path / "b.json").write_text(nerfstudio(is_fisheye=True))
-    models = {"p3.xml": "p3 = 0.01, allowed is 0", "a.toml": "distortion_model = kannala_brandt4"}
+    models = {"p3.xml": "p3 = 0.01; it must be 0", "a.toml": "distortion_model = kannala_brandt4"}
     models |= {"b.toml": "fisheye = True", "a.json": "OPENCV_FISHEYE", "b.json": "only perspective models"}
     for model in ("OPENCV_FISHEYE", "FOV", "THIN_PRISM_FISHEYE", "SIMPLE_RADIAL_FISHEYE"):
         colmap(tmp_path / model, [""] * 3, model=model)
-        models[model] = f"model {model}, allowed are"
+        models[model] = f"model {model}; it must be one of"
     for name, said in models.items():
         with pytest.raises(CalibrationError, match=said):
             load_cameras_file(tmp_path / name)

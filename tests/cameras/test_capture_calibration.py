@@ -85,11 +85,11 @@ def test_a_capture_is_read_with_absolute_paths(folder):
     [
         ('jawusd-capture/1"', 'jawusd-capture/2"', VersionError, "Update jawusd"),
         ('"jawusd-capture/1"', '"other/1"', FormatError, 'expected "jawusd-capture/1"'),
-        ('units = "mm"', 'units = "m"', UnitsError, 'allowed is "mm"'),
+        ('units = "mm"', 'units = "m"', UnitsError, 'must be "mm"'),
         ("fps = 24.0", "fps = -1", FormatError, "fps"),
         ("fps = 24.0", "fsp = 24.0", FormatError, "fsp"),
         ("frames = [30, 90]", "frames = [90, 30]", FormatError, "one past the last"),
-        ('reference = "cam1"', 'reference = "cam7"', FormatError, "allowed are cam0, cam1"),
+        ('reference = "cam1"', 'reference = "cam7"', FormatError, "cameras are cam0, cam1"),
         ('camera = "cam1", x', 'camera = "cam9", x', FormatError, "cam9"),
         ('name = "cam1"', 'name = "cam0"', FormatError, "must be unique"),
         ('video = "cam1.mp4"', "", FormatError, "has neither video nor masks"),

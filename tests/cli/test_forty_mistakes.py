@@ -22,9 +22,9 @@ CAMERAS = f'[cam_0]\nname = "left"\n{CAMERA}[cam_1]\nname = "right"\n{CAMERA}'
 
 # The mistake; the replacement and the replaced text in capture.toml; key; found; allowed; remedy.
 IN_THE_FILE = [
-    ("a misspelt key", "video = ", "vidoe = ", '[[camera]] 1 ("left")', '"vidoe"', "allowed are name", '"video"'),
+    ("a misspelt key", "video = ", "vidoe = ", '[[camera]] 1 ("left")', '"vidoe"', "allowed keys: name", '"video"'),
     ("a misspelt table", "[scans]", "[scan]", "", '"scan"', "fps, frames, calibration", 'mean "scans"'),
-    ("capitals", "fps", "FPS", "", '"FPS"', "allowed are format", 'mean "fps"'),
+    ("capitals", "fps", "FPS", "", '"FPS"', "allowed keys: format", 'mean "fps"'),
     ("a key of another table", "cols", "square_mm = 2\ncols", "", "overwrite a value", "", ""),
     ("a key below the tables", "cols", "fps = 24.0\ncols", "[boards]", '"fps"', "pattern, cols", "top of the file"),
     ("masks that are one word", "video = ", "mask = ", '("left")', '"mask"', "video, masks", 'mean "masks"'),
@@ -57,7 +57,7 @@ IN_THE_FILE = [
     ("a pick before the take", "[boards]", "[bootstrap]\nframe = -1\n[boards]", "frame", "-1", "0 or more", "For ex"),
     ("a pick of no camera", "[boards]", PICK % "mid", "[[bootstrap.upper]] camera", '"mid"', "left, ", "Use the"),
     ("a newer file", "capture/1", "capture/9", "format", "capture/9", "up to", "Update jawusd"),
-    ("centimetres", "fps", 'units = "cm"\nfps', "units", '"cm"', 'allowed is "mm"', "Scale to mm"),
+    ("centimetres", "fps", 'units = "cm"\nfps', "units", '"cm"', 'must be "mm"', "Scale to mm"),
     ("text without quotes", 'name = "x"', "name = x", "", "line 2", "TOML", "in quotes"),
     ("a video for a scan", '"u.ply"', '"left.mp4"', "[scans] upper_teeth", '"left.mp4"', "a mesh is needed", "Name"),
     ("a scan for a clip", '= "left.mp4"', '= "u.ply"', '1 ("left") video', '"u.ply"', "a video or an image", "Name"),

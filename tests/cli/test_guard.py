@@ -69,7 +69,7 @@ def test_the_limit_is_a_share_of_the_machine_that_can_be_set(monkeypatch):
     assert guard.memory_limit() == 4 * 10**9
     for wrong in ("much", "-1", "nan"):
         monkeypatch.setenv(guard.SETTING, wrong)
-        with pytest.raises(ResourceError, match="is a number of GB"):
+        with pytest.raises(ResourceError, match="must be a number of GB"):
             guard.memory_limit()
         assert guarded("", env={guard.SETTING: wrong}).stderr.startswith("jawusd: JAWUSD_MEMORY_GB is")
 

@@ -44,7 +44,7 @@ def test_other_formats_are_refused(tmp_path, found):
 
 @pytest.mark.parametrize("meta", [{"units": {"length": "m", "angle": "rad"}}, {"twist_order": ["v", "omega"]}])
 def test_other_units_and_orders_are_refused(tmp_path, meta):
-    with pytest.raises(UnitsError, match="allowed"):
+    with pytest.raises(UnitsError, match="must be"):
         evaluator.load(write(tmp_path / "m.npz", **meta))
 
 

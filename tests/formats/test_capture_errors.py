@@ -38,10 +38,10 @@ def test_a_good_file_is_read(told):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('video = "left.mp4"', 'mask.upper = "a"', '[[camera]] 1 ("left"): unknown key "mask"; allowed are name'),
+        ('video = "left.mp4"', 'mask.upper = "a"', '[[camera]] 1 ("left"): unknown key "mask"; allowed keys: name'),
         ('video = "left.mp4"', 'mask.upper = "a"', 'Did you mean "masks"?'),
         ('video = "right.mp4"', 'vidoe = "right.mp4"', '[[camera]] 2 ("right"): unknown key "vidoe"'),
-        ("fps", "FPS", 'unknown key "FPS"; allowed are format, units, name, fps'),
+        ("fps", "FPS", 'unknown key "FPS"; allowed keys: format, units, name, fps'),
         ("[scans]", "[scan]", 'Did you mean "scans"?'),
         ("[scans]", "[scans]\nfps = 24.0", '"fps" goes at the top of the file, before the first [table]'),
         ("[scans]", "[scans]\nsquare_mm = 2.0", '"square_mm" belongs to [boards]'),
@@ -70,8 +70,8 @@ def test_a_good_file_is_read(told):
         ("cols = 9", 'cols = 9\npattern = "checkers"', 'pattern = "checkers" must be "chessboard" or "charuco"'),
         (', "right.mp4"]', "]", "[boards] videos lists 1 clips, 2 are needed, one per camera: left, right. List"),
         ("[boards]", '[sync]\nmethod = "clap"\n[boards]', '[sync] method = "clap" must be "flash"'),
-        ("[boards]", '[sync]\nreference = "middle"\n[boards]', 'reference names camera "middle", allowed are left'),
-        ("[boards]", "[sync]\noffsets = { left = 0 }\n[boards]", "no entry for right, needed are left, right."),
+        ("[boards]", '[sync]\nreference = "middle"\n[boards]', 'reference names camera "middle", cameras are left'),
+        ("[boards]", "[sync]\noffsets = { left = 0 }\n[boards]", "no entry for right; required: left, right."),
         ("[boards]", "[bootstrap]\nframe = -1\n[boards]", "[bootstrap] frame = -1 must be 0 or more"),
         (
             "[boards]",

@@ -55,7 +55,7 @@ def test_a_marker_description_and_numbers(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "holds no frames"),
+        ("", "has no frames"),
         ("1 2 3\n1 2\n", "line 2 has 2 numbers, 3 are expected"),
         ("1 2 3 4\n", "has 4 numbers per frame"),
         ("frame,m00\n1,2\n", "is not a table of marker positions"),
@@ -218,7 +218,7 @@ def test_frames_that_a_table_leaves_out_show_no_markers(tmp_path):
         ("a.tsv", qtm(cells()[:4]), "its header declares 6 frames, but it has 4"),
         ("a.trc", trc(cells()[:5]), "its header declares 6 frames, but it has 5"),
         ("a.trc", trc(cells(ZEROS))[:-40], "numbers, 12 are expected"),
-        ("a.trc", trc(cells(), unit="inch"), 'lengths are in "inch", allowed are mm, cm, m'),
+        ("a.trc", trc(cells(), unit="inch"), 'lengths are in "inch"; the unit must be one of mm, cm, m'),
         ("a.trc", trc(cells(), frames=[1, 2, 2, 3, 4, 5]), "must be increasing whole numbers"),
         ("a.tsv", qtm(cells()).replace("\t4\n", "\t5\n", 1), "declares 5 markers but names 4"),
         ("a.tsv", qtm(cells()).replace("DATA_INCLUDED\t3D", "DATA_INCLUDED\t6D"), "has 6D data of Qualisys"),

@@ -113,7 +113,7 @@ def test_landmarks_keep_their_order(tmp_path):
     [
         ({"format": "jawusd-model/1"}, FormatError, "jawusd-landmarks/1"),
         ({"format": "jawusd-landmarks/2"}, VersionError, "Update"),
-        ({"units": "cm"}, UnitsError, '"cm", allowed is "mm"'),
+        ({"units": "cm"}, UnitsError, '"cm"; they must be "mm"'),
         ({"landmarks": {"incisor": [0, 0, 0]}}, FormatError, "molar_left"),
         ({"landmarks": {name: [0, 0] for name in NAMES}}, FormatError, 'landmark "incisor"'),
         ({"landmarks": {name: ["a", 0, 0] for name in NAMES}}, FormatError, "array of numbers"),

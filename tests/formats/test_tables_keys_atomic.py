@@ -84,7 +84,7 @@ def test_keys_round_trip_and_faults(tmp_path):
         ('{"fps": 24, "keys": [{"frame": 1}]}', "keys, entry 1: d needs three numbers"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 2, "d": [0,"x",0]}]}', 'entry 2: d needs .*"x"'),
         ('{"fps": 24, "keys": [{"d": [0,0,0]}]}', "keys, entry 1: frame needs a number"),
-        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0], "D": 1}]}', 'unknown key "D"; allowed are frame, d'),
+        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0], "D": 1}]}', 'unknown key "D"; allowed keys: frame, d'),
         ('{"fps": 24, "keys": [7]}', "keys: entry 1 needs a JSON object, found 7"),
         ('{"fps": "fast", "keys": []}', 'fps needs a number above 0, at most 10000 .1/s., found "fast"'),
         ("[]", "the file needs a JSON object"),

@@ -88,7 +88,7 @@ def test_what_is_not_json_is_named_with_its_line(tmp_path, text, words):
         ({"neutral": [0, 0, 0]}, "neutral needs four numbers within"),
         ({"gain_mm": [[0, 0, 0, 0]] * 2}, "gain_mm needs three rows of four numbers"),
         ({"dead_zone": [0, 0, 0, -1]}, "dead_zone needs four numbers within .*, none below 0, found -1"),
-        ({"gains": 1}, 'unknown key "gains"; allowed are format, actor'),
+        ({"gains": 1}, 'unknown key "gains"; allowed keys: format, actor'),
         ({"format": "jawusd-arkit/9"}, 'format needs "jawusd-arkit/1", found "jawusd-arkit/9"'),
     ],
 )

@@ -243,7 +243,7 @@ def test_masks_of_a_variable_rate_are_shown_at_their_time(tmp_path, variable):
 def test_masks_that_cannot_belong_to_a_video_are_refused(tmp_path, variable):
     short = write(tmp_path / "short.mkv", [mask(k) for k in range(9)], "ffv1", "gray", {})
     source = CameraSource(name="a", video=variable, masks={"upper": short, "lower": short, **VALUES})
-    with pytest.raises(CaptureError, match=r"short\.mkv: .* has 9 pictures, but the camera's video 11 in 14 frames"):
+    with pytest.raises(CaptureError, match=r"short\.mkv: .* 9 pictures, but the camera's video has 11 in 14 frames"):
         open_masks(source, SIZE)
     cv2.imwrite(str(tmp_path / "u000012.png"), mask(1))
     source = CameraSource(name="a", video=variable, masks={"labels": tmp_path / "u%06d.png", **VALUES})

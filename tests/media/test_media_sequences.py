@@ -124,7 +124,7 @@ def test_film_scans_are_shown_by_their_density():
 
 
 def test_a_colour_space_that_nobody_knows(tmp_path):
-    with pytest.raises(CaptureError, match='"Log C" is unknown; allowed are display, linear, cineon'):
+    with pytest.raises(CaptureError, match='"Log C" is unknown; it must be display, linear, cineon'):
         to_display(np.zeros((2, 2), np.uint16), 65535, "Log C", None)
 
 

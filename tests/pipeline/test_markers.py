@@ -212,7 +212,7 @@ def test_each_mistake_of_a_c3d_is_named(tmp_path, markers):
     with pytest.raises(FormatError, match="is not a readable C3D file"):
         read_c3d(path)
     write_c3d(path, markers, unit="in")
-    with pytest.raises(FormatError, match='lengths are in "in", allowed are mm, cm, m'):
+    with pytest.raises(FormatError, match='lengths are in "in"; the unit must be one of mm, cm, m'):
         read_c3d(path)
     with pytest.raises(FormatError, match="no such file"):
         read_c3d(tmp_path / "none.c3d")

@@ -74,5 +74,5 @@ def test_the_page_asks_for_nothing_and_draws_the_values():
 
 
 def test_tracks_that_no_solve_made_are_refused():
-    with pytest.raises(FormatError, match="holds no solved performance"):
+    with pytest.raises(FormatError, match="has no solved performance"):
         solve_page(solve_data(tracks=report_data().tracks))
