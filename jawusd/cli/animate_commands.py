@@ -41,7 +41,7 @@ def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) ->
 
     if not holds_stage(source):
         return read_motion(loaded, source)
-    own = None if source.suffix.lower() in USD_SUFFIXES else prim  # a stage may have another prim path
+    own = None if source.suffix.lower() in USD_SUFFIXES else prim  # the stage may have the rig at another prim path
     found = read_stage_motion(loaded, rig, source, own, None, None, None)
     return AuthoredMotion(found.frames, found.d, found.fps)
 
@@ -165,7 +165,7 @@ def animate(
     emit_motion(out, rate, motion, changes, as_json)
 
 
-_CLAMPED_MM = 0.005  # smaller values would be printed as 0.00
+_CLAMPED_MM = 0.005  # minimum value that is listed; smaller ones would be printed as 0.00
 
 
 def arkit_fit(
@@ -239,7 +239,8 @@ def arkit_table(
 ) -> None:
     """Write the jaw joint's offset for each ARKit shape at half and full weight, for rigs that sum joint deltas.
 
-    Millimetres and degrees relative to the neutral face, about the point midway between the condyles, skull axes.
+    Offsets are in millimetres and degrees relative to the neutral face, about the point midway between the condyles,
+    along the skull's axes.
     """
     import jawusd
     from jawusd.formats.poses import save_joint_table
@@ -285,8 +286,8 @@ def _rate_of(rig: Path, prim: str | None) -> float:
 def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None) -> AuthoredMotion:
     """Read the jaw of an ARKit face capture, by the subject's mapping or as fractions of the subject's ranges.
 
-    As fractions, JawOpen 1 is the full opening; JawLeft minus JawRight, and JawForward, are fractions of the ranges at
-    that opening. Left is the subject's left.
+    Without a mapping, JawOpen 1 is the full opening, and JawLeft minus JawRight and JawForward are fractions of the
+    ranges at that opening. Left is the subject's left.
 
     Args:
         source: CSV of Live Link Face.

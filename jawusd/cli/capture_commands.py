@@ -111,7 +111,7 @@ def sync(
             else:
                 result = sync_videos(videos, reference or next(iter(videos)), report)
         except SyncError as error:
-            failure = error  # raised later, after the curves are written, in which the reason is visible
+            failure = error  # raised after the curves are written, because the curves show the reason
         found = light_curves(videos, report) if curves is not None or plot is not None else {}
         if curves is not None:
             write_light_curves(curves, found)
@@ -252,8 +252,8 @@ def photos(
 ) -> None:
     """Register two scans in occlusion, from outlines drawn in photographs of the closed bite.
 
-    All photographs show the same bite and come from the same camera, whose focal length may be unknown; some may be
-    taken in a mirror. Exit code 6 if the scans do not fit the outlines.
+    All photographs must show the same bite and come from one camera, whose focal length may be unknown. Some may be
+    taken through a mirror. Exit code 6 if the scans do not fit the outlines.
     """
     from jawusd.base.errors import TrackingError
     from jawusd.cli.text_capture import photograph_lines

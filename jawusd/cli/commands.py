@@ -68,8 +68,8 @@ _WORDS = "jawusd.words"  # context key of a command's arguments
 _VECTOR = re.compile(r" *[-+]?[\d.eE+-]+((, *| +)[-+]?[\d.eE+-]+){2} *")
 _VECTORS = ("--d", "--point", "--target", "--start")
 
-# Which results of an interrupted command are kept, and how to resume it; other commands write complete files at the
-# end.
+# Messages about the results that interrupted commands keep, and about how to resume; commands not listed write complete
+# files at the end.
 _KEPT = {
     "build": "finished stages are kept; resume with the same command and --resume, start over with --fresh",
     "build-many": "finished captures and stages are kept; resume with the same command and --resume",
@@ -123,7 +123,7 @@ def with_vectors_split(args: list[str]) -> list[str]:
 
 
 class _StoppedError(KeyboardInterrupt):
-    """A signal other than Ctrl+C that ends a command in the same way."""
+    """A signal that ends a command like Ctrl+C does."""
 
     def __init__(self, number: int) -> None:
         super().__init__()

@@ -60,9 +60,9 @@ _verbose = False
 
 def main() -> None:
     """Run the command line and exit: 0 success, 1 negative result, 2 wrong usage, 3 and above by error family."""
-    if "PXR_WORK_THREAD_LIMIT" not in os.environ:  # before OpenUSD is loaded; rigs are too small to gain from threads
+    if "PXR_WORK_THREAD_LIMIT" not in os.environ:  # read when OpenUSD loads; rigs are too small for threads
         os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
-    # Before numpy is loaded: multi-threaded sums differ in their last bits between machines, which changes fits by
+    # Set before numpy is loaded. Multi-threaded sums differ in their last bits between machines, which changes fits by
     # micrometres. The matrices are too small to gain from threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):  # escape characters that the terminal cannot encode
@@ -76,7 +76,7 @@ def main() -> None:
     except MemoryError as error:
         sys.exit(_report(out_of_memory(), error))
     except BrokenPipeError:
-        # The reader of the pipe (head, less) has closed it.
+        # The program that reads the pipe, such as head or less, has closed it.
         sys.stderr.close()
         sys.exit(0)
     except (OSError, RuntimeError) as error:
@@ -99,11 +99,11 @@ def _unwritable(error: OSError | RuntimeError) -> int:
     """
     if isinstance(error, OSError):
         message = f"{str(error.filename or 'the output'):.200}: {error.strerror or error}."
-    elif str(error).startswith("Symlink loop"):  # Path.resolve
+    elif str(error).startswith("Symlink loop"):  # raised by Path.resolve
         message = f"{error}."
     else:
         raise error
     complain(message)
-    with contextlib.suppress(OSError):  # or Python would try to flush it again at exit
+    with contextlib.suppress(OSError):  # otherwise Python would try to flush stdout again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return OutputError.exit_code

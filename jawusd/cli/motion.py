@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 _MOVED_MM = 1e-6
-_FINE = 10  # samples of a curve per frame
-_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # tolerance and most refinements of a piecewise linear approximation
+_FINE = 10  # number of samples of a curve per frame
+_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # tolerance and maximum number of refinements of a polyline
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class AuthoredMotion:
     frames: Array  # frame numbers (F,), increasing
     d: Array  # parameters (F, 3) [mm], NaN in frames without parameters
     fps: float | None  # frames per second, None if the source does not state it
-    keys: Keys | None = None  # keys from which the motion was interpolated
+    keys: Keys | None = None  # keys between which the motion was interpolated
 
     def __post_init__(self) -> None:
         """Validate frames and parameters."""
@@ -48,11 +48,11 @@ class AuthoredMotion:
             before, after = self.frames[falls[0] : falls[0] + 2]
             raise FormatError(f"frames must increase: frame {after:g} follows {before:g}.")
         if (np.abs(self.d) > FARTHEST_MM).any():
-            raise FormatError(f"a parameter is {np.nanmax(np.abs(self.d)):g} mm; allowed are +-{FARTHEST_MM:g} mm.")
+            raise FormatError(f"a parameter is {np.nanmax(np.abs(self.d)):g} mm; the limit is +-{FARTHEST_MM:g} mm.")
         first, last = self.frames[0], self.frames[-1]
         if not (last - first <= MOST_FRAMES and max(abs(first), abs(last)) <= FARTHEST_FRAME):
             raise FormatError(
-                f"the motion runs from frame {first:g} to {last:g}; allowed are {MOST_FRAMES} frames within "
+                f"the motion runs from frame {first:g} to {last:g}; at most {MOST_FRAMES} frames are allowed, within "
                 f"+-{FARTHEST_FRAME:g}."
             )
 
@@ -96,7 +96,7 @@ class Changes:
     """Summary of the changes made to a motion."""
 
     figures: dict[str, float]  # counts, and distances [mm]
-    lines: list[str]  # as text; the first line is appended to that with the file name
+    lines: list[str]  # summary as text; the first line is appended to the line with the file name
 
 
 def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes, as_json: bool) -> None:
@@ -110,7 +110,7 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
     """Project a motion into the bound, see `JawRig.keep_inside`; frames without parameters are kept.
 
-    Of a smooth motion only the keys are projected if that suffices, so that keys remain connected by curves.
+    Only the keys of a smooth motion are projected if that suffices, so that they remain connected by curves.
     """
     known = np.isfinite(motion.d).all(axis=1)
     lost = int((~known).sum())

@@ -211,7 +211,8 @@ def _column_map(text: str | None) -> dict[str, str]:
             raise typer.BadParameter(f'"{part}" is not of the form name=column.', param_hint="--columns")
         if ours not in known:
             raise typer.BadParameter(
-                f'"{ours}" is not a column of poses; allowed are frame, {", ".join(QUATERNION_COLUMNS)}, m00 ... m33.',
+                f'"{ours}" is not a column of poses; it must be one of frame, '
+                f"{', '.join(QUATERNION_COLUMNS)}, m00 ... m33.",
                 param_hint="--columns",
             )
         if ours in found:

@@ -148,7 +148,7 @@ class RunLog:
 
 
 class _Copied:
-    """A stream whose lines are copied to a log."""
+    """An output stream that also copies its lines to a log."""
 
     def __init__(self, stream: TextIO, log: RunLog) -> None:
         self._stream, self._log, self._pending = stream, log, ""

@@ -67,7 +67,7 @@ def rebake(
 ) -> None:
     """Make d and mandible of the rigs of a shot agree, after only one of them was edited.
 
-    One layer contains the opinions for all rigs, to be sublayered by the shot. Motions are projected into the bound,
+    The layer contains opinions for all rigs; add it to the sublayers of the shot. Motions are projected into the bound,
     and samples outside are reported with their margin. A stage without the rig but with copies of its meshes, moved by
     transforms, bones or point caches, gives a layer over RIG. FBX and glTF are read through Blender.
     """
@@ -96,7 +96,7 @@ class _BakedRig:
 
 
 def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str | None]:
-    """Return the prims to bake: those given, otherwise all of the shot; None stands for the only rig, or RIG."""
+    """Return the prims to bake: those given, otherwise all rigs of the shot; None stands for the only rig, or RIG."""
     if stage is not None and len(prims or ()) > 1:
         raise typer.BadParameter("RIG STAGE bakes one rig; several are baked with the shot alone.", param_hint="--prim")
     if prims or stage is not None:
@@ -137,7 +137,7 @@ def _write_baked(
     motion = first.motion
     if (
         first.found.fitted and prim is not None and shot.suffix.lower() not in USD_SUFFIXES
-    ):  # otherwise `prim` is a path in the shot
+    ):  # in the other branches, `prim` is a path in the shot
         write_over(out, rig, first.rig, motion.frames, motion.d, first.found.fps, prim)
     elif first.found.fitted:
         write_animation(out, rig, motion.frames, motion.d, first.found.fps, rig=first.rig)

@@ -132,7 +132,9 @@ def _report_found(
         with progress() as tell:
             path = report_build(source, capture, tell, allow_outside=allow_outside)
     else:
-        raise typer.BadParameter("poses have no report: add --experiments for the paper's experiments on them.")
+        raise typer.BadParameter(
+            "no report is available for a pose file; add --experiments to run the paper's experiments on it."
+        )
     emit({"file": str(path), "bytes": path.stat().st_size}, as_json, lambda: [str(path)])
 
 

@@ -141,7 +141,7 @@ def live(
     prim: Prim = None,
     allow: Allow = None,
 ) -> None:
-    """Track the jaw of a subject with a rig in live video: a line of JSON per instant, OSC, a page.
+    """Track the jaw of a subject with a rig in live video; output as a line of JSON per frame, OSC, and a page.
 
     Frames are dropped if images arrive too fast; every line contains the latency.
     """

@@ -112,7 +112,7 @@ def publish(
     emit({"files": files}, as_json, lambda: files)
 
 
-_STILL_MM = 0.01  # largest motion of a jaw at rest; ten times the rounding error in single precision
+_STILL_MM = 0.01  # maximum displacement of a jaw that counts as still; ten times the rounding error in single precision
 
 
 def read_stage_motion(

@@ -195,7 +195,7 @@ def contact_words(contact: object) -> str:
     return f"{meet} in the closed bite; clearances to {error:.2f} mm"
 
 
-_FARTHEST_MM = 1.5  # largest distance that is measured, see `meshes.collision`
+_FARTHEST_MM = 1.5  # maximum distance that `meshes.collision` measures
 
 
 def joint_words(joints: object) -> str:

@@ -28,7 +28,7 @@ def check_lines(findings: Sequence[Finding]) -> list[str]:
     return [*(finding.line() for finding in findings), counted]
 
 
-_LISTED = 10  # most images listed per camera
+_LISTED = 10  # maximum number of images listed per camera
 _LISTED_MASKS = 12
 
 
@@ -121,7 +121,7 @@ def start_lines(start: CaptureStart) -> list[str]:
     return [*lines, f"next: jawusd check {folder}"]
 
 
-_LEAST_APART_MM = 10.0  # as in `capture.camera_checks`, which rejects captures below
+_LEAST_APART_MM = 10.0  # minimum distance between cameras, below which `capture.camera_checks` rejects a capture
 
 
 def camera_lines(cameras: list[Camera], files: list[Path]) -> list[str]:

@@ -2,8 +2,8 @@
 
     blender -b --factory-startup -P blender_convert.py -- take.fbx take.usdc 24
 
-It also runs in a Python with `bpy`. The last argument is the frame rate of files that do not state one, such as glTF,
-and ignored for FBX. Time 0 is frame 0.
+It also runs in a Python with `bpy`. The last argument is the frame rate of files that do not state one, such as glTF;
+it is ignored for FBX. Time 0 is frame 0.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import traceback
 
 import bpy
 
-_STILL = 1e-6  # largest variation of a curve of an object that does not move
+_STILL = 1e-6  # maximum variation of a curve that counts as constant
 _TRANSFORM_PATHS = ("location", "rotation", "scale", "pose.bones")
 
 
@@ -39,8 +39,8 @@ def convert(source: str, target: str, fps: float) -> None:
 def _assign_takes() -> None:
     """Assign to every object the take of an FBX file in which it moves.
 
-    Blender's FBX exporter by default writes every action for every object, even the camera's for the jaw, and its
-    importer assigns the first one.
+    By default, Blender's FBX exporter writes every action for every object, for example the camera's action for the
+    jaw, and its importer assigns the first action.
 
     Raises:
         ValueError: A mesh moves in several takes, so the choice is ambiguous.
@@ -55,7 +55,7 @@ def _assign_takes() -> None:
         if moving:
             data = found.animation_data
             data.action = moving[0]
-            if hasattr(data, "action_slot"):  # Blender 4.4 and later; not set by the importer
+            if hasattr(data, "action_slot"):  # action slots exist since Blender 4.4; the importer does not set them
                 data.action_slot = data.action_suitable_slots[0]
 
 

@@ -28,7 +28,7 @@ def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps:
     Args:
         path: An .fbx, .glb or .gltf file.
         folder: Folder of the stage.
-        fps: Frames per second of files that do not state it, such as glTF of other programs.
+        fps: Frame rate of files that do not state one, such as glTF of other programs.
 
     Raises:
         MissingDependencyError: Blender is not installed.

@@ -14,7 +14,7 @@ from jawusd.plugins.vendoring import vendored_files
 _HERE = Path(__file__).parent
 _READER = "jawusd_reader.py"
 _SCRIPTS = ("jawusd_recipes.py",)
-# fixed, so that the zip is reproducible
+# file time in the zip; fixed, so that the zip is reproducible
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 
@@ -52,7 +52,7 @@ def packed_reader() -> str:
     Imports from jawusd are replaced by the contents of the imported modules.
 
     Raises:
-        ValueError: A module cannot be packed, because of an unsupported import, or a name defined in two modules.
+        ValueError: A module has an unsupported import, or two modules define the same name.
     """
     modules: dict[Path, ast.Module] = {}
     _collect(_HERE / _READER, modules)

@@ -43,7 +43,7 @@ LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forw
 
 _NOT_NEEDED = ("codes", "polygon_", "residual_limit_mm", "tolerance_mm")
 _SEARCH_STEPS = 60
-_SLICES = 48  # openings from which the nearest valid d is searched
+_SLICES = 48  # number of openings from which the search for the nearest valid d starts
 _CODES = {
     "f2": "e", "f4": "f", "f8": "d", "b1": "?", "i1": "b", "i2": "h", "i4": "i", "i8": "q",
     "u1": "B", "u2": "H", "u4": "I", "u8": "Q",
@@ -52,7 +52,7 @@ _OPERATIONS = FloatOperations()
 
 
 class ReaderError(Exception):
-    """Report a file that is not a jaw rig, or too new for this reader."""
+    """A file is not a jaw rig, or is too new for this reader."""
 
 
 def load(path: str, prim_path: str | None = None) -> Rig:
@@ -103,7 +103,7 @@ def from_prim(prim: Usd.Prim) -> Rig:
     """Read a rig from a USD prim.
 
     Raises:
-        ReaderError: The prim is not a rig, or is of a newer version.
+        ReaderError: The prim is not a rig, or its version is too new.
     """
 
     def value(name: str) -> float | Sequence[float] | str:
@@ -131,7 +131,7 @@ def _flat(value: float | Sequence[float] | str) -> list[float]:
 
 
 def _attributes_of(kind: str, gliding: bool) -> dict[str, tuple[str, ...]]:
-    """Return the attributes of all arrays that poses and margins need; ``gliding`` models have a glide table."""
+    """Return the names of the attributes that poses and margins need; ``gliding`` models also have a glide table."""
     if kind not in MODELS:
         raise ReaderError(f"model kind {kind!r} is unknown to this reader")
     every = {**arrays_of(kind), **(GLIDE_ARRAYS if gliding else {})}
@@ -272,7 +272,7 @@ class Rig:
         return best
 
     def ranges(self, d1: float, d2: float = 0.0, d3: float = 0.0) -> tuple[Pair, Pair]:
-        """Return the valid (min, max) of d2 at this d3, and of d3 at this d2 [mm]; (nan, nan) if there is none.
+        """Return the valid (min, max) of d2 at this d3, and of d3 at this d2 [mm]; (nan, nan) if no value is valid.
 
         The bound ends some tenths of a mm before the limits of d1; beyond, the last valid opening is used.
         """

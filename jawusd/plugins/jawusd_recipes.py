@@ -80,7 +80,7 @@ def poses(rig: jawusd_reader.Rig, keys: Keys, *, measured: bool = False) -> dict
 def nearest_turn(
     angles: Sequence[float], previous: Sequence[float] | None, middle: int = 1, full: float = 360.0
 ) -> list[float]:
-    """Return the Euler angles of the same rotation that are nearest to those of the previous frame.
+    """Return the equivalent Euler angles that are nearest to those of the previous frame.
 
     Args:
         angles: Three Euler angles.
@@ -105,7 +105,8 @@ def row_matrix(T: Rows, scale: float = 1.0) -> list[float]:
 def unreal_pose(T: Rows, scale: float = 0.1) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return location and quaternion (x, y, z, w) of a pose in Unreal's left-handed axes with Z up.
 
-    Unreal's USD importer swaps y and z, a reflection S. R becomes S R S: its rotation axis is swapped and negated.
+    Unreal's USD importer swaps y and z, a reflection S. R becomes S R S, whose rotation axis is that of R with y and z
+    swapped, negated.
     """
     (x, y, z), (qw, qx, qy, qz) = jawusd_reader.decompose(T)
     return (scale * x, scale * z, scale * y), (-qx, -qz, -qy, qw)

@@ -1,4 +1,4 @@
-"""Copy modules of jawusd, and all modules they import, into a package that must work without jawusd installed."""
+"""Copy modules of jawusd, and all jawusd modules they import, into a package that must work without jawusd."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def test_ik_reaches_a_reachable_target(actor):
         (("validate", "{actor}", "{tmp}/empty.csv"), 3, "empty"),
         (("animate", "{actor}", "{tmp}/bad.json"), 3, "must increase"),
         (("animate", "{actor}", "{tmp}/falling.csv"), 3, "frame 2 follows 3"),
-        (("animate", "{actor}", "{tmp}/far.csv"), 3, "allowed are +-1e+06 mm"),
+        (("animate", "{actor}", "{tmp}/far.csv"), 3, "the limit is +-1e+06 mm"),
         (("animate", "{actor}"), 2, "either a source or --arkit"),
         (("animate", "{actor}", "{tmp}/bad.json", "--arkit", "{tmp}/nan.csv"), 2, "either a source or --arkit"),
         (("animate", "{actor}", "--arkit", "{tmp}/nan.csv"), 3, "timecode"),

@@ -41,7 +41,7 @@ def glTF2_pre_export_callback(export_settings: Mapping[str, logging.Logger]) -> 
 def register() -> None:
     """Register the hook, the panel and the handlers that restore rigs in reopened files."""
     vendored.find_blender_pxr(bpy.utils.resource_path)
-    # Blender aborts if a hook is registered and pxr cannot be imported: fail earlier
+    # fails here if pxr is missing: with a registered hook, Blender would abort
     import pxr.Usd  # noqa: F401
 
     bpy.utils.register_class(JawUsdHook)

@@ -7,7 +7,7 @@ import numpy as np
 
 from . import jaw, vendored
 
-#: Export operators that write keys but not drivers; their relevant settings, with advice.
+#: Export operators that write keys but not drivers, each with advice on its relevant settings.
 SETTINGS = {
     "EXPORT_SCENE_OT_fbx": {
         "bake_anim_simplify_factor": "0: keep every frame; 1 costs up to 0.05 mm in slow motion",
@@ -18,10 +18,10 @@ SETTINGS = {
     "WM_OT_collada_export": {},
 }
 _CHANNELS = ("location", "rotation_quaternion")
-# FBX export assigns an action to every object that has all its channels; a property that only the mandible has prevents
-# this.
+# Key of the name of a property that only this mandible has. FBX export assigns an action to every object that has all
+# channels of the action; a channel for that property prevents this.
 _OWN = "jawusd_own"
-_LINEAR = 1  # the interpolation of a key, as Blender stores it
+_LINEAR = 1  # Blender's enum value of linear interpolation
 
 
 def warning(scene: bpy.types.Scene) -> str | None:

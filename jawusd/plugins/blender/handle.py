@@ -8,7 +8,7 @@ import numpy as np
 from . import jaw, vendored
 
 _POINT, _ACTOR = "jawusd_point", "jawusd_handle_of"
-_MOVED_MM = 1e-3  # smallest drag of a handle; above single-precision rounding
+_MOVED_MM = 1e-3  # minimum displacement of a handle that counts as a drag; above single-precision rounding
 
 
 def add(actor: bpy.types.Object, point: tuple[float, float, float], name: str) -> bpy.types.Object:
@@ -55,7 +55,7 @@ def follow(handle: bpy.types.Object) -> bool:
 
 @bpy.app.handlers.persistent
 def _dragged(_: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Move sliders after dragged handles, and handles after jaws that were moved otherwise."""
+    """Move sliders to follow dragged handles, and handles to follow jaws that were moved in other ways."""
     moved = {update.id.original for update in depsgraph.updates if isinstance(update.id, bpy.types.Object)}
     for handle in handles():
         if handle in moved and not jaw.curves(handle):

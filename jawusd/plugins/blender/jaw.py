@@ -23,15 +23,15 @@ PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # prim paths to the objects a
 SOURCE, KEEP, FPS = "jawusd_source", "keep_valid", "jawusd_fps"
 _STORE, _ACTOR, _FIXED = "jawusd_rig", "jawusd_actor", "jawusd_fixed"
 _FUNCTION, _OLD_FUNCTION = "jawusd_offset", "jawusd_channel"
-# Drivers evaluate to 0 when they fail, as without the add-on or with scripts disabled. The mandible's transform is
-# therefore its rest pose, and the drivers set offsets that are 0 at rest: the delta location, and x, y, z of the delta
-# rotation, whose w is constant.
+# Channels that the drivers set. A driver that fails, without the add-on or with scripts disabled, evaluates to 0. The
+# mandible's transform is therefore its rest pose, and the drivers set offsets that are 0 at rest: the delta location,
+# and x, y, z of the delta rotation, whose w is constant.
 _CHANNELS = (*(("delta_location", i) for i in range(3)), *(("delta_rotation_quaternion", i) for i in (1, 2, 3)))
-# Large, because Blender 5.0 snaps driven values within 1e-4 of 0 or 1, which for a unit quaternion is up to 0.02 mm at
-# the chin. Quaternions are normalised before use.
+# The w of the delta rotation, which Blender normalises. It is large because Blender 5.0 rounds driven values within
+# 1e-4 of 0 or 1, which for a unit quaternion would move the chin by up to 0.02 mm.
 _QUATERNION_W = 1024.0
 
-_rigs: dict[str, vendored.JawRig] = {}  # cache, by the text stored in the actor
+_rigs: dict[str, vendored.JawRig] = {}  # evaluators by the text stored in the actor
 _poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
 
 
@@ -160,7 +160,7 @@ def _source_of(prim: Usd.Prim) -> str:
 
 
 def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
-    """Return the object created from a prim, or from its only child if the two were merged."""
+    """Return the object created from a prim, or from the prim's only child if Blender merged the two."""
     below = [other for other in prim_map if str(other).startswith(f"{path}/")]
     return next((found for other in (path, *below) for found in _objects(prim_map, other)), None)
 
@@ -195,7 +195,7 @@ def _set_limits(actor: bpy.types.Object, rig: vendored.JawRig) -> None:
 
 
 def drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
-    """Drive the mandible by d1, d2, d3 of the actor, replacing its keys or the file's cached motion."""
+    """Drive the mandible by the actor's d1, d2, d3 instead of by keys or the file's cached motion."""
     for constraint in list(mandible.constraints):
         if constraint.type == "TRANSFORM_CACHE":
             mandible.constraints.remove(constraint)
@@ -225,7 +225,7 @@ def remove_drivers(mandible: bpy.types.Object) -> None:
 
 
 def is_driven(mandible: bpy.types.Object) -> bool:
-    """Return whether the sliders drive a mandible, rather than its own keys."""
+    """Return whether a mandible is moved by the sliders instead of by its own keys."""
     return bool(_drivers(mandible, (_FUNCTION,)))
 
 
@@ -272,7 +272,7 @@ def _offset(mandible: bpy.types.Object, d1: float, d2: float, d3: float, keep: f
     actor = mandible[_ACTOR]
     key = (actor[_STORE], d1, d2, d3, bool(keep))
     if key not in _poses:
-        _poses.clear()  # keep only the latest pose: its six channels are evaluated in succession
+        _poses.clear()  # keeps only the latest pose, because the six channels of a pose are evaluated in succession
         rig = rig_of(actor)
         T, rest = rig.pose(_kept(rig, (d1, d2, d3)) if keep else (d1, d2, d3)), rig.pose((0.0, 0.0, 0.0))
         w, *turn = vendored.wxyz_from_matrix(T[:3, :3] @ rest[:3, :3].T).tolist()
