@@ -20,12 +20,12 @@ from jawusd.media.video import Video
 
 Search = Callable[[NDArray[np.uint8]], Array | None]
 
-_TIMES, _FEW_MARKERS = 2, 4  # images that must agree on a different board, and minimum number of markers in each
-_FEWEST_CORNERS = 8  # minimum for a ChArUco board: fewer do not determine its pose
+_TIMES, _FEW_MARKERS = 2, 4  # minimum number of images with the same wrong board, and of markers in each
+_FEWEST_CORNERS = 8  # minimum number of corners of a ChArUco board; fewer do not determine its pose
 # Refinement window as a fraction of a cell: blur and distortion bias corners in larger windows, noise dominates in
 # smaller ones.
 _WINDOW_SHARE, _WINDOW_PX = 0.12, (3, 12)
-_LARGE_PX = 1000  # width from which images are first searched at half resolution, which takes a quarter of the time
+_LARGE_PX = 1000  # wider images are first searched at half resolution, which takes a quarter of the time
 _FLAGS = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 
 
@@ -42,8 +42,8 @@ def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed:
     """Return a description of the board in gray images (h, w) if it differs from that of [boards], otherwise None.
 
     Args:
-        missed: whether the board of [boards] is not found in most images of the clip, so that missing markers are
-            evidence.
+        missed: whether the board of [boards] was missed in most images of the clip; only then are absent markers
+            evidence of a smaller board.
     """
     plain: Counter[tuple[int, int]] = Counter()
     for image in images:
@@ -103,7 +103,7 @@ def _chessboard(boards: Boards) -> Search:
 
 
 def _refined(image: NDArray[np.uint8], corners_px: Array, boards: Boards) -> Array:
-    """Return corners refined to the saddle points (Förstner & Gülch 1987, in OpenCV): a third of the scatter."""
+    """Return corners refined to the saddle points (Förstner & Gülch 1987, in OpenCV), with a third of the scatter."""
     grid = corners_px.reshape(boards.rows, boards.cols, 2)
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     half = int(np.clip(round(_WINDOW_SHARE * min(sides)), *_WINDOW_PX))

@@ -15,10 +15,11 @@ from jawusd.capture.board_detection import BoardClip, corners_and_width, detecto
 from jawusd.formats.capture import Boards
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT
 
-MOST_VIEWS = 80  # more views take more time without increasing accuracy
-_LOOKED_AT = 6  # images searched for a different board
-_PER_WINDOW = 2  # consecutive video frames of which the sharpest is used
-# An image is blurred if its 10 to 90 % edge width exceeds this multiple of the camera's median, within these limits.
+MOST_VIEWS = 80  # maximum number of views used; more would take longer without increasing accuracy
+_LOOKED_AT = 6  # number of images searched for a different board
+_PER_WINDOW = 2  # number of consecutive video frames of which the sharpest is used
+# An image is blurred if its 10 to 90 % edge width exceeds the camera's median times this ratio, clamped to
+# these limits.
 _BLUR_RATIO, _BLUR_LIMITS_PX = 1.5, (4.0, 8.0)
 
 

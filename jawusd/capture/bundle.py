@@ -24,8 +24,8 @@ _LENS = 6  # fx, fy, cx, cy, k1, k2
 _POSE = 6  # rotation vector [rad], translation [mm]
 _HUBER_SIGMAS, _LEAST_SIGMA_PX = 3.0, 0.02
 _MOST_STEPS = 100
-_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # a corner whose residual exceeds both is an outlier
-_FEWEST_CORNERS = 6  # views with fewer inliers are dropped
+_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # a corner is an outlier if its residual exceeds both limits
+_FEWEST_CORNERS = 6  # minimum number of inliers of a view; views with fewer are dropped
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Bundle:
 
 
 def adjust(start: InitialGuess, points_mm: Array) -> Bundle:
-    """Adjust, discard outlier corners, and adjust again; points_mm (N, 3) are the corners on the board.
+    """Adjust, discard outlier corners and readjust; `points_mm` (N, 3) are the corners on the board.
 
     Raises:
         CalibrationError: the adjustment does not converge.
@@ -172,7 +172,7 @@ class _Problem:
         J, residual = self.jacobian(x), self.residuals(x)
         sigma = 1.4826 * np.median(np.abs(residual))
         normal = (J.T @ J).toarray()
-        scale = 1 / np.sqrt(np.diag(normal))  # units are px, rad and mm: normalise before inverting
+        scale = 1 / np.sqrt(np.diag(normal))  # units differ (px, rad, mm): normalise before inverting
         inverse = np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
         own = len(self.split(x)[0])
         return sigma**2 * inverse[:own, :own]
@@ -197,7 +197,7 @@ class _Problem:
         return residual.ravel(), np.asarray(derived, np.float64), turned, carried
 
     def _parts(self, x: Array, turns: Array, slopes: Array, c: int) -> list[tuple[Array | int, Array]]:
-        """Return the blocks of one camera's Jacobian, shape (2n, 6), each with its first column, an int or one per row.
+        """Return blocks (2n, 6) of one camera's Jacobian, each with its first column: one int, or one per row.
 
         Args:
             turns, slopes: rotations of the boards and their left Jacobians, shape (V, 3, 3).

@@ -24,15 +24,15 @@ from jawusd.capture.scale import (
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera
 
-#: Called with the cameras and a check that has the reason why the picks do not determine the scale.
+#: Called with the cameras and the failed check of the picks, whose `reason` says why they do not determine the scale.
 MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 
-_ENOUGH_VIEWS = 40  # with these, the shape error is a quarter of that with 20 views
+_ENOUGH_VIEWS = 40  # recommended number of views; the shape error is a quarter of that with 20 views
 _GOOD_RMS_PX = 0.5
-_FAR_MM = 40.0  # distance of the board's nearest corner from the centre of the mouth above which advice is given
-_GRID = (8, 5)  # cells of the image for which coverage is computed
+_FAR_MM = 40.0  # advice is given if even the nearest corner of the board is farther from the centre of the mouth
+_GRID = (8, 5)  # number of image cells (columns, rows) for which coverage is computed
 _LITTLE_COVERAGE = 0.5
-_LARGE_EXPECTED_MM = 0.05  # half of the typical tracking error of 0.1 mm
+_LARGE_EXPECTED_MM = 0.05  # advice is given above this error, half of the typical tracking error of 0.1 mm
 
 
 class CameraFigures(TypedDict):
@@ -57,11 +57,11 @@ class CalibrationReport:
     views: int  # board poses used
     board_shape: ShapeError  # error of distances between triangulated corners near the mouth, in the images used
     expected_shape_mm: float  # expected mean error of distances in the mouth, from the scatter of the corners
-    mouth_mm: tuple[float, float, float]  # centre of the mouth in the world, and its source
-    mouth_from: str
+    mouth_mm: tuple[float, float, float]  # centre of the mouth in the world
+    mouth_from: str  # source of that centre
     scale: ScaleCheck  # the board's square size, checked against the teeth
     advice: tuple[str, ...]  # possible improvements, one sentence each
-    notes: tuple[str, ...]  # assumptions
+    notes: tuple[str, ...]  # assumptions made, one sentence each
 
     def as_dict(self) -> dict[str, object]:
         """Return the report as plain data."""
@@ -145,7 +145,7 @@ def _camera_figures(c: int, camera: Camera, bundle: Bundle, detections: BoardDet
     cells = np.floor(pixels / camera.size_px * _GRID).astype(int)
     covered = {(x, y) for x, y in cells.tolist()}
     corners = {"top left": (0, 0), "top right": (1, 0), "bottom left": (0, 1), "bottom right": (1, 1)}
-    # Each corner of the image extends over a quarter of its width and height.
+    # A corner region of the image extends over a quarter of its width and height.
     share = pixels / camera.size_px
     empty = [name for name, (right, low) in corners.items() if not ((np.abs(share - [right, low]) < 0.25).all(1)).any()]
     return {

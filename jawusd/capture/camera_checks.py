@@ -13,10 +13,10 @@ from jawusd.geometry import Camera
 
 # Range of the ratio of focal length to image width: fields of view from 100 down to 3 degrees.
 _FOCAL_WIDTHS = (0.4, 20.0)
-_SQUARE = 0.03  # relative difference of fx and fy; current cameras have square pixels
-_CENTRE_SHARE = 0.15  # offset of the principal point from the image centre, relative to the image width
+_SQUARE = 0.03  # maximum relative difference of fx and fy; current cameras have square pixels
+_CENTRE_SHARE = 0.15  # maximum offset of the principal point from the image centre, relative to the image width
 _LEAST_BASELINE_MM, _MOST_BASELINE_MM = 10.0, 5000.0
-_LEAST_ANGLE_DEG = 3.0  # smallest angle between two views of the teeth: depth is then ten times as uncertain as a pixel
+_LEAST_ANGLE_DEG = 3.0  # minimum angle between two views of the teeth; below it, depth is poorly determined
 _NEAREST_MM, _FARTHEST_MM = 40.0, 5000.0
 
 
@@ -34,8 +34,8 @@ def camera_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
             yield Finding(
                 "cameras_together" if baseline < _LEAST_BASELINE_MM else "cameras_far_apart",
                 "error" if max(baselines) < _LEAST_BASELINE_MM else "warning",
-                f"it is {baseline:.4g} mm away from camera {a.name}, the usual range is {_LEAST_BASELINE_MM:g} to "
-                f"{_MOST_BASELINE_MM:g} mm.{unit}",
+                f"this camera is {baseline:.4g} mm away from camera {a.name}; the usual range is "
+                f"{_LEAST_BASELINE_MM:g} to {_MOST_BASELINE_MM:g} mm.{unit}",
                 baseline,
                 _LEAST_BASELINE_MM,
                 path=path,
@@ -79,7 +79,7 @@ def _fold(camera: Camera) -> float | None:
     share = np.linspace(0.0, 1.0, 101)[:, None]
     folds = []
     for corner in corners:
-        # Undistorted radii up to the corner, which are larger under barrel distortion.
+        # Undistorted radii up to that of the corner, which barrel distortion increases.
         seen = camera.distort_pixels(centre + 1.5 * share * (corner - centre))
         reach = np.linalg.norm(seen - centre, axis=1)
         turned = np.flatnonzero(np.diff(reach) < 0)
@@ -97,7 +97,7 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
             yield Finding(
                 "camera_aim",
                 "warning",
-                f"the common target of the cameras is {depth:.0f} mm in front of it, the usual range is "
+                f"the cameras' common target is {depth:.0f} mm in front of this camera; the usual range is "
                 f"{_NEAREST_MM:g} to {_FARTHEST_MM:g} mm",
                 depth,
                 _NEAREST_MM,

@@ -14,7 +14,7 @@ from jawusd.media.footage import open_clip
 _DAY_S = 86400
 _RATE_TOLERANCE = 1e-3
 _NEARLY_WHOLE = 0.01
-_FASTEST_USUAL = 30.5  # frames per second; above it, two or four images often have the same time code
+_FASTEST_USUAL = 30.5  # images per second; at higher rates, two or four images often share a time code
 
 
 def check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
@@ -34,7 +34,7 @@ def check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
 
 
 def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ...]]:
-    """Return the offset of every camera by clock `[sync] method`, "timecode" or "numbers", and notes for the user.
+    """Return every camera's offset and notes for the user; the clock is `[sync] method`, "timecode" or "numbers".
 
     Raises:
         SyncError: a camera has no video, or its clip has no clock of that kind; the clips do not overlap, or their
@@ -88,7 +88,7 @@ def _frames_of_number(clip: Clip) -> int:
     """Return the number of images per time code.
 
     Raises:
-        CaptureError: it is not an integer.
+        CaptureError: this number is not an integer.
     """
     ratio = clip.timeline.rate / (clip.timecode_fps or clip.timeline.rate)
     if round(ratio) < 1 or abs(ratio / round(ratio) - 1) > _NEARLY_WHOLE:

@@ -19,12 +19,12 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import CalibrationError
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log
 
-FEWEST_VIEWS = 6  # per camera; with fewer, focal length and distance are ambiguous
-_SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # tolerance of equal relative poses: angle, relative distance
-_LEAST_AGREEMENT = 0.5  # fraction of the views shared by two cameras that must agree
+FEWEST_VIEWS = 6  # minimum number of views per camera; with fewer, focal length and distance are ambiguous
+_SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # tolerances for equal relative poses: angle, relative distance
+_LEAST_AGREEMENT = 0.5  # minimum fraction of two cameras' shared views that must agree on the relative pose
 _INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-_WIDTH_PX = 960  # search width: sufficient for boards that fill a fifth of the image
-_FEWEST_PICTURES = 2  # images that must agree
+_WIDTH_PX = 960  # images are searched at this width, which suffices for boards that fill a fifth of the image
+_FEWEST_PICTURES = 2  # minimum number of images that must agree on the board
 _FEWEST_MARKERS = 4
 _FAMILIES = ("4X4", "5X5", "6X6", "7X7")
 _SIZES = (50, 100, 250, 1000)  # OpenCV's smaller dictionaries are prefixes of the larger ones
@@ -178,7 +178,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
 
 @dataclass(frozen=True)
 class DetectedBoard:
-    """Board found in clips: size in inner corners of a chessboard, or dictionary of markers."""
+    """Board found in clips: the inner corners of a chessboard, or a marker dictionary."""
 
     pattern: str
     cols: int | None = None

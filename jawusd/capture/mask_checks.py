@@ -17,11 +17,11 @@ from jawusd.geometry import Camera, triangulate
 
 #: First and last frame with a mask of the upper and of the lower teeth, in the camera's own numbers; None if empty.
 Ranges = tuple[tuple[int, int] | None, tuple[int, int] | None]
-#: Centre of all teeth pixels at one instant, by camera [px], shape (2,).
+#: Centre of all teeth pixels of one frame, by camera [px], shape (2,).
 MaskCentres = Mapping[str, Array]
 
-# Largest distance of the two rays through the mask centres [mm]; the visible part of the teeth differs between views.
-# 70 valid synthetic subjects have at most 10.4 mm, so there is no false alarm.
+# Maximum distance between the rays through two mask centres [mm]; it is not 0, since the visible part of the teeth
+# differs between views. It was at most 10.4 mm in 70 valid synthetic captures, so none raised a false alarm.
 _RAYS_MM = 15.0
 # Plausible width of the teeth in the masks at the triangulated depth [mm]; lips may hide a large part of them.
 _SEEN_MM = (10.0, 90.0)
@@ -52,7 +52,7 @@ def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[Ma
 
     Args:
         cameras: calibrated cameras by name.
-        centres: mask centres at some instants, one entry per candidate offset; the best candidate is used.
+        centres: mask centres in some frames, one entry per candidate offset; the best candidate is used.
 
     The camera in most of the inconsistent pairs is reported.
     """
@@ -84,11 +84,11 @@ def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[Ma
 
 
 def width_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -> Iterator[Finding]:
-    """Yield findings about masks whose width, at the triangulated depth, is not that of teeth.
+    """Yield findings about masks whose width at the triangulated depth is implausible for teeth.
 
     Args:
         cameras: calibrated cameras by name.
-        pixels: some teeth pixels by camera at one instant, shape (N, 2).
+        pixels: some teeth pixels of one frame, by camera, shape (N, 2).
     """
     seen = {name: camera for name, camera in cameras.items() if len(pixels.get(name, ()))}
     if len(seen) < 2:

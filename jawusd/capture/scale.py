@@ -15,10 +15,10 @@ from jawusd.capture.camera_checks import common_target
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, triangulate
 
-_FEWEST_PICKS = 3  # minimum per arch
-_TOLERANCE = 0.03  # largest deviation of the size ratio from 1; picks determine it to about 0.5 %
+_FEWEST_PICKS = 3  # minimum number of picks per arch
+_TOLERANCE = 0.03  # maximum deviation of the size ratio from 1; picks determine the ratio to about 0.5 %
 _SIGMAS = 4.0
-_MOUTH_RADIUS_MM = 35.0  # radius that contains both arches up to an opening of 40 mm
+_MOUTH_RADIUS_MM = 35.0  # radius of a sphere that contains both arches up to an opening of 40 mm
 _DRAWS = 40
 _POINTS = 150
 
@@ -27,8 +27,8 @@ _POINTS = 150
 class ScaleCheck:
     """Size of the teeth measured with the cameras, relative to the scan."""
 
-    ratio: float | None  # measured / scanned, None if unknown
-    sigma: float | None  # its standard error
+    ratio: float | None  # measured size / scanned size, None if unknown
+    sigma: float | None  # standard error of the ratio
     reason: str = ""  # why the ratio is unknown, otherwise empty
 
 
@@ -106,7 +106,7 @@ class ShapeError:
 
     mean: float  # mean absolute error
     p95: float  # 95th percentile of the absolute error
-    max: float  # largest error
+    max: float  # maximum absolute error
     distances: int  # number of distances compared; 0 if no corner near the mouth was visible to two cameras
 
 

@@ -24,29 +24,29 @@ from jawusd.base.errors import SyncError
 from jawusd.media.clip import Clip
 from jawusd.media.containers import Sound
 
-_FIRST_WINDOW_S = 4.0  # initial search window at both ends; doubled until a flash is found
+_FIRST_WINDOW_S = 4.0  # initial length of the part searched at each end of a video; doubled until a flash is found
 _SPARSE = 8  # subsampling of pixels in both directions for the mean brightness
-_CONTRAST = 0.3  # smallest relative change of brightness due to a flash; moving people cause a few per cent
-_ABRUPT_FRAMES = 3  # longest duration of a light step
-_TOLERANCE_FRAMES = 1.0  # tolerance of matched steps
-_DROPPED_S = 0.5  # difference in offset up to which further matching steps indicate dropped frames
+_CONTRAST = 0.3  # minimum relative brightness change of a flash; moving people change it by a few per cent
+_ABRUPT_FRAMES = 3  # maximum duration of a light step
+_TOLERANCE_FRAMES = 1.0  # maximum time difference of matched steps
+_DROPPED_S = 0.5  # steps that match at another offset within this distance indicate dropped frames
 _FEWEST_STEPS = 2
-_BETWEEN_FRAMES = 0.15  # fractions of a frame below this are noise
+_BETWEEN_FRAMES = 0.15  # smaller fractional offsets are noise and are ignored
 RATE_HZ = 16000
 _WHITENING = 0.75
 _LOWEST_HZ = 80.0  # lower frequencies, such as mains hum and wind, are ignored
-_APART_S = 0.02  # peaks closer than this count as one
-_LEAST_SIGMAS = 9.0  # minimum height of the peak; the largest of millions of random correlations is below 6
-_SECOND_PEAK = 0.7  # height of the second peak relative to the highest; above, the sound is periodic
+_APART_S = 0.02  # correlation peaks closer than this count as one
+_LEAST_SIGMAS = 9.0  # minimum height of the correlation peak; the highest of millions of random ones is below 6
+_SECOND_PEAK = 0.7  # maximum height of the second peak relative to the highest; above it, the sound is periodic
 
 
 @dataclass(frozen=True)
 class Step:
     """A sudden change of brightness."""
 
-    time_frames: float  # time in frames of the camera's video; k is the start of the exposure of frame k
+    time_frames: float  # time in frames of the camera's video; the exposure of frame k starts at time k
     rising: bool  # whether the light is switched on
-    slack_frames: float = 0.0  # how much earlier the step may be, since preceding images are missing
+    slack_frames: float = 0.0  # by how much the step may be earlier, if images before it are missing
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Offset:
 
     frames: int  # the offset in whole frames
     exact_frames: float  # the offset with its estimated fraction
-    spread_frames: float  # largest deviation of a matched step from exact_frames; 0 for sound
+    spread_frames: float  # maximum deviation of a matched step from exact_frames; 0 for sound
     matched_steps: int  # number of steps found in both cameras; 0 for sound
     confidence: float  # fraction of the steps of both cameras that match, or `SoundMatch.confidence`; 0 .. 1
 
@@ -65,11 +65,11 @@ class Flashes:
     """Light steps of one video."""
 
     steps: list[Step]  # in order of time
-    reason: str = ""  # why there are too few steps to synchronise by, otherwise empty
+    reason: str = ""  # reason why there are too few steps for synchronisation; empty if there are enough
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
-    """Return the times at which the light is switched, in order; empty if brightness changes less than in a flash.
+    """Return the ordered times of light switching; empty if the brightness changes less than in a flash.
 
     Args:
         brightness: mean brightness of successive images, 0 .. 255, shape (n,).
@@ -161,8 +161,8 @@ def to_frames(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
         nearest = round(step.time_frames)
         between = abs(step.time_frames - nearest) < _BETWEEN_FRAMES and 0 < nearest < len(numbers)
         picture = nearest if between else min(int(step.time_frames), len(numbers) - 1)
-        # A step between two images is anywhere in the gap; the time of one within an exposure follows from its
-        # brightness.
+        # A step between two images may be anywhere in the gap; the time of a step within an exposure follows from the
+        # brightness of the image.
         gap = float(numbers[picture] - numbers[picture - 1] - 1) if between else 0.0
         out.append(Step(float(numbers[picture]) + step.time_frames - picture, step.rising, max(0.0, gap)))
     return out
@@ -241,7 +241,7 @@ def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
     second = float(correlation[far].max()) if far.any() else 0.0
     if peak < _LEAST_SIGMAS * sigma:
         raise SyncError(
-            f"the sounds do not match: the correlation peak has {peak / sigma:.1f} sigma, at least "
+            f"the sounds do not match: the correlation peak is {peak / sigma:.1f} sigma high, at least "
             f"{_LEAST_SIGMAS:g} are needed."
         )
     if second > _SECOND_PEAK * peak:

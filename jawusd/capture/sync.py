@@ -33,8 +33,8 @@ from jawusd.media.containers import Sound, read_sound
 from jawusd.media.footage import open_clip
 from jawusd.media.video import Video
 
-_FPS_TOLERANCE = 5e-3  # relative: accepts 24 for 23.976
-_EARLY_S = 2.0  # largest usual difference between the ends of clips
+_FPS_TOLERANCE = 5e-3  # relative tolerance; accepts 24 for 23.976
+_EARLY_S = 2.0  # clips that end earlier than this before the last one are reported
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
     """Synchronise videos with the reference camera by light flashes or sound.
 
     At first, only the start and end of each video are decoded, then more until flashes are found. If a video has no
-    flash, or without `by_light`, sound is used, which all videos must then have.
+    flash, or if `by_light` is false, sound is used; all videos must then have sound.
 
     Raises:
         SyncError: there are neither flashes nor sound, frame rates differ, or the signals do not match.
@@ -153,7 +153,7 @@ def _missing_pictures(videos: Mapping[str, Clip]) -> tuple[str, ...]:
 
 
 def _stopped_early(videos: Mapping[str, Clip], offsets: Mapping[str, Offset], rate: float) -> tuple[str, ...]:
-    """Return a note for every clip that ends long before the last one."""
+    """Return a note for every clip that ends more than `_EARLY_S` before the clip that ends last."""
     ends = {name: offsets[name].frames + video.timeline.count for name, video in videos.items()}
     last = max(ends, key=lambda name: ends[name])
     return tuple(
@@ -175,7 +175,7 @@ def _by_sound(name: str, reference: str, sounds: Mapping[str, Sound], videos: Ma
 def _compared(
     name: str, reference: str, video: Clip, hint: str, work: Callable[[], Offset], before: str = ""
 ) -> Offset:
-    """Run a comparison of two cameras, and name both in its errors."""
+    """Compare two cameras; errors name both of them."""
     try:
         return work()
     except SyncError as error:

@@ -153,7 +153,7 @@ def _read_poses(path: Path) -> tuple[list[int], Array]:
     table = read_table(path, _MAX_BYTES)
     missing = [name for name in ("frame", *_MATRIX_COLUMNS) if name not in table.header]
     if missing:
-        raise FormatError(f'has no "{missing[0]}"; needed are frame, m00 ... m33.', path=path)
+        raise FormatError(f'has no "{missing[0]}"; required columns: frame, m00 ... m33.', path=path)
     frames = table.numbers([table.header.index("frame")])[:, 0]
     uneven = np.flatnonzero((frames != np.round(frames)) | ~(np.abs(frames) <= 2**53))
     if uneven.size:

@@ -1,4 +1,4 @@
-"""The named arrays of a rig, and the checks of their presence, shapes and values."""
+"""The named arrays of a rig, and checks of their presence, shapes and values."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def _check_values(arrays: dict[str, Array]) -> None:
             raise EvaluatorError(f'"{name}" is {arrays[name].tolist()}; it must be positive.')
     for name in _RISING:
         if name in arrays and (len(arrays[name]) < 2 or (np.diff(arrays[name]) <= 0).any()):
-            raise EvaluatorError(f'"{name}" must hold at least two rising values.')
+            raise EvaluatorError(f'"{name}" must contain at least two increasing values.')
     if len(arrays["landmarks"]) < 3:
         raise EvaluatorError(f'"landmarks" has {len(arrays["landmarks"])} points; at least 3 are needed.')
     low, high = arrays["d_range"].T

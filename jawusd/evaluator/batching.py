@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array, Indices
 
-Rows = TypeVar("Rows", Array, Indices)  # rows, or row indices
+Rows = TypeVar("Rows", Array, Indices)  # an array of rows, or of row indices
 
 CHUNK_ROWS = 2048
 LARGEST = 1e9  # [mm] far beyond any jaw, but small enough that cubes do not overflow
@@ -70,7 +70,7 @@ def in_chunks(function: Callable[[Rows], Array], rows: Rows) -> Array:
 
 
 def pairs_in_chunks(function: Callable[[Rows], tuple[Array, Array]], rows: Rows) -> tuple[Array, Array]:
-    """Return the same as `in_chunks` for a function that returns two arrays."""
+    """Return two arrays computed as by `in_chunks`, for a function that returns both."""
     if len(rows) <= CHUNK_ROWS:
         return function(rows)
     parts = [function(rows[i : i + CHUNK_ROWS]) for i in range(0, len(rows), CHUNK_ROWS)]

@@ -27,7 +27,7 @@ _ARRAYS = ("slice_d1", "slice_directions", "slice_support", "slice_softness_mm",
 _NEWTON_ITERATIONS = 60
 _ROOT_TOLERANCE_MM = 1e-12
 _CANDIDATE_SLICES = 48
-# fractions of the way from the centre of a section to its outline; denser near the outline, where nearest points lie
+# fractions of the distance from a section's centre to its outline; denser near the outline, where nearest points lie
 _CANDIDATE_RADII = (0.4, 0.75, 0.9, 0.97, 1.0)
 
 
@@ -38,7 +38,7 @@ class SliceHull:
     Attributes:
         supports: h_k(d1) [mm], constant outside the captured openings.
         directions: Unit normals n_k in (d2, d3) around the full circle, shape (K, 2).
-        softness_mm: Radius of the rounding where half-spaces meet.
+        softness_mm: Radius of the rounded edges between half-spaces.
         offset_mm: Distance by which the bound extends beyond its supports.
         slopes: Derivatives of v_k, v_low and v_high with respect to d, shape (K + 2, 3), without the d1 derivatives of
             v_k, which depend on d1 and are 0 here.
@@ -162,7 +162,7 @@ class SliceHull:
 
     def candidates(self) -> Array:
         """Return starting points (n, 3) [mm] of searches, spread over the valid volume and denser near its surface."""
-        reach = self.offset_mm - self.softness_mm  # the rounding closes the section at the very ends
+        reach = self.offset_mm - self.softness_mm  # rounding closes the sections at both end openings
         low, high = self.first_mm - reach, self.last_mm + reach
         points = []
         for d1 in np.linspace(low, high, _CANDIDATE_SLICES):
@@ -217,7 +217,7 @@ def largest_share(outside: Callable[[Array], Mask], count: int, iterations: int)
     return low
 
 
-# Lower limit of a range [mm]: keeps the normalisation invertible where a section closes.
+# Minimum length of a range [mm]; keeps the normalisation invertible where a section shrinks to a point.
 SMALLEST_REACH_MM = 0.5
 
 
@@ -294,7 +294,8 @@ def _distance_to_edges(points: Array, edges: Array) -> Array:
     length_squared = np.maximum(np.einsum("ei,ei->e", along, along), np.finfo(float).tiny)
     s = np.clip((rx * along[:, 0] + ry * along[:, 1]) / length_squared, 0.0, 1.0)
     distance = np.sqrt(np.min((rx - s * along[:, 0]) ** 2 + (ry - s * along[:, 1]) ** 2, axis=1))
-    # a ray to +x crosses an edge whose ends lie on both sides of it, if the point is left of the edge
+    # a ray from the point to +x crosses an edge if the edge's ends lie on both sides of the ray, and the point lies to
+    # the left of the edge
     crosses = (edges[:, 0, 1] > y) != (edges[:, 1, 1] > y)
     left = (rx * along[:, 1] < ry * along[:, 0]) == (along[:, 1] > 0)
     inside = np.count_nonzero(crosses & left, axis=1) % 2 == 1

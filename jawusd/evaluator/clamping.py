@@ -15,21 +15,20 @@ from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.spine import INSET_MM, Spine, distances, moved_to_spine
 
-MAX_STRETCH = 1.045  # largest factor by which a step may grow: 5 %, less an allowance for rounding
+MAX_STRETCH = 1.045  # maximum factor by which a step may grow: 5 %, less an allowance for rounding
 
 _SAMPLE_MM = 0.2  # sample spacing near the bound
-_MAX_PIECES = 400  # largest number of samples in one step
-_STEEPEST = 5.0  # largest gradient norm of the margin: a step stays inside if its ends are this many step lengths deep
+_MAX_PIECES = 400  # maximum number of samples in one step
+_STEEPEST = 5.0  # maximum gradient norm of the margin: a step stays inside if both ends are this many step lengths deep
 _STILL_MM = 1e-12
-_TIME_SHARE = 0.998  # fraction of the available time a path may take: finer sampling makes it slightly longer
-# Lines between samples are checked at the first spacing, and again more finely where the margin is below the second
-# length.
+_TIME_SHARE = 0.998  # fraction of the available time that a path may take; finer sampling lengthens the path slightly
+# Lines between samples are checked at points `_CHECK_MM` apart, and more finely where the margin is below `_NEAR_MM`.
 _CHECK_MM, _NEAR_MM, _MAX_ROUNDS, _ROUNDING_MM = 0.03, 1e-3, 8, 1e-9
 
 _LINE_MM = 0.1  # sample spacing of shortcuts
-_SHORTCUTS = 24  # end points tried at once for a shortcut
+_SHORTCUTS = 24  # number of end points tried at once for a shortcut
 _TIGHT_POINTS, _TIGHT_ROUNDS, _TIGHT_GAIN_MM = 49, 20, 0.01
-_TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)  # fractions of the way to the straight line that tightening tries, in this order
+_TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)  # fractions of the distance to the straight line, in the order tried
 
 
 class Inside(NamedTuple):

@@ -23,7 +23,7 @@ from jawusd.evaluator.verdicts import Verdicts
 UNIT_MM = 0.01
 #: How much deeper than in the closed bite teeth may penetrate in an authored pose [mm].
 AUTHORED_MM = 0.15
-#: Clearances below this are included in the measured error [mm].
+#: The interpolation error is measured where the clearance is below this [mm].
 NEAR_MM = 0.5
 
 

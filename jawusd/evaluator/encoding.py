@@ -70,7 +70,7 @@ def point_velocities(R: Array, t: Array, S: Array, points: Array) -> Array:
 
 
 def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> Residual:
-    """Return the residual function, for `minimise`, of the vectors (4, m) and their targets (n, 3, m)."""
+    """Return the residual function that `minimise` needs, for vectors (4, m) and their targets (n, 3, m)."""
     count = vectors.shape[1]
 
     def residual(x: Array, rows: Indices) -> tuple[Array, Array]:

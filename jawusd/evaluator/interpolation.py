@@ -1,9 +1,9 @@
 """Interpolation between key frames of d: straight lines as in the paper, or smooth curves without overshoot.
 
 A smooth curve is cubic between keys, separately in each parameter, with tangents that keep it monotone (F. N. Fritsch
-and R. E. Carlson, Monotone Piecewise Cubic Interpolation, SIAM J. Numer. Anal. 17, 1980), here those of F. N. Fritsch
-and J. Butland (SIAM J. Sci. Stat. Comput. 5, 1984): the weighted harmonic mean of the slopes on both sides, zero at
-extrema and next to constant segments. The curve starts and stops at rest.
+and R. E. Carlson, Monotone Piecewise Cubic Interpolation, SIAM J. Numer. Anal. 17, 1980). They are computed as by F. N.
+Fritsch and J. Butland (SIAM J. Sci. Stat. Comput. 5, 1984): the weighted harmonic mean of the slopes on both sides,
+zero at extrema and next to constant segments. The curve starts and stops at rest.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.clamping import kept_inside
 from jawusd.evaluator.curves import HermiteCurve
 
-_SAMPLES = 129  # samples of a segment that is moved inside
+_SAMPLES = 129  # number of samples of a segment that is moved inside
 # Fractions of a segment at which it is checked against the bound, dense at its ends, since keys may lie on the bound.
 _CHECK_SHARES = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 1025))
 _ROUNDING_MM = 1e-9

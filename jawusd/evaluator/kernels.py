@@ -21,7 +21,7 @@ from jawusd.evaluator.solver import Residual, minimise
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
 from jawusd.geometry.se3 import rigidity_defect, transform_points
 
-_FEW_ROWS = 3  # up to this many rows, one search per row in floats is faster
+_FEW_ROWS = 3  # maximum number of rows for which one search per row, in floats, is faster
 
 
 @dataclass(frozen=True)

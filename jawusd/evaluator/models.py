@@ -234,7 +234,7 @@ class AnchoredModel:
         r = q @ (-2.0 * self.centres.T)
         r += self.centres_squared
         r += q_squared[:, None]
-        np.maximum(r, 0.0, out=r)  # the expanded square may round to just below zero at a centre
+        np.maximum(r, 0.0, out=r)  # at a centre, rounding may make the expanded square slightly negative
         np.sqrt(r, out=r)
         sums = r @ self.moments
         plain, by_centre = sums[:, :3], sums[:, 3:12].reshape(-1, 3, 3)

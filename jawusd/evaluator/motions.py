@@ -140,7 +140,7 @@ class SingleAnchored:
         """Return the rotation vector [rad] and the distances (m,) to the centres at the spline's argument."""
         q0, q1, q2 = q
         squared = self._distances.dot(np.array((q0, q1, q2, q0 * q0 + q1 * q1 + q2 * q2, 1.0)))
-        np.abs(squared, squared)  # rounding may give slightly negative values at a centre
+        np.abs(squared, squared)  # at a centre, rounding may make the square slightly negative
         r = np.sqrt(squared)
         squared *= r
         kx, ky, kz = squared.dot(self._kernel).tolist()

@@ -30,7 +30,7 @@ FAMILY, VERSION = "jawusd-model", 2
 BoundName = Literal["slices", "polygons"]
 
 _scalar = cast("Callable[[float], Array]", np.float64)  # numpy's stubs do not treat scalars as arrays
-_SINGLE_LIMIT_MM = 1e4  # beyond this, float functions may raise where array functions give infinities
+_SINGLE_LIMIT_MM = 1e4  # maximum |d|; beyond it, float functions may raise where array functions give infinities
 
 
 class JawRig(RigClearance, RigAuthoring):

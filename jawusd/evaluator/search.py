@@ -21,8 +21,8 @@ Search = Callable[[Indices, Array], tuple[Array, Array]]
 
 _MAX_VALLEYS = 4
 _RIPPLE_STEPS = (-2.0, -1.0, 1.0, 2.0)
-_MAX_DRAG_MM = 3.0  # largest change of d between two events of a drag; beyond it, another basin may be better
-_SCAN_ROWS = 64  # rows compared with all candidates at once: 64 x 6,000 distances take 3 MB
+_MAX_DRAG_MM = 3.0  # maximum change of d between two drag events; after a larger one, another basin may be better
+_SCAN_ROWS = 64  # number of rows compared with all candidates at once; 64 x 6,000 distances take 3 MB
 
 
 class IkResult(NamedTuple):
@@ -83,7 +83,7 @@ class BoundedSearch:
         """Return the local minimum in whose basin start (n, 3) [mm] lies.
 
         Short steps keep the search in that basin, which makes dragging continuous. A result far from its start is not
-        part of a drag; it is replaced by that of `solve_ik_multistart` if this is better.
+        part of a drag; the result of `solve_ik_multistart` replaces it if that is better.
         """
         found, left = self._kernels.solve_ik(vectors, target, start)
         far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _MAX_DRAG_MM)
@@ -151,7 +151,7 @@ class _Scan:
         return (self._motions @ vectors).reshape(len(self.points), -1)
 
     def valleys(self, features: Array, wanted: Array) -> tuple[Indices, Array]:
-        """Return starts: row indices (m,), several per row, and d (m, 3) [mm]; rows with NaN have none.
+        """Return starting points: row indices (m,), with repeats, and d (m, 3) [mm]; rows with NaN have none.
 
         A valley is a slice whose best point is at least as good as those of both neighbouring slices.
 

@@ -11,15 +11,13 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
 
-_MIN_FRAMES = 30  # smallest number of fourth differences for an estimate
+_MIN_FRAMES = 30  # minimum number of fourth differences for an estimate
 # Sums of the squared coefficients of first, second and fourth differences: the factor by which differencing multiplies
 # the variance of white noise.
 _NOISE_IN = {1: 2.0, 2: 6.0, 4: 70.0}
-_SIGMA_OF_MEDIAN = 1.4826  # ratio of standard deviation to median absolute value, normal distribution
-_MIN_SIGNAL = 0.05  # lower limit of the fraction of the observed variance that counts as motion
-_MIN_SPREAD = (
-    1e-6  # smallest relative variance in any direction; keeps covariances of one-dimensional motion invertible
-)
+_SIGMA_OF_MEDIAN = 1.4826  # ratio of standard deviation to median absolute value of a normal distribution
+_MIN_SIGNAL = 0.05  # minimum fraction of the observed variance that is attributed to motion
+_MIN_SPREAD = 1e-6  # minimum relative variance in any direction; keeps covariances of one-dimensional motion invertible
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +83,7 @@ def _known(changes: Array) -> Array:
 
 
 def _denoised(seen: Array, noise: Array) -> Array:
-    """Return a covariance (3, 3) minus that of noise, limited from below in every direction."""
+    """Subtract the noise covariance from an observed one (3, 3), leaving a minimum variance in every direction."""
     floor = _MIN_SPREAD * np.trace(seen) / 3.0 + 1e-12
     root = np.linalg.cholesky(seen + floor * np.eye(3))
     share = np.linalg.solve(root, np.linalg.solve(root, noise).T)

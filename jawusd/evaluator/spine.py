@@ -16,12 +16,12 @@ from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull, largest_share
 
-INSET_MM = 0.01  # depth of points moved inside, so that lines between samples stay inside
+INSET_MM = 0.01  # depth at which points moved inside end, so that lines between samples stay inside
 
 _SLICES = 97
-_CAP_MM = 0.3  # depth of the ends of the spine below the surface; openings beyond them are clamped
+_CAP_MM = 0.3  # depth of the spine's ends below the surface; openings beyond the ends are clamped
 _NEWTON, _BISECTIONS = 40, 40
-_MIN_DEPTH = 0.25  # smallest depth of a spine moved into a box, relative to its original depth
+_MIN_DEPTH = 0.25  # minimum depth of a spine moved into a box, relative to its original depth
 _ENTRY_TOLERANCE_MM = 1e-10
 
 
@@ -85,7 +85,7 @@ def _moved_inside(bound: SliceHull, d1: Array, start: Array, aim: Array, depth: 
 
 
 def moved_to_spine(bound: SliceHull, spine: Spine, d: Array, least_mm: float = 0.0) -> Array:
-    """Return d (n, 3) [mm]; rows with a smaller margin than `least_mm` are moved towards the spine.
+    """Return d (n, 3) [mm], with rows of a margin below `least_mm` moved towards the spine.
 
     A continuous function of d: first d2 and d3 move towards the spine at that opening, then an opening beyond the ends
     of the spine moves towards them.
@@ -111,7 +111,7 @@ def moved_to_spine(bound: SliceHull, spine: Spine, d: Array, least_mm: float = 0
 
 
 def _entry(bound: SliceHull, start: Array, offset: Array, depth: float) -> Array:
-    """Return the largest fraction (n,) of each offset (n, 3) from a point inside that still ends ``depth`` [mm] deep.
+    """Return the largest fractions (n,) of offsets (n, 3) from points inside that keep a depth of ``depth`` [mm].
 
     Newton from the far end: the signed distance is convex along a line across a section, so no step overshoots.
     """

@@ -42,7 +42,7 @@ class SampledTable:
         if twists.shape != (*counts, 6) or self.T_rest.shape != (4, 4):
             raise ValueError(f"twists must have shape {(*counts, 6)} and T_rest (4, 4), got {twists.shape}")
         if len(counts) != 3 or any(len(axis) < 2 or (np.diff(axis) <= 0).any() for axis in self.grid_axes):
-            raise ValueError("grid_axes must be three rising arrays of at least two positions")
+            raise ValueError("grid_axes must be three increasing arrays of at least two positions")
         # neighbours along d3 are stored side by side: half as many memory accesses
         self._pairs = np.concatenate([twists[:, :, :-1], twists[:, :, 1:]], axis=3)
         self._flat = self._pairs.reshape(-1, 12)

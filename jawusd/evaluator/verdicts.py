@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.formula import ON_BOUND_MM
 
-# Accepts matrices rounded to 5 decimals or to half precision; rejects sheared or scaled ones.
+# Maximum rigidity defect: accepts matrices rounded to 5 decimals or to half precision, rejects sheared or scaled ones.
 RIGID_TOLERANCE = 1e-3
 
 INSIDE, OUTSIDE = "inside", "outside"
@@ -80,7 +80,7 @@ class Verdicts(NamedTuple):
 
     def with_collisions(self, collide: Mask) -> Verdicts:
         """Return the verdicts with the poses in ``collide`` (n,) marked as colliding."""
-        if not np.count_nonzero(collide):  # a tenth of the time of `any`
+        if not np.count_nonzero(collide):  # takes a tenth of the time of `any`
             return self
         reason = self.reason | np.where(collide, Reason.TEETH_COLLIDE.value, 0).astype(np.uint8)
         return self._replace(valid=reason == 0, reason=reason)

@@ -1,4 +1,4 @@
-"""Compiled: encoding of a pose, by the damped Gauss-Newton of `jawusd.evaluator.solver`, and verdicts.
+"""Compiled encoding of single poses, by the damped Gauss-Newton of `jawusd.evaluator.solver`, and verdicts.
 
 All functions take one row. A `Problem` consists of the chart of the unknowns x [mm], homogeneous vectors (4, m), and
 their targets (3, m) [mm].

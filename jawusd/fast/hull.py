@@ -1,4 +1,4 @@
-"""Compiled: the slice hull of `jawusd.evaluator.bounds`, for one row.
+"""Compiled slice hull of `jawusd.evaluator.bounds`, for one row.
 
 `bound` is the array from `packing.packed_bound`, `v` the scratch memory from `hull_scratch`.
 """
@@ -13,12 +13,12 @@ from jawusd.base.arrays import Array
 from jawusd.fast.packing import HULL, MARGIN, ROUNDING, SIDES
 from jawusd.fast.rigid import Vector, device, interval
 
-_NEGLIGIBLE = 45.0  # exp(-45) = 3e-20, below rounding
+_NEGLIGIBLE = 45.0  # terms smaller by this exponent are skipped: exp(-45) = 3e-20 is below rounding
 
 
 @device
 def hull_scratch(bound: Array) -> Array:
-    """Allocate the scratch memory of one call: a number for each side of the hull."""
+    """Allocate the scratch memory of one call: one number per half-plane."""
     return np.empty(int(bound[SIDES]))
 
 

@@ -1,4 +1,4 @@
-"""Compiled: gauge, spline and curves of a jaw model, its motions M(d), twists, derivatives and poses, for one row.
+"""Compiled jaw model, for one row: gauge, spline, curves, motions M(d), twists, derivatives and poses.
 
 See `jawusd.evaluator.models`. `model` is the array from `packing.packed_model`, `w` the scratch memory of one call.
 """

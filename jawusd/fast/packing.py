@@ -16,12 +16,12 @@ from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED, KINDS
 
-# the model, every kind
+# offsets into the model, of any kind
 KIND = 0  # index into `schema.KINDS`
 COUNT = 1  # number of spline centres; 0 for an additive model
 INCISOR = 2  # (3,) [mm]
-FROM_ANATOMICAL = 5  # (4, 4), row-major: L of pose = L M Q
-CLOSED = 21  # (4, 4): Q of pose = L M Q
+FROM_ANATOMICAL = 5  # (4, 4), row-major: L in pose = L M Q
+CLOSED = 21  # (4, 4): Q in pose = L M Q
 TO_ANATOMICAL = 37  # (4, 4): L^-1
 FROM_CLOSED = 53  # (4, 4): Q^-1
 ADJOINT = 69  # (6, 6): twists from the anatomical to the skull frame
@@ -29,7 +29,7 @@ VECTORS = 105  # (4, 4): vectors that represent the landmarks, see `evaluator.en
 REST = 121  # start of the part that depends on the kind
 ANCHORED_KIND, ADDITIVE_KIND = KINDS.index(ANCHORED), KINDS.index(ADDITIVE)
 
-# anchored
+# offsets into an anchored model
 SCALES = REST  # (3,) [mm]
 OFFSET = REST + 3  # (3,) [rad]
 LINEAR = REST + 6  # (3 inputs, 3 outputs) [rad]
@@ -39,16 +39,16 @@ DROP = REST + 35  # (4,)
 SOFTNESS = REST + 39  # [mm]
 FADE = REST + 40  # [mm]
 SPLINE = REST + 41  # centres, column-major (3, m), then kernel weights (m, 3), then the table of the glide surface
-# the table: numbers of knots n2 and n3, both 0 without a table; knots of d2 (n2,), starts (n2 + 1,), likewise for d3,
-# coefficients (n2 + 1, n3 + 1, 4, 4)
+# layout of the table: numbers of knots n2 and n3, both 0 without a table; knots of d2 (n2,), starts (n2 + 1,), likewise
+# for d3, coefficients (n2 + 1, n3 + 1, 4, 4)
 
-# additive
+# offsets into an additive model
 CURVES = REST  # offsets of the three curves
 STARTS = REST + 3  # number n of starting points for searches
 GRID = REST + 4  # d (n, 3) and incisal displacements (n, 3) of the starting points [mm], then the curves
-# a curve, from its offset: number of knots n, knots (n,), starts (n + 1,), coefficients (n + 1, 4, k)
+# layout of a curve: number of knots n, knots (n,), starts (n + 1,), coefficients (n + 1, 4, k)
 
-# the bound
+# offsets into the bound
 ROUNDING = 0  # [mm]
 MARGIN = 1  # [mm]
 SIDES = 2  # number k of half-planes

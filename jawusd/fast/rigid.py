@@ -1,4 +1,4 @@
-"""Compiled: rotations, rigid motions and small linear algebra, for one row."""
+"""Compiled rotations, rigid motions and small linear algebra, for one row."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from jawusd.geometry.rodrigues import angle_coefficients, apply_series, dot, tur
 
 Vector = tuple[float, float, float]
 
-# not cached: inlined into the functions of `kernels`, which are cached on disk
+# device functions are not cached themselves: they are inlined into those of `kernels`, which are cached on disk
 device = numba.njit(nogil=True, error_model="numpy")
-# the same, but sums may be reassociated
+# like `device`, but sums may be reassociated
 summing = numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 
 # Plain functions of other modules that compiled code calls. Without inlining, the functions in an `Elementary` would be
@@ -53,7 +53,7 @@ def _clip(x: float, low: float, high: float) -> float:
 
 @device
 def interval(knots: Array, count: int, x: float) -> int:
-    """Return the number of knots, of the first ``count``, that are <= x."""
+    """Return how many of the first ``count`` knots are <= x."""
     low, high = 0, count
     while low < high:
         middle = (low + high) // 2
@@ -135,7 +135,7 @@ def move(twist: Array, M: Array) -> None:
 
 @device
 def product(A: Array, first: int, M: Array, B: Array, second: int, out: Array) -> None:
-    """Write the first three rows of L M Q to out, L (4, 4) in A from ``first`` and Q (4, 4) in B from ``second``."""
+    """Write the first three rows of L M Q to out; L (4, 4) starts at A[first], Q (4, 4) at B[second]."""
     for i in range(3):
         l = A[first + 4 * i :]
         for k in range(4):

@@ -34,14 +34,14 @@ MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 # Fraction of the mandible's rms speed below which the incisal point counts as standing still or reversing.
 _SLOWEST = 0.2
-_SHORTEST_MM = 0.01  # a curve that moves the incisal point less comes from a collapsed network
+_SHORTEST_MM = 0.01  # minimum motion of the incisal point along a curve; less is due to a collapsed network
 
-_PIECES = (8, 6, 6)  # polynomial pieces of the three curves
+_PIECES = (8, 6, 6)  # number of polynomial pieces of each of the three curves
 _ROUNDS = 8
 _SMOOTHING = 10.0 ** np.arange(-4.0, 5.0)
-_TAIL_RIDGE = 1e-4  # keeps coefficients finite in intervals without frames
-_HIDDEN_RIDGE = 1e9  # keeps coefficients at zero for parameters that the data do not show
-_TRIM_FLOOR_MM = 0.8  # residuals up to this count as model error, not as tracking failures
+_TAIL_RIDGE = 1e-4  # penalty that keeps coefficients finite in intervals without frames
+_HIDDEN_RIDGE = 1e9  # penalty that keeps coefficients at zero for parameters that the data do not exercise
+_TRIM_FLOOR_MM = 0.8  # smaller residuals count as model error, not as tracking failures
 _CV_BLOCK, _CV_FOLDS, _CV_CAP_MM = 25, 5, 1.0
 _LARGEST_CONDITION = 1e3
 
@@ -55,7 +55,7 @@ def in_millimetres(
     so that every point of the curve has a parameter.
 
     Args:
-        limits: interval of t that the data reach, containing 0.
+        limits: range of t in the data, containing 0.
         root: L with |L^T xi| = rms displacement of the mandible under a small twist xi [mm], shape (6, 6).
         incisor: incisal point at rest [mm], shape (3,).
         axis: 0 opening, 1 laterotrusion, 2 protrusion.
@@ -100,7 +100,7 @@ def translation(axis: int) -> Array:
 
 
 def _incisal_advance(twist: Array, rate: Array, incisor: Array, direction: Array) -> tuple[Array, Array]:
-    """Return the displacement (n,) of the incisal point along a direction [mm], and its derivative in t."""
+    """Return the incisal displacement (n,) along a direction [mm], and its derivative with respect to t."""
     M = se3_exp(twist)
     point = M[:, :3, :3] @ incisor + M[:, :3, 3]
     spatial = np.einsum("nij,nj->ni", se3_left_jacobian(twist), rate)
@@ -134,7 +134,7 @@ def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
     """Fit the sum of three curves.
 
     Args:
-        shown: which parameters the data show, shape (3,); the curves of the others are translations without rotation.
+        shown: which parameters the data exercise, shape (3,); the curves of the others are pure translations.
         trim_mad: see `FittingConfig`.
     """
     u = data.displacement()
@@ -233,7 +233,7 @@ def fit_pca(data: TrainingData, shown: Mask) -> FittedForm:
     The note `singular_values_mm` lists the singular values of the weighted twists, as rms displacement of the mandible.
 
     Args:
-        shown: parameters that the data show, shape (3,); the others become translations without rotation.
+        shown: parameters that the data exercise, shape (3,); the others become pure translations.
 
     Raises:
         FittingError: the components do not move the incisal point in independent directions.

@@ -32,28 +32,28 @@ from jawusd.fitting.gauge_fit import fit_gauge, fit_path
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve, within
 from jawusd.geometry import make_transform, so3_exp, so3_log
 
-_SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # normalise the polynomials' arguments
+_SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # lengths that normalise the polynomials' arguments
 _DEGREE = 4
 _RIDGE = 1e-3
-_RANGE_PERCENTILES = (0.5, 99.5)  # percentiles of the slides; outside them, the eminence is extrapolated linearly
-_LANDMARK_SIGMA_MM = 10.0  # standard deviation of the kinematic centre about the landmark
+_RANGE_PERCENTILES = (0.5, 99.5)  # slide percentiles outside which the eminence is extrapolated linearly
+_LANDMARK_SIGMA_MM = 10.0  # prior standard deviation of the kinematic centre about the landmark
 _PATH_SIGMA_MM = 0.3  # standard deviation of the kinematic centre about its path
-_FRAMES_ALIKE = 25  # consecutive frames (a second of video) that count as one independent observation
+_FRAMES_ALIKE = 25  # number of consecutive frames (one second) that count as one independent observation
 _NEWTON_STEPS, _LARGEST_STEP_RAD, _SETTLED_MM = 15, 0.1, 1e-6
-_FARTHER_MM = 4.0  # largest extrapolation beyond the captured slides
+_FARTHER_MM = 4.0  # maximum extrapolation beyond the captured slides
 
 CENTRES = 80
 _ROUNDS = 4
 _SCALES_MM = np.array([10.0, 7.0, 5.0])  # length scales of f along opening, sideways and forward
-_HIDDEN_SCALE_MM = 1e9  # makes f independent of a parameter that the data do not show
+_HIDDEN_SCALE_MM = 1e9  # length scale that makes f independent of a parameter that the data do not exercise
 _SMOOTHING = 10.0 ** np.arange(-6.0, 4.0)
-_CV_BLOCK, _CV_FOLDS = 25, 5  # block of frames held out together (about a second of video), number of folds
+_CV_BLOCK, _CV_FOLDS = 25, 5  # number of frames held out together (one second), and number of folds
 _CV_CAP_MM = 1.0
-_TAIL_RIDGE = 1e-6  # keeps the linear coefficients finite along a direction without motion
+_TAIL_RIDGE = 1e-6  # penalty that keeps the linear coefficients finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
 _TRIM_FLOOR_MM = 0.5
-_GUIDED_GRID = (9, 7, 7)  # number of points along opening, sideways and forward at which condylar paths predict
-_GUIDED_SHARE = 0.08  # total weight of these points relative to the frames, for paths without misfit
+_GUIDED_GRID = (9, 7, 7)  # numbers of grid points (opening, sideways, forward) at which condylar paths predict
+_GUIDED_SHARE = 0.08  # total weight of these points relative to that of the frames, for paths without misfit
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ class CondylarGuidance:
         return so3_log(R), found
 
     def _residual(self, R: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return residuals (N, 3) [mm], their derivatives in a spatial rotation (N, 3, 3), and the slides (N, 2).
+        """Return residuals (N, 3) [mm], their derivatives (N, 3, 3) with respect to rotation, and the slides (N, 2).
 
-        The poses are rotations R (N, 3, 3) at incisal displacements u (N, 3) [mm].
+        The poses are rotations R (N, 3, 3) at incisal displacements u (N, 3) [mm]; derivatives are spatial.
         """
         arms = np.einsum("nij,kj->nki", R, self.centres - self.incisor)
         moved = arms + (u + self.incisor)[:, None] - self.centres
@@ -154,7 +154,7 @@ def _powers(slide: Array) -> Array:
 
 
 def _shift_columns(difference: Array, opening: Array) -> tuple[Array, Array]:
-    """Return the regressors (N, 5) of the sideways movement, and their derivatives in the difference of the slides."""
+    """Return regressors (N, 5) of the sideways movement, and their derivatives with respect to the slide difference."""
     d, o = difference / _SLIDE_SCALE_MM, opening / _OPENING_SCALE_MM
     zero, one = np.zeros_like(d), np.ones_like(d)
     columns = np.stack([d, d * np.abs(d), d * o, o, o * o], axis=1)
@@ -171,7 +171,7 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
     """Fit the anchored model.
 
     Args:
-        shown: which of opening, laterotrusion, protrusion the data show, shape (3,); f does not depend on the others.
+        shown: which of opening, laterotrusion, protrusion the data exercise, shape (3,); f ignores the others.
         trim_mad: see `FittingConfig`.
     """
     u = data.displacement()
@@ -215,7 +215,7 @@ class _Chart:
 def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bool) -> tuple[AnchoredModel, float]:
     """Fit f to the best rotation of each frame with its incisal point fixed at u.
 
-    The smoothing is chosen in every call, since f may be less stiff once outliers are trimmed.
+    The smoothing factor is chosen anew in every call, since f may be less stiff once outliers are trimmed.
     """
     rotation = data.metric.best_rotation(data.motion, data.incisor, u + data.incisor)[kept]
     omega, q, weights = so3_log(rotation), chart.of(u[kept]), data.weights[kept]

@@ -23,28 +23,28 @@ from shapely.geometry.polygon import orient
 from jawusd.base.arrays import Array
 from jawusd.evaluator.bounds import SliceHull
 
-#: Names and columns of d of the planes of the alpha shapes.
+#: Planes of the alpha shapes: their names, and their columns of d.
 PLANES = {"polygon_d1d2": [0, 1], "polygon_d1d3": [0, 2]}
 
-_SMALLEST_RANGE_MM = 0.5  # smaller ranges are noise, which normalisation would amplify
-_SLIVER = 1e-12  # twice the smallest triangle area that is not degenerate, normalised units
-_THIN = 0.02  # distance by which the shape of collinear points is widened, normalised units
+_SMALLEST_RANGE_MM = 0.5  # minimum range used for normalisation; smaller ranges are noise, which would be amplified
+_SLIVER = 1e-12  # triangles with a smaller doubled area are degenerate, normalised units
+_THIN = 0.02  # distance by which the hull of collinear points is widened, normalised units
 
 DIRECTIONS = 16
 KNOTS = 48
 SOFTNESS_MM = 0.1
 
-_PROTRUSION_STRETCH = 1.6  # protrusion, the shorter axis, is stretched before directions are spaced evenly
-_WINDOW_MM = 3.5  # a section is built from the frames whose opening differs by less than this
-_FEWEST_IN_WINDOW = 12  # number of nearest frames used if fewer are in the window
+_PROTRUSION_STRETCH = 1.6  # factor that stretches protrusion, the shorter axis, before directions are spaced evenly
+_WINDOW_MM = 3.5  # maximum difference in opening between a section and the frames it is built from
+_FEWEST_IN_WINDOW = 12  # minimum number of frames per section: the nearest are used if the window contains fewer
 _TAPER = 0.35  # fraction by which a frame at the edge of the window is moved towards the section's median
 _KERNEL_KNOTS = 1.0  # standard deviation of the smoothing kernel over the opening, in knots
-_FOLDS, _BLOCK = 5, 50  # number of folds, and length of their blocks [frames], about one exercise
+_FOLDS, _BLOCK = 5, 50  # number of folds, and length of their blocks [frames], which is about that of an exercise
 # The soft maximum over all half-spaces is up to SOFTNESS_MM * log(DIRECTIONS + 2) = 0.29 mm above the largest one. With
-# a smaller margin, a section without extent (a parameter the data do not show) would be empty.
+# a smaller margin, a section without extent (a parameter that the data do not exercise) would be empty.
 _MARGIN_MM = 0.38
 _CONTACT_TOLERANCE_MM = 0.05  # extension of the hull below the captured openings
-_FRAMES_PER_SLIP = 400  # noise may place one frame in this many beyond closed teeth
+_FRAMES_PER_SLIP = 400  # noise may place one in this many frames beyond closed teeth
 _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
 

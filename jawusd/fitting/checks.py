@@ -18,28 +18,28 @@ from jawusd.geometry import landmark_frame, se3_inverse, so3_log
 _OPENING_MAX_MM = 75.0
 _LATERAL_MAX_MM = 20.0
 _PROTRUSION_MAX_MM = 16.0
-_RETRUSION_MAX_MM = 6.0  # posterior to the habitual path, teeth nearly together
-_NEAR_CLOSED_MM = 5.0  # openings up to which protrusion and retrusion are measured
-_RISE_MAX_MM = 4.0  # largest rise of the lower incisor above the closed bite
+_RETRUSION_MAX_MM = 6.0  # maximum retrusion behind the habitual path, with the teeth nearly together
+_NEAR_CLOSED_MM = 5.0  # maximum opening at which protrusion and retrusion are measured
+_RISE_MAX_MM = 4.0  # maximum rise of the lower incisor above its position in the closed bite
 _ROTATION_MAX_DEG = 57.0
 _CONDYLE_MAX_MM = 32.0
 _CONDYLES_APART_MM = (70.0, 140.0)
 _QUANTILE = 99.5
-_SAME_FRAME = 0.01  # largest difference of rotation matrices if the frame was derived from the landmarks themselves
+_SAME_FRAME = 0.01  # maximum difference of rotation matrices if the frame was derived from the landmarks
 
-_UNITS = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 1e-3}  # mm in one unit
+_UNITS = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 1e-3}  # length of each unit in mm
 
 # Ranges below which a take should be repeated; nearly all adults exceed them (Hirsch 2006, Zawawi 2003).
 _SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
-_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # fraction of the largest opening that counts as wide open; frames required
+_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # wide open: fraction of the largest opening, minimum number of frames
 _HALF_OPEN = (0.25, 0.65)  # fractions of the largest opening between which the mouth counts as half open
-_HALF_OPEN_SHARE = 0.35  # fraction of the full range that should be reached with the mouth half open
-# Directions in (laterotrusion, protrusion), the fraction of the range that counts as covering one with the mouth half
-# open, and the number that should be covered.
+_HALF_OPEN_SHARE = 0.35  # minimum fraction of the full range that should be reached with the mouth half open
+# Number of directions in (laterotrusion, protrusion), fraction of the range that covers a direction with the mouth half
+# open, and minimum number of directions that should be covered.
 _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
-#: A point of the bound farther than this from all captured poses lies in a gap, per parameter [mm].
+#: A point of the bound lies in a gap if it is farther than this from all captured poses, per parameter [mm].
 FAR_MM = np.array([3.0, 2.0, 2.0])
-_MOST_GAPS = 0.15  # fraction of the bound in gaps above which more should be recorded
+_MOST_GAPS = 0.15  # if a larger fraction of the bound lies in gaps, more should be recorded
 # Ranges (1st to 99th percentile) below which a parameter counts as not exercised [mm].
 _SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
 
@@ -180,7 +180,7 @@ def missing_movements(d: Array, shown: Mask) -> list[str]:
 
     Args:
         d: parameters of the captured poses [mm], shape (N, 3).
-        shown: parameters that the data show, shape (3,); `shown_parameters` reports the others.
+        shown: parameters that the data exercise, shape (3,); `shown_parameters` reports the others.
     """
     widest = float(d[:, 0].max())
     found = []

@@ -20,19 +20,19 @@ Source = Tracks | tuple[ArrayLike, ArrayLike]
 
 #: Names of d1, d2 and d3.
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
-#: Deviation of real jaws from a three-parameter model [mm]: smaller tracking errors hardly matter.
+#: Typical deviation of real jaws from a three-parameter model [mm]; smaller tracking errors hardly matter.
 MODEL_SIGMA_MM = 0.3
-_LARGEST_SIGMA_MM = 2.0  # frames with a larger standard deviation (rms over the mandible) are discarded
+_LARGEST_SIGMA_MM = 2.0  # maximum standard deviation of a frame (rms over the mandible); others are discarded
 _RIGID = 1e-3
 _FEWEST_POSES = 15
-_SMALLEST_MOTION_MM = 1.0  # 95 % quantile of the rms displacement of the mandible from the first pose
+_SMALLEST_MOTION_MM = 1.0  # minimum 95 % quantile of the mandible's rms displacement from the first pose
 
-_FEWEST = 60  # poses required for screening
+_FEWEST = 60  # minimum number of poses for outlier screening
 _TRIALS, _SAMPLE = 300, 15  # number and size of the random samples; each output component has ten unknowns
-_CONSENSUS = 0.75  # fraction of the poses that must agree
+_CONSENSUS = 0.75  # minimum fraction of the poses that must agree
 _REFITS = 3
-# Outlier threshold, relative to the majority's spread and absolute [mm, rms over the mandible]. A jaw deviates from the
-# quadratic by one or two millimetres at its borders; the smooth models trim smaller failures themselves.
+# Outlier thresholds: relative to the majority's spread, and absolute [mm, rms over the mandible]. A jaw deviates from
+# the quadratic by one or two millimetres at its borders; the smooth models trim smaller failures themselves.
 _TIMES, _FLOOR_MM = 8.0, 6.0
 REASON = "far from the other poses' smooth motion"
 
@@ -87,10 +87,10 @@ class TrainingData:
 
     frames: NDArray[np.int64]
     motion: Array  # motions away from the closed bite, anatomical frame, shape (N, 4, 4)
-    weights: Array  # between 0 and 1, shape (N,)
+    weights: Array  # weight of each pose, 0 .. 1, shape (N,)
     incisor: Array  # lower incisal point in the closed bite, anatomical frame [mm], shape (3,)
     landmarks: Array  # all landmarks in the closed bite, anatomical frame [mm], shape (5, 3)
-    metric: MandibleMetric  # anatomical frame
+    metric: MandibleMetric  # in the anatomical frame
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -116,12 +116,12 @@ class Selection:
 
 
 def displacement(motion: Array, point: Array) -> Array:
-    """Return the displacement (N, 3) of a point (3,) under motions (N, 4, 4) [mm]."""
+    """Return the displacements (N, 3) [mm] of a point (3,) under motions (N, 4, 4)."""
     return motion[:, :3, :3] @ point + motion[:, :3, 3] - point
 
 
 def select(source: Source, anatomy: SubjectAnatomy) -> Selection:
-    """Select the frames of a source that can train a model; raise as `select_tracks` and `select_poses` do."""
+    """Select the frames of a source that can train a model, by `select_tracks` or `select_poses`, with their errors."""
     return select_tracks(source, anatomy) if isinstance(source, Tracks) else select_poses(*source, anatomy)
 
 
@@ -265,9 +265,9 @@ class FittedForm:
 def screened(selection: Selection) -> Selection:
     """Return the selection without gross outliers: isolated tracking failures of centimetres.
 
-    A spline would interpolate such poses. A quadratic map from the incisal displacement to the rotation is too stiff
-    for that: fitted by random sample consensus (Fischler & Bolles 1981), it follows the majority, and the residual of
-    an outlier equals its error.
+    A spline would interpolate such poses. A quadratic map from the incisal displacement to the rotation is too stiff to
+    do so: fitted by random sample consensus (Fischler & Bolles 1981), it follows the majority, and the residual of an
+    outlier is its error.
     """
     outliers = gross_outliers(selection.data)
     if not outliers.any():

@@ -18,15 +18,15 @@ Refit = Callable[[TrainingData], FittedForm]
 #: Mean, median, p95, max [mm] and number of frames, by landmark or "mandible".
 ErrorTable = dict[str, dict[str, float]]
 
-_INSIDE_TWO_SD = 0.97  # fraction of held-out frames; more than 95 %, as other exercises are farther from training poses
-_SLOWEST_GROWTH = 0.01  # [mm/mm] smallest growth of errors with distance, even if held-out frames show none
+_INSIDE_TWO_SD = 0.97  # more than 95 %, since other exercises are farther from training poses
+_SLOWEST_GROWTH = 0.01  # minimum growth of errors with distance [mm/mm], even if those of held-out frames do not grow
 
 
 def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
     """Return the errors of every frame for the motions (N, 4, 4) of a model.
 
     Returns:
-        Distances [mm], shape (N,), by landmark, and of the farthest vertex under "mandible".
+        Distances [mm], shape (N,), by landmark; "mandible" is the distance of the farthest vertex.
     """
     errors = {"mandible": data.metric.largest(model, data.motion)}
     for name, point in zip(LANDMARKS, data.landmarks, strict=True):
@@ -35,7 +35,7 @@ def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
 
 
 def summarise(errors: dict[str, Array]) -> ErrorTable:
-    """Return the error table of the errors of every frame [mm], by column; empty columns are omitted."""
+    """Return the error table for columns of per-frame errors [mm]; empty columns are omitted."""
     return {
         name: {
             "mean": float(values.mean()),

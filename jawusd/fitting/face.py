@@ -12,14 +12,14 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.arkit import ArkitMapping, FaceCapture, moved_terms, shares_of
 from jawusd.geometry import transform_points
 
-_REST_SHARE = 0.1  # fraction of the frames, those nearest to the closed bite, that determine the neutral weights
+_REST_SHARE = 0.1  # fraction of the frames that determine the neutral weights: those nearest to the closed bite
 _DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # candidate dead zones of each weight
 _ROUNDS = 2
-_COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # coarse and fine step of the offset search, fine steps to each side
-_BLOCKS = 5  # contiguous blocks for cross-validation
+_COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offset search: coarse step, fine step, fine steps to each side
+_BLOCKS = 5  # number of contiguous blocks in cross-validation
 _LEAST_SECONDS = 10.0
-_LEAST_REACH = 0.4  # fraction of the subject's range that a take must reach in each direction
-_LEAST_FOLLOWING = 0.7  # smallest correlation of JawOpen with the opening; mismatched takes stay below
+_LEAST_REACH = 0.4  # minimum fraction of the subject's range that a take must reach in each direction
+_LEAST_FOLLOWING = 0.7  # minimum correlation of JawOpen with the opening; mismatched takes stay below it
 _DIRECTIONS = ("opening", "movement to the left", "movement to the right", "movement forward")
 
 
@@ -29,9 +29,9 @@ class ArkitFit:
 
     mapping: ArkitMapping
     error_mm: float  # mean error of the incisal point on held-out parts
-    shares_error_mm: float  # the same if weights are used as fixed fractions of the subject's ranges
-    offset_s: float  # clock of the jaw minus clock of the face, each counted from its first frame
-    frames: int  # jaw frames that the mapping was learned from
+    shares_error_mm: float  # the same error if weights are used as fixed fractions of the subject's ranges
+    offset_s: float  # jaw time minus face time, each counted from its first frame
+    frames: int  # number of jaw frames from which the mapping was learned
 
 
 def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s: float | None = None) -> ArkitFit:
@@ -68,9 +68,9 @@ def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s
     shares_error = _incisal_error(rig, rig.denormalized(shares_of(weights)), d)
     if error >= shares_error:
         raise FittingError(
-            f"the mapping learned from this take errs by {error:.2f} mm on held-out parts, fixed shares of the "
-            f"ranges by {shares_error:.2f} mm: it would not be an improvement.",
-            hint="Check that both takes show the same performance; without a mapping, `animate --arkit` uses shares.",
+            f"the mapping learned from this take has an error of {error:.2f} mm on held-out parts, fixed "
+            f"fractions of the ranges have {shares_error:.2f} mm: it would not be an improvement.",
+            hint="Check that both takes show the same performance; without a mapping, `animate --arkit` uses these.",
         )
     return ArkitFit(mapping, error, shares_error, offset_s, len(d))
 
@@ -108,7 +108,7 @@ def _weights_at(face_s: Array, weights: Array, times_s: Array) -> Array:
 
 
 def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
-    """Return the offset [s] at which weights correlate best with opening and side, of those that overlap half a take.
+    """Return the offset [s], with half a take of overlap, at which weights best correlate with opening and side.
 
     The opening alone is ambiguous if the subject opens rhythmically.
     """

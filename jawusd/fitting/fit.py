@@ -39,14 +39,14 @@ Result = TypeVar("Result")
 #: Called with the number of steps done and the total.
 Progress = Callable[[int, int], None]
 Method = Literal["anchored", "additive", "paper", "pca"]
-#: Fitter of one method; the mask (3,) selects the parameters that the data show.
+#: Fitter of one method; the mask (3,) selects the parameters that the data exercise.
 FormFitter = Callable[[TrainingData, Mask, "FittingConfig"], FittedForm]
 
-_MOST_CAPTURED = 2000  # largest number of captured poses whose parameters a model stores
+_MOST_CAPTURED = 2000  # maximum number of captured poses whose parameters a model stores
 # Percentiles of the training and of the hold-out residuals. The larger value is the limit beyond which a measured pose
 # counts as off the model; 99.5 % of the take's own poses are within both this limit and the bound.
 _TRAINED_QUANTILE, _UNSEEN_QUANTILE = 99.8, 99.5
-_SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # noise-free poses must not make every measured pose "off the model"
+_SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # otherwise, noise-free training poses would put all measured poses off the model
 _FEW_POSES = 100
 
 #: Fitters by method; `jawusd.paper.model.FORMS` adds the paper's own, which needs torch.
@@ -55,7 +55,7 @@ FORMS: Mapping[str, FormFitter] = {
     "additive": lambda data, shown, config: fit_additive(data, shown, config.trim_mad),
     "pca": lambda data, shown, config: fit_pca(data, shown),
 }
-_FASTEST_MM_S2 = 3e4  # largest plausible acceleration, three times gravity; beyond it, poses jump
+_FASTEST_MM_S2 = 3e4  # maximum plausible acceleration, three times gravity; larger values are jumps of the poses
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,14 @@ class FittingConfig:
     """Choice of model, and settings of its fit and validation."""
 
     method: Method = "anchored"
-    literal: bool = False  # for method "paper": keep the paper's fixed grouping of components
-    # contiguous parts of the take held out in turn to measure the error on unseen poses; 0 to skip
+    literal: bool = False  # for method "paper": whether to keep the paper's fixed grouping of components
+    # number of contiguous parts of the take held out in turn to measure the error on unseen poses; 0 to skip
     holdout_folds: int = 5
     # frames whose residual exceeds the median by this many normalised median absolute deviations count as tracking
     # failures and are discarded
     trim_mad: float = 4.5
-    alpha: float = 0.23  # largest triangle circumradius of the paper's alpha shapes, range-normalised units
-    starts: int = 4  # random initialisations of the networks of method "paper"; the best is kept
+    alpha: float = 0.23  # maximum triangle circumradius in the paper's alpha shapes, range-normalised units
+    starts: int = 4  # number of random initialisations of the networks of method "paper"; the best is kept
     seed: int = 0  # seed of the first initialisation
 
     def __post_init__(self) -> None:
@@ -125,7 +125,7 @@ def fit_model(
 
     Returns:
         The model. Its `d` and `residual_mm` are those of the raw poses; `meta` contains the error tables [mm], the
-        excluded and trimmed frames, warnings, and the parameters that the poses do not show.
+        excluded and trimmed frames, warnings, and the parameters that the poses do not exercise.
 
     Raises:
         FittingError: too few poses, no motion, poses that are not rigid, or parameters outside what a rig allows.
@@ -188,7 +188,7 @@ def _errors(
     forms: Mapping[str, FormFitter],
     notify: Callable[[int], None],
 ) -> tuple[dict[str, ErrorTable], dict[str, dict[str, float]], Array]:
-    """Return the error tables of a fit by name, and the other results of `unseen_errors`, empty if none is held out."""
+    """Return the error tables of a fit by name, and the other results of `unseen_errors`, empty without hold-out."""
     tables = seen_errors(data, form)
     if not config.holdout_folds:
         return tables, {}, np.zeros(0)
@@ -235,7 +235,7 @@ def _model(
 
 
 def with_speeds(model: JawModel, fps: float) -> JawModel:
-    """Return a model with the speeds of the take it was fitted to, which was recorded at a frame rate [1/s].
+    """Return the model with the speeds of its training take, recorded at `fps` frames per second.
 
     Only training frames count. The model is returned unchanged if too few of them are consecutive, or if the
     accelerations are implausible.

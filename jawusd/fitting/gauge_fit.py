@@ -14,26 +14,26 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.gauge import Gauge
 
-SOFTNESS_MM = 2.0  # rounding of the arch across d2 = 0, which keeps slider motion smooth there
-FADE_MM = 14.0  # opening at which tooth guidance has faded to 1/e
+SOFTNESS_MM = 2.0  # radius of the rounding of the arch at d2 = 0, which keeps slider motion smooth there
+FADE_MM = 14.0  # opening at which tooth guidance has decreased to 1/e
 
 _PATH_DEGREE, _PATH_ITERATIONS, _PATH_RIDGE = 5, 40, 1e-5
 _SMALLEST_SPREAD_MM = 0.3  # lower limit of the scale of the path's residuals
-#: Range of openings (1st to 99th percentile) below which no path is fitted: the teeth glide while closed [mm].
+#: Minimum range of openings (1st to 99th percentile) for fitting a path; in a smaller range, closed teeth glide [mm].
 SMALLEST_OPENING_MM = 5.0
 
 _ROUNDS = 3
 _ITERATIONS = 60
-_RESIDUAL_FLOOR_MM = 0.08  # keeps the reweighting of the quantile regressions finite
+_RESIDUAL_FLOOR_MM = 0.08  # minimum residual in the reweighting of the quantile regressions, which keeps weights finite
 _ARCH_QUANTILE, _ARCH_RIDGE, _ARCH_MIN_SIDE_MM = 0.5, 1e-3, 1.0
 _DROP_QUANTILE, _DROP_RIDGE, _DROP_MAX_OPENING_MM = 0.1, 3e-2, 1.2 * FADE_MM
-_UNKNOWN = 1e6  # extra stiffness of terms without data
+_UNKNOWN = 1e6  # additional ridge penalty of terms without data
 _FEWEST_FRAMES = 20
 
-#: Smallest principal minor of the gauge's Jacobian that counts as invertible; it is 1 for an undistorted gauge.
+#: Minimum principal minor of the Jacobian of an invertible gauge; it is 1 for an undistorted gauge.
 SMALLEST_MINOR = 0.25
 _STIFFNESSES = 4.0 ** np.arange(8)
-_WIDER_MM = 3.0  # margin of the checked box around the captured poses: the largest margin of a bound
+_WIDER_MM = 3.0  # margin of the checked box around the captured poses, as large as the largest margin of a bound
 _GRID = 33
 
 
@@ -88,7 +88,7 @@ def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
 
     Args:
         path: the gauge of the habitual path alone.
-        shown: which of opening, laterotrusion, protrusion the data show, shape (3,).
+        shown: which of opening, laterotrusion, protrusion the data exercise, shape (3,).
 
     Returns:
         The gauge; if no stiffness makes it invertible, the gauge of the path alone, which always is.

@@ -16,7 +16,7 @@ from jawusd.evaluator.encoding import landmark_vectors, nearest_in_chart, vector
 from jawusd.evaluator.models import JawModelForm
 from jawusd.geometry import hat, make_transform
 
-_TOGETHER = 32  # poses per block: few enough that displacements stay in the CPU cache
+_TOGETHER = 32  # number of poses per block, small enough that displacements stay in the CPU cache
 _EVERY = 32  # stride through the hull vertices in `largest_at_least`
 
 
@@ -33,7 +33,7 @@ class MandibleMetric:
         """Build the metric of mandible points at rest (N, 3), N >= 3, anatomical frame [mm]."""
         try:
             extremes = points[ConvexHull(points).vertices]
-        except QhullError:  # fewer than four points, or all in one plane
+        except QhullError:  # fewer than four points, or coplanar points
             extremes = points
         return cls(landmark_vectors(points), extremes)
 

@@ -13,9 +13,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from jawusd.base.arrays import Array, Indices, Mask
 
-_RANK = 1e-9  # singular values below this fraction of the largest count as zero
+_RANK = 1e-9  # relative threshold below which singular values count as zero
 _TIE_DIGITS = 9
-_SAME_CENTRE = 1e-6  # normalised distance below which two points count as one centre
+_SAME_CENTRE = 1e-6  # points closer than this normalised distance count as one centre
 
 
 def farthest_points(points: Array, count: int) -> Array:

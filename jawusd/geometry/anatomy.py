@@ -19,13 +19,13 @@ LANDMARKS = ("incisor", "molar_left", "molar_right", "condyle_left", "condyle_ri
 # the Bonwill triangle (about 100 mm between the condyles and from each to the incisal point), condyles 37 mm above
 # the occlusal plane.
 _CONDYLE_FROM_INCISOR_MM = np.array([50.0, 36.0, -80.0])
-# Typical position of the first molars, behind the incisal point and to the side.
+# Typical distances of the first molars from the incisal point, backwards and sideways.
 _MOLAR_BEHIND_INCISOR_MM = 25.0
 _MOLAR_ASIDE_MM = 22.0
-_MIDLINE_MM = 4.0  # half width of the front edge
-_MIN_FRONT = 40  # smallest number of points on a front edge
-_MIN_SLABS = 4  # smallest number of coronal slabs with teeth on both sides that define a midline
-# Arches are compared by local heights in cells of this size, or by mean heights if they share fewer cells than this.
+_MIDLINE_MM = 4.0  # the front edge extends this far to each side of the midline
+_MIN_FRONT = 40  # minimum number of points on a front edge
+_MIN_SLABS = 4  # minimum number of coronal slabs with teeth on both sides for a midline
+# Arches are compared by local heights in cells of `_CELL_MM`, or by mean heights if they share fewer than `_MIN_CELLS`.
 _CELL_MM, _MIN_CELLS = 4.0, 6
 
 

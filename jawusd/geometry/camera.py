@@ -37,7 +37,7 @@ class Camera:
         distortion = np.array(self.distortion, dtype=np.float64).ravel()
         if distortion.size not in _ALLOWED_COEFFICIENTS:
             raise ValueError(
-                f"camera {self.name}: {distortion.size} distortion coefficients, allowed are {_ALLOWED_COEFFICIENTS}"
+                f"camera {self.name}: {distortion.size} distortion coefficients; must be one of {_ALLOWED_COEFFICIENTS}"
             )
         object.__setattr__(self, "distortion", distortion)
 
@@ -146,8 +146,8 @@ def _paired(x: Array, y: Array) -> Array:
 
 
 _SAMPLES = 400  # number of radii at which the polynomial is sampled for the fit
-_RADIUS_FACTOR = 1.1  # factor on the fitted image radius: the undistorted image may be larger than the recorded one
-_TOLERANCE_PX = 0.005  # largest error of the coefficients up to which K is kept
+_RADIUS_FACTOR = 1.1  # factor on the fitted image radius, since undistortion may enlarge the image
+_TOLERANCE_PX = 0.005  # K is kept if the coefficients alone fit the lens with at most this error
 _ROUNDS, _MAX_DAMPING = 200, 1e12
 
 
@@ -183,8 +183,8 @@ def opencv_lens(K: Array, recorded_px: Array, ideal: Array) -> tuple[Array, Arra
     """Return K and OpenCV's eight coefficients, fitted to a lens given by distorted and undistorted points.
 
     K is kept if the coefficients alone fit the lens. Otherwise K is fitted too, which covers linear effects such as an
-    anamorphic squeeze. If that is not sufficient, so is the camera rotation, which together with the principal point
-    moves the centre of distortion.
+    anamorphic squeeze. If that is not sufficient, the camera rotation is fitted too, which together with the principal
+    point moves the centre of distortion.
 
     Args:
         K: Initial intrinsic matrix (3, 3) [px].

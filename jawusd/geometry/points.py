@@ -86,7 +86,7 @@ def welded(points: Array) -> tuple[Array, NDArray[np.int64]]:
     return sorted_points[first], index
 
 
-_PARALLEL = 1e-12  # determinant below which a ray is parallel to a triangle
+_PARALLEL = 1e-12  # a ray counts as parallel to a triangle if the determinant is below this
 
 
 def meet_triangles(origin: Array, direction: Array, corners: Array) -> tuple[Array, Array, Array]:

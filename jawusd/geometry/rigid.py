@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry.se3 import make_transform, transform_points
 
-_MIN_ASPECT = 1e-6  # ratio of second to first extent, below which points count as collinear
+_MIN_ASPECT = 1e-6  # points count as collinear if the ratio of their second to their first extent is below this
 
 
 def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:

@@ -96,7 +96,7 @@ def so3_left_jacobian_inverse(w: ArrayLike) -> Array:
     small = x < SMALL_SQUARED_ANGLE
     safe = np.where(small, 1.0, x)
     half = 0.5 * np.sqrt(safe)
-    # (1 - (a/2) cot(a/2)) / a^2, the even function of the closed form
+    # (1 - (a/2) cot(a/2)) / a^2, the even function in the closed form
     factor = np.where(small, 1 / 12 + x / 720 * (1 + x / 42), (1 - half / np.tan(half)) / safe)
     return _series(w, -0.5, factor)
 

@@ -1,7 +1,7 @@
 """The index of a folder of rigs: `library.json`, format jawusd-library/1.
 
-The index is only a cache of the scan: paths in it are never opened. Rigs are searched for below the folder only, and
-reread when their content has changed.
+The index only caches the scan; its paths are never opened. Rigs are searched for only within the folder, and reread
+when their content has changed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MAX_FOLDERS = 20_000
 _MAX_INDEX_BYTES = 64 << 20
 _CHUNK_BYTES = 1 << 20
 
-#: Reads a rig from a file.
+#: Function that reads a rig from a file.
 Loader = Callable[[Path], JawRig]
 
 
@@ -63,7 +63,7 @@ class Library:
 
     folder: Path  # the folder, resolved
     entries: tuple[Entry, ...]  # its rigs, sorted by path
-    skipped: dict[str, str]  # for files that could not be read, the reason by path
+    skipped: dict[str, str]  # reasons why files could not be read, by path
     reread: int  # number of new or changed rigs
 
     def find(self, name: str) -> Entry:

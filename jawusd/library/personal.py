@@ -70,9 +70,9 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
 
 # Candidate bandwidths [mm]: landmark distance at which a weight falls to exp(-1/2); inf means equal weights.
 BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)
-_POSES = 1600  # number of predicted poses
-_POSES_LEFT_OUT = 120  # poses per subject in leave-one-out validation
-_MIN_DONORS = 2  # smallest number of subjects for leave-one-out validation
+_POSES = 1600  # number of poses predicted
+_POSES_LEFT_OUT = 120  # number of poses per subject in leave-one-out validation
+_MIN_DONORS = 2  # minimum number of subjects for leave-one-out validation
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class PersonalMotion:
     # T_skull_mandible in the landmark frame, the identity with the teeth together, shape (N, 4, 4)
     poses: Array
     weights: dict[str, float]  # weights of the library's subjects, by name; they sum to 1
-    learned: Learned  # the bandwidth from which the weights follow, and the expected error
+    learned: Learned  # bandwidth of the weights, and the expected error
 
 
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
@@ -142,7 +142,7 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
         FittingError: no donors.
     """
     if not donors:
-        raise FittingError("the library has no person whose motion can be transferred.")
+        raise FittingError("the library has no subject whose motion can be transferred.")
     if len(donors) < _MIN_DONORS:
         return Learned(None, None)
     choices: tuple[float | None, ...] = (None,) if closest else BANDWIDTHS_MM

@@ -16,14 +16,14 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 
-STILL_MM = 1e-6  # smaller steps of the original count as having no direction
+STILL_MM = 1e-6  # steps of the original up to this size count as having no direction
 
 
 def follow(original: Array, carried: Array, least: float) -> Array:
-    """Return the curve [mm] (F,) nearest to a retargeted one that rises and falls where the original (F,) does.
+    """Return the curve (F,) [mm] nearest to a retargeted one, among those that rise and fall with the original (F,).
 
     Args:
-        least: Smallest step of the result per 1 mm step of the original, > 0, which keeps peaks from becoming plateaus.
+        least: Minimum step of the result per 1 mm step of the original, > 0; keeps peaks from becoming plateaus.
     """
     steps = np.diff(original)
     still = np.flatnonzero(np.abs(steps) < STILL_MM) + 1

@@ -105,7 +105,7 @@ def _check_near(pair: Pair, depth_mm: float) -> None:
         return
     gap, _ = cKDTree(pair.upper.samples.points).query(pair.lower.samples.points)
     if gap.min() > _WIDEST_MM:
-        raise NoContact(f"a condyle is {gap.min():.1f} mm from the skull (at most {_WIDEST_MM:g} mm is a joint)")
+        raise NoContact(f"a condyle is {gap.min():.1f} mm from the skull (at most {_WIDEST_MM:g} mm allowed)")
 
 
 def _check_fine(name: str, corners: Array, box: Array) -> None:

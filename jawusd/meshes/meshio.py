@@ -128,7 +128,7 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
         unit = min(fitting, key=fitting.__getitem__) if fitting else ""
         guess = f" It looks like {unit}." if fitting and low <= diagonal * _UNITS_MM[unit] <= high else ""
         raise CaptureError(
-            f"the mesh is {diagonal:.4g} mm across its bounding box; allowed for a {kind} is {low:g} to "
+            f"the mesh is {diagonal:.4g} mm across its bounding box; a {kind} must measure {low:g} to "
             f"{high:g} mm.{guess}",
             path=path,
             hint="Lengths must be in mm: scale the mesh and export it again.",

@@ -276,7 +276,7 @@ def count_and_not(first: Bits, second: Bits) -> np.int64:
         ValueError: the two images differ in shape.
     """
     if first.shape != second.shape:
-        raise ValueError("bit rows: the two pictures differ in shape")
+        raise ValueError("bit rows: the two images differ in shape")
     total = np.uint64(0)
     for y in range(first.shape[0]):
         for k in range(first.shape[1]):

@@ -49,10 +49,10 @@ def check_precision(name: str, found: torch.dtype, own: torch.dtype | None = Non
     if own is not None and own not in _ALLOWED:
         raise TypeError(
             f"the layer was converted to {own}, too coarse for poses; it computes in float32 or float64. "
-            "Convert it back with layer.float() after converting the module that holds it."
+            "Convert it back with layer.float() after converting the module that contains it."
         )
     if found not in _ALLOWED:
-        raise TypeError(f"{name} is {found}, allowed are float32 and float64. Convert it: {name}.float().")
+        raise TypeError(f"{name} is {found}; it must be float32 or float64. Convert it: {name}.float().")
     if own is not None and found != own:
         raise TypeError(
             f"{name} is {found}, the layer computes in {own}. "

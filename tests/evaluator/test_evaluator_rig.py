@@ -225,7 +225,7 @@ def test_changing_the_given_arrays_does_not_change_the_rig():
         ({"landmarks": np.zeros((0, 3))}, '"landmarks" has 0 points'),
         ({"T_rest": np.diag([1.0, 2.0, 1.0, 1.0])}, '"T_rest" is not rigid'),
         ({"slice_softness_mm": np.array(0.0)}, '"slice_softness_mm" is 0.0; it must be positive'),
-        ({"slice_d1": np.zeros(33)}, '"slice_d1" must hold at least two rising values'),
+        ({"slice_d1": np.zeros(33)}, '"slice_d1" must contain at least two increasing values'),
         ({"d_range": np.zeros((3, 2))}, '"d_range"'),
         ({"tolerance_mm": np.array(-0.5)}, '"tolerance_mm" not negative'),
         ({"slice_directions": np.tile([[1.0, 0.0]], (16, 1))}, "leave a side open"),

@@ -156,10 +156,10 @@ def test_wrong_units_are_named(tmp_path: Path, scale: float, unit: str) -> None:
 def test_bones_may_be_larger_than_scans(tmp_path: Path) -> None:
     arch(4).export(tmp_path / "a.stl")
     assert len(meshio.load_mesh(tmp_path / "a.stl", kind="bone").faces) == len(arch().faces)
-    with pytest.raises(CaptureError, match="allowed for a scan is 20 to 150 mm"):
+    with pytest.raises(CaptureError, match="a scan must measure 20 to 150 mm"):
         meshio.load_mesh(tmp_path / "a.stl")
     arch(12).export(tmp_path / "b.stl")
-    with pytest.raises(CaptureError, match="allowed for a bone is 50 to 500 mm"):
+    with pytest.raises(CaptureError, match="a bone must measure 50 to 500 mm"):
         meshio.load_mesh(tmp_path / "b.stl", kind="bone")
 
 

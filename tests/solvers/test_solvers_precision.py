@@ -64,7 +64,7 @@ def test_mixed_precision_of_the_program_changes_no_pose(pair, device):
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_coarse_number_types_are_refused(pair, dtype):
     rig, layer = pair
-    with pytest.raises(TypeError, match="allowed are float32 and float64"):
+    with pytest.raises(TypeError, match="must be float32 or float64"):
         layer(torch.zeros(3, dtype=dtype))
     coarse = torch.nn.Sequential(copy.deepcopy(layer)).to(dtype)
     with pytest.raises(TypeError, match=r"too coarse for poses.*layer.float\(\)"):
