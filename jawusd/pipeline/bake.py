@@ -20,8 +20,8 @@ from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import BONES, Subject, registered_subject
 
 DEFAULT_FPS = 24.0
-_PROXY_FACES = 1500  # faces per proxy mesh, not counting those along borders; see `proxy_of`
-_TEETH_APART_MM = 15.0  # wide limit, because molar landmarks may be picked by hand or detected
+_PROXY_FACES = 1500  # number of faces of a proxy mesh, without those along borders; see `proxy_of`
+_TEETH_APART_MM = 15.0  # maximum; molar landmarks may be picked by hand or detected
 
 
 def check_same_jaw(subject: Subject, model: JawModel) -> None:
@@ -68,7 +68,7 @@ def bake_subject(
     subject = registered_subject(subject, model.meta)
     # Bones come from segmented volumes and need cleaning; the vertices of teeth scans are kept.
     meshes = {key: manifold(mesh) if key in BONES else mesh for key, mesh in subject.meshes.items()}
-    if "contact" not in model.meta:  # fitted without the scans
+    if "contact" not in model.meta:  # the model was fitted without the scans
         axes, landmarks, rest = (model.arrays[name] for name in ("T_anatomical_skull", "landmarks", "T_rest"))
         model = with_tooth_contact(model, tooth_solids(subject.meshes, axes, rest), progress, regauge=False)
         model = with_condyle_contact(model, condyle_solids(subject.meshes, axes, landmarks, rest), progress)
@@ -118,17 +118,17 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
 
 
 SHAPES = ("JawOpen", "JawLeft", "JawRight", "JawForward")
-_WEIGHTS = (0.5, 1.0)  # several, because the joint does not move linearly with the weight
+_WEIGHTS = (0.5, 1.0)  # weights in the table; several, because the joint does not move linearly with the weight
 
 
 def joint_deltas(rig: JawRig, mapping: ArkitMapping | None = None) -> list[JointDelta]:
-    """Return the offset of the joint midway between the condyles for each shape, at half and full weight.
+    """Return the offset of the jaw joint, midway between the condyles, for each shape at half and full weight.
 
     The other weights are neutral. d is projected into the bound, as by `jawusd animate`.
 
     Args:
-        mapping: that of the subject; None: weights are fractions of the ranges, and the neutral face has the closed
-            bite.
+        mapping: the subject's mapping; None: weights are fractions of the ranges, and the teeth of the neutral face are
+            closed.
     """
     from jawusd.rig.skel import joint_poses
 

@@ -36,7 +36,7 @@ from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
 from jawusd.pipeline.workspace import DryWorkspace, Stage, StageMissing, Workspace, check_folder, opened
 
-OLD_MASKS = "masks"  # version 0.1 wrote masks to this folder if the capture named none
+OLD_MASKS = "masks"  # folder to which version 0.1 wrote masks if the capture named none
 
 
 @dataclass(frozen=True)
@@ -271,8 +271,8 @@ class PlannedStage:
     """A stage of a planned build."""
 
     name: str
-    keeps: bool  # the record is reused
-    seconds: float  # duration of a recorded stage, otherwise an estimate
+    keeps: bool  # whether its record is reused
+    seconds: float  # recorded duration, or an estimate for stages without a record
 
 
 @explain_missing_packages()
@@ -307,7 +307,7 @@ def _stages(capture: Capture) -> list[Stage[Mapping[str, object]]]:
 
 
 def _pictures(capture: Capture) -> int:
-    """Return the number of images of all cameras that are processed."""
+    """Return the total number of images that are processed, over all cameras."""
     from jawusd.media.footage import open_clip
 
     counts = [open_clip(camera.clip).count for camera in capture.cameras if camera.clip is not None]

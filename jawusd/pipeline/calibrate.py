@@ -55,7 +55,7 @@ class CalibrationSummary(TypedDict):
 
 
 class SyncResult(TypedDict):
-    """Frame offset of every camera to the reference camera [frames], with figures specific to the method."""
+    """Offset of every camera to the reference camera [frames], with figures that depend on the method."""
 
     offsets: dict[str, Frames]
     method: str
@@ -86,7 +86,7 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> Calibra
             lambda cameras, by_picks: _scale_by_masks(capture, meshes, cameras, by_picks, progress),
         )
     save_calibration(out, cameras)
-    return cast(CalibrationSummary, asdict(report))  # asdict loses the field types
+    return cast(CalibrationSummary, asdict(report))  # the return type of asdict has no fields
 
 
 def _scale_by_masks(
@@ -125,7 +125,8 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
     if capture.sync.offsets is not None:
         result = SyncResult(offsets=dict(capture.sync.offsets), method="given in the capture")
     elif len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
-        # Flashes are not visible in masks: equal frame numbers are assumed to be simultaneous, as the report states.
+        # Masks do not show flashes, so frames with equal numbers are assumed to be simultaneous; the report states
+        # this.
         result = SyncResult(offsets={camera.name: 0 for camera in capture.cameras}, method="taken as simultaneous")
     else:
         from jawusd.capture.sync import estimate_offsets
@@ -142,7 +143,7 @@ def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progres
 
     Args:
         videos: clips by the names of their cameras.
-        reference: the camera that the others are aligned to.
+        reference: the camera to which the others are aligned.
 
     Raises:
         SyncError, CaptureError: see `capture.sync.align_videos`.

@@ -108,7 +108,7 @@ def load_cameras(capture: Capture) -> list[Camera]:
 
 
 def rescaled_cameras(capture: Capture) -> dict[str, tuple[Size, Size]]:
-    """Return calibrated and recorded size (width, height) [px] by camera, for cameras for which they differ.
+    """Return calibrated and recorded size (width, height) [px] of the cameras for which these differ, by name.
 
     Raises:
         CalibrationError, CaptureError: see `load_cameras`.
@@ -141,7 +141,7 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
             hint="Name a calibration file there; `jawusd calibrate` makes one from [boards].",
         )
     found = read_calibration(capture.calibration, capture.calibration_unit_mm, lambda: _recorded_sizes(capture))
-    # Camera names in a capture have no dots; those of other programs may.
+    # Camera names of other programs may contain dots, which names in a capture cannot.
     plain = {plain_name(camera.name): camera for camera in found}
     known = (plain if len(plain) == len(found) else {}) | {camera.name: camera for camera in found}
     missing = [source.name for source in capture.cameras if source.name not in known]
@@ -175,8 +175,8 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     width, height = _size(camera)
     if tuple(recorded) == (width, height):
         return camera
-    # The tolerance of one pixel allows for rounding of a scaled height. Anamorphic images are stored narrower (or, as
-    # DV, wider) than displayed, and may be calibrated as stored or as displayed.
+    # One pixel of tolerance allows for a rounded height after scaling. Anamorphic images are stored narrower than
+    # displayed (DV: wider), and may be calibrated as stored or as displayed.
     if min(abs(recorded[0] * share * height / width - recorded[1]) for share in (1.0, aspect)) > 1.0:
         raise CalibrationError(
             f"calibrated for pictures of {width} x {height} px, but {path.name} has "

@@ -68,7 +68,7 @@ def input_hashes(
         found = {part: hashed(files) for part, files in input_files(capture, names).items()}
     except OSError as error:
         raise CaptureError(f"cannot be read: {error.strerror}.", path=error.filename) from error
-    if "videos" in names:  # hash also the settings that change how footage is decoded
+    if "videos" in names:  # settings that change how footage is decoded are hashed too
         keys = {"timecode", "start_frame", "fps", "colour_space", "pixel_aspect"}
         found["footage as read"] = hash_value([camera.model_dump(include=keys) for camera in capture.cameras])
         if capture.colour_config is not None:
@@ -112,5 +112,5 @@ def _sequence_files(path: Path) -> list[Path]:
         return [path]
     try:
         return list(numbered_files(path).values())
-    except CaptureError:  # the reader of the clip reports it
+    except CaptureError:  # the reader of the clip reports the error
         return []

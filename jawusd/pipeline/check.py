@@ -17,10 +17,10 @@ from jawusd.pipeline.check_files import Parts, boards, bone_findings, calibratio
 from jawusd.pipeline.check_views import frames, masks, picks, synchronisation, views
 from jawusd.pipeline.state import Progress, no_progress
 
-# Packages required by the stages, and those that only the report needs.
+# Packages that the stages need, and packages that only the report needs.
 _NEEDED = ("av", "cv2", "numba", "scipy", "torch", "onnx", "shapely", "trimesh", "pyfqmr", "PIL")
 _FOR_REPORT = ("matplotlib", "jinja2")
-# Disk space for rig, tracks and report, and the least free space to start a build [MB].
+# Disk space of rig, tracks and report, and minimum free space to start a build [MB].
 _RIG_MB, _LEAST_MB = 200.0, 20.0
 
 
@@ -111,7 +111,7 @@ def check_capture(
             progress("check", done, len(_CHECKS))
             findings += _run(check, parts)
     progress("check", len(_CHECKS), len(_CHECKS))
-    if loaded is None:  # a single note instead of one per check
+    if loaded is None:  # one note for all checks
         findings = [finding for finding in findings if finding.kind != "not_checked"]
         findings.append(Finding("not_checked", "note", "nothing else was checked, because the capture cannot be read"))
     order = {"error": 0, "warning": 1, "note": 2}

@@ -40,7 +40,7 @@ class Parts:
     out: Path  # future folder of the rig
     allow_outside: bool
     meshes: dict[str, Mesh] = field(default_factory=dict)
-    scans: tuple[Scan, ...] = ()  # upper and lower, if both are usable
+    scans: tuple[Scan, ...] = ()  # upper and lower scan, if both are usable
     videos: dict[str, Clip] = field(default_factory=dict)
     cameras: dict[str, Camera] = field(default_factory=dict)
     samples: dict[str, MaskSamples] = field(default_factory=dict)
@@ -85,7 +85,7 @@ class Parts:
         return None
 
     def offset_guesses(self) -> list[Mapping[str, int]]:
-        """Return the offsets, or two guesses: zero, and those that align the first masks of all cameras."""
+        """Return the offsets; if unknown, two guesses: zero, and offsets that align the first masks of all cameras."""
         if (known := self.offsets()) is not None:
             return [known]
         capture = self.given
@@ -112,9 +112,9 @@ def found_error(kind: str, error: JawusdError, severity: Literal["error", "warni
     )
 
 
-# Largest median distance of crown vertices from their bone [mm]; larger ones indicate another coordinate frame.
+# Maximum median distance of crown vertices from their bone [mm]; larger distances indicate another coordinate frame.
 _TEETH_TO_BONE_MM = 20.0
-_CONDYLES_MM = (75.0, 140.0)  # plausible distance between the condyle centres; about 100 in adults
+_CONDYLES_MM = (75.0, 140.0)  # smallest and largest plausible distance of the condyle centres; about 100 in adults
 
 
 def scans(parts: Parts) -> Iterator[Finding]:
@@ -185,7 +185,7 @@ def bone_findings(parts: Parts) -> Iterator[Finding]:
 
 
 def clips(parts: Parts) -> Iterator[Finding]:
-    """Open every clip and decode it; of long clips only parts."""
+    """Open every clip and decode it; long clips are decoded only in parts."""
     from jawusd.media.clip_checks import decoded_findings, rate_findings
     from jawusd.media.footage import open_clip
 
@@ -206,7 +206,7 @@ def clips(parts: Parts) -> Iterator[Finding]:
 
 
 def _copies(clips: Mapping[str, Path]) -> Iterator[Finding]:
-    """Find clips with identical contents: two cameras never record the same bytes."""
+    """Find clips with identical contents, a mistake because two cameras never record the same bytes."""
     for one, other in combinations(clips, 2):
         paths = clips[one], clips[other]
         if not all(path.is_file() for path in paths) or not filecmp.cmp(*paths, shallow=False):
@@ -228,7 +228,7 @@ def calibration(parts: Parts) -> Iterator[Finding]:
             yield Finding("no_calibration", "error", message, path=parts.description, hint=hint)
         return
     if not parts.usable(capture.calibration) or not all(parts.clip_read(camera) for camera in capture.cameras):
-        return  # a camera's recorded size is unknown, because its clip cannot be read
+        return  # without its clip, the recorded size of a camera is unknown
     if len(capture.cameras) < 2:
         message = "has one camera; tracking in 3-D needs at least two"
         yield Finding("one_camera", "error", message, 1, 2, path=parts.description)

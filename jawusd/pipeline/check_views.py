@@ -14,7 +14,7 @@ from jawusd.formats.finding import Finding, Severity
 from jawusd.geometry import Camera
 from jawusd.pipeline.check_files import Parts, found_error
 
-_INSTANTS = 5  # instants at which the views are compared
+_INSTANTS = 5  # number of frames at which the views are compared
 _CROWN_POINTS = 6000
 
 
@@ -155,7 +155,7 @@ def views(parts: Parts) -> Iterator[Finding]:
 
 
 def _teeth(parts: Parts, cameras: Mapping[str, Camera], instant: int, offsets: Mapping[str, int]) -> dict[str, Array]:
-    """Return mask pixels of both arches at an instant of the reference camera, for cameras with masks of both."""
+    """Return mask pixels of both arches at a frame of the reference camera, for cameras with masks of both arches."""
     out = {}
     for name in cameras:
         if name not in offsets:
@@ -190,7 +190,7 @@ def picks(parts: Parts) -> Iterator[Finding]:
         parts.cameras,
     )
     guesses = parts.offset_guesses()
-    # If masks of two cameras were swapped, their numbers may be frames of either camera.
+    # If the masks of two cameras were swapped, they may be numbered by the frames of either camera.
     seen = [partial(_pixels, parts, picked.frame, guess, {}, numbered) for guess in guesses for numbered in (0, 1)]
     try:
         yield from pick_findings(given, seen, [name for name in parts.cameras if name in parts.samples], picked.frame)
@@ -207,9 +207,9 @@ def _pixels(
     source: str,
     camera: str,
 ) -> tuple[Array, Array]:
-    """Return the mask pixels of a source by arch, attributed to a camera, at an instant of the reference camera.
+    """Return the mask pixels of a source by arch, attributed to a camera, at a frame of the reference camera.
 
-    `numbered` is 0 if the masks are numbered by the frames of the camera, 1 if by those of the source.
+    `numbered` is 0 if the masks are numbered by the camera's frames, and 1 if they are numbered by the source's frames.
     """
     nothing = np.empty((0, 2))
     by = (camera, source)[numbered]

@@ -29,17 +29,17 @@ _QUALITY = 88  # JPEG quality of the images
 class ContactSummary(TypedDict, total=False):
     """Contact of the teeth, or of the condyles."""
 
-    missing: str  # why it was not measured
-    closed_mm: float  # penetration of the scans in the closed bite
-    error_mm: float  # largest error of the clearances
-    limit_mm: float  # smallest clearance of captured poses; poses with a smaller one count as collisions
+    missing: str  # reason why contact was not measured
+    closed_mm: float  # penetration of the scans with the teeth closed
+    error_mm: float  # maximum error of the clearances
+    limit_mm: float  # smallest clearance of captured poses; poses below it count as collisions
 
 
 def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture, ...]:
-    """Draw the contacts in the closed bite, and halfway through protrusion and both laterotrusions.
+    """Draw the contacts with the teeth closed, and halfway through protrusion and both laterotrusions.
 
     Args:
-        subject: its scans must be registered like the poses of the model.
+        subject: the subject; its scans must have the registration of the model's poses.
 
     Raises:
         RigError: the scans do not show contacts.
@@ -85,10 +85,10 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
 
 
 def tooth_solids(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: Array) -> Teeth | str:
-    """Return both arches as solids, or why that failed; axes and rest pose as in `Subject`.
+    """Return both arches as solids, or the reason for failure; axes and rest pose as in `Subject`.
 
     Args:
-        meshes: scans and bones, registered like the poses.
+        meshes: scans and bones, with the registration of the poses.
     """
     from jawusd.meshes.contact import NoContact, find_teeth
 
@@ -103,7 +103,7 @@ def tooth_solids(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: 
 def condyle_solids(
     meshes: Mapping[str, Mesh], T_anatomical_skull: Array, landmarks: Array, T_rest: Array
 ) -> Joints | str:
-    """Return condyles and skull as solids, or why that failed; see `tooth_solids`."""
+    """Return condyles and skull as solids, or the reason for failure; see `tooth_solids`."""
     from jawusd.meshes.contact import NoContact
     from jawusd.meshes.joints import find_joints
 

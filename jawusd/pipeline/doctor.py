@@ -23,9 +23,9 @@ class Examined(TypedDict):
     """Result of `jawusd doctor`.
 
     Attributes:
-        versions: by package; "" if not installed.
+        versions: version of each package; "" if not installed.
         extras: missing packages of each extra.
-        graphics: OpenGL version, or why there is none.
+        graphics: OpenGL version, or the reason why OpenGL is not available.
         codecs: whether each codec can be decoded.
         memory_limit_gb: memory limit of a command, 0 for none.
         problems: reasons why a build would fail.
@@ -129,7 +129,7 @@ def _codecs() -> dict[str, bool]:
 
 
 def _cache() -> str:
-    """Return the folder in which numba caches compiled functions, in words."""
+    """Return a description of the folder in which numba caches compiled functions."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     if named:
         return f"{named}{'' if os.access(named, os.W_OK) else ' (not writable: every start compiles again)'}"

@@ -52,21 +52,21 @@ HDF5_SUFFIXES = (".h5", ".hdf5")
 RAW_GROUP = "T_model_origin_mand_landmark_t"
 _HDF5_UNITS_MM = {"mm": 1.0, "m": 1000.0}
 _RIGID_TOLERANCE = 1e-3
-_MOST_NUMBERS = 16_000_000  # a million 4 x 4 matrices
+_MOST_NUMBERS = 16_000_000  # maximum number of array elements: a million 4 x 4 matrices
 
 
 @dataclass(frozen=True)
 class TrajectoryOptions:
     """Conventions of a file of poses."""
 
-    # jawusd's column names to those of the file, see `formats.poses.read_poses`; for tables only
+    # for tables: the file's column names by jawusd's column names, see `formats.poses.read_poses`
     columns: Mapping[str, str] = field(default_factory=dict)
     length_unit: str = "mm"  # a key of `LENGTH_UNITS_MM`, for files that do not state their unit
-    invert: bool = False  # the poses map skull to mandible
-    # a frame with the teeth in occlusion: poses are made relative to it, so that the file may use any mandible frame;
-    # None: the poses in the file are identity in occlusion
+    invert: bool = False  # whether the poses map skull to mandible
+    # frame with the teeth in occlusion, to which poses are made relative, so that the file may use any mandible frame;
+    # None: in the file, the pose in occlusion is the identity
     rest_frame: int | None = None
-    group: str | None = None  # trajectory of an HDF5 file; None: the raw one
+    group: str | None = None  # trajectory of an HDF5 file; None: the raw trajectory
     # rigid bodies in a table of markers, see `pipeline.markers.marker_poses`; empty if the file contains poses
     rigid: Mapping[str, str] = field(default_factory=dict)
 
@@ -96,7 +96,7 @@ def fit_subject(
     """Fit the jaw model of a subject.
 
     Args:
-        fps: frame rate of the poses; None: that of the subject.
+        fps: frame rate of the poses; None: the subject's frame rate.
         method: "anchored", "additive", "paper" or "pca".
 
     Raises:
@@ -110,7 +110,7 @@ def fit_subject(
     if registration is not None:
         subject = registered_subject(subject, {"registration": registration})
     axes, rest = subject.T_anatomical_skull, subject.T_rest
-    with ThreadPoolExecutor(1) as pool:  # solids do not depend on the model, and mostly release the GIL
+    with ThreadPoolExecutor(1) as pool:  # computing solids needs no model, and mostly releases the GIL
         teeth = pool.submit(tooth_solids, subject.meshes, axes, rest)
         joints = pool.submit(condyle_solids, subject.meshes, axes, subject.landmarks, rest)
         model = fit_model(
@@ -211,7 +211,7 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
     """Read a trajectory of jaw-tracking-system: the landmark frame in the model frame, frames numbered from 0.
 
     Args:
-        group: name of the trajectory; None: the raw one, or the only one.
+        group: name of the trajectory; None: the raw trajectory, or the only one.
 
     Raises:
         FormatError: the file is invalid, lacks the group, has data sets of wrong shapes, or poses that are not rigid.

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 
-_WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # working resolution at the teeth, and margin around them
+_WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # working resolution at the teeth, and margin of the crop around the teeth
 
 
 class Cutter:
@@ -55,7 +55,7 @@ class Cutter:
         self._probes = [scan.probes for scan in scans]
 
     def cut(self, pictures: Pictures) -> Cut:
-        """Return a function that crops the images of one instant around given poses."""
+        """Return a function that crops the images of one frame around given poses."""
 
         def cut(poses: Array) -> list[Picture | None]:
             around = np.concatenate([transform_points(T, own) for T, own in zip(poses, self._probes, strict=True)])
@@ -79,10 +79,11 @@ class Cutter:
         return None if window is None else Picture(window.camera, window.rgb)
 
 
-# Second difference of the jaw's motion [mm] above which the preceding frames are tracked again, backwards; and distance
-# below which two poses count as equal. Speech and chewing reach 1 mm at 24 fps; a false positive costs one frame.
+# Threshold of the second difference of the jaw's motion [mm], above which the preceding frames are tracked again
+# backwards, and distance [mm] below which two poses count as equal. Speech and chewing reach second differences of 1 mm
+# at 24 fps; a false positive costs the time of one frame.
 _JUMP_MM, _SAME_MM = 0.8, 0.15
-_SAMPLED_VIEWS = 10  # most frames whose views are kept: a few MB
+_SAMPLED_VIEWS = 10  # maximum number of frames whose views are kept: a few MB
 STAGE = "follow"
 
 
@@ -91,7 +92,7 @@ class Follower:
 
     Attributes:
         cameras: calibrated, those that have a video, by name.
-        sampled_views: poses and views of frames, evenly sampled from the last run.
+        sampled_views: poses and views of evenly sampled frames of the last run.
     """
 
     def __init__(
@@ -118,7 +119,7 @@ class Follower:
     def start_at(self, frame: int, poses: Array) -> tuple[RegionPose, float]:
         """Refine T_world_upper, T_world_lower (2, 4, 4) on a frame, from which `run` then starts; return pose and fit.
 
-        The fit is that of the worse arch: the fraction of the visible contour that matches the colours, 0 .. 1.
+        The fit is the fraction of the visible contour that matches the colours, 0 .. 1, for the worse arch.
 
         Raises:
             CaptureError: an image cannot be decoded.
@@ -159,7 +160,7 @@ class Follower:
 
 
 class _Latest(Iterator["Cut"]):
-    """An iterator that stores its last item; `itertools.tee` would keep up to 57 items."""
+    """An iterator that stores only its last item; `itertools.tee` would store up to 57."""
 
     def __init__(self, cuts: Iterator[Cut]) -> None:
         self._cuts = cuts
@@ -184,9 +185,9 @@ def _jumps(way: range, known: Mapping[int, RegionPose], points: Array) -> list[i
 
 
 def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, RegionPose], points: Array) -> None:
-    """Replace poses by those tracked backwards, as long as they differ and more of the contour fits.
+    """Replace poses by those tracked backwards, as long as the two differ and the latter fit more of the contour.
 
-    A jump means that the tracker recovered from an error; each of the wrong poses before it is plausible by itself.
+    A jump means that the tracker recovered from an error; each wrong pose before the jump is plausible by itself.
     """
     for frame, found in zip(back, again, strict=False):
         apart_mm = np.linalg.norm(_places(found, points) - _places(known[frame], points), axis=-1).mean()
@@ -197,9 +198,9 @@ def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, Regi
 
 
 FEWEST_VIDEOS = 2
-# Least fraction of the visible contour that matches the colours; picks below it are rejected. Six path-traced mouths
-# had 0.26 to 0.5. Three that were dark, noisy or without colour had 0.13 to 0.27, with errors up to 0.3 mm. Focal
-# lengths 15 % off gave 0.05, another subject's lower scan 0.08 and 0.12, with errors above 1 mm.
+# Minimum fraction of the visible contour that matches the colours, below which picks are rejected. Fractions of six
+# path-traced mouths were 0.26 to 0.5; of three dark, noisy or colourless ones 0.13 to 0.27, with errors up to 0.3 mm. A
+# focal length wrong by 15 % gave 0.05, another subject's lower scan 0.08 and 0.12, with errors above 1 mm.
 _LEAST_PICKED_FIT = 0.1
 
 
@@ -297,5 +298,5 @@ def searched_start(
 
     search = PictureSearch(capture, footage, len(follower.cameras), near, judged)
     begin = search.run(frames, progress)
-    follower.start_at(begin.frame, begin.pose)  # again, as the search may have tried other frames since
+    follower.start_at(begin.frame, begin.pose)  # repeated, because the search may have tried other frames since
     return begin

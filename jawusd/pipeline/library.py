@@ -25,9 +25,9 @@ from jawusd.pipeline.fit import fit_summary
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_landmarks
 
-# Least step of a retargeted motion, relative to the source's step times the ratio of the ranges.
+# Minimum step of a retargeted motion, relative to the source's step times the ratio of the ranges.
 _SLOWEST = 0.1
-_ROUNDS = 400  # most iterations of timing and projection into the bound; most motions need fewer than 40
+_ROUNDS = 400  # maximum number of iterations of timing and projection into the bound; most motions need fewer than 40
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -157,7 +157,7 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         (np.arange(len(motion.poses)), motion.poses),
         T_anatomical_skull=subject.T_anatomical_skull,
         landmarks=subject.landmarks,
-        config=FittingConfig(holdout_folds=0),  # held-out frames would be those of other subjects
+        config=FittingConfig(holdout_folds=0),  # no cross-validation: held-out frames would be those of other subjects
         actor=subject.name,
         progress=partial(progress, "fit"),
     )
@@ -169,7 +169,7 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         "expected_error_mm": None if expected is None else expected.summary(),
         "fit_to_carried_motion_mm": model.meta["errors"],
     }
-    # The training error is meaningless for the subject, whose motion was not measured.
+    # The training error does not apply to this subject, whose motion was not measured.
     model.meta["errors"] = {} if expected is None else {"expected": expected.table()}
     caution = {"code": "personal", "message": _caution(motion)}
     model.meta["warnings"] = [*fit_summary(model)["warnings"], caution]
@@ -196,7 +196,7 @@ def _finite(value: float | None) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
-    """A retargeted motion, and how it was changed."""
+    """A retargeted motion, and the changes that were made to it."""
 
     frames: Array  # frame numbers, shape (G,)
     d: Array  # parameters of the target [mm], inside its bound, NaN where the motion is lost, shape (G, 3)
@@ -205,7 +205,7 @@ class Retargeted:
 
 
 def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retargeted:
-    """Retarget a motion to another subject: equal fractions of both ranges, same timing, inside the bound.
+    """Retarget a motion to another subject: equal fractions of both subjects' ranges, same timing, inside the bound.
 
     The motion is resampled at all whole frames, because it is linear in d between samples, but not in the fractions
     of the ranges. Equal fractions alone would shift peaks by some frames and might leave the bound, so the motion is
@@ -236,7 +236,7 @@ def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retarge
 
 
 def _in_time(source: JawRig, target: JawRig, original: Array, carried: Array) -> Array:
-    """Return d (F, 3) [mm] near `carried`, inside the bound, rising and falling where the original does."""
+    """Return d (F, 3) [mm] inside the bound and near `carried`, which rises and falls where the original does."""
     sizes = [np.ptp(rig.d_range, axis=1) for rig in (source, target)]
     least = _SLOWEST * sizes[1] / np.maximum(sizes[0], SMALLEST_REACH_MM)
     kept = carried.copy()

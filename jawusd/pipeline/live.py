@@ -36,24 +36,24 @@ if TYPE_CHECKING:
     from jawusd.tracking.performance.coordinates import Pose
 
 
-_PATIENCE_S = 2.0  # time without teeth after which a new search begins
+_PATIENCE_S = 2.0  # time without visible teeth after which a new search begins
 _WAIT_S = 0.25
 _MOST_BEHIND_S = 0.15  # lag behind the newest images above which frames are dropped
-_BEFORE = 6  # frames tracked before playback of a file, to estimate the motion
+_BEFORE = 6  # number of frames tracked before playback of a file, to estimate the motion
 
 
 @dataclass(frozen=True, eq=False)
 class LiveFrame:
-    """Result of one instant.
+    """Result of one frame: images of all sources at one time.
 
     Attributes:
-        time_s: capture time of its images since the start of the sources; in files, since their first images.
+        time_s: capture time of the images [s] since the start of the sources; for files, since their first images.
         d, sigma: jaw parameters and their standard deviations [mm], shape (3,).
         margin_mm: signed distance to the rig's bound, > 0 inside.
-        verdict: verdict of the rig on the pose.
+        verdict: the rig's verdict on the pose.
         state: `SolveState`, solved or carried.
         latency_ms: time since the images were captured.
-        dropped: number of instants dropped since the last one.
+        dropped: number of frames dropped since the last result.
     """
 
     time_s: float
@@ -66,7 +66,7 @@ class LiveFrame:
     dropped: int
 
     def as_json(self) -> dict[str, object]:
-        """Return the values, rounded to significant digits."""
+        """Return the result as plain values, rounded to significant digits."""
         return {
             "time_s": round(self.time_s, 4),
             "d": [round(value, 3) for value in self.d.tolist()],
@@ -92,7 +92,7 @@ def live(
     silence_s: float = 10.0,
     allow_outside: bool = False,
 ) -> Iterator[LiveFrame]:
-    """Yield a result per instant; frames are dropped if images arrive too fast.
+    """Yield a result per frame; frames are dropped if images arrive too fast.
 
     Args:
         rig: `actor.usda`, another layer of it, or `model.npz`.
@@ -103,7 +103,7 @@ def live(
         fixed_head: the cameras are head-mounted.
         jobs: number of threads.
         seconds: stop after this time; None: when the sources end.
-        silence_s: longest time without an image from a device or stream [s].
+        silence_s: maximum time without an image from a device or stream [s].
         allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
@@ -121,14 +121,14 @@ def live(
 
 
 def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:
-    """Return the time of the next instant to process, None if a source has no image of it yet.
+    """Return the time of the next frame to process; None if a source has no image of that frame yet.
 
-    This is the first instant that is not too old. A search takes as long as several frames; tracking is faster than
-    real time and catches up.
+    This is the first frame that is not too old. A search takes as long as several frames; tracking is faster than real
+    time and catches up.
 
     Args:
         times_s: increasing times of the buffered images of each source.
-        after_s: earliest time.
+        after_s: time that the frame must follow [s].
     """
     if not all(len(kept) for kept in times_s):
         return None
@@ -197,7 +197,7 @@ class _Follower:
             source.stop()
 
     def run(self, seconds: float | None, silence_s: float) -> Iterator[LiveFrame]:
-        """Yield instants until the sources end."""
+        """Yield results until the sources end."""
         start = self._begin_in_files() if self._files else 0
         for source in self._sources.values():
             source.open(start * self._period_s)
@@ -238,7 +238,7 @@ class _Follower:
         """Search for the teeth before the files are played; return the frame at which playback starts.
 
         Raises:
-            TrackingError: they were not found.
+            TrackingError: the teeth were not found.
         """
         shot = VideoShot(self._capture, self._cameras, self._offsets, self._teeth, self._jaw, VideoOptions())
         begin = shot.begin(no_progress)
@@ -275,7 +275,7 @@ class _Follower:
             self._learn(pictures, near)
 
     def _next(self, last: float, silence_s: float) -> float | None:
-        """Wait for the next instant of which all sources have an image; return its time, None at the end."""
+        """Wait for the next frame of which all sources have an image; return its time, or None at the end."""
         after = last + 0.5 * self._period_s
         while True:
             at = next_instant([source.times_s() for source in self._sources.values()], after)
@@ -286,14 +286,14 @@ class _Follower:
                 source.refuse_silence(silence_s)
 
     def _pictures(self, at: float) -> Pictures:
-        """Return the images of an instant, None for sources without an image near it."""
+        """Return the images of all sources at a time, None for sources without an image near it."""
         found = {name: source.at(at) for name, source in self._sources.items()}
         near = self._period_s
         return {n: None if p is None or abs(p.time_s - at) > near else p.rgb for n, p in found.items()}
 
 
 class OscSender:
-    """Sender of an OSC bundle per instant over UDP.
+    """Sender of an OSC bundle per frame over UDP.
 
     The arguments of /jaw/d and /jaw/sigma are three floats [mm], of /jaw/margin one [mm], of /jaw/time one [s], and of
     /jaw/state 1 for solved or 2 for carried, as in `SolveState`.
@@ -323,7 +323,7 @@ class OscSender:
 
     @explain_missing_packages()
     def send(self, frame: LiveFrame) -> None:
-        """Send one instant; a missing receiver is not an error."""
+        """Send one result; a missing receiver is not an error."""
         from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
         from pythonosc.osc_message_builder import OscMessageBuilder
 

@@ -46,8 +46,8 @@ BUILT, KEPT, FAILED, STOPPED = "built", "kept", "failed", "stopped"
 #: Callback for events, with one line of text each.
 Notify = Callable[[str], None]
 
-_NOTIFY_SECONDS = 10.0  # least interval between two lines about the same stage of a capture
-_STOP_SECONDS = 15.0  # time for running builds to stop
+_NOTIFY_SECONDS = 10.0  # minimum interval between two lines about the same stage of a capture
+_STOP_SECONDS = 15.0  # time that running builds have to stop
 CONNECT_SECONDS = 10
 _LOOPBACK = "127.0.0.1"
 
@@ -56,7 +56,7 @@ _cancelled: set[str] = set()
 
 
 class _CancelledError(Exception):
-    """The run of this build was cancelled."""
+    """Raised on a worker whose run was cancelled."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class ManyOptions:
         build: options of each build.
         cluster: address of a Dask scheduler; None: local processes.
         workers: number of local processes; None: one per core, at most one per capture.
-        retries: how often a capture is retried after its process died; an existing scheduler uses its own setting.
+        retries: number of retries of a capture after its process died; an existing scheduler uses its own setting.
     """
 
     build: BuildOptions
@@ -84,9 +84,9 @@ class Outcome:
         name: name of the output folder.
         capture: path of the capture.
         status: "built", "kept" (nothing changed since an earlier build), "failed" or "stopped".
-        frames, tracked: number of frames, and of those with both arches tracked.
-        model_mm: mean over frames of the largest error of a mandible vertex.
-        holdout_mm: the same for held-out frames.
+        frames, tracked: number of frames, and number of frames with both arches tracked.
+        model_mm: maximum error over the mandible's vertices, mean over frames.
+        holdout_mm: the same error for held-out frames.
         sigma_incisor_mm: median standard deviation of the tracked incisal point.
         seconds: total duration of the stages.
         error: reason of a failure.
@@ -147,7 +147,7 @@ def _run(
 ) -> Iterator[Outcome]:
     """Yield outcomes as builds end; on an interrupt, cancel the running builds."""
     run = uuid.uuid4().hex
-    # When a worker has died, the retry reuses the stages that it finished.
+    # After a worker has died, the retry reuses the stages that the worker finished.
     options = options if options.fresh else replace(options, resume=True)
     with _listening(client, run, notify):
         items = {
@@ -167,7 +167,7 @@ def _run(
 
 @contextlib.contextmanager
 def _listening(client: Client, run: str, notify: Notify) -> Iterator[None]:
-    """Forward the messages of the workers of a run."""
+    """Forward messages from the workers of a run."""
     client.subscribe_topic(run, lambda event: notify(event[1]))
     try:
         yield
@@ -258,10 +258,10 @@ class _IgnoreInterrupt(WorkerPlugin):
 def local_cluster(workers: int, retries: int) -> Iterator[Client]:
     """Start single-threaded worker processes on the loopback interface, and yield their client.
 
-    They end with the block.
+    The processes end with the block.
 
     Args:
-        retries: how often work is retried after its worker died.
+        retries: number of retries of a task after its worker died.
     """
     settings = {
         "distributed.scheduler.allowed-failures": retries,

@@ -18,15 +18,15 @@ from jawusd.geometry import rigid_fits, se3_inverse
 
 BODIES = ("head", "jaw")
 LENGTH_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-_MOST_C3D_FRAMES = 65_535  # the frame counter has 16 bits
+_MOST_C3D_FRAMES = 65_535  # maximum of C3D's 16-bit frame counter
 _BLOCK, _C3D_KEY = 512, 0x50
-#: Byte order, and header offset of the byte with the scale's sign, by processor type: Intel, DEC, MIPS.
+#: Byte order, and offset in the header of the byte with the scale's sign, for the processor types Intel, DEC and MIPS.
 _BYTE_ORDERS = {b"T": ("<", 15), b"U": ("<", 13), b"V": (">", 12)}
-_LABELS = ("LABELS", *(f"LABELS{k}" for k in range(2, 9)))  # parameters with the labels of up to 255 points each
+_LABELS = ("LABELS", *(f"LABELS{k}" for k in range(2, 9)))  # parameters, each with up to 255 labels
 
-# RMS residual of a rigid body [mm] above which a frame has no pose: a marker jumped or was mislabelled. The largest of
-# 6,400 fits to recorded speech and clenching is 0.18 mm. Four markers with 0.3 mm of noise per axis exceed the limit
-# once in 10 million frames (chi squared with six degrees of freedom).
+# Maximum RMS residual of a rigid body [mm]; above it, a marker jumped or was mislabelled, and the frame has no pose.
+# The largest residual of 6,400 fits to recorded speech and clenching is 0.18 mm. Four markers with 0.3 mm of noise per
+# axis exceed the limit once in 10 million frames (chi squared with six degrees of freedom).
 _FARTHEST_MM = 1.0
 
 
@@ -40,7 +40,7 @@ def marker_poses(
         rigid: descriptions of the rigid bodies "head" and "jaw", see `formats.rigid_bodies.read_body`; without "head",
             the table is in head coordinates.
         rest_frame: frame that defines the shape of rigid bodies for which only the markers are named.
-        unit: unit of the rigid bodies, and of tables that do not state theirs; a key of `LENGTH_UNITS_MM`.
+        unit: unit of the rigid bodies, and of tables that do not state a unit; a key of `LENGTH_UNITS_MM`.
 
     Raises:
         FormatError: a rigid body is unknown, missing or does not fit the markers; the rest frame is missing or lacks a
@@ -159,7 +159,7 @@ def _moved(
     unit_mm: float,
     path: Path,
 ) -> Array:
-    """Return the pose of a rigid body in the table's frame, (F, 4, 4)."""
+    """Return the poses (F, 4, 4) of a rigid body in the table's coordinate frame."""
     seen = points[:, _columns(body, names, points.shape[1], name, path)]
     shape = _shape_at(rest_frame, seen, body, name, path) if body.points is None else body.points * unit_mm
     T, off_mm = rigid_fits(shape, seen)

@@ -20,8 +20,8 @@ from jawusd.photographs import Drawing, PhotoAlignment, align_photographs, read_
 from jawusd.pipeline.state import Progress, no_progress
 
 RESULT = "photos.json"
-_COLOURS = np.array([[60, 220, 60], [60, 160, 255]], np.uint8)  # upper, lower; red, green, blue
-# Fraction of bright pixels above which a drawing counts as filled areas: 4 px lines around 20 teeth cover 4 %.
+_COLOURS = np.array([[60, 220, 60], [60, 160, 255]], np.uint8)  # of the upper and lower crowns, (red, green, blue)
+# Fraction of bright pixels above which a drawing is read as filled areas; lines 4 px wide around 20 teeth cover 4 %.
 _FILLED = 0.08
 
 
@@ -47,8 +47,8 @@ def align_photograph_files(
     """Align scans with outlines drawn in photographs, and write poses, lenses, bite and overlays.
 
     Args:
-        outlines: a drawing per photograph, all of one bite and one camera: tooth outlines as bright lines on black, or
-            filled teeth with one gray value each.
+        outlines: a drawing per photograph, all of one bite and from one camera: tooth outlines as bright lines on
+            black, or filled teeth, each with its own gray value.
         upper_teeth, lower_teeth: scans, each in any frame.
         out: folder of photos.json and an overlay per photograph.
         force: overwrite existing files.

@@ -1,4 +1,4 @@
-"""Search for the teeth in footage, on frames in which the arches are visibly apart."""
+"""Search for the teeth in the frames of footage in which the arches are visibly apart."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ if TYPE_CHECKING:
 
 # Frame stride of the search, frames per part of the take, and starts tried per part.
 _EVERY, _PART, _TRIED = 8, 240, 4
-# Starts tried in total, at about ten seconds of CPU time each. If six parts yield none that fits, scans, cameras or
-# the detection are wrong, and more tries would not help. A count, so that results do not depend on the machine.
+# Maximum number of starts tried, at about ten seconds of CPU time each. If six parts yield no start that fits, scans,
+# cameras or the detection are wrong, and more tries would not help. The limit is a number instead of a time, so that
+# results do not depend on the machine.
 _MOST_TRIED = 24
-#: Largest fraction of the line between the arches that may be bridged for them to count as apart. All images with less,
-#: of 64 images of eight mouths, were separated correctly.
+#: Maximum fraction of the line between the arches that may be bridged if the arches are to count as apart. Of 64 images
+#: of eight mouths, all below it were separated correctly.
 MOST_BRIDGED = 0.1
-#: Least fraction of the visible contour that matches the colours; starts below it are rejected. The 20 starts found in
-#: one take, all but one within 0.5 mm, had 0.19 to 0.48. Above the other two limits (for several cameras, and for one
-#: camera, whose depth may be wrong), a start is accepted without further search.
+#: Limits of the fraction of the visible contour that matches the colours. Starts below `LEAST_FIT` are rejected; the 20
+#: starts found in one take, all but one within 0.5 mm, had 0.19 to 0.48. A start above `_CLEAR_FIT` (several cameras)
+#: or `_CLEAR_FIT_SINGLE` (one camera, where depth may be wrong) ends the search.
 LEAST_FIT, _CLEAR_FIT, _CLEAR_FIT_SINGLE = 0.15, 0.25, 0.4
 
 T = TypeVar("T")
@@ -54,7 +55,7 @@ class _Candidate:
 
     @property
     def bridged(self) -> float:
-        """Fraction of the line between the arches without a gap, in the worst camera."""
+        """Fraction of the line between the arches along which they are not separated, in the worst camera."""
         return max(rows.bridged for rows in self.rows.values())
 
 
@@ -77,7 +78,7 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress) -> Start[T]:
-        """Return the first start with a clear fit, or the best of a part of the take.
+        """Return the first start with a clear fit; after each part of the take, accept the best start if it fits.
 
         Raises:
             TrackingError: no start fits.

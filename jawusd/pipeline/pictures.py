@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from jawusd.media.side_by_side import CameraWall
 
 
-_UNCOVERED, _UNCERTAIN = 3, 2  # frames drawn for each reason, in addition to a typical frame for comparison
+_UNCOVERED, _UNCERTAIN = 3, 2  # number of frames drawn for each reason, in addition to a typical frame
 _MOST_CAMERAS = 4
 _REPORT_TILE_PX = (400, 225)
 _QUALITY = 82
-_MOST_FACES = 6000  # per mesh of the report's replay
+_MOST_FACES = 6000  # maximum number of faces of a mesh in the report's replay
 
 
 def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> tuple[Overlay, ...]:
@@ -62,7 +62,7 @@ def draw_frames(
     backdrops: Mapping[str, Backdrop],
     scans: tuple[Mesh, Mesh],
 ) -> tuple[Overlay, ...]:
-    """Draw the scans over the images of frames, given by row of the tracks and reason.
+    """Draw the scans over the images of frames; each frame is given by its row in the tracks and the reason to draw it.
 
     Raises:
         CaptureError: an image cannot be decoded.
@@ -79,7 +79,7 @@ def draw_frames(
 
 
 def chosen_frames(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return rows of frames to inspect, each with the reason, the worst first."""
+    """Return the rows in the tracks of frames to inspect, each with the reason, worst frames first."""
     tracked = tracks.tracked()
     uncovered = np.where(tracked, np.fmax.reduce(uncovered_percent(tracks), axis=1), np.nan)
     sigma_mm = np.where(tracked, tracks.sigma_mm.max(axis=1), np.nan)
@@ -144,7 +144,7 @@ def write_plates(
 
 
 def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
-    """Return decimated meshes of a rig for the report, in the anatomical frame and the closed bite [mm].
+    """Return decimated meshes of a rig with the teeth closed, in the anatomical frame [mm], for the report.
 
     Raises:
         RigError: there is no geometry.
@@ -175,10 +175,10 @@ def _small(mesh: Mesh) -> Mesh:
 
 
 SHEET = "contact_sheet.png"
-#: Suffix of a video of all cameras.
+#: Suffix of the path if one video of all cameras is written.
 VIDEO = ".mp4"
 _SHEET_FRAMES = 6
-_CRF = 20  # H.264 quality for viewing; archive quality takes twice the time to encode
+_CRF = 20  # H.264 rate factor of viewing quality; archive quality takes twice the time to encode
 TILE_PX = (640, 480)
 _FILL = 0.12  # opacity of the crowns, low enough for outlines to remain visible
 
@@ -196,9 +196,9 @@ def write_overlay(
 ) -> list[Path]:
     """Write H.264 video of the tracked frames with both scans drawn over them; return `overlay_files`.
 
-    If `path` is a folder, a contact sheet and, for each camera with footage, a synchronised video of whole images are
-    written, with gray for missing images. If it is an .mp4 file, all cameras are placed side by side, cropped to the
-    teeth, with masks for cameras without footage. Existing files are overwritten.
+    If `path` is a folder, it gets a contact sheet and a synchronised video of whole images for each camera with
+    footage; missing images are gray. If `path` is an .mp4 file, all cameras are placed side by side, cropped to the
+    teeth; cameras without footage show their masks. Existing files are overwritten.
 
     Args:
         offsets: frame offset by camera.

@@ -91,7 +91,7 @@ def write_build_report(
         FormatError, RigError: a file of the build is corrupt.
         OutputError: the file cannot be written.
     """
-    # raises an error before any work if they are not installed
+    # raises an error before any work if packages are missing
     from jawusd.paper.figures import inline_figures
     from jawusd.report.document import draw_figures, write_document
 
@@ -185,7 +185,7 @@ def report_build(
         given = open_capture(capture, allow_outside=allow_outside) if capture is not None else None
         facts = build_facts(folder, state, given, allow_outside=allow_outside)
         path, verdict = write_build_report(folder, facts, progress, experiments)
-        # Record the new file, or the next --resume would write the report again.
+        # Record the new file; otherwise the next --resume would write the report again.
         known = state.stages.get("report")
         result = dict(known.result if known else {}) | {"file": path.name, "verdict": verdict}
         if facts.capture:
@@ -200,7 +200,7 @@ def is_build(folder: Path) -> bool:
 
 
 def fitted_poses(folder: Path) -> Path:
-    """Return the tracks that the model of a build was fitted to: the first pass, without the model as a prior."""
+    """Return the tracks to which a build fitted its model: those of the first pass, without the model as a prior."""
     first = folder / FIRST_PASS
     return first if first.is_file() else folder / "tracks.npz"
 
@@ -219,7 +219,7 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
     """Return the facts of a build, with its capture if it can be found.
 
     Args:
-        capture: None: use the path recorded in the build.
+        capture: capture.toml or its folder; None: use the path recorded in the build.
         allow_outside: allow paths in the capture that point outside its folder.
     """
     record = state.stages.get("report")
@@ -248,12 +248,12 @@ def relative_capture_path(capture: Capture, folder: Path) -> str:
     """Return the path of a capture relative to the rig's folder; absolute on another drive."""
     try:
         return os.path.relpath(capture.folder, folder.resolve())
-    except ValueError:  # another drive
+    except ValueError:  # on another drive
         return str(capture.folder)
 
 
 def attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
-    """Run a part of the report; on failure, list it as left out and return None."""
+    """Run a part of the report; on failure, list the part as left out and return None."""
     try:
         with explain_missing_packages():
             return work()

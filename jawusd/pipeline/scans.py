@@ -32,7 +32,7 @@ class ScanSummary(TypedDict):
     labels_file: str | None  # None if none was read or written
     faces: int
     pieces: int
-    merged_vertices: int  # number of vertices that coincide with another one
+    merged_vertices: int  # number of vertices that coincide with another vertex
     empty_faces: int
     repeated_faces: int
     crown_percent: float  # percentage of the vertices

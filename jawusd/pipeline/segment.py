@@ -44,9 +44,9 @@ ARCHES = ("upper", "lower")
 class SegmentOptions:
     """Options of the segmentation."""
 
-    keys: Path | None = None  # folder with hand-drawn masks or strokes of some frames
-    resume: bool = False  # keep finished frames
-    jobs: int = 2  # threads
+    keys: Path | None = None  # folder with masks or strokes drawn by hand for some frames
+    resume: bool = False  # whether to keep finished frames
+    jobs: int = 2  # number of threads
 
 
 @explain_missing_packages()
@@ -61,7 +61,7 @@ def segment_teeth(
         folder: output folder of masks CAMERA/upper/000123.png, numbered by the camera's own frames.
 
     Returns:
-        The record of every frame.
+        The record of all frames.
 
     Raises:
         CaptureError: fewer than two cameras have a video, or one cannot be decoded.
@@ -229,7 +229,7 @@ class _Segmentation:
             known = {name: model.counts() for name, model in colours.items()}
             with self._opened(frame, pictures) as shown:
                 _, record = next(follow)
-            if (record.status == LOST).any():  # do not learn colours from the wrong region
+            if (record.status == LOST).any():  # forget colours learned from the wrong region
                 for name, model in colours.items():
                     model.restore(*known[name])
             state.save(frame, step)

@@ -1,4 +1,4 @@
-"""Poses tracked by colour alone: stored beside the masks that were segmented around them, and compared with tracks."""
+"""Poses tracked by colour alone, stored beside the masks that were segmented around them and compared with tracks."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from jawusd.pipeline.subject import registration_of
 if TYPE_CHECKING:
     from jawusd.tracking.region.tracker import RegionPose
 
-# Distance between jaw poses from masks and from colours above which one of them must be wrong [mm]; correct poses of
-# three takes differed by at most 0.9. Fractions of wrong or lost frames above which a take is partly unreliable, and
-# unusable.
+# Maximum distance [mm] between the jaw poses from masks and from colours, above which one of them must be wrong;
+# correct poses of three takes differed by at most 0.9 mm. Fractions of wrong or lost frames above which a take is
+# reported as doubtful (`_FEW`) or as not usable (`_MANY`).
 _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 
@@ -77,7 +77,7 @@ def _read(path: Path) -> tuple[dict[int, RegionPose], str]:
 
 
 def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[Tracks, list[Finding]]:
-    """Combine tracks of automatic masks with the poses tracked by colour; return also findings on their agreement.
+    """Combine tracks of automatic masks with the poses tracked by colour; also return findings on their agreement.
 
     Tracks of other masks are returned unchanged. Masks segmented around a wrong pose confirm that pose; colour edges
     have independent errors, so the wrong pose is detected as a disagreement. Findings: "footage_doubtful" [%] for

@@ -29,13 +29,14 @@ FORMAT = "jawusd-segment/1"
 _MAX_LEARNED_BYTES = 1 << 20
 # Masks below this confidence need inspection.
 _DOUBTFUL = 0.5
-# Symptoms of a bad mask, with the sign of the direction that is worse; each is compared with its median over the take.
+# Symptoms of a bad mask: 1 if larger values are worse, -1 if smaller values are. Each is compared with its median over
+# the take.
 _SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
 _LEAST_SPREAD = {"contrast": 0.03, "unexpected": 0.01, "residual_px": 0.05, "uncovered": 0.01}
 _USUAL_OFF = 3.0  # deviation, in robust sigmas, at which a single symptom halves the confidence
-# Likely outline error [px of the working image]: at an image edge, without one, and between the arches. Integrated
-# along the outline and divided by the mask's area, it is the fraction of the mask that may be wrong. It is comparable
-# across cameras, so frames of all cameras are pooled, with a stricter limit.
+# Likely outline error [px of the working image] along image edges, where there is no edge, and between the arches. Its
+# integral along the outline, divided by the mask's area, is the fraction of the mask that may be wrong. This fraction
+# is comparable across cameras, so frames of all cameras are pooled, with a stricter limit.
 _OUTLINE_PX = (0.4, 2.0, 0.6)
 _OUTLINE, _OUTLINE_SPREAD, _OUTLINE_OFF = "outline", 0.01, 1.5
 _SHEET_FRAMES = 12
@@ -56,7 +57,7 @@ class CameraEntry(TypedDict):
 
 
 class TrackEntry(TypedDict):
-    """Fields of `FrameSummary` on the quality of tracking."""
+    """The fields of `FrameSummary` that describe the quality of tracking."""
 
     used: list[list[bool]]
     coverage: list[Pair]
@@ -86,7 +87,7 @@ class MaskConfidence(TypedDict):
 
 
 class Learned(TypedDict):
-    """Result of learning from drawn masks: their number, and the disagreement with them before and after."""
+    """Result of learning from drawn masks: number of masks, and disagreement with them before and after learning."""
 
     pictures: int
     disagreement: list[float]
@@ -241,7 +242,7 @@ def _outline_doubt(found: Sequence[CameraEntry]) -> Array:
 
 
 def _off(values: Array, groups: NDArray[np.str_], least_spread: float) -> Array:
-    """Return how many robust sigmas values (N, 2) are above the median of their group and arch, shape (N, 2)."""
+    """Return by how many robust sigmas values (N, 2) exceed the median of their group and arch, shape (N, 2)."""
     out = np.zeros_like(values)
     for group in np.unique(groups):
         of = groups == group

@@ -78,7 +78,7 @@ class VideoShot:
 
     Attributes:
         cameras: calibrated cameras with a video, by name.
-        footage: the images of these cameras.
+        footage: the images of those cameras.
         take: tracks the teeth.
     """
 
@@ -181,15 +181,15 @@ class SolveSummary(TypedDict):
     solved: int
     carried: list[tuple[int, int]]  # runs of frames (first, last) in which an arch is occluded
     lost: list[tuple[int, int]]  # runs of frames in which no pose fits the images
-    within_tolerance: int  # outside the bound, within the tolerance of measured poses
-    outside: int  # beyond the tolerance
+    within_tolerance: int  # frames outside the bound but within the tolerance of measured poses
+    outside: int  # frames beyond the tolerance
     cameras: list[str]
     sigma_mm: dict[str, float]  # median standard deviation of d1, d2, d3 over solved frames
-    worst_sigma_mm: dict[str, float]  # the largest over all frames
+    worst_sigma_mm: dict[str, float]  # maximum over all frames
     limits: str  # what limits the accuracy, in words
     focal: NotRequired[
         dict[str, tuple[float, float]]
-    ]  # estimated over calibrated focal length, and its sigma, by camera
+    ]  # ratio of the estimated to the calibrated focal length, and its sigma, by camera
     findings: NotRequired[list[dict[str, str | float | int]]]
 
 
@@ -217,7 +217,8 @@ def solve(
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
         prim: path of the rig's prim, if a stage has several; an animation layer then targets the stage.
         overlay: video to write (.mp4) of the solved scans over all cameras side by side.
-        report: page to write (.html): d with sigma, frames in which an arch is hidden, verdicts, findings and images.
+        report: page to write (.html), with d and sigma, frames in which an arch is hidden, verdicts, findings and
+            images.
         fixed_head: the cameras are head-mounted.
         free_focal: estimate focal lengths; those of the calibration may be off by 10 %.
         jobs: number of threads; the result does not depend on it.
@@ -356,7 +357,7 @@ def solve_summary(performance: Performance) -> SolveSummary:
 
 
 def _runs(p: Performance, state: SolveState) -> list[tuple[int, int]]:
-    """Return the runs of frames in a state, first and last frame of each."""
+    """Return the first and last frame of each run of frames in a state."""
     runs: list[tuple[int, int]] = []
     for frame in p.frames[p.state == state].tolist():
         if runs and runs[-1][1] == frame - 1:

@@ -22,7 +22,7 @@ from jawusd.pipeline.report import attempt, camera_facts
 from jawusd.pipeline.state import Progress, make_folder, package_versions
 
 PAGE = ".html"
-_MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # frames drawn for each reason, in addition to a typical frame
+_MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # number of frames drawn for each reason
 
 
 @explain_missing_packages()
@@ -135,7 +135,7 @@ def _overlays(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> t
 
 
 def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return rows of frames to inspect, each with the reason: an arch hidden or lost, outside, uncertain, or typical.
+    """Return the rows of frames to inspect, with reasons: arch hidden or lost, pose outside or uncertain, or typical.
 
     Raises:
         ValueError: the tracks do not come from a solve.

@@ -25,7 +25,7 @@ _PICTURES = 5  # number of images of a board clip that are examined
 _USUAL_RATES = tuple(Fraction(n, d) for d in (1, 1001) for n in (24 * d, 25 * d, 30 * d, 50 * d, 60 * d, 120 * d)) + (
     *(Fraction(n * 1000, 1001) for n in (24, 30, 60, 120)),
 )
-_RATE_TOLERANCE = 2e-4  # relative; 24 and 23.976 differ by 1e-3
+_RATE_TOLERANCE = 2e-4  # relative difference below which rates are equal; 24 and 23.976 differ by 1e-3
 
 
 @dataclass
@@ -46,7 +46,7 @@ def start_capture(folder: Path, square_mm: float | None, fps: float | None, prog
     Args:
         folder: folder with footage, scans, and board clips or a calibration.
         square_mm: side of the board's squares [mm], which cannot be derived from images.
-        fps: frame rate; None: that of the clips.
+        fps: frame rate; None: the rate of the clips.
 
     Raises:
         CaptureError: the path is not a folder.

@@ -32,14 +32,14 @@ from jawusd.formats.text import parse_json, read_text
 FAMILY, VERSION = "jawusd-build", 1
 BUILD_FILE = "build.json"
 LOCK_FILE = ".jawusd-lock"
-CALIBRATION = "calibration.toml"  # made from the boards if the capture names no calibration
+CALIBRATION = "calibration.toml"  # written by the build if the capture names no calibration
 LABELS = "labels"  # folder of the labels of scans that are neither painted nor labelled
 FIRST_PASS = "first_pass.npz"  # tracks without the model as a prior, to which the model is fitted
 _CHUNK_BYTES = 1 << 20
 _ENDING_S = 2.0  # time to wait for a lock: a killed build keeps it until the system has freed its memory
-_MOST_BYTES = 64 << 20  # largest size of build.json, which lists every mask file of a take
+_MOST_BYTES = 64 << 20  # maximum size of build.json, which lists every mask file of a take
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-# Error numbers if another process holds the lock; others mean that the file system does not support locks.
+# Error numbers that mean that another process holds the lock; others mean that the file system does not support locks.
 _HELD = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
 _MAKE_AGAIN = "Run `jawusd build ... --resume` to make it again, or restore the file that the build wrote."
 _AGAIN = "Delete it, or build with --fresh into a new folder."
@@ -106,7 +106,7 @@ class BuildState:
         return None if any(self._changed(*output) for output in record.outputs.items()) else record
 
     def changed(self) -> list[Finding]:
-        """Return an error for every file that is missing, or is not what the build wrote."""
+        """Return an error for every file that is missing or differs from what the build wrote."""
         outputs = [output for record in self.stages.values() for output in record.outputs.items()]
         return [
             Finding("build_changed", "error", f"{message} since the build", path=name, hint=_MAKE_AGAIN)

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 TEETH = {"upper": "upper_teeth", "lower": "lower_teeth"}
 
-# Fraction of the crown border without a crease above which the labels need review. Of 58 synthetic scans, all 51 with a
-# mean border error below 0.3 mm are below it; plaster casts of patients have 0.07 to 0.11, one without teeth 0.77.
+# Fraction of the crown border without a crease above which the labels need review. All 51 of 58 synthetic scans with a
+# mean border error below 0.3 mm are below it; plaster casts of patients have 0.07 to 0.11, a cast without teeth 0.77.
 _WEAK_SHARE = 0.15
 
 Origin = Literal["file", "paint", "shape"]
@@ -43,7 +43,7 @@ class LabelledScan:
     mesh: Mesh  # with labels, unless painted
     origin: Origin
     labels: ScanLabels | None  # None if the scan is painted
-    shape: Labelling | None  # labelling by shape, if there were neither paint nor labels
+    shape: Labelling | None  # result of labelling by shape, if there were neither paint nor labels
     findings: tuple[Finding, ...]
 
 
@@ -190,7 +190,7 @@ def registered_meshes(meshes: Mapping[str, Mesh], meta: Mapping[str, object]) ->
 
 
 def registration_of(meta: Mapping[str, object]) -> Array | None:
-    """Return the registration of the lower scan in the metadata of tracks or model, shape (4, 4); None without."""
+    """Return the registration (4, 4) of the lower scan in the metadata of tracks or model; None if there is none."""
     found = meta.get("registration")
     if not isinstance(found, dict) or not found.get("applied"):
         return None
@@ -199,14 +199,14 @@ def registration_of(meta: Mapping[str, object]) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A person: anatomical axes, landmarks and meshes, for fitting and reports."""
+    """A subject for fitting and reports: anatomical axes, landmarks and meshes."""
 
     name: str  # name of the subject or the capture
     T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
     landmarks: Array  # `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3)
     meshes: Mapping[str, Mesh]  # by the names in `MESHES`, scan frame [mm]; may be empty
     fps: float | None = None  # frame rate of the poses, None if unknown
-    T_rest: Array = field(default_factory=lambda: np.eye(4))  # T_skull_mandible of the closed bite, shape (4, 4)
+    T_rest: Array = field(default_factory=lambda: np.eye(4))  # T_skull_mandible with the teeth closed, shape (4, 4)
     inferred: tuple[str, ...] = ()  # quantities derived from the meshes instead of given
 
     def measured_points(self) -> Array | None:

@@ -46,17 +46,17 @@ class TrackSummary(TakeNotes):
     frames: int
     tracked: int
     lost: list[int]  # frame numbers
-    lost_reasons: NotRequired[dict[str, dict[str, int]]]  # frames lost for each reason, by arch
+    lost_reasons: NotRequired[dict[str, dict[str, int]]]  # number of frames lost for each reason, by arch
     recovered: int
     without_a_camera: int
     prior_aided: int
     sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if unknown
     coverage_error_percent: float | None  # uncovered fraction of the masks used, None without masks
-    frames_used: NotRequired[dict[str, int]]  # number of frames that used a camera, by camera
+    frames_used: NotRequired[dict[str, int]]  # number of frames in which a camera was used, by camera
 
 
 class ArchSummary(TypedDict):
-    """Tracking of one arch in a frame; for a lost arch also the quantity that failed its check, and the limit."""
+    """Tracking of one arch in a frame; for a lost arch, also the quantity that failed its check, and its limit."""
 
     status: str
     masks_used: list[str]

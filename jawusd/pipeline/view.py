@@ -31,7 +31,7 @@ CAPTURED = "captured take"
 
 _TRACKS = "tracks.npz"
 _ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
-_MOST_FACES = 8_000  # per mesh; renders smoothly in a browser without a GPU
+_MOST_FACES = 8_000  # maximum number of faces of a mesh; renders smoothly in a browser without a GPU
 
 
 @explain_missing_packages()
@@ -128,7 +128,7 @@ def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
 
 
 def part_of(mesh: Mesh, chosen: Mask) -> Mesh:
-    """Return the chosen faces of a mesh, a mask of shape (F,), with the vertices they use."""
+    """Return the faces of a mesh chosen by a mask (F,), with the vertices that they use."""
     used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
     return Mesh(
         mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), None if mesh.colors is None else mesh.colors[used]

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 CAPTURE_FILE = "capture.toml"
 _TRACKS = "tracks.npz"
 _SPECKS_PERCENT = 0.5
-_TILE_PX = (480, 360)  # size of each camera's tile; three tiles fill the width of the page
+_TILE_PX = (480, 360)  # maximum size of a camera's tile; three tiles fill the width of the page
 _FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
 
 
@@ -221,7 +221,7 @@ class _Footage:
         return [PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
 
     def teeth_region(self, name: str, frame: int) -> tuple[float, float, float, float] | None:
-        """Return left, top, right and bottom [px] of the masks of a camera at a frame, None without any."""
+        """Return left, top, right and bottom [px] of the masks of a camera at a frame; None without masks."""
         from jawusd.media.masks import open_masks
 
         source = next(camera for camera in self.capture.cameras if camera.name == name)

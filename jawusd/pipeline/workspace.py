@@ -47,7 +47,7 @@ class Stage(Generic[R_co]):
 
 
 class StageMissing(Exception):
-    """Raised by a dry run when a stage would have to run."""
+    """Raised in a dry run when a stage would have to run."""
 
 
 class Workspace:
@@ -90,13 +90,13 @@ class Workspace:
         """Run a stage, or reuse its record.
 
         Args:
-            parts: parts of the capture that it reads, by the names of `capture_inputs.input_files`.
-            settings: all else on which its result depends: options, and inputs and outputs of earlier stages.
+            parts: parts of the capture that the stage reads, by the names of `capture_inputs.input_files`.
+            settings: everything else that determines the result: options, and inputs and outputs of earlier stages.
             work: function that runs the stage; returns the files written, inside the folder, and the result for
                 build.json.
 
         Raises:
-            CaptureError: an input changed while the stage ran; it is not recorded.
+            CaptureError: an input changed while the stage ran; the stage is not recorded.
         """
         inputs = hash_value([self.hashes(parts), *settings, __version__])
         record = self.state.valid(stage.name, inputs)
@@ -115,7 +115,7 @@ class Workspace:
         return self.state.finish(stage.name, inputs, outputs, time.perf_counter() - start, result)
 
     def _refuse_changes(self, stage: str) -> None:
-        """Raise an error if inputs of a stage were edited while it ran, as it is unknown which version it read.
+        """Raise an error if inputs of a stage were edited while it ran, as it is unknown which version the stage read.
 
         Edits of capture.toml that change no value are ignored.
         """
@@ -167,7 +167,8 @@ def check_folder(folder: Path, *, resume: bool, fresh: bool) -> None:
     """Check that a build may write to a folder.
 
     Raises:
-        OutputError: it is a file, is not empty, or contains a build and neither `resume` nor `fresh` is set.
+        OutputError: the path is a file, or the folder is not empty, or it contains a build and neither `resume` nor
+            `fresh` is set.
     """
     if folder.is_file():
         raise OutputError("is a file; the rig needs a folder.", path=folder, hint="Choose a new folder.")
