@@ -215,7 +215,7 @@ def explain_missing_packages(extra: str | None = None) -> Iterator[None]:
     """Name the extra to install when a package is missing; a context manager and decorator.
 
     Args:
-        extra: the extra of all packages used inside; by default it is looked up by the missing package.
+        extra: the extra that provides all packages used in the block; by default, that of the missing package.
 
     Raises:
         MissingDependencyError: instead of the ModuleNotFoundError.

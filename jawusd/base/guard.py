@@ -22,15 +22,15 @@ from jawusd.base.errors import ResourceError
 
 try:
     import resource
-except ImportError:  # on Windows, which has no such limits
+except ImportError:  # Windows has no resource limits
     resource = None  # type: ignore[assignment]  # a module on other systems
 
 #: Environment variable: how much memory [GB] a command may use; 0 for no limit.
 SETTING = "JAWUSD_MEMORY_GB"
 
-_FRACTION, _MIN_GB = 0.75, 4.0  # default limit, as fraction of the memory, and its minimum, enough for usual builds
-_MIN_SPACE_GB = 1.5  # least address space that is accepted; OpenUSD's libraries take 1.3 GB
-_CHILD = "_JAWUSD_CHILD"  # environment variable that marks the child where processes cannot fork
+_FRACTION, _MIN_GB = 0.75, 4.0  # default limit: fraction of the memory, and minimum for usual builds
+_MIN_SPACE_GB = 1.5  # minimum accepted address space; OpenUSD's libraries take 1.3 GB
+_CHILD = "_JAWUSD_CHILD"  # environment variable set in the child on systems without fork
 _SI_KERNEL = 0x80  # si_code in Linux's siginfo.h: sent by the terminal, which signals the child as well
 _PR_SET_PDEATHSIG = 1  # from Linux's prctl.h
 _PASSED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGTSTP", "SIGCONT")
@@ -59,7 +59,7 @@ def run_in_child() -> None:
     passed = {getattr(signal, name) for name in _PASSED}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {*passed, signal.SIGCHLD})
     parent = os.getpid()
-    gc.freeze()  # a garbage collection would copy the pages that parent and child share
+    gc.freeze()  # otherwise, garbage collection would copy the pages shared by parent and child
     child = os.fork()
     if child:
         _exit_like(_wait(child, passed))
@@ -90,7 +90,7 @@ def machine_memory() -> int:
     except (AttributeError, ValueError, OSError):  # Windows has no sysconf
         return 0
     for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        with contextlib.suppress(OSError, ValueError):  # "max"
+        with contextlib.suppress(OSError, ValueError):  # "max" means no limit
             found = min(found, int(Path(name).read_text()))
     return found
 
@@ -129,7 +129,7 @@ def _lower(kind: int, most: int) -> None:
 
 
 def out_of_memory(path: str | PathLike[str] | None = None) -> ResourceError:
-    """Return the out-of-memory error for a file, by default the one recorded last, with the limit."""
+    """Return the out-of-memory error for a file, by default the one recorded last; its message includes the limit."""
     limits = []
     if resource is not None:
         found = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_DATA, resource.RLIMIT_AS))
@@ -144,7 +144,7 @@ _MORE = f"Raise the limit with {SETTING} (and ulimit -v), or use a smaller input
 
 
 def note_input(path: str | PathLike[str]) -> None:
-    """Record the file that is read next, for the message if the program crashes."""
+    """Record the file about to be read, which the error message names if the program crashes."""
     if _current is not None:
         name = os.fsencode(os.path.abspath(path))[: mmap.PAGESIZE - 1]
         _current[:] = name.ljust(mmap.PAGESIZE, b"\0")
@@ -241,7 +241,7 @@ def _exit_with_error(error: ResourceError) -> NoReturn:
 
 
 def _run_in_subprocess() -> NoReturn:
-    """Run the program in a second Python process and exit with its status, where processes cannot fork."""
+    """Run the program in a second Python process and exit with its status, on systems without fork."""
     import subprocess
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the console interrupts both processes
@@ -253,7 +253,7 @@ def _run_in_subprocess() -> NoReturn:
 
 
 _M_MMAP_THRESHOLD = -3  # parameter of mallopt, from glibc's malloc.h
-_LARGE_BYTES = 8_000_000  # mapping costs time: with a threshold of 1 MB, a report takes 10 % longer
+_LARGE_BYTES = 8_000_000  # threshold above which glibc maps arrays; mapping is slow: 1 MB makes a report 10 % slower
 
 
 def map_large_arrays() -> None:
@@ -273,7 +273,7 @@ def map_large_arrays() -> None:
 def trim_memory() -> None:
     """Return freed memory to the system with glibc; other C libraries do so on their own.
 
-    glibc does not return free blocks below one in use: about 100 MB after each stage of a build.
+    glibc keeps free blocks that lie below a block in use: about 100 MB after each stage of a build.
     """
     if sys.platform == "linux":
         import ctypes

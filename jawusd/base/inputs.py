@@ -19,7 +19,7 @@ _given: ContextVar[tuple[Path, ...]] = ContextVar("allowed_folders", default=())
 
 
 def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatError) -> None:
-    """Check that an input is a regular file, and record it as the current one. Missing files are left to the reader.
+    """Check that an input is a regular file, and record it as the current one; the reader reports missing files.
 
     Reading an idle pipe would block, and reading a device may never end. Anonymous pipes are allowed: shells use them
     for process substitution.
@@ -28,7 +28,7 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
         JawusdError: the path is a folder, a named pipe, a device or a socket; raised as an instance of `error`.
     """
     note_input(path)
-    there = Path(os.path.realpath(path))  # "pipe:[1234]" for an anonymous pipe, which does not exist
+    there = Path(os.path.realpath(path))  # for an anonymous pipe "pipe:[1234]", a path that does not exist
     try:
         wrong = there.exists() and not there.is_file()
     except OSError:  # the name is too long; the reader reports it
@@ -71,12 +71,15 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
 
 
 def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
-    """Let stages reference files in folders and subfolders, besides those of the setting; replaces earlier calls."""
+    """Allow stages to reference files in folders and subfolders, besides those of the environment variable.
+
+    Replaces the folders of earlier calls.
+    """
     _given.set(tuple(Path(folder).resolve() for folder in folders))
 
 
 def allowed_folders() -> list[Path]:
-    """Return the allowed folders, links resolved."""
+    """Return the allowed folders, with links resolved."""
     named = [Path(folder).resolve() for folder in os.environ.get(SETTING, "").split(os.pathsep) if folder]
     return [*_given.get(), *named]
 

@@ -24,7 +24,7 @@ TWIST_ORDER = ["omega", "v"]
 NamedArrays = dict[str, Array]  # arrays of any dtype; `take` checks those that are used
 JsonObject = dict[str, object]
 
-# Ten times the largest array of a take of 20,000 frames; guards against zip bombs.
+# Maximum unpacked size of a file, ten times that of the largest array of 20,000 frames; guards against zip bombs.
 _MAX_ARRAY_BYTES = 512 << 20
 #: Exceptions of zipfile and numpy for damaged members, besides OSError: decoder errors, unsupported compression methods
 #: and encryption (RuntimeError), headers that declare too much data (MemoryError) or nest too deeply, and errors of
@@ -109,7 +109,7 @@ def check_units(meta: Mapping[str, object], path: str | os.PathLike[str]) -> Non
 def upgraded_model(arrays: NamedArrays, path: object) -> NamedArrays:
     """Return the arrays of a model of any version under their current names.
 
-    Version 1 stored the tolerance of measured poses as the smallest margin of a valid pose, "margin_limit_mm".
+    Version 1 stored the tolerance of measured poses as the minimum margin of a valid pose, "margin_limit_mm".
 
     Raises:
         FormatError: that margin is not a number.

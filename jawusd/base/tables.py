@@ -4,8 +4,8 @@ All readers share these rules:
 
 * encoding: UTF-8, or UTF-16 and UTF-32 by the byte order mark or the first bytes;
 * line ends: LF, CRLF, CR;
-* separator: tab, semicolon or comma, the first that splits header and first row into equally many cells, or that splits
-  the header; a line `sep=;` overrides this;
+* separator: tab, semicolon or comma, the first that splits header and first row into the same number of cells; if there
+  is none, the first that splits the header; a line `sep=;` overrides this;
 * decimal sign: a point, or a comma if no number of the table has a point. Thousands separators are not supported, and
   the ambiguous `1,234` is rejected.
 
@@ -40,7 +40,7 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
 
     Args:
         path: the file.
-        most_bytes: the largest accepted size.
+        most_bytes: maximum size of the file.
         encoding: used unless a byte order mark or null bytes indicate UTF-16 or UTF-32.
 
     Raises:
@@ -116,7 +116,7 @@ def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool
 
     Args:
         path: the file.
-        most_bytes: the largest accepted size.
+        most_bytes: maximum size of the file.
         comment: prefix of lines to skip.
         short_rows: allow rows to end early; the caller checks them with `check_width`.
 

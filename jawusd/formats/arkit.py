@@ -40,11 +40,11 @@ _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:[.,]\d+)?)")
 _RATES = (24, 25, 30, 48, 50, 60, 100, 120)
 _NTSC_SLACK = 0.006
 _DAY_S = 86_400
-_FEWEST_REPEATED = 3  # distinct time codes needed to detect repetition
-_FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # allowed rows of the median second, over the requested rate
-_MOST_STEPS_OFF = 2.0  # largest deviation of the step across seconds from the step within seconds [steps]
-# ARKit's weights are 0 to 1. With a calibrated neutral face or gains they exceed this slightly; percentages and
-# standardised weights exceed it by far.
+_FEWEST_REPEATED = 3  # minimum number of distinct time codes for detecting repetition
+_FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # range of median rows per second / requested rate
+_MOST_STEPS_OFF = 2.0  # maximum deviation of the step across seconds from that within a second [steps]
+# Accepted range of weights, and the weight above which they are taken as percentages. ARKit's weights are 0 to 1; with
+# a calibrated neutral face or gains they exceed this slightly, percentages and standardised weights by far.
 _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
 _MAX_MAPPING_BYTES = 1 << 20
@@ -65,7 +65,7 @@ class FaceCapture:
 
 
 def shares_of(weights: Array) -> Array:
-    """Return weights (F, 4) as fractions of full opening, reach to the left and reach forward, shape (F, 3)."""
+    """Return opening, leftward and forward motion of weights (F, 4) as fractions of their full ranges, shape (F, 3)."""
     opening, left, right, forward = weights.T
     return np.stack([opening, left - right, forward], axis=1)
 
@@ -157,8 +157,8 @@ def _seconds_and_frame(code: str, named: str, path: Path) -> tuple[int, float]:
 def _spread(codes: Array) -> Array:
     """Return the frame within the second of every row; rows that repeat a time code are spread evenly.
 
-    Rows are spread only if most time codes are repeated. Of a time code with fewer rows than usual, the last rows are
-    assumed to be missing, or the first rows if it begins the recording.
+    Rows are spread only if most time codes are repeated. If a time code has fewer rows than usual, its last rows are
+    assumed to be missing, or its first rows if it begins the recording.
 
     Args:
         codes: seconds and frames within the second, shape (F, 2).
@@ -185,7 +185,7 @@ def _numbers_per_second(
     step = float(np.median(np.diff(inside)[same])) if same.any() else 1.0
     at_rate = round(given * step, 3)  # rate of the time codes if the samples have the given rate
     rates = [rate for rate in sorted({*_RATES, given, at_rate}) if rate > highest and rate % 1 == 0]
-    # Not at the start of a minute, where frame numbers may be dropped.
+    # Starts of minutes are excluded, because frame numbers may be dropped there.
     turns = np.flatnonzero((np.diff(seconds) == 1) & (seconds[1:] % 60 != 0))
     # The first and last seconds are incomplete.
     rows_of_whole = np.unique(seconds, return_counts=True)[1][1:-1]

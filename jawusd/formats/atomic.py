@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # Prefix of unfinished files and folders, by which leftovers of killed runs are found and deleted.
 _UNFINISHED = ".jawusd-tmp-"
-_LONGEST_SUFFIX = 16  # bytes; keeps temporary names within the length limit
+_LONGEST_SUFFIX = 16  # maximum length of a kept suffix [bytes], so that temporary names are not too long
 #: Hint for files and folders that cannot be written.
 ELSEWHERE = "Choose a folder where you have write access."
 # Errors of file systems that lack fsync or file modes.
@@ -32,7 +32,7 @@ def destination(path: str | os.PathLike[str]) -> Path:
     """Return the file that an output is written to: the path itself or, for a link within its folder, its target.
 
     Raises:
-        OutputError: a folder, a disk, a socket, a link out of its folder, or an invalid name.
+        OutputError: the path is a folder, a disk, a socket, a link that leads out of its folder, or an invalid name.
     """
     target = Path(path)
     try:
@@ -56,7 +56,7 @@ def refuse_existing(path: Path, force: bool) -> None:
     """Check before any work that an output may be written: it does not exist yet, or `force` is set.
 
     Raises:
-        OutputError: it exists, or as `destination`.
+        OutputError: it exists, or `destination` rejects the path.
     """
     destination(path)
     if os.path.lexists(path) and not force and not is_stream(path):

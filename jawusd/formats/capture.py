@@ -18,7 +18,7 @@ from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
 
 FAMILY, VERSION = "jawusd-capture", 1
-_MOST_PICKS = 200  # per arch; the number of triples of picks grows with the cube
+_MOST_PICKS = 200  # maximum number of picks per arch; tracking tries triples, whose number grows cubically
 
 
 class Sync(Strict):
@@ -156,7 +156,7 @@ class Capture(Strict):
             camera.model_copy(update={key: value for key, value in own.items() if getattr(camera, key) is None})
             for camera in self.cameras
         )
-        object.__setattr__(self, "cameras", cameras)  # the model is frozen
+        object.__setattr__(self, "cameras", cameras)  # bypasses the check for frozen models
         names = [camera.name for camera in self.cameras]
         listed = ", ".join(names)
         twice = [name for name in names if names.count(name) > 1]
@@ -205,7 +205,7 @@ class Capture(Strict):
         return self.sync.reference or self.cameras[0].name
 
 
-_MOST_LOOKED_AT = 4096  # leading bytes searched for null bytes
+_MOST_LOOKED_AT = 4096  # number of leading bytes that are searched for null bytes
 
 
 def _refuse_other_files(path: Path) -> None:

@@ -30,7 +30,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
     check_input(path)
     try:
         data = path.read_bytes()
-        encoding = json.detect_encoding(data)  # same rule as `jawusd.base.tables.read_text`; preserved on writing
+        encoding = json.detect_encoding(data)  # by the rule of `jawusd.base.tables.read_text`; kept on writing
         text = data.decode(encoding)
         found = tomllib.loads(text).get(_TABLE)
         there = None if found is None else Bootstrap.model_validate(found)

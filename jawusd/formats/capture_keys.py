@@ -17,8 +17,8 @@ from typing import Annotated, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-_CLOSE = 0.6  # least difflib ratio of a key that is suggested for a misspelt one; "mask" and "masks" have 0.89
-_ALLOWED_SHOWN = 300  # characters
+_CLOSE = 0.6  # minimum difflib ratio between a misspelt and a suggested key; "mask" and "masks" have 0.89
+_ALLOWED_SHOWN = 300  # maximum length of a list of keys in messages [characters]
 
 Location = tuple[int | str, ...]
 #: Messages by pydantic's error type; names in braces are keys of the error's context.
@@ -184,13 +184,13 @@ def problems_of(
     for problem in sorted(found, key=lambda problem: not _is_unknown(problem["type"])):
         location, kind = problem["loc"], problem["type"]
         if kind == "too_short" and location in deeper:
-            continue  # the errors of its entries are reported
+            continue  # the errors of the list's entries are reported instead
         if _is_unknown(kind):
             out.append(_unknown_key(str(location[-1]), location[:-1], model, place(location[:-1], data)))
         elif kind == "missing" and any(
             table == location[:-1] and _meant(key, [str(location[-1])]) for table, key in unknown
         ):
-            continue  # misspelt, which is reported as an unknown key
+            continue  # the key is misspelt, and reported as an unknown key
         else:
             out.append(_wrong_value(problem, location, model, data))
     return out

@@ -17,7 +17,7 @@ from jawusd.formats.file_names import is_pattern, wrong_kind
 
 M = TypeVar("M", bound=BaseModel)
 _MOVE = "Move the file into that folder, or allow it with --allow-outside."
-_SHOWN = 3  # most names suggested
+_SHOWN = 3  # maximum number of suggested names
 _DRIVE = re.compile(r"[A-Za-z]:[\\/]")  # prefix of a Windows path
 _NO_NAME = re.compile(r"[\x00-\x1f]")  # control characters from TOML escapes, such as \t in videos\take.mp4
 _RELATIVE = "Write it relative to the capture's folder, with slashes, such as video/left.mp4."
@@ -46,7 +46,7 @@ def resolve_paths(
         try:
             problem = _problem(value, full, folder, allow_outside) or _misnamed(location, full)
             problem = problem or _named_twice(location, full, named, data)
-        except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, circular links
+        except (OSError, ValueError, RuntimeError) as error:  # too long a path, a null byte, a circular link
             problem = f"is not a valid path ({error!s:.100}).", None
         if problem is not None:
             text, hint = problem
@@ -71,7 +71,7 @@ def resolve_paths(
 
 
 def _where(location: Location, data: Mapping[str, object]) -> str:
-    """Return table and key, as `[[camera]] 2 ("left") video`."""
+    """Return table and key, such as `[[camera]] 2 ("left") video`."""
     keys = len(location) - 1
     while keys > 0 and isinstance(location[keys], int):
         keys -= 1

@@ -29,9 +29,9 @@ from jawusd.base.errors import CaptureError
 _CODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.,])(\d{2,3})")
 _HOURS_PER_DAY = 24
 _PATH = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
-_HEAD, _LONG_HEAD = 8, 16  # bytes of an atom's header (size and type), and of the header of atoms above 4 GB
-_TO_ENTRIES = 8  # bytes of a table's version, flags and count
-_MOST_ATOMS = 100_000  # limits the search in damaged files
+_HEAD, _LONG_HEAD = 8, 16  # length of an atom's header (size and type) [bytes], and that of atoms above 4 GB
+_TO_ENTRIES = 8  # length of a table's version, flags and count, before its entries [bytes]
+_MOST_ATOMS = 100_000  # maximum number of atoms that are read; limits the search in damaged files
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class ClipSource:
 class LightCurve:
     """Brightness of one clip over time."""
 
-    times_s: Array  # presentation time of every image after the first one [s], shape (n,)
+    times_s: Array  # presentation times, relative to the first image [s], shape (n,)
     frames: NDArray[np.int64]  # frame of each image on the clip's regular grid, shape (n,)
     brightness: Array  # mean brightness of each image, 0 .. 255, shape (n,)
     # times of abrupt darkening and brightening [frames], shapes (a,), (b,)
@@ -145,6 +145,6 @@ def _rate(file: BinaryIO, place: int) -> Fraction | None:
     entry = file.read(34)
     if len(entry) < 33 or entry[4:8] != b"tmcd":
         return None
-    # After type, index and flags: time scale, and units per frame.
+    # Time scale and units per frame follow type, index and flags.
     scale, duration = struct.unpack_from(">2I", entry, 24)
     return Fraction(scale, duration) if scale and duration else None

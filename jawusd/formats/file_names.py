@@ -22,7 +22,7 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mxf", ".mts", ".mpg
 PICTURES = (".png", ".tif", ".tiff", ".exr", ".dpx", ".jpg", ".jpeg")
 MESHES = (".ply", ".stl", ".obj", ".dcm")
 
-# Suffixes of the wrong file types for a key of capture.toml, by group of keys.
+# File types that are wrong for a group of keys of capture.toml, with their suffixes.
 _WRONG = {
     "scans": (("a video", VIDEOS), ("a picture", PICTURES)),
     "footage": (("a mesh", MESHES), ("a calibration", (".toml", ".json", ".xml", ".csv", ".yml", ".yaml"))),
@@ -44,7 +44,7 @@ def is_pattern(path: Path) -> bool:
     """Tell whether a path is a pattern of numbered files rather than one file."""
     try:
         return any(sign in path.name for sign in "%#*?") and not path.is_file()
-    except (OSError, ValueError):  # too long, or a null byte; reported by the reader
+    except (OSError, ValueError):  # the path is too long or has a null byte; the reader reports it
         return False
 
 

@@ -24,7 +24,7 @@ class Finding:
     severity: Severity
     message: str  # one sentence, without the place: what was found and what is allowed, with units
     value: float | None = None  # the measured value, in the unit given in the message
-    limit: float | None = None  # what is allowed, in the same unit
+    limit: float | None = None  # the limit of the value, in the same unit
     path: str | None = None
     camera: str | None = None
     frame: int | None = None

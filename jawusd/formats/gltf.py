@@ -24,7 +24,7 @@ _MM = 1e-3  # a millimetre in metres
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _Values = NDArray[np.float32] | NDArray[np.uint16] | NDArray[np.uint32]
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
-_VERTICES, _INDICES = 34962, 34963  # targets of buffer views
+_VERTICES, _INDICES = 34962, 34963  # glTF targets of buffer views
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A mesh with materials by face."""
+    """A mesh whose faces are grouped by material."""
 
     name: str
     vertices: Array  # positions [mm], shape (V, 3)
@@ -71,7 +71,7 @@ def save_glb(
     Args:
         path: File to write.
         name: Name of the root and of the animation.
-        materials: By the names that surfaces use.
+        materials: Materials, by the names that surfaces refer to.
         nodes: Nodes to write.
         generator: Name of the writing program.
         extras: Metadata of the animation.

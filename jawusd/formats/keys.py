@@ -15,10 +15,10 @@ from jawusd.base.tables import read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_model
 
-#: Most frames, an hour at 60 frames per second, since every frame is baked; and largest frame number.
+#: Maximum number of frames, an hour at 60 frames per second, since every frame is baked; maximum frame number.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
 _MAX_BYTES = 64 << 20
-#: Largest parameter [mm]: larger values overflow when projected into the bound.
+#: Maximum magnitude of a parameter [mm]: larger values overflow when projected into the bound.
 FARTHEST_MM = 1e6
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Parameter = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST_MM, le=FARTHEST_MM)]

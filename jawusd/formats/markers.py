@@ -47,7 +47,7 @@ _NOT_READ = {
 _LENGTHS = ("mm", "cm", "m")
 _MAX_BYTES = 1 << 28
 _MOST_FRAMES = 10_000_000
-_OUT_OF_SIGHT = 1e20  # coordinates of this magnitude or more mean a hidden marker
+_OUT_OF_SIGHT = 1e20  # coordinates of at least this magnitude indicate a hidden marker
 _INTERPOLATIONS = ("step", "linear", "parabolic", "cubic", "cubicstep", "quadraticstep", "sphericallinear")
 _LEADING_ZERO = re.compile(r"[+-]?0\d+")
 
@@ -118,7 +118,7 @@ def _read_table(path: Path) -> MarkerTable:
     rows, separator = split_rows(read_text(path, _MAX_BYTES), path, blank_rows=True)
     if not rows:
         raise FormatError("has no frames.", path=path)
-    if max(len(row) for _, row in rows) == 1:  # separated by spaces only
+    if max(len(row) for _, row in rows) == 1:  # columns are separated only by spaces
         rows = [(line, row[0].split()) for line, row in rows]
     keys = [row[0].strip().lower() for _, row in rows]
     if "marker_names" in keys or "data_included" in keys:
@@ -136,7 +136,7 @@ def _read_table(path: Path) -> MarkerTable:
 
 def _plain(rows: _Rows, separator: str, path: Path) -> Array:
     """Return the positions in plain numbers or an ArtiSynth probe, shape (F, N, 3)."""
-    if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # spaces within cells
+    if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # columns are also separated by spaces
         rows = [(line, separator.join(row).split()) for line, row in rows]
     probe = len(rows) > 1 and rows[1][1][0].strip().lower() in _INTERPOLATIONS
     if probe:
@@ -194,7 +194,7 @@ def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
     data = [(line, row) for line, row in rows if _is_number_or_blank(row[0])]
     header = next((row for _, row in rows if row[0].strip().lower() == "frame"), [])
     first = [cell.strip().lower() in ("frame", "time") for cell in header[:2]].count(True)
-    if not header:  # two extra columns are frame and time
+    if not header:  # extra columns at the beginning are frame and time
         filled = max((k + 1 for _, row in data for k, cell in enumerate(row) if cell.strip()), default=0)
         first = max(filled - 3 * count, 0)
     points = _positions(data, first, 3 * count, path)

@@ -12,10 +12,10 @@ from jawusd.base.arrays import Array, Mask
 
 GUM, TOOTH, BOUNDARY, BASE = 0, 1, 2, 3
 
-# Least excess of red or green over the other channels (of 255) in a painted label: pure red has 255, gum in
-# photographic textures, such as (200, 110, 110), less than this.
+# Minimum difference of red or green from the other channels (of 255) in a painted label: pure red has 255, gum in
+# photographic textures, such as (200, 110, 110), has less than 100.
 _PAINT_CONTRAST = 100
-_FEWEST_PAINTED = 0.01  # fraction of vertices below which a scan does not count as painted
+_FEWEST_PAINTED = 0.01  # minimum fraction of red or green vertices in a painted scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class Mark(NamedTuple):
 
     color: tuple[int, int, int]  # red, green, blue, 0 to 255
     meaning: str
-    apart_mm: float  # largest distance with this colour; negative: penetration beyond that of the closed bite
+    apart_mm: float  # maximum distance with this colour; negative: penetration deeper than in occlusion
 
 
 DEEP = Mark((120, 40, 200), "deeper than in the closed bite", -0.15)

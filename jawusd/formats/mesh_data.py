@@ -64,7 +64,7 @@ def byte_colors(values: Array) -> NDArray[np.uint8] | None:
     """Return colours (n, 3) of 0 to 1, 0 to 255 or 0 to 65535 as bytes; NaN becomes gray; None for negative values."""
     top = np.nanmax(values, initial=0.0)
     if np.nanmin(values, initial=0.0) < 0 or top > 65535:
-        return None  # not colours, but normals, for example
+        return None  # these are not colours but, for example, normals
     scale = 255.0 if top <= 1 else 1.0 if top <= 255 else 1 / 257
     return np.where(np.isfinite(values), np.round(values * scale), NO_COLOUR).astype(np.uint8)
 
@@ -103,7 +103,7 @@ def cut_polygons(vertices: Array, counts: Indices, corners: Indices) -> tuple[In
 def _fan_starts(vertices: Array, polygons: Indices) -> Indices:
     """Return the corner order of each polygon (m, n), rotated to start at a valid fan apex, shape (m, n)."""
     m, n = polygons.shape
-    turns = (np.arange(n)[:, None] + np.arange(n)) % n  # row k lists the corners from corner k on
+    turns = (np.arange(n)[:, None] + np.arange(n)) % n  # row k: all corners, beginning with corner k
     chosen = np.zeros(m, np.int64)
     points = vertices[np.clip(polygons, 0, len(vertices) - 1)]
     open_ones = np.ones(m, bool)

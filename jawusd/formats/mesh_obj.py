@@ -28,8 +28,8 @@ from jawusd.formats.mesh_data import (
 _MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
 _COUNTED = re.compile(r"^#\s*Faces:\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE)  # written by MeshLab above the faces
-# OBJ does not declare counts. A file is truncated if its last line does not end and at least this fraction of vertices
-# is unused.
+# Minimum fraction of unused vertices in a truncated file, whose last line also lacks a line break; OBJ does not declare
+# counts.
 _LEAST_LOOSE = 0.1
 
 
@@ -46,7 +46,7 @@ def read_obj(path: Path) -> MeshData:
     places: list[list[str]] = []
     counts: list[int] = []
     corners: list[str] = []
-    # Per face with negative indices: its first corner, and the vertices and texture coordinates so far.
+    # Per face with negative indices: number of corners, vertices and texture coordinates before it.
     relative: list[tuple[int, int, int]] = []
     for line in text.replace("\\\n", " ").split("\n"):
         words = (line.partition("#")[0] if "#" in line else line).split()

@@ -261,7 +261,7 @@ class _Reader:
         return np.array(starts, np.int64), np.array(counts, np.int64).reshape(rows, -1)
 
     def _table(self, groups: list[tuple[Indices, NDArray[np.void]]], counts: Indices) -> _Table:
-        """Return the table from rows that were read in groups; each group comes with its row indices."""
+        """Return the table assembled from groups of rows, each given with its row indices."""
         columns: dict[str, Array] = {}
         lists: dict[str, tuple[Indices, Array]] = {}
         for k, one in enumerate(self._element.properties):

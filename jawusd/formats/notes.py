@@ -32,7 +32,7 @@ class CameraCorrections(TypedDict, total=False):
 
 
 class Registration(TypedDict, total=False):
-    """Registration of the lower scan to the closed bite found in the take, in skull (scan) axes.
+    """Registration of the lower scan to the occlusion found in the take, in skull (scan) axes.
 
     `T` (4, 4) maps the lower scan from its given to its corrected position; shift and turn describe the same motion,
     about the centre of the lower crowns.
@@ -52,10 +52,10 @@ class TakeNotes(TypedDict, total=False):
     """Estimates for the whole take, stored in tracks and printed in summaries; pairs are (upper, lower)."""
 
     outline_bias_px: dict[str, list[float]]  # by camera: bias of the mask outlines at free edges
-    gum_bias_px: dict[str, list[float]]  # by camera: the same at the gum line
+    gum_bias_px: dict[str, list[float]]  # by camera: bias of the mask outlines at the gum line
     gum_line_mm: list[float]  # offset of the drawn gum line from the scans', along the surface towards the gum
-    registration: Registration  # of the lower scan, estimated from frames with the teeth together
-    calibration_rescaled_px: dict[str, list[list[int]]]  # by camera: (width, height) calibrated and recorded
+    registration: Registration  # registration of the lower scan, estimated in occlusion
+    calibration_rescaled_px: dict[str, list[list[int]]]  # by camera: calibrated and recorded (width, height)
     prior_spread_mm: float  # standard deviation of the model prior used for all final poses, if any
     findings: list[dict[str, str | float | int]]  # `Finding.as_json` of all warnings about the take
 
@@ -71,20 +71,20 @@ class TracksMeta(TakeNotes, total=False):
     outline_bias_sigma_px: dict[str, list[float]]
     gum_bias_sigma_px: dict[str, list[float]]
     gum_line_sigma_mm: list[float]
-    steady_error: list[list[list[float]]]  # per arch S (4, 4): the poses T_world_arch @ S fit the masks
+    steady_error: list[list[list[float]]]  # per arch: S (4, 4) such that T_world_arch @ S fits the masks
     extrinsics: CameraCorrections
-    focal: dict[str, list[float]]  # by camera: estimated over calibrated focal length, and its standard deviation
+    focal: dict[str, list[float]]  # by camera: estimated / calibrated focal length, and its standard deviation
     start: dict[str, object]  # how and on which frame tracking was initialised
     painted: list[bool]
     solver: str
     backend: str
     evaluations_per_row_and_frame: float
     fps: float  # frames per second of a performance
-    tolerance_mm: float  # largest distance outside the bound at which the rig accepts poses of a performance
+    tolerance_mm: float  # maximum distance outside the bound at which the rig accepts poses of a performance
 
 
 class ModelWarning(TypedDict):
-    """A movement that the take lacks, or a quality that is too low, for a good model."""
+    """A warning about a model: a movement that the take lacks, or insufficient quality."""
 
     code: str
     message: str

@@ -53,7 +53,7 @@ class Performance:
         d: jaw parameters [mm], shape (F, 3).
         covariance: covariance of a head twist in head axes about `pivot` (omega [rad], v [mm]) and of d [mm], shape
             (F, 9, 9).
-        pivot: point of the upper scan [mm], shape (3,).
+        pivot: reference point of the head twist, upper scan frame [mm], shape (3,).
         state: `SolveState`, shape (F,).
         found: arches whose outlines were used, (upper, lower), shape (F, 2).
         use: masks that were used, or cameras if there are no masks, shape (F, 2, C).

@@ -1,4 +1,4 @@
-"""The closed bite estimated from photographs: photos.json, format jawusd-photos/1."""
+"""The occlusion estimated from photographs: photos.json, format jawusd-photos/1."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class AlignedPhoto:
     T_cam_upper: Array  # upper scan to camera, shape (4, 4)
     outline_rms_px: float  # rms distance of drawn points from the outlines, in px of an image 1440 px wide
     outline_median_px: float
-    free_rms_px: float  # the same without gum lines
-    # worse arch's mean squared distance in position and direction, relative to half a millimetre; each at most 1
+    free_rms_px: float  # outline_rms_px without gum lines
+    # mean squared distance of the worse arch in position and direction, relative to 0.5 mm; each square is capped at 1
     misfit: float
-    other_hand: float  # misfit with the opposite handedness over that with this one, at the initial pose [-]
+    other_hand: float  # ratio of the misfits with the opposite and with the chosen handedness, at the initial pose [-]
     T_upper_lower_alone: Array  # the bite estimated from this photograph alone, shape (4, 4)
-    alone_off_mm: float  # distance of that bite from the common one at the lower incisor
+    alone_off_mm: float  # distance between that and the common bite at the lower incisor
 
     def as_json(self) -> dict[str, object]:
         """Return the fields for JSON."""

@@ -35,7 +35,7 @@ MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 PARAMETER_COLUMNS = ("d1", "d2", "d3")
 _MAX_BYTES = 1 << 30
-# Rigidity defect of a matrix written with 5 decimals.
+# Maximum rigidity defect of a matrix, which accepts matrices written with 5 decimals.
 _RIGID_TOLERANCE = 1e-3
 _ZERO_QUATERNION = 1e-6
 _JOINT_COLUMNS = "shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,qz,clamped_mm"
@@ -232,7 +232,7 @@ class JointDelta:
 
     shape: str  # ARKit's name
     weight: float  # 0 .. 1
-    d: Array  # the pose [mm], shape (3,)
+    d: Array  # parameters of the pose [mm], shape (3,)
     translation_mm: Array  # translation of the joint, skull axes, shape (3,)
     rotation: Array  # skull axes, shape (3, 3)
     clamped_mm: float  # distance by which d was clamped to the bound

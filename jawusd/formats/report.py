@@ -19,7 +19,7 @@ class Origin:
 
     finished: str  # date and time
     command: str  # the command line; "" if called from Python
-    versions: Mapping[str, str]  # by package
+    versions: Mapping[str, str]  # versions by package
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,16 @@ class ReplayPart:
     """A mesh of the replay."""
 
     name: str  # display name
-    kind: str  # "bone", "tooth" or "gum": how it is coloured
+    kind: str  # "bone", "tooth" or "gum": determines the colour
     moves: bool  # moves with the mandible
-    mesh: Mesh  # decimated, anatomical frame, at the closed bite [mm]
+    mesh: Mesh  # decimated, anatomical frame, in occlusion [mm]
 
 
 @dataclass(frozen=True)
 class RigFacts:
     """Results of checking the rig files."""
 
-    table_error_mm: float  # largest vertex distance of the sampled decoder to the exact model [mm]
+    table_error_mm: float  # maximum vertex distance between the sampled decoder and the exact model [mm]
     findings: tuple[str, ...]  # findings of the validators, "severity: message"
 
 
@@ -78,7 +78,7 @@ class ReportData:
     sync: SyncNotes
     cameras: tuple[CameraFacts, ...]  # empty if the capture is not available
     inferred: tuple[str, ...]  # values that were derived instead of given
-    seconds: Mapping[str, float]  # per stage [s]
+    seconds: Mapping[str, float]  # duration of each stage [s]
     hashes: Mapping[str, str]  # SHA-256 by file name of the build
     origin: Origin
     rig: RigFacts
@@ -95,10 +95,10 @@ class SolveReportData:
     """Data of the report of a solved performance."""
 
     shot: str
-    tracks: Tracks  # with the arrays in `solved`
+    tracks: Tracks  # tracks with `solved` arrays
     fps: float  # frames per second
     limits: str  # accuracy and limits of the result, in words; "" if unknown
     cameras: tuple[CameraFacts, ...]  # empty if the shot is not available
     overlays: tuple[Overlay, ...]  # frames of the shot, the worst first
-    versions: Mapping[str, str]  # by package
+    versions: Mapping[str, str]  # versions by package
     left_out: tuple[str, ...]  # parts omitted from the report, and why

@@ -52,7 +52,7 @@ def save_scan_labels(path: str | os.PathLike[str], labels: ScanLabels, mesh: Mes
     """Write the labels of a scan.
 
     Raises:
-        ValueError: they are not of this mesh.
+        ValueError: their number differs from that of the vertices.
         OutputError: the file cannot be written.
     """
     if labels.labels.shape != mesh.vertices.shape[:1]:

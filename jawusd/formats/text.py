@@ -18,8 +18,8 @@ from jawusd.formats.capture_keys import table_model
 Model = TypeVar("Model", bound=BaseModel)
 
 _MOST_TOML_BYTES = 4 << 20
-_SHOWN = 80  # characters of a line in messages
-# Most parts of a dotted key: tomllib takes quadratic time, hours for a file of 200 kB.
+_SHOWN = 80  # maximum length of a line in messages [characters]
+# Maximum number of parts of a dotted key: tomllib takes quadratic time, hours for a key of 200 kB.
 _MOST_DOTS = 64
 _NAME = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_NAME}[ \t]*+\.[ \t]*+){{{_MOST_DOTS}}}", re.ASCII)
@@ -43,7 +43,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
         raise FormatError(f"has a dotted key of more than {_MOST_DOTS} parts.", path=path)
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # includes numbers of more than 4300 digits
+    except (ValueError, RecursionError) as error:  # also raised for numbers of more than 4300 digits
         said, hint = _not_toml(text, str(error))
         raise FormatError(f"is not valid TOML: {said}.", path=path, hint=hint) from error
 

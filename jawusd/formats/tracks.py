@@ -21,7 +21,7 @@ from jawusd.formats.performance import SolvedJaw, take_solved
 from jawusd.geometry import LANDMARKS, rigidity_defect
 
 FAMILY, VERSION = "jawusd-tracks", 1
-_APART_S = 0.5  # least time between chosen frames; adjacent frames have the same problem
+_APART_S = 0.5  # minimum time between chosen frames; adjacent frames have the same problem
 
 
 class TrackStatus(IntEnum):
@@ -207,7 +207,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         UnitsError: other units or twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
-    limit = meta.pop("margin_limit_mm", None)  # in older files: the smallest allowed margin, a negative value
+    limit = meta.pop("margin_limit_mm", None)  # older files store the minimum allowed margin, a negative value
     if isinstance(limit, float):
         meta["tolerance_mm"] = -limit
     check_notes(meta, TracksMeta, path)
@@ -215,7 +215,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
         raise FormatError('"meta" has no list "camera_names".', path=path)
     count = len(take(arrays, "frames", (None,), path))
-    if "masks_used" not in arrays and "coverage_error" in arrays:  # optional for other trackers
+    if "masks_used" not in arrays and "coverage_error" in arrays:  # other trackers may omit it
         arrays["masks_used"] = np.isfinite(arrays["coverage_error"])
     values = {
         # Lost frames are NaN, so only integer arrays must be finite.
@@ -268,8 +268,8 @@ def worst_frames(
     Args:
         badness: shape (F,); frames with NaN are never chosen.
         frames: frame numbers, shape (F,).
-        most: largest number of frames.
-        taken: indices of frames chosen before, to keep the same distance from.
+        most: maximum number of frames.
+        taken: indices of already chosen frames; the same distance from them is kept.
     """
     apart = max(round(_APART_S * fps), 1)
     found: list[int] = []
