@@ -20,7 +20,7 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import read_toml
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp, so3_log
 
-# Largest allowed entry of R R^T - I; rotations written with 6 digits stay below.
+# Maximum entry of R R^T - I; rotations written with 6 digits stay below it.
 _ROTATION_TOLERANCE = 1e-4
 _CAMERA_TABLE = re.compile(r"^cam_\d+$")
 

@@ -142,7 +142,7 @@ def _lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Array]:
     size = (int(values[0]), int(values[1]))
     fx, fy, cx, cy = (values[2], *values[2:5]) if focal == "f" else values[2:6]
     distortion = values[expected - terms :]
-    if 0 < terms < 4:  # radial terms only
+    if 0 < terms < 4:  # the model has only radial terms
         distortion = np.concatenate([distortion, np.zeros(4 - terms)])
     return size, corner_matrix(path, f"camera {row[0]}", fx, fy, cx, cy), distortion
 
@@ -157,7 +157,7 @@ FORMAT = CameraFormat(
 
 
 def save_colmap(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """Write cameras as a COLMAP text model in mm, with one image `NAME.png` each and an empty `points3D.txt`.
+    """Write cameras as a COLMAP text model in mm, with one image `NAME.png` per camera and an empty `points3D.txt`.
 
     Raises:
         CalibrationError: a camera has pixel skew, which COLMAP's camera models lack.

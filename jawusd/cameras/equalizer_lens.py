@@ -6,7 +6,7 @@ and a line per key; <end_of_file>. `LD_...` nodes (File, Export, Nuke LD_3DE4 Le
 as knobs.
 
 The models (Science-D-Visions, "The Standard Models for Lens Distortion in 3DE4", and its Lens Distortion Plugin Kit)
-map recorded to undistorted points, in coordinates from the lens centre, y up, over half the film back diagonal. OpenCV
+map recorded to undistorted points, relative to the lens centre, y up, in units of half the film back diagonal. OpenCV
 maps in the other direction: its coefficients are fitted to the model over the image, and lenses with residuals above
 0.05 px are rejected. Only "OpenCV Radial Degree 6, Decentered Degree 2" uses OpenCV's own coefficients.
 """
@@ -75,7 +75,7 @@ _GRID, _BEYOND = 33, 0.03  # fitting points per side of the image, and margin ar
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens."""
+    """A lens and its distortion model."""
 
     name: str
     path: Path
@@ -251,7 +251,7 @@ def opencv_of(
 
 
 def _undistorted(model: str, values: list[float], x: Array, y: Array) -> tuple[Array, Array]:
-    """Undistort points, relative to the lens centre, y up, over half the film back diagonal.
+    """Undistort points given relative to the lens centre, y up, in units of half the film back diagonal.
 
     The Standard Models for Lens Distortion in 3DE4; Lens Distortion Plugin Kit 2.12.
     """

@@ -47,7 +47,7 @@ def load_metashape(path: Path) -> list[Camera]:
         (chunk, node)
         for chunk in root.findall("chunk") or [root]
         for node in chunk.iter("camera")
-        if (node.findtext("transform") or "").strip()  # cameras without one are not aligned
+        if (node.findtext("transform") or "").strip()  # cameras without a transform are not aligned
     ]
     if not nodes:
         raise CalibrationError("has no aligned cameras.", path=path, hint="Align the photos, then export the cameras.")

@@ -18,10 +18,10 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.formats.text import read_text
 
-SAME = 1e-3  # tolerance for equality: relative for lengths, [rad] for rotations
+SAME = 1e-3  # tolerance for equal values: relative for lengths, [rad] for rotations
 
 _MOST_BYTES = 64 << 20
-_MOST_LEVELS = 4  # deepest nesting of braces in a knob
+_MOST_LEVELS = 4  # maximum nesting of braces in a knob
 _START = re.compile(r"^\s*(?P<kind>\w+)\s*\{\s*$")
 _KNOB = re.compile(r"^\s*(?P<name>\w+)(?:\s+(?P<value>.*))?$", re.DOTALL)
 _BRACE = re.compile(r"(?<!\\)[{}]")
@@ -162,5 +162,5 @@ def _unwrapped(items: list[object]) -> list[object]:
 
 
 def _is_sign(word: str) -> bool:
-    """Tell whether a word of a curve is not a value but the keyword, a frame, an interpolation type, or a slope."""
+    """Tell whether a word of a curve is the keyword, a frame, an interpolation type or a slope rather than a value."""
     return word == "curve" or bool(re.fullmatch(r"[A-Za-z]|[a-z]-?[\d.]+(?:e[-+]?\d+)?", word))

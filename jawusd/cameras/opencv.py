@@ -24,7 +24,7 @@ from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp
 
 _MOST_BYTES = 16 << 20
 _YAML = (".yml", ".yaml")
-_BEGINNING = 4096  # leading bytes searched for OpenCV's markers in XML and JSON
+_BEGINNING = 4096  # number of leading bytes searched for OpenCV's markers in XML and JSON
 _MATRIX = re.compile(
     r"^\s*(?P<name>[\w.-]+)\s*:\s*(?:!!opencv-matrix)?\s*\n\s*rows\s*:\s*(?P<rows>\d+)\s*\n\s*cols\s*:\s*(?P<cols>\d+)"
     r"\s*\n(?:\s*dt\s*:\s*\S+\s*\n)?\s*data\s*:\s*\[(?P<data>[^\]]*)\]",

@@ -1,4 +1,4 @@
-"""Helpers of the camera readers: the format registry entry, names, sizes, lens models, XML, numbers."""
+"""Helpers for the camera readers: the registry entry of a format, names, sizes, lens models, XML, numbers."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Size = tuple[int, int]
 MOST_BYTES = 64 << 20
 UNDISTORT = "Undistort the footage first, or calibrate with OpenCV's standard model."
 _LARGEST_DEFECT = 1e-3
-# Tolerances between the poses of a static camera in its images: rotation [rad], and position relative to its distance
-# from the origin.
+# Maximum differences between a static camera's poses in different images: rotation [rad], and position as a fraction of
+# the distance from the origin.
 _MOVED_RAD, _MOVED_SHARE = 1e-3, 1e-3
-_LARGEST_ERROR_PX = 0.05  # largest error of a lens model converted to OpenCV's
+_LARGEST_ERROR_PX = 0.05  # maximum error of a lens model converted to OpenCV's
 _MODEL_KEYS = ("distortion_model", "distortion_type", "lens_model", "camera_model", "model_type", "projection_model")
 _FLAG_KEYS = ("fisheye", "fisheye_model", "is_fisheye", "use_fisheye", "xi")  # xi: omnidirectional
 # Names of OpenCV's radial-tangential model with up to eight coefficients, in ROS, Kalibr, camodocal and others.
@@ -40,12 +40,12 @@ _OTHER_MODELS = re.compile(
 class CameraFormat:
     """A camera format. To add one, define it as FORMAT in a module of this folder."""
 
-    # whether a path has this format: 0 no, 1 by its name, 2 by its content
+    # returns 1 if a path has this format by its name, 2 if by its content, 0 if not
     reads: Callable[[Path], int]
     # returns the cameras in the file's order and unit, given (width, height) [px] of the images by camera
     load: Callable[[Path, Mapping[str, Size]], list[Camera]]
-    files: Callable[[Path], list[Path]] = lambda path: [path]  # all files of a calibration
-    lacks_sizes: bool = False  # image sizes are not, or not always, in the file
+    files: Callable[[Path], list[Path]] = lambda path: [path]  # returns all files of a calibration
+    lacks_sizes: bool = False  # image sizes may be missing from the file
 
 
 def files_in(path: Path, *suffixes: str) -> list[Path]:

@@ -48,7 +48,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read the XMP files of a folder as cameras named after the files, in the files' unit.
+    """Read the XMP files of a folder; return cameras named after the files, in the files' unit.
 
     Args:
         folder: the folder of the files.

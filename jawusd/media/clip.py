@@ -28,7 +28,7 @@ class VideoFrame:
     """One decoded image."""
 
     index: int  # index in presentation order, from 0
-    time_s: float  # presentation time after the first image [s]
+    time_s: float  # presentation time, relative to the first image [s]
     image: NDArray[np.uint8]  # (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, 0..255, read-only
 
 
@@ -38,7 +38,7 @@ class Clip(ABC):
     Attributes:
         path: the file, or the pattern of the files.
         count: number of images.
-        times_s: presentation times after the first image [s], shape (count,), increasing.
+        times_s: presentation times, relative to the first image [s], shape (count,), increasing.
         timeline: maps frames to images.
         keys: indices of key frames, shape (n,).
         start_s: presentation time of the file's first image, on the same clock as its sound [s].

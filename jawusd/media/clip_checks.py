@@ -15,26 +15,29 @@ from jawusd.formats.finding import Finding
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT, Clip
 from jawusd.media.picture_sequence import PictureSequence
 
-# Largest drift between cameras over a take that is not reported [frames].
+# Maximum drift between cameras over a take that is not reported [frames].
 _DRIFT_FRAMES = 0.5
 # Relative tolerance of frame rates: accepts rounding to three digits and 23.976 for 24, but not 25 [1].
 _RATE_TOLERANCE = 0.005
-_DECODED_PX = 1.5e9  # pixels decoded per clip: 700 images of full HD, a few seconds
-_ENDS_S = 4.0  # duration at either end that `sync` reads first
+_DECODED_PX = 1.5e9  # maximum number of pixels decoded per clip: 700 images of full HD, a few seconds
+_ENDS_S = 4.0  # duration decoded at either end, which `sync` reads first
 _PART = 48  # images per decoded part
-_SPARSE = 4  # subsampling: every 4th pixel in both directions
+_SPARSE = 4  # subsampling step: every 4th pixel in both directions
 _LISTED = 5
-# Thresholds for repeated images, relative to the usual change: a percentile over a window of images. Chosen with
-# `tests/benchmarks/frozen.py`, which measures false positives in static and noisy scenes.
+# Thresholds for repeated images are relative to the usual change: this percentile of the changes within this number of
+# images before and after. Chosen with `tests/benchmarks/frozen.py`, which measures false positives in static and noisy
+# scenes.
 _MOST, _AROUND = 75, 48
-_FEWEST = 12  # images needed to estimate the usual change
-_LEAST_CHANGE = 0.1  # least change that counts as noise or motion, of 255 levels
-_SAME, _ALIKE = 0.05, 0.03  # for long runs; for one or two images, which a reversal of motion resembles
-_SHORT, _SOME, _LONG = 2, 5, 12  # lengths of runs [images]
+_FEWEST = 12  # minimum number of images for estimating the usual change
+_LEAST_CHANGE = 0.1  # minimum change that counts as noise or motion [of 255 levels]
+# Maximum change in a long run, and in a run of one or two images, which a reversal of motion resembles.
+_SAME, _ALIKE = 0.05, 0.03
+# Run lengths [images]: maximum of a short run, minimum for comparing with noise, minimum at the end of a clip.
+_SHORT, _SOME, _LONG = 2, 5, 12
 _STOPS, _FARTHER = (0.5, 4.0), 1.25
-_FAR_BELOW = 0.2  # largest change within a run, as a fraction of the 25th percentile of changes
+_FAR_BELOW = 0.2  # maximum change within a run, as a fraction of the 25th percentile of changes around it
 _REGULAR = 0.15  # fraction of repeated images above which repetition counts as regular
-_MISSING_SHARE = 0.01  # fraction of frames that may lack an image at a constant rate
+_MISSING_SHARE = 0.01  # maximum fraction of frames without an image at a constant rate
 
 
 def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
@@ -97,11 +100,11 @@ def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
 
 
 def repeated_runs(changes: Array) -> list[tuple[int, int]]:
-    """Return the first and last image of runs that repeat the image before them.
+    """Return the indices of the first and last image of each run of images that repeat their predecessor.
 
     Encoders also repeat images of static scenes, but there the changes fade out and in. In a freeze they stop and
     resume abruptly, and after one or two repeated images the next change is larger than usual. If a light was switched
-    off, the change before the run is the larger one. Scenes without a usual change are skipped.
+    off, the change before the run is the larger one. Scenes that hardly change are skipped.
 
     Args:
         changes: result of `picture_changes`, shape (n,).
@@ -116,7 +119,7 @@ def repeated_runs(changes: Array) -> list[tuple[int, int]]:
     short = [
         run for run in runs if run[1] - run[0] < _SHORT and known[run[0] : run[1] + 1].max() <= _ALIKE * usual[run[0]]
     ]
-    regular = len(short) > _REGULAR * len(known)  # images repeated regularly, as by frame rate conversion
+    regular = len(short) > _REGULAR * len(known)  # regular repetition, as by frame rate conversion
     found = [run for run in runs if (run in short and regular) or _stands_out(known, *run)]
     return [(first + 1, last + 1) for first, last in found]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jawusd.base.errors import CaptureError
 from jawusd.base.inputs import check_input
 
-#: Most pixels of an image, four times 8K: a header of a few bytes can declare one that exhausts memory.
+#: Maximum number of pixels of an image, four times 8K: a header of a few bytes can declare one that exhausts memory.
 MOST_PX = 1 << 27
 #: Self-contained formats. FFmpeg also follows playlists (HLS, DASH, concat, SDP), which refer to other files and URLs.
 FORMATS = (
@@ -53,7 +53,7 @@ def open_container(
     options = {"format_whitelist": ",".join(formats), "protocol_whitelist": "file"}
     container = av.open(
         os.fspath(path), metadata_errors="replace", options=options | limit
-    )  # this also decodes a few images
+    )  # `av.open` also decodes a few images
     for stream in container.streams.video:
         if stream.codec_context is not None:  # None for unknown codecs
             strict = _STRICT if stream.codec_context.name in _STRICT_CODECS else {}
@@ -62,7 +62,7 @@ def open_container(
 
 
 def slices_are_whole(packet: bytes) -> bool:
-    """Verify the slice checksums of an FFV1 image; false also if there are none.
+    """Return whether all slices of an FFV1 image have correct checksums; false if they have none.
 
     FFmpeg silently replaces damaged slices with those of the previous image. RFC 9043, 4.9: a slice ends with its size
     (3 bytes), a status (1) and a CRC (4; polynomial 0x04C11DB7, highest bit first, initial value 0).

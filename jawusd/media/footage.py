@@ -17,8 +17,8 @@ from jawusd.media.clip import Clip, VideoFrame
 from jawusd.media.picture_sequence import PictureSequence
 from jawusd.media.video import Video
 
-_AHEAD = 24  # images up to which decoding forward is faster than seeking
-_BACK = 8  # images decoded together when stepping backwards
+_AHEAD = 24  # maximum number of images for which decoding forward is faster than seeking
+_BACK = 8  # number of images decoded together when stepping backwards
 _KEPT_BYTES = 128 << 20
 
 
@@ -81,7 +81,7 @@ class FrameReader:
 
     def _read_to(self, index: int) -> None:
         running = self._running
-        self._running = None  # if decoding fails, the next image opens the file again
+        self._running = None  # if decoding fails, the next read reopens the file
         if running is None or not self._next <= index < self._next + _AHEAD:
             walks_back = self._last - _BACK <= index < self._last
             first = max(0, index - min(_BACK, self._most - 1)) if walks_back else index

@@ -12,7 +12,7 @@ from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh
 from jawusd.media.overlay import captioned, contact_sheet
 from jawusd.meshes.raster import draw_depth_labels
 
-#: Colours of gum, crown, crown at a border of interest, and base.
+#: Colours by label: gum, crown, crown at a border of interest, base.
 COLOURS = np.array([(214, 108, 112), (240, 234, 214), (150, 205, 130), (120, 135, 165)], np.uint8)
 _BACKGROUND = (40, 42, 46)
 _TILE_PX = (520, 400)

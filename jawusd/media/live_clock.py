@@ -12,5 +12,5 @@ def now_s() -> float:
 
 
 def wait_until(time_s: float, stopped: threading.Event) -> bool:
-    """Wait until a time [s]; return whether `stopped` was set before."""
+    """Wait until a time [s]; return whether `stopped` was set before then."""
     return stopped.wait(max(0.0, time_s - time.monotonic()))

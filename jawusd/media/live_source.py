@@ -18,21 +18,21 @@ from jawusd.media.pixels import ColourPicture, DecodedPicture
 from jawusd.media.video import Video
 
 _WAIT_S = 0.1
-_KEPT = 8  # size of the buffer, larger than the number of images that can wait for processing
+_KEPT = 8  # number of buffered images, more than can wait for processing
 # PyAV's input format for local devices, by address prefix.
 _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
 
 
 @dataclass(frozen=True, eq=False)
 class LivePicture:
-    """An image: its time on the common clock [s], and its pixels, RGB uint8 (H, W, 3), converted on first access."""
+    """An image with its time on the common clock [s], and RGB pixels uint8 (H, W, 3), converted on first access."""
 
     time_s: float
     rgb: ColourPicture
 
 
 class LiveSource:
-    """Reader of one camera in its own thread, with a buffer of the last images."""
+    """Reader of one camera in its own thread, with a buffer of the most recent images."""
 
     def __init__(self, where: str, size_px: tuple[int, int], early_s: float = 0.0) -> None:
         """Prepare to read from an address.
@@ -40,7 +40,7 @@ class LiveSource:
         Args:
             where: a file, a URL (rtsp://, http://, ...), or a device (/dev/video0 on Linux).
             size_px: width and height for which the camera was calibrated.
-            early_s: time by which the recording in a file begins before those of the other sources [s].
+            early_s: how much earlier the recording in a file begins than those of the other sources [s].
         """
         self.where, self._size_px, self._early_s = where, size_px, early_s
         self._kept: deque[LivePicture] = deque(maxlen=_KEPT)

@@ -21,7 +21,7 @@ from jawusd.media.pixels import Colour
 LabelValues = tuple[int, int]
 
 _NUMBER = re.compile(r"%(0(\d+))?d")
-_FEW = 6  # most label values listed in messages
+_FEW = 6  # maximum number of label values listed in messages
 
 
 class PngMasks:
@@ -45,7 +45,7 @@ class PngMasks:
             pattern: pattern of the files.
             size_px: (width, height) of all of them, if known.
             labels: see `LabelValues`.
-            is_other: detects images that are not masks, which are excluded from finding the levels.
+            is_other: detects images that are not masks; they are not used to find the levels.
 
         Raises:
             CaptureError: the folder is missing or has no such file.
@@ -171,7 +171,7 @@ class VideoMasks:
         Raises:
             CaptureError: an image cannot be decoded, or the images are not masks.
         """
-        if self._labels is not None:  # use luma where possible: conversions change values
+        if self._labels is not None:  # luma where possible, because conversions change values
             colour: Colour = "rgb" if self._video.is_rgb else "gray"
             for frame in self._video.frames(first, colour=colour, threads=1):
                 yield _labelled(frame.image, self._labels, self._video.path, f"picture {frame.index}: ")

@@ -17,19 +17,17 @@ from jawusd.media.pixels import Slices
 MaskImage = NDArray[np.uint8]
 RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as stored in files
 
-# Largest fraction of intermediate values in a mask. Blurred edges reach 0.2 in small masks; photographs have 0.39 or
-# more.
+# Maximum fraction of a mask's pixels at intermediate values. Blurred edges reach 0.2 in small masks; photographs have
+# 0.39 or more.
 MOST_GRAY = 0.2
-MOST_SOFT = 0.35  # the same outside the background, for a typical image of a source, as after a blur of 8 px
-_FAINT = 0.25  # of the contrast: smaller values are noise; an image without larger ones has no teeth
-_DEAD_ZONE = 0.06  # of the contrast: deviation from the levels that is attributed to lossy coding
-_NEAR = 24  # of 255: closer values belong to one level, after blur or lossy coding
-_FLAT = 10  # of 255: pixels that differ less from their neighbours are inside a region, not on its edge
-_ALIKE = 0.15  # of the contrast: largest difference of levels between images of one source
-_MOST_THIRD = 0.25  # largest area of a third level over the smaller of the other two; soft edges have no flat area
-_SHARP = (
-    0.8  # least fraction of a level's area within 1 of its value; labels reach it, smooth parts of photographs do not
-)
+MOST_SOFT = 0.35  # maximum median fraction of intermediate values outside the background, as after a blur of 8 px
+_FAINT = 0.25  # maximum coverage in an image without teeth, whose pixels are noise
+_DEAD_ZONE = 0.06  # maximum deviation from a level due to lossy coding, as a fraction of the contrast
+_NEAR = 24  # maximum difference of values of one level after blur or lossy coding [of 255]
+_FLAT = 10  # maximum difference between adjacent pixels inside a region [of 255]; edges have larger differences
+_ALIKE = 0.15  # maximum difference of a level between images of one source, as a fraction of the contrast
+_MOST_THIRD = 0.25  # maximum area of a third level / area of the second largest; soft edges have no flat area
+_SHARP = 0.8  # minimum fraction of a third level's area within 1 of its value; labels exceed it, photographs do not
 
 
 @dataclass(frozen=True)
@@ -43,10 +41,10 @@ class MaskLevels:
     plane: str = "brightest"
     background: float = 0.0
     teeth: float = 255.0
-    deep: bool = False  # 16 bit per channel
-    lossy: bool = False  # lossy coding has left noise around the levels
+    deep: bool = False  # whether images have 16 bits per channel
+    lossy: bool = False  # whether lossy coding has left noise around the levels
     ambiguous: bool = False  # whether border and area disagree about which level is the background
-    # of the pixels outside the background, the fraction between the levels
+    # fraction of the pixels outside the background that lie between the levels
     soft: float = field(default=0.0, compare=False)
 
     @property
@@ -74,7 +72,7 @@ class MaskLevels:
         if low == high:
             empty = self.plane == "alpha" or abs(low - self.teeth) > abs(low - self.background)
             return None, "" if empty else f"is uniformly {low:g}, which means teeth everywhere"
-        box = self._around_teeth(plane)  # usually a tenth of the image
+        box = self._around_teeth(plane)  # usually a tenth of the image, to save time
         part = self._shares(plane[box])
         inside = cv2.countNonZero(cv2.inRange(part, 128, 255))
         if inside == 0:
@@ -158,10 +156,10 @@ def border_share(image: MaskImage, above: float) -> float:
 
 
 class NotMasks(Exception):
-    """Images are not masks, for a `reason`, with a `hint`; `index` is the offending image, if it is a single one."""
+    """Raised if images are not masks; `index` is that of the offending image, if it is a single one."""
 
     def __init__(self, index: int | None, reason: str, hint: str) -> None:
-        """Store the index among the given images, None if all of them are concerned."""
+        """Store the index of the offending image among the given ones, None if it concerns all."""
         super().__init__(reason)
         self.index, self.reason, self.hint = index, reason, hint
 
@@ -173,11 +171,11 @@ class _Levels:
     low: float
     high: float
     light: float  # fraction of the image that is closer to the high level
-    light_border: float  # the same along the image's border
+    light_border: float  # fraction of the image's border that is closer to the high level
     gray: float  # fraction of the image at neither level
-    soft: float  # of all that is not dark, the fraction at neither level: the softness if teeth are light
-    soft_dark: float  # of all that is not light, the fraction at neither level: the softness if teeth are dark
-    third: float | None  # a third level of large area, if any
+    soft: float  # fraction at neither level of all pixels that are not dark: the softness if teeth are light
+    soft_dark: float  # fraction at neither level of all pixels that are not light: the softness if teeth are dark
+    third: float | None  # a third level with a large area, if any
 
     @property
     def contrast(self) -> float:
@@ -190,15 +188,15 @@ class _Looked:
 
     number: int  # index among the sampled images
     planes: dict[str, _Levels]
-    opaque: bool  # has an alpha channel that is opaque
+    opaque: bool  # has an opaque alpha channel
     deep: bool
 
 
 def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], Iterable[RawImage]]) -> MaskLevels | None:
     """Return the meaning of a source's pixel values, None if all its images are empty.
 
-    The two levels are those that most images have. The background is the darker one, unless the lighter one has most of
-    the area and of the border, since teeth are inside the image.
+    The two levels are those that most images share. The background is the darker one, unless the lighter one has
+    most of the area and of the border, since teeth are inside the image.
 
     Args:
         pictures: samples from the whole take.
@@ -262,7 +260,7 @@ def _agreed(shown: Sequence[_Looked], lossy: bool) -> MaskLevels:
 
 def _alike(levels: _Levels, of: _Levels, lossy: bool) -> bool:
     if lossy and of.contrast <= _NEAR < levels.contrast:
-        return False  # noise of an empty image
+        return False  # the image is empty except for noise
     near = _ALIKE * of.contrast
     return abs(levels.low - of.low) <= near and abs(levels.high - of.high) <= near
 
@@ -304,7 +302,7 @@ def _levels(plane: RawImage) -> _Levels | None:
     counts = cv2.calcHist([unit], [0], cv2.inRange(uneven, 0, _FLAT), [256], [0, 256]).ravel().astype(np.float64)
     first, _, rest = _peak(counts)
     second, area, rest = _peak(rest)
-    if not area:  # too small for flat regions
+    if not area:  # the teeth are too small to have flat regions
         second = 255 if first < 128 else 0
     third, third_area, _ = _peak(rest)
     dark, light = sorted((first, second))
@@ -328,7 +326,7 @@ def _levels(plane: RawImage) -> _Levels | None:
 
 
 def _peak(counts: Array) -> tuple[int, float, Array]:
-    """Return the most frequent of 256 values, the count of it and its neighbours, and the histogram without them."""
+    """Return the most frequent of 256 values, the total count of it and its neighbours, and the remaining histogram."""
     at = int(counts.argmax())
     near = slice(max(at - _NEAR, 0), at + _NEAR + 1)
     rest = counts.copy()

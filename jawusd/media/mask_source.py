@@ -16,9 +16,9 @@ from jawusd.media.pictures import has_palette, read_palette_numbers, read_pictur
 from jawusd.media.pixels import Colour
 from jawusd.media.video import Video
 
-_SAMPLED = 10  # sampled images per take
+_SAMPLED = 10  # number of sampled images per take
 _FEWEST_OF_VIDEO = 4
-_NEUTRAL = 12  # largest difference of channels, of 255, in gray after lossy coding
+_NEUTRAL = 12  # maximum difference between channels of gray images after lossy coding [of 255]
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def mask_video(path: Path) -> Video:
         CaptureError: see `Video`.
     """
     if not path.is_file():
-        return Video(path)  # raises the error
+        return Video(path)  # raises the error for a missing file
     found = path.stat()
     return _video_of_version(path, found.st_mtime_ns, found.st_size)
 
@@ -102,7 +102,7 @@ def _png_levels_of_version(
     others: _Others,
     is_other: Callable[[RawImage], bool] | None,
 ) -> SourceLevels:
-    """Find the levels of files; modification times and sizes of the sample identify their version."""
+    """Find the levels of files; modification times and sizes of the sampled files identify their version."""
     for palette_numbers in (False, True) if any(map(has_palette, sample)) else (False,):
         read: list[Path] = []
         sizes: dict[tuple[int, int], Path] = {}

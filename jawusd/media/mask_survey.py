@@ -17,8 +17,8 @@ from jawusd.media.masks import MaskReader, open_masks
 
 ARCHES = ("upper", "lower")
 _LISTED = 5
-_SPREAD = 9  # frames sampled per clip
-_POINTS = 500  # pixels sampled per mask
+_SPREAD = 9  # number of frames sampled per clip
+_POINTS = 500  # maximum number of pixels sampled per mask
 _HALF = 128
 
 
@@ -186,7 +186,7 @@ def _first_last(reader: MaskReader) -> tuple[int, int] | None:
 
 
 def _boundary(reader: MaskReader, shown: int, empty: int) -> int:
-    """Return the frame with a mask that is adjacent to the empty frames, by bisection."""
+    """Return the frame with a mask next to the empty frames, found by bisection."""
     while abs(shown - empty) > 1:
         middle = (shown + empty) // 2
         if _shows(reader, middle):

@@ -21,8 +21,8 @@ from jawusd.media.mask_levels import MaskImage, MaskLevels
 from jawusd.media.timeline import Timeline
 from jawusd.media.video import Video
 
-_LOOKED_AT = 10  # label images sampled
-_AHEAD = 4  # buffered images: 8 MB of full HD per reader
+_LOOKED_AT = 10  # number of label images sampled
+_AHEAD = 4  # number of buffered images: 8 MB per reader for full HD
 
 
 class MaskReader:
@@ -163,7 +163,7 @@ class MaskReader:
                 continue
             if pictures is None:
                 pictures, at = self._source.masks(picture), picture
-            while at < picture:  # of two images in one frame, use the first
+            while at < picture:  # if two images share a frame, use the first
                 next(pictures)
                 at += 1
             yield next(pictures)

@@ -21,14 +21,14 @@ from jawusd.geometry import Camera, transform_points
 from jawusd.media.backdrop import Backdrop
 from jawusd.meshes.raster import draw_depth_labels
 
-#: RGB.
+#: Red, green and blue, 0 .. 255.
 Colour = tuple[int, int, int]
 
 UPPER_COLOUR: Colour = (255, 170, 0)
 LOWER_COLOUR: Colour = (0, 200, 255)
 _LINE_PX = 2
 CAPTION_PX = 22
-#: Gray of a tile whose camera has no image.
+#: Gray value of a tile whose camera has no image.
 EMPTY_GRAY = 60
 _MARGIN = 0.25  # margin around the teeth in a tile [fraction of their extent]
 
@@ -37,7 +37,7 @@ _MARGIN = 0.25  # margin around the teeth in a tile [fraction of their extent]
 class PlacedScan:
     """A teeth scan at its tracked pose."""
 
-    mesh: Mesh  # the scan [mm]; its gum is not drawn, but occludes
+    mesh: Mesh  # the scan [mm]; its gum is not drawn, but hides what is behind it
     T_world_scan: Array  # its pose, shape (4, 4); NaN omits the scan
     colour: Colour
 

@@ -21,8 +21,8 @@ from jawusd.media.timeline import Timeline
 
 #: Frame rate if neither the capture nor the files have one.
 _USUAL_RATE = 24.0
-_FASTEST_COUNT = 30.0  # highest rate of time codes in headers [frames per second]
-_AHEAD = 2  # images decoded ahead
+_FASTEST_COUNT = 30.0  # maximum rate of time codes in headers [frames per second]
+_AHEAD = 2  # number of images decoded ahead
 
 
 class PictureSequence(Clip):

@@ -28,10 +28,11 @@ RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 _PNG = b"\x89PNG\r\n\x1a\n"
 _HINT = "Export the pictures again, as PNG, TIFF, EXR, DPX or JPEG."
 _MOST_HEADER_BYTES = 1 << 16
-#: Largest image, 8K [px]: small files can declare images that exhaust memory; decoding takes up to 28 bytes per pixel.
+#: Maximum number of pixels of an image, 8K: small files can declare images that exhaust memory, and decoding takes up
+#: to 28 bytes per pixel.
 MOST_STORED_PX = 36_000_000
 _EXR, _DPX = b"\x76\x2f\x31\x01", (b"SDPX", b"XPDS")
-_QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # Exif orientations: quarter turns, mirrored ones
+_QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # Exif orientations: quarter turns by value; mirrored values
 _DPX_LOG = (1, 3)  # transfer characteristics "printing density" and "logarithmic", SMPTE ST 268-1 table 5A
 
 

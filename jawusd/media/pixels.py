@@ -28,7 +28,7 @@ _BYTE_BITS = 8
 # ffmpeg's fast conversion to RGB is 1.3 of 255 levels too dark and does not interpolate chroma; these flags round and
 # interpolate.
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-_AROUND_PX = 8  # margin around a region, for chroma interpolation
+_AROUND_PX = 8  # margin converted around a region, for chroma interpolation
 _STEP_PX = 32  # alignment of the region's sides
 _ANY_TIME = Fraction(1, 1000)  # arbitrary, but filters need a time base
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG

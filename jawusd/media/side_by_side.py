@@ -34,13 +34,13 @@ from jawusd.media.overlay import (
 Part = tuple[int, int, int, int]
 
 _MOST_IN_ROW = 3
-_MOST_FRAMES, _MOST_POINTS = 200, 300  # frames per take and vertices per scan that are sampled to locate the teeth
-_STRAYS_PERCENT = 1.0  # percentage of frames whose teeth may leave the crop, at each side
+_MOST_FRAMES, _MOST_POINTS = 200, 300  # maximum number of frames and of vertices per scan, sampled to locate the teeth
+_STRAYS_PERCENT = 1.0  # percentage of frames in which teeth may leave the crop, per side
 _ROOM = 0.25  # margin around the teeth [fraction of their extent]
 _LEAST_PX = 32
 _SHOW_PARTLY_S = 0.3  # time after which partial results are shown
 _WHITE: Colour = (240, 240, 240)
-_WIDE_PX = 1200  # narrower status bars use one line per piece of text
+_WIDE_PX = 1200  # width below which a status bar has one line per piece of text
 _LINE_PX, _LEFT_PX, _GAP_PX, _SWATCH_PX = 26, 10, 34, 14
 _FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.55
 
@@ -167,7 +167,7 @@ def _teeth_parts(
 
 
 def _part_around(camera: Camera, world: Array, aspect: float) -> Part:
-    """Return the region around points (F, n, 3) [mm] of many frames, NaN where unknown, inside the image."""
+    """Return the image region around the points (F, n, 3) [mm] of many frames; unknown points are NaN."""
     size = np.array(camera.size_px)
     pixels = camera.project(world)
     pixels[camera.depth(world) <= 0] = np.nan

@@ -34,7 +34,7 @@ class Timeline:
     def _set(self, numbers: NDArray[np.int64], rate: float, stored: NDArray[np.int64]) -> None:
         self.numbers, self.rate, self.stored = numbers, rate, stored
         self.count = int(numbers[-1]) + 1
-        # Of two images in one frame, use the first.
+        # If two images share a frame, use the first.
         self._picture = dict(zip(numbers[::-1].tolist(), range(len(numbers) - 1, -1, -1)))
 
     @property

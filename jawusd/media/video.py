@@ -153,7 +153,7 @@ class Video(Clip):
     def _packet_table(
         self, container: av.container.InputContainer, stream: av.VideoStream
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.intp], int]:
-        """Return per image its time stamp, the decoding time of its key frame and that frame's index.
+        """Return each image's time stamp, the decoding time of its key frame, and the index of that key frame.
 
         The last value is the number of stored images.
         """
@@ -211,11 +211,11 @@ class Video(Clip):
             raise self._undecodable(wanted)
 
     def _seek(self, container: av.container.InputContainer, stream: av.VideoStream, index: int) -> None:
-        """Seek to the last key frame shown no later than an image, or to an earlier one.
+        """Seek to the last key frame shown no later than an image, or to an earlier key frame.
 
-        Containers seek by presentation or by decoding time of key frames. If seeking by the former leads past the
-        image, the latter is used. MP4 seeks by presentation time; a decoding time would lead to one key frame too
-        early.
+        Containers seek by presentation or by decoding time of key frames. If seeking by presentation time leads past
+        the image, decoding time is used. MP4 seeks by presentation time; a decoding time would lead to one key frame
+        too early.
         """
         for time in (self._pts[self._key_before[index]], self._seek_dts[index]):
             container.seek(int(time), stream=stream, backward=True)
@@ -227,10 +227,10 @@ class Video(Clip):
     def _decoded(
         self, container: av.container.InputContainer, stream: av.VideoStream, alpha: bool, first: int, broken: set[int]
     ) -> Iterator[av.VideoFrame]:
-        """Yield decoded images from the current position on; before a time stamp, decode only reference images.
+        """Yield decoded images from the current position on; decode only reference images before time stamp `first`.
 
-        Time stamps of packets that are damaged according to container flags or checksums are added to a set, and so are
-        all others up to the next key frame.
+        Time stamps of packets that are damaged according to container flags or checksums are added to `broken`, with
+        those of all later packets up to the next key frame.
         """
         if not (alpha and self._alpha_decoder):
             damaged = False

@@ -14,21 +14,21 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry.camera import Camera
 from jawusd.media.pixels import ColourPicture, DecodedPicture, Slices
 
-_NODE_PX = 16  # spacing of the map's nodes that are searched for a region
+_NODE_PX = 16  # spacing of the map's nodes, among which the region of a mask is searched
 
 
 _Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
 
 def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pixel]:
-    """Return an image sampled bilinearly at positions (h, w, 2) [px], 0 outside of it."""
+    """Return an image sampled bilinearly at positions (h, w, 2) [px], 0 outside the image."""
     black = cv2.BORDER_CONSTANT
     found = cv2.remap(image, positions, None, cv2.INTER_LINEAR, borderMode=black)  # type: ignore[call-overload]  # no 2nd map
     return np.asarray(found, image.dtype)
 
 
 def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Convert only the bounding box of positions (h, w, 2) [px] of an image.
+    """Return an image of which only the bounding box of positions (h, w, 2) [px] is converted.
 
     The rest is black and costs no memory, as untouched pages are not allocated.
     """
@@ -136,7 +136,7 @@ class WorkingView:
         return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _window(self, mask: NDArray[np.uint8]) -> Slices | None:
-        """Return the working pixels that may sample a non-black pixel of the mask, or None."""
+        """Return the window of working pixels that may sample a non-black pixel of the mask, None if there are none."""
         rows = np.flatnonzero(mask.max(axis=1))
         if rows.size == 0:
             return None

@@ -65,7 +65,7 @@ class VideoWriter:
             stream = container.add_stream("ffv1" if self._lossless else "libx264", rate=self._rate)
             stream.width, stream.height = self._size_px
             stream.pix_fmt = "gray" if self._lossless else "yuv420p"
-            # Only key frames in FFV1: fast seeking, and damage affects one image.
+            # FFV1 with key frames only: seeking is fast, and damage affects one image.
             stream.options = {"level": "3", "g": "1"} if self._lossless else {"crf": str(self._crf)}
             self._stream = stream
             self._next = 0

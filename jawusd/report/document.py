@@ -27,7 +27,7 @@ from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
 from jawusd.report.verdicts import MARKS, WORDS, BuildVerdict, judge, overall, summary
 
-_LISTED = 60  # most frame ranges listed
+_LISTED = 60  # maximum number of frame ranges listed
 _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
 
 
@@ -94,7 +94,7 @@ def page_environment() -> jinja2.Environment:
 
 def worded(text: str) -> Markup:
     """Return a sentence as HTML, with text in backticks as code."""
-    parts = re.split(r"`([^`]*)`", shown(text))  # elements with odd indices are code
+    parts = re.split(r"`([^`]*)`", shown(text))  # elements at odd indices were in backticks
     return Markup().join(Markup("<code>{}</code>").format(p) if k % 2 else escape(p) for k, p in enumerate(parts))
 
 
@@ -117,7 +117,7 @@ def draw_figures(data: ReportData) -> dict[str, Markup]:
 
 
 def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict[str, float]]]]]:
-    """Return (short name, description, rows (place, figures)) per table."""
+    """Return the error tables, each with short name, description, and rows of (place, figures)."""
     names = {
         "train": ("fit", "poses the model was fitted to"),
         "holdout": ("held out", "poses of parts of the take that were held out of the fit, one part at a time"),
@@ -222,7 +222,7 @@ def _drawn(meta: TracksMeta, camera: str) -> str:
 
 
 def _bite(data: ReportData) -> str:
-    """Return what was estimated from the take about the annotated gum line and the closed bite."""
+    """Return sentences on the annotated gum line and the occlusion as estimated from the take."""
     meta, said = data.tracks.meta, []
     if "gum_line_mm" in meta:
         upper, lower = meta["gum_line_mm"]

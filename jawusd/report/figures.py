@@ -36,14 +36,14 @@ from jawusd.report.style import (
 )
 from jawusd.report.verdicts import GOOD, LOOK
 
-_COLUMNS = 1200  # most points per curve; of longer takes, the extreme of every few frames is drawn
+_COLUMNS = 1200  # maximum number of points per curve; longer takes are reduced to the extreme of every few frames
 _LANES = ("tracked", "recovered", "without a camera", "lost", "regularised")
 _LANE_COLORS = (GREEN, SKY, ORANGE, VERMILION, BLUE)
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, BLACK, GREY)
-_AROUND_FRAMES = 12  # frames drawn before and after a flash
-_APART_FRAMES = 48  # light steps farther apart than this are separate flashes
-_QUANTILE = 99.5  # percentile that is robust to single outliers
-_NEAR_CLOSED_MM = 5.0  # largest opening at which protrusion is measured, as in clinical practice
+_AROUND_FRAMES = 12  # number of frames drawn before and after a flash
+_APART_FRAMES = 48  # maximum distance between successive light steps of one flash
+_QUANTILE = 99.5  # percentile taken as the end of a range of motion, robust to single outliers
+_NEAR_CLOSED_MM = 5.0  # maximum opening at which protrusion is measured, as in clinical practice
 
 
 RANGES = "ranges"  # file name of the figure of several actors
@@ -54,7 +54,7 @@ _PARAMETERS = {
     "protrusion": ("protrusion d3, + forward", SKY),
 }
 _ROW_IN, _MARGINS_IN = 0.22, 0.9
-_MOST_ROWS = 400  # most actors drawn; common programs cannot open taller images
+_MOST_ROWS = 400  # maximum number of actors drawn; common programs cannot open taller images
 
 
 def tracking_figure(tracks: Tracks) -> Figure:
@@ -141,7 +141,7 @@ def larger_magnitude(a: Array, b: Array) -> Array:
 
 
 def thinned(frames: NDArray[np.int64], values: Array, keep: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
-    """Return at most `_COLUMNS` points (frames, values), reducing groups of frames with `keep`."""
+    """Return at most `_COLUMNS` points (frames, values), with each group of frames reduced by `keep`."""
     step = -(-len(frames) // _COLUMNS)
     if step <= 1:
         return frames.astype(np.float64), values
@@ -161,7 +161,7 @@ def legend_beside(axis: Axes) -> None:
 
 
 def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str, path: Path) -> None:
-    """Plot the brightness of all clips to a PNG or SVG file: whole clips, and around the first and last flash.
+    """Plot the brightness of all clips, in full and around the first and last flash, to a PNG or SVG file.
 
     Args:
         offsets: frame k of a camera is simultaneous with frame k + offset of the reference camera; None: plot the clips
@@ -208,7 +208,7 @@ def _draw_curves(axis: Axes, curves: Mapping[str, LightCurve], shifts: Mapping[s
         for steps, mark in ((curve.off_frames, "v"), (curve.on_frames, "^")):
             height = np.interp(steps, curve.frames, curve.brightness)
             axis.plot(steps + shifts[name], height, mark, color=colour, ms=7, mec="white", mew=0.6)
-    # One legend entry per kind of marker for all cameras.
+    # One legend entry per kind of marker, shared by all cameras.
     axis.plot([], [], "v", color=GREY, label="light off")
     axis.plot([], [], "^", color=GREY, label="light on")
     axis.set_ylim(0, 255)
@@ -236,7 +236,7 @@ class RangeRow:
     grade: str
 
 
-# Lowest and highest usual value: mean -+ 2 SD; the extremes over both sexes where they were published separately.
+# Usual minimum and maximum: mean -+ 2 SD, or the extremes over both sexes where they were published separately.
 _REFERENCE = {
     "opening at the incisors": (
         36.0,

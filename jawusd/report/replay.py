@@ -16,14 +16,14 @@ from jawusd.geometry import transform_points
 
 #: Names of the states of a frame.
 STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "regularised by the model")
-_MOST_FRAMES = 6000  # longer takes are subsampled
+_MOST_FRAMES = 6000  # maximum number of frames; longer takes are subsampled
 _DEFAULT_FPS = 24.0
 
 
 def replay_data(data: ReportData) -> dict[str, object] | None:
     """Return the input of replay.js for JSON; None without meshes or frames.
 
-    Poses are motions relative to the closed bite in the anatomical frame, upper 3 x 4 part in row-major order. Mesh
+    Poses are motions relative to occlusion in the anatomical frame, as row-major 3 x 4 matrices. Mesh
     vertices are quantised to 16 bits over the bounding box.
     """
     tracks, model = data.tracks, data.model
@@ -35,7 +35,7 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
     fitted = np.full((len(rows), 4, 4), np.nan)
     known = np.all(np.isfinite(d), axis=1)
     fitted[known] = JawRig(model.arrays, model.meta).pose(d[known])
-    # The camera is fitted to the jaw without the skull.
+    # The camera frames the jaw, without the skull.
     jaw = [part.mesh.vertices for part in data.parts if part.name != "skull"] or [data.parts[0].mesh.vertices]
     low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
     A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]

@@ -33,7 +33,7 @@ _INKS = (BLACK, BLUE, VERMILION)
 _STYLES = ("-", "--", ":")
 _BAND = 2.0  # half width of the band [sigma]: 95 % of normally distributed errors
 _UNOBSERVED = (SolveState.CARRIED, SolveState.LOST)
-_LISTED = 60  # most runs listed
+_LISTED = 60  # maximum number of runs listed
 
 
 def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
@@ -62,7 +62,7 @@ def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
 
 
 def observation_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
-    """Plot the state and verdict of every frame, and the masks used of each camera and arch."""
+    """Plot the state and verdict of every frame, and the masks used per camera and arch."""
     frames, names = tracks.frames, tracks.camera_names
     lanes = [(str(state), solved.state == state, ink) for state, ink in STATE_INKS.items()]
     lanes.append(("within tolerance", solved.valid & ~is_inside(solved.margin_mm), GREY))
@@ -244,7 +244,7 @@ def _sentence(solved: SolvedJaw, doubts: bool) -> str:
 
 
 def _jaw_rows(solved: SolvedJaw) -> list[tuple[str, str, str, str, str]]:
-    """Return (parameter, smallest, largest, median sigma, largest sigma) in mm; the median is over solved frames."""
+    """Return (parameter, minimum, maximum, median sigma, maximum sigma) in mm; the median is over solved frames."""
     names = ("d1 opening", "d2 laterotrusion (left is positive)", "d3 protrusion (forward is positive)")
     seen = solved.state == SolveState.SOLVED
     rows = []

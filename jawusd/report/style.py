@@ -81,7 +81,7 @@ def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = Fal
     """Return a figure encoded as a file type, without dates and versions, so that equal figures give equal bytes."""
     drawn = io.BytesIO()
     metadata = {"Software": None} if kind == "png" else {"Date": None}
-    for text in figure.findobj(Text):  # draw names literally: without control characters, and with $ not parsed as math
+    for text in figure.findobj(Text):  # draw names literally: drop control characters, and do not parse $ as math
         text.set_text("\n".join(map(shown, text.get_text().split("\n"))))
         text.set_parse_math("$" not in text.get_text())
     with matplotlib.rc_context(SETTINGS):

@@ -23,7 +23,7 @@ from jawusd.viewer.viewed import Region, ViewedCapture
 from jawusd.viewer.widgets import begin_panel, errors_shown, guarded, limit_uploads
 
 _PANEL_PX = 370
-_SLOW_S = 0.3  # time after which "loading" is displayed
+_SLOW_S = 0.3  # decoding time after which "loading" is displayed
 _USUAL_MM, _USUAL_WEIGHT = 250.0, 1e-3  # mean and weight of the prior on the distance from a camera to the mouth
 _SPACE_SIDE = (0.9, -0.7, 0.0)  # offset of the 3-D view's direction from that of the first camera
 
@@ -189,7 +189,7 @@ class CapturePage:
             self.picks.show_fit(error.statement())
 
     def _lay_out(self, view: str, frame: int) -> PickingLayout:
-        """Return the layout of a camera's image, or of all of them."""
+        """Return the layout of one camera's image, or of all cameras side by side."""
         capture = self._capture
         if view not in capture.sizes_px:
             width, height = capture.wall_px

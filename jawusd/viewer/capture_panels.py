@@ -119,7 +119,7 @@ class FootagePanel:
             self.refresh()
 
     def follow(self, frame: int) -> None:
-        """During playback, set the widgets to the frame just drawn, so that they are never ahead of the image."""
+        """Set the widgets to the frame just drawn during playback, so that they are never ahead of the image."""
         if self.player.playing:
             self._show(frame)
 

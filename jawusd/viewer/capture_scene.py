@@ -15,12 +15,12 @@ from jawusd.viewer.picking import ARCHES, FOV_RAD, PickBook, PickingLayout
 from jawusd.viewer.viewed import ViewedCapture, for_view
 
 ENAMEL, GUM, BASE = (236, 229, 212), (196, 112, 108), (120, 135, 165)
-#: Colours of the picks by arch, as in the outlines; colour of the selected pick.
+#: Colours of picks by arch, as in the outlines, and colour of the selected pick.
 ARCH_COLORS, SELECTED = {"upper": (255, 170, 0), "lower": (0, 200, 255)}, (255, 60, 200)
 #: Up direction of the page.
 UP = (0.0, -1.0, 0.0)
-_MOST_FACES = 7_000  # faces drawn per part of an arch; clicks are tested with the full scan
-_MOST_PAINTED_FACES = 25_000  # the same while labels are being edited
+_MOST_FACES = 7_000  # maximum number of faces drawn per part of an arch; clicks are tested on the full scan
+_MOST_PAINTED_FACES = 25_000  # maximum number of faces while labels are being edited
 _JPEG_QUALITY = 88
 _THUMB_PX = 480
 _FRUSTUM_MM = 60.0  # distance from a camera's centre to its image

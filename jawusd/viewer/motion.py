@@ -17,7 +17,7 @@ from jawusd.formats.keys import Key
 #: Keys of an animation, in the order of their frames.
 KeyTrack = tuple[Key, ...]
 
-_MOST_PER_S = 30.0  # most updates per second, to limit network load
+_MOST_PER_S = 30.0  # maximum updates per second, to limit network load
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +135,6 @@ class Player:
                     break
                 await asyncio.sleep(1.0 / min(fps, _MOST_PER_S))
         finally:
-            if self._task is asyncio.current_task():  # otherwise `stop` has called `ended` already
+            if self._task is asyncio.current_task():  # after `stop`, `ended` has already been called
                 self._task = None
                 self._ended()

@@ -22,7 +22,7 @@ from jawusd.viewer.widgets import Choice, assign, guarded, limit_uploads, notify
 
 KEYS = "keys"
 _LENGTH = 100
-_MOST_THUMBS = 40  # most keys for which there is a multi-slider
+_MOST_THUMBS = 40  # maximum number of keys for which there is a multi-slider
 
 
 class MotionPanel:

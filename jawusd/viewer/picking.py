@@ -21,13 +21,13 @@ from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.viewed import Region
 
 ARCHES = ("upper", "lower")
-_FEWEST, _FEWEST_VIEWS = 3, 2  # least number of picks per arch, and of views per pick
+_FEWEST, _FEWEST_VIEWS = 3, 2  # minimum number of picks per arch, and of views per pick
 FOV_RAD = 0.35
 #: Rotation of the scans about the subject's vertical and transverse axis [deg], by the side that faces the viewer.
 SIDES = {"front": (0.0, 0.0), "left": (-60.0, 0.0), "right": (60.0, 0.0), "biting side": (0.0, 65.0)}
-_TEETH_MM = 60.0  # width of a region around the teeth in the layout
+_TEETH_MM = 60.0  # width in the layout to which the region around the teeth is scaled
 _GAP_MM = 5.0
-_EDGE = 1e-9  # tolerance, so that rays cannot pass between adjacent faces
+_EDGE = 1e-9  # barycentric tolerance, so that rays cannot pass between adjacent faces
 _MARGIN = 1.05
 
 
@@ -172,7 +172,7 @@ class PickingLayout:
         return (float(x), float(y)) if -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5 else None
 
     def scan_poses(self, scans: Mapping[str, Mesh], T_anatomical_skull: Array, side: str) -> dict[str, Array]:
-        """Return T_layout_scan (4, 4) of both arches: in front of the image, below the region, showing a side."""
+        """Return T_layout_scan (4, 4) of both arches: in front of the image, below the region, seen from a side."""
         top = float(self.place([self.region[0], self.region[3]])[1]) + _GAP_MM
         middle = float(self.place([(self.region[0] + self.region[2]) / 2, 0.0])[0])
         found = {}
@@ -194,7 +194,7 @@ class PickingLayout:
 
 
 def fit_view(points: ArrayLike, away: ArrayLike, up: ArrayLike, aspect: float) -> tuple[Array, Array]:
-    """Return the closest camera position (3,) and its target (3,) that show all points (n, 3).
+    """Return the closest camera position (3,) from which all points (n, 3) are visible, and its target (3,).
 
     Args:
         away: direction from target to camera, shape (3,).
@@ -225,7 +225,7 @@ def region_around(points_px: ArrayLike, size_px: tuple[int, int]) -> Region:
 
 
 def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: ArrayLike) -> tuple[int, float] | None:
-    """Return the vertex nearest to a world ray's hit on a posed scan, and the hit's distance [mm]; None if missed."""
+    """Return the vertex nearest to where a world ray hits a posed scan, and the distance [mm]; None without a hit."""
     inverse = se3_inverse(T_world_scan)
     o = transform_point(inverse, np.asarray(origin, dtype=np.float64))
     d = inverse[:3, :3] @ np.asarray(direction, dtype=np.float64)

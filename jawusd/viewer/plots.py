@@ -29,7 +29,7 @@ _TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot with its static part drawn.
+    """A plot whose static part has been drawn.
 
     Attributes:
         name: id of the static part in the page.

@@ -41,7 +41,7 @@ def landmark_places(rig: JawRig, d: Array) -> Array:
 
 
 def rest_places(rig: JawRig) -> Array:
-    """Return the landmarks in the closed bite, anatomical frame [mm], shape (5, 3)."""
+    """Return the landmarks in occlusion, anatomical frame [mm], shape (5, 3)."""
     T = rig.T_anatomical_skull @ rig.T_rest
     return transform_points(T, rig.landmarks)
 

@@ -20,7 +20,7 @@ _HELP = (
     "White: crown, red: gum, blue: base. Click on a scan to paint around the clicked point. Tracking uses only the "
     "line between crown and gum; labels below the gum have no effect."
 )
-_RADIUS_MM = (0.3, 8.0, 0.1, 1.5)  # smallest and largest radius, step, initial value
+_RADIUS_MM = (0.3, 8.0, 0.1, 1.5)  # radius of the brush: minimum, maximum, step, initial value
 
 
 class ScanBrush:
@@ -66,7 +66,7 @@ class ScanBrush:
         self.changed.discard(arch)
 
     def faces_with(self, arch: str, label: int) -> Mask:
-        """Return which faces of an arch have a label at most of their corners, shape (F,)."""
+        """Return which faces of an arch have a label at the majority of their corners, shape (F,)."""
         corner = self.labels[arch][self._scans[arch].faces]
         tooth = ((corner != GUM) & (corner != BASE)).sum(axis=1) >= 2
         base = (corner == BASE).sum(axis=1) >= 2

@@ -20,14 +20,14 @@ Color = tuple[int, int, int]
 _ENAMEL, _GUM, _BONE = (236, 229, 212), (196, 112, 108), (222, 207, 178)
 _COLORS = {"upper_teeth": _ENAMEL, "lower_teeth": _ENAMEL, "upper_gum": _GUM, "lower_gum": _GUM}
 _OUTSIDE: Color = (222, 120, 90)
-_PLACEHOLDER: Color = (150, 158, 168)  # distinct from the colour of bone
+_PLACEHOLDER: Color = (150, 158, 168)  # colour of placeholders, distinct from bone
 _CLEAR = 0.45  # opacity of a translucent mandible
 _INCISOR, _CONDYLE, _PIN, _HELD = (0, 114, 178), (0, 158, 115), (230, 159, 0), (213, 94, 0)
 _SKULL_OPACITY = 0.28
 _GROUND: Color = (196, 190, 186)
 _AMBIENT = 1.6
 _MARKER_MM, _PIN_MM = 1.2, 2.2
-_BALL = 2  # icosphere subdivisions of a marker (320 faces)
+_BALL = 2  # number of subdivisions of a marker, an icosphere (320 faces)
 _CAPTURED_MM, _MOST_CAPTURED = 0.5, 400
 
 #: Views by name: offset from target to camera, anatomical axes [mm].
@@ -52,7 +52,7 @@ class JawScene:
     """3-D scene of one page; `grips` are the meshes that can be dragged."""
 
     def __init__(self, client: viser.ClientHandle, actor: ViewedActor) -> None:
-        """Draw skull and jaw in the closed bite."""
+        """Draw skull and jaw in occlusion."""
         self._client, self._scene = client, client.scene
         rig = actor.rig
         self._T_world_skull = np.array(rig.T_anatomical_skull)

@@ -27,9 +27,9 @@ from jawusd.viewer.widgets import set_theme
 
 log = logging.getLogger(__name__)
 
-# Without a GPU, building the panels blocks a browser for most of a second: send the jaw earlier, by this time [s].
+# Time between sending the jaw and the panels: without a GPU, building the panels blocks a browser for almost a second.
 _HEAD_START_S = 0.5
-_SHOW_EVERY_S = 0.1  # shortest interval between live poses
+_SHOW_EVERY_S = 0.1  # minimum interval between live poses
 
 
 class _WithoutTraceback(logging.Filter):
@@ -51,7 +51,7 @@ _WITHOUT_TRACEBACK = _WithoutTraceback()
 
 
 def _report_task(loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-    """Log in one line that a message of a page failed."""
+    """Log in one line that a message from a page could not be processed."""
     error = context.get("exception")
     log.warning("a message of a page failed (%s)", _words(error or context.get("message")))
     if isinstance(error, BaseException):
@@ -89,9 +89,9 @@ class PageServer(ABC):
         self._host = host
         self.pages: dict[int, _Closable] = {}
         _check_address(host)
-        with contextlib.redirect_stdout(sys.stderr):  # stdout is for results, but viser prints a greeting
+        with contextlib.redirect_stdout(sys.stderr):  # viser prints a greeting, but stdout is for results
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
-        logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # adding it again has no effect
+        logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # no effect if already added
         self._server.get_event_loop().set_exception_handler(_report_task)
         set_theme(self._server.gui)
         self._server.on_client_connect(self._connected)

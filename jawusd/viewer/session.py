@@ -50,7 +50,7 @@ class Session:
     """Posing, dragging and keying of a rig by one visitor; with `keep_valid` sliders stay inside the bound."""
 
     def __init__(self, rig: JawRig, fps: float) -> None:
-        """Start in the closed bite without keys."""
+        """Start in occlusion without keys."""
         self.rig = rig
         self.work = Work(d=triple(rig.project(np.zeros(3))), fps=fps)
         self.keep_valid = True
@@ -129,7 +129,7 @@ class Session:
         return d if self.rig.is_inside(d) else self.rig.project(d)
 
     def _kept(self, d: Array, index: int) -> Array:
-        """Return d (3,) moved inside the bound, with the least change of parameter `index`."""
+        """Return d (3,) moved inside the bound while changing parameter `index` as little as possible."""
         if float(self.rig.margin(d)) >= 0.0:
             return d
         d = d.copy()

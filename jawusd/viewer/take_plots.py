@@ -27,7 +27,7 @@ _STATUS: dict[int, str] = {
     RECOVERED: "recovered",
     PARTIAL: "tracked without one camera",
 }
-_COLORS = (ORANGE, BLUE)  # upper, lower; same as the outlines in the images
+_COLORS = (ORANGE, BLUE)  # upper and lower arch, as in the outlines in the images
 _NAMES = ("d1 opening", "d2 laterotrusion", "d3 protrusion")
 _BAND = 2.0  # half width of the bands [sigma]: 95 % of normally distributed errors
 _MOST_SAMPLES = 400
@@ -104,7 +104,7 @@ def solve_plot(tracks: Tracks, solved: SolvedJaw, span: tuple[int, int]) -> Plot
 
 
 def _corners(span: tuple[int, int], low: float, high: float) -> Array:
-    """Return two corners (2, 2) of a range of frames, at least one frame wide, and a range of values."""
+    """Return two opposite corners (2, 2) of a plot over a range of frames and values, at least one frame wide."""
     return np.array([[span[0], low], [max(span[1], span[0] + 1), high]], np.float64)
 
 

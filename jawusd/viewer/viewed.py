@@ -24,7 +24,7 @@ STILL, MOVING = ("skull", "upper_teeth", "upper_gum"), ("mandible", "lower_teeth
 Look = Literal["outlines", "tinted", "footage"]
 #: A region of an image: left, top, right, bottom [px].
 Region = tuple[float, float, float, float]
-_STEPS, _NEAR = 8, 0.93  # most iterations; they end above this fraction of the requested number of faces
+_STEPS, _NEAR = 8, 0.93  # maximum number of iterations, and fraction of the requested number of faces that ends them
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class ViewedActor:
 
     name: str
     rig: JawRig
-    # by the names in `STILL` and `MOVING` [mm], decimated for display; each is optional
+    # meshes [mm] by the names in `STILL` and `MOVING`, decimated for display; each is optional
     meshes: Mapping[str, Mesh]
     placeholders: frozenset[str]  # names of meshes that are placeholders, not anatomy
     fps: float  # frames per second of new animations
@@ -54,21 +54,21 @@ class ViewedCapture:
 
     name: str
     fps: float
-    frames: tuple[int, int]  # first and last frame to step through, of the reference camera, both inclusive
+    frames: tuple[int, int]  # first and last frame (inclusive) of the reference camera to step through
     offsets: Mapping[str, int]  # frame k of a camera is simultaneous with frame k + offset of the reference camera
     # (width, height) of the images of every camera with footage, in the capture's order
     sizes_px: Mapping[str, tuple[int, int]]
     cameras: Mapping[str, Camera]  # calibrated cameras by name; empty without a calibration
     scans: Mapping[str, Mesh]  # the teeth by arch, "upper" and "lower" [mm], vertices as in their files
-    crowns: Mapping[str, Mask]  # which faces of a scan are teeth, shape (F,); the others are gum
-    labels: Mapping[str, NDArray[np.uint8]]  # GUM, TOOTH, BOUNDARY or BASE per vertex of a scan, shape (V,), by arch
+    crowns: Mapping[str, Mask]  # by arch: which faces of a scan are teeth, shape (F,); the others are gum
+    labels: Mapping[str, NDArray[np.uint8]]  # by arch: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,)
     T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
     tracks: Tracks | None  # tracked poses, if any
     picks: Bootstrap | None  # picks of the capture file, if any
     # maps (camera, frame of the reference camera, T_world_upper and T_world_lower or None, look) to RGB (h, w, 3)
     # uint8, gray if the camera has no image; raises a JawusdError
     picture: Callable[[str, int, tuple[Array, Array] | None, Look], NDArray[np.uint8]]
-    # the same for all cameras side by side, each of the size `wall_px`; the last argument is called with partial
+    # like `picture`, for all cameras side by side in an image of `wall_px`; the last argument is called with partial
     # images while cameras are being decoded
     wall: Callable[
         [int, tuple[Array, Array] | None, Look, Callable[[NDArray[np.uint8]], None] | None], NDArray[np.uint8]
@@ -79,7 +79,7 @@ class ViewedCapture:
     # fits T_world_upper and T_world_lower (4, 4) to picks, and returns them with the names of inconsistent picks;
     # raises a JawusdError
     poses_of_picks: Callable[[Bootstrap], tuple[tuple[Array, Array], list[str]]]
-    # writes picks to the capture file, given those read before; raises a JawusdError
+    # writes picks (first argument) to the capture file if it still has the second ones; raises a JawusdError
     save_picks: Callable[[Bootstrap, Bootstrap | None], None]
     # writes the approved labels of an arch and returns the file; raises a JawusdError
     save_labels: Callable[[str, NDArray[np.uint8]], Path]
@@ -96,7 +96,7 @@ def for_view(mesh: Mesh, most_faces: int) -> Mesh:
     """Return a mesh decimated to at most `most_faces` faces for display; smaller meshes are unchanged.
 
     Vertex clustering (Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993).
-    The next cell size to try follows from the face count being inversely proportional to the square of the cell size.
+    The next cell size assumes that the number of faces is inversely proportional to the square of the cell size.
     """
     if len(mesh.faces) <= most_faces:
         return mesh

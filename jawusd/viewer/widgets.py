@@ -23,7 +23,7 @@ Value = TypeVar("Value")
 #: The event of a button group.
 Choice = viser.GuiEvent[viser.GuiButtonGroupHandle]
 MOST_BYTES = 8 << 20
-_MOST_LETTERS = 80  # longest file name in messages
+_MOST_LETTERS = 80  # maximum length of a file name in messages [characters]
 
 
 def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
@@ -155,7 +155,7 @@ def limit_uploads(client: viser.ClientHandle, button: viser.GuiUploadButtonHandl
 
     async def part_received(_: int, message: _messages.FileTransferPart) -> None:
         state = pending.get(message.transfer_uuid)
-        # A page may send more bytes than announced.
+        # A page may send more bytes than it announced.
         if state is not None and state["transferred_bytes"] > MOST_BYTES:
             drop(message.transfer_uuid, f"is {state['transferred_bytes']} bytes; the limit is {MOST_BYTES}.")
 
