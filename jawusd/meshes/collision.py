@@ -16,13 +16,13 @@ from jawusd.geometry.points import welded
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.meshes.solid import DistanceGrid, distance_grid, outer_faces
 
-#: Largest distance that is measured [mm].
+#: Maximum distance measured [mm]; larger ones are truncated.
 FARTHEST_MM = 1.5
 #: Default grid step for surfaces with the curvature of teeth [mm].
 STEP_MM = 0.25
 
-_SAMPLE_MM = 0.5  # largest spacing of surface samples
-_BOXES_MM = (4.8, 2.4, 1.2, 0.6)  # edge lengths of nested boxes
+_SAMPLE_MM = 0.5  # maximum spacing of surface samples
+_BOXES_MM = (4.8, 2.4, 1.2, 0.6)  # edge lengths of the nested boxes of the tree
 _PARTS = 16  # number of chunks into which poses are split for threads
 
 
@@ -48,7 +48,7 @@ class Solid:
 
     grid: DistanceGrid
     samples: Samples
-    entering: float  # see `outer_faces`
+    entering: float  # fraction of vertical lines whose first crossing enters the solid, see `outer_faces`
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def solid(corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> So
         step_mm: step of the distance grid, which is interpolated linearly.
     """
     outer, entering = outer_faces(corners, up)
-    # Interpolation uses exact values up to FARTHEST_MM if they extend one cell diagonal beyond it.
+    # Distances up to FARTHEST_MM are interpolated from exact values if these extend one cell diagonal farther.
     grid = distance_grid(corners, outer, box, step_mm, up, FARTHEST_MM + 3.0**0.5 * step_mm)
     near = ((corners <= box[1]) & (corners >= box[0])).all(axis=2).any(axis=1)
     return Solid(grid, in_boxes(surface_points(corners[outer & near], _SAMPLE_MM)), entering)

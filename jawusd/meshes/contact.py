@@ -17,25 +17,25 @@ from jawusd.formats.mesh import BASE, DEEP, TOUCHING, Mesh
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.meshes.collision import FARTHEST_MM, STEP_MM, Pair, Solid, distances, solid, tips_box
 
-_CROWN_MM = 14.0  # largest height of crowns above the gum
-# fraction of lines that must enter a scan at their first crossing; it is 0.93 and more for consistent winding
+_CROWN_MM = 14.0  # maximum height of crowns above the gum
+# minimum fraction of lines whose first crossing enters the scan; at least 0.93 for consistent winding
 _LEAST_WOUND = 0.6
 _WIDEST_GAP_MM = 1.0
 _DEEPEST_MM = 2.5
 _COARSEST_MM = 1.5
 
-_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # grid step and largest opening of the field of the teeth
-_CLOSE_MM = 1.0  # larger clearances come from the coarse field; twice the clearance up to which errors are measured
-_BEYOND_MM = 1.0  # width of the margin outside the bound that is also sampled
-_FREE_MM = 0.8  # the field ends at the opening beyond which all valid poses have at least this clearance
-_ERROR_SAMPLES = 30000  # random samples over the whole field; one in twenty is a valid pose with close teeth
+_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # grid step and maximum opening of the teeth's clearance field
+_CLOSE_MM = 1.0  # larger clearances come from the coarse field; twice NEAR_MM, below which errors are measured
+_BEYOND_MM = 1.0  # poses up to this far outside the bound are sampled too
+_FREE_MM = 0.8  # the field ends where all valid poses at larger openings have at least this clearance
+_ERROR_SAMPLES = 30000  # number of random samples over the field; one in twenty is a valid pose with close teeth
 _CAPTURED_QUANTILE = 0.01
 _LARGEST_LIMIT_MM = 1.0
 Picture = NDArray[np.uint8]
 
 _ENAMEL, _PAPER = np.array([236.0, 229.0, 212.0]), 255
 _LIGHT = np.array([0.3, 0.87, -0.4])
-_FLOOR_MM = 11.0  # depth below the tips up to which surfaces are drawn; deeper ones are gum
+_FLOOR_MM = 11.0  # maximum depth below the tips of the surfaces drawn; deeper ones are gum
 
 
 class NoContact(Exception):

@@ -21,13 +21,13 @@ from jawusd.meshes.contact import NoContact, wound_solid
 #: Step of sampled clearances [mm].
 STEP_MM = 0.8
 
-_GRID_MM = 0.5  # step of the distance grid; with a step of 0.25 mm, clearances differ by at most 0.014 mm
+_GRID_MM = 0.5  # step of the distance grid; clearances differ by at most 0.014 mm from those with 0.25 mm
 _CONDYLES = [index for index, name in enumerate(LANDMARKS) if name.startswith("condyle")]  # left, right
 _CONDYLE_MM = 10.0  # radius around the landmark that contains the condylar head but not the coronoid process
-_REACH_MM = 26.0  # largest translation of the condylar head, forward beyond the eminence
-_COARSEST_MM = 4.0  # largest median edge length; a condyle is about 8 mm deep
+_REACH_MM = 26.0  # maximum translation of the condylar head, which may pass the eminence
+_COARSEST_MM = 4.0  # maximum median edge length; a condyle is about 8 mm deep
 _FEWEST_FACES = 30
-_DEEPEST_MM, _WIDEST_MM = 2.5, 8.0  # largest penetration into the skull, and largest distance to it, in the closed bite
+_DEEPEST_MM, _WIDEST_MM = 2.5, 8.0  # closed bite: maximum penetration into the skull, and distance to it
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,8 @@ from jawusd.geometry.points import welded
 __all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]
 
 _NO_FACES = "Export the surface, not a point cloud, with the suffix of its format."
-# Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch measures about 80, a mandible 165, a skull
-# 290.
+# Diagonal of the bounding box [mm]: minimum, typical value, maximum. A full arch measures about 80, a mandible 165, a
+# skull 290.
 _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
 
@@ -143,8 +143,8 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
 class Winding(NamedTuple):
     """Winding of a mesh."""
 
-    closed: bool  # every edge is shared by exactly two triangles, with opposite directions
-    outward: bool  # triangles are counter-clockwise seen from outside; a strong hint only, unless the mesh is closed
+    closed: bool  # whether every edge is shared by exactly two triangles, in opposite directions
+    outward: bool  # whether triangles are counter-clockwise seen from outside; only probable if not closed
     volume_mm3: float  # signed volume, positive if outward
 
 

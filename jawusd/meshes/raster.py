@@ -123,7 +123,7 @@ def _interval(low: float, high: float, first: int, last: int) -> tuple[int, int]
 def _span(edges: _Edges, y: int, first: int, last: int) -> tuple[int, int]:
     """Return the first and last covered pixel (i, j) of image row y within the columns [first, last]."""
     ax, ay, bx, by, cx, cy, slope_ac, slope_ab, slope_bc = edges
-    if ay == cy:  # a degenerate triangle, seen edge-on along the row
+    if ay == cy:  # a degenerate triangle, projected to a line along the row
         return _interval(min(ax, bx, cx), max(ax, bx, cx), first, last)
     left = ax + (y - ay) * slope_ac
     right = ax + (y - ay) * slope_ab if y < by else bx + (y - by) * slope_bc

@@ -13,8 +13,8 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import GUM, TOOTH, Mesh, crown_face_mask
 from jawusd.geometry.points import welded
 
-# Offset between parts of a surface that touch in a single point [mm], since validators report coincident points as
-# unmerged seams.
+# Offset [mm] that separates parts of a surface touching in a single point, since validators report coincident points
+# as unmerged seams.
 _APART_MM = 1e-3
 
 

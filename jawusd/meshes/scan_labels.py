@@ -18,33 +18,33 @@ from jawusd.meshes.scan_surface import ScanSurface
 from jawusd.meshes.scan_tops import Tops, biting_direction, topped_by, tops
 from jawusd.meshes.scan_walk import CreaseWalk
 
-# Bounding box diagonal [mm]: that of a crown, including scanned root and gum, is smaller; that of the gum of an arch or
-# quadrant is larger.
+# Bounding box diagonal [mm] that is larger than that of any crown, including scanned root and gum, and smaller than
+# that of the gum of an arch or quadrant.
 _TOOTH_MM = 30.0
-_FEWEST_FACES = 100  # fewer faces cannot be labelled or tracked
+_FEWEST_FACES = 100  # minimum number of faces; scans with fewer cannot be labelled or tracked
 # Bounding box diagonal of the smallest crown [mm]; smaller components are scraps and brackets, which take the label of
 # their neighbours.
 _CROWN_MM = 4.0
-# Lowest part of a component that is used as gum seeds if there are no better ones [fraction of its height].
+# Fraction of a component's height whose lowest vertices are the gum seeds if there are no better ones.
 _LOWEST = 0.12
-# Largest rate at which walks leave a crown top for the gum, per mm of its outline [1/mm]; it is divided by a factor
-# that grows with the depth of the top below the hull of the arch. Rates on 40 scans of one surface: 0.003 (median) to
-# 0.030 at crowns, 0.026 to 0.074 at ridges without teeth, which are mostly below the hull.
+# Maximum rate at which walks leave a crown top for the gum, per mm of the top's outline [1/mm]; the limit is divided by
+# a factor that grows with the depth of the top below the hull of the arch. Rates on 40 scans of one surface: 0.003
+# (median) to 0.030 at crowns, 0.026 to 0.074 at ridges without teeth, which are mostly below the hull.
 _LEAVING, _DOUBT_PER_MM, _MOST_DOUBT_MM = 0.06, 3.0, 0.6
-# Fraction of a component's crown-gum border without a crease, median over an arch, up to which the components contain
-# gum: 0.02 to 0.162 for crowns with a collar of gum (58 scans of synthetic subjects with 5,000 faces and more), 0.8 to
-# 1.0 for plain synthetic crowns, 0.24 to 0.34 for real ones, and 0.167 in one scan seen from the roots, whose grooves
-# and necks resemble short creases.
+# Maximum fraction of a component's crown-gum border without a crease, median over an arch, for which the components
+# are taken to contain gum. Observed: 0.02 to 0.162 for crowns with a collar of gum (58 scans of synthetic subjects with
+# 5,000 faces and more), 0.8 to 1.0 for plain synthetic crowns, 0.24 to 0.34 for plain real ones, and 0.167 in one scan
+# seen from the roots, whose grooves and necks resemble short creases.
 _MOST_WEAK = 0.165
-_COARSE_MM = 1.2  # edge length above which creases at the gum line are lost, so that apparent crowns may contain gum
-# Components that start this far above the lower end of the adjacent crown are attached to it (brackets), not gum
-# [fraction of the crown's height].
+_COARSE_MM = 1.2  # longer edges do not resolve creases at the gum line, so that apparent crowns may contain gum
+# Minimum height of a component's lower end above that of the adjacent crown, as a fraction of the crown's height, for
+# which the component is attached to the crown (a bracket) and not gum.
 _ON_CROWN = 0.2
-# Smallest difference in redness between the highest points and points far below them, in standard deviations, for which
-# colours are used; stone casts and untextured scans stay below it.
+# Minimum difference in redness between the highest points and points far below them, in standard deviations, for which
+# colours are used; it is smaller for stone casts and untextured scans.
 _LEAST_CONTRAST = 4.0
-_FAR_BELOW_MM = 9.0  # depth below the highest point nearby, beyond most crowns
-_FEWEST = 50  # smallest number of vertices that are certainly crown, and of those certainly gum, to use colours
+_FAR_BELOW_MM = 9.0  # depth below the highest point nearby that most crowns do not reach
+_FEWEST = 50  # colours need at least this many vertices that are certainly crown, and as many that are certainly gum
 _GRAIN = 0.003  # standard deviation of redness due to 8-bit quantisation
 
 
@@ -93,7 +93,7 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
     bearing = (extent > _CROWN_MM) & (starts > 0) | alone
     high = (seen.crown | (alone & (starts == 0))[piece] & (_height_share(surface, up) > 1 - _LOWEST)) & bearing[piece]
     if (bearing & small).sum() >= 3 and high[~small[piece]].sum() < 0.2 * high.sum():
-        bearing &= small  # larger components are then the gum around these separate crowns
+        bearing &= small  # components larger than these separate crowns are then their gum
         high &= small[piece]
     low = seen.gum | ~bearing[piece]
     surely = np.bincount(piece, seen.gum, len(extent)) > 0

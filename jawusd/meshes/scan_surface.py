@@ -13,11 +13,11 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array, Indices
 from jawusd.formats.mesh import Mesh
 
-# Length over which normals are averaged before curvature is computed [mm]: scanners round creases by some tenths of a
-# millimetre and leave ripples of some hundredths.
+# Length over which normals are averaged before curvature is computed [mm]; scanners round creases by some tenths of a
+# millimetre and cause ripples of some hundredths.
 _SCALE_MM = 0.35
 _MOST_ROUNDS = 12
-_FINE_MM = 0.4  # edges up to this length use vertex normals for creases, edges of twice this use face angles [mm]
+_FINE_MM = 0.4  # creases use vertex normals up to this edge length, and face angles from twice this length
 _SEEN_MM = 0.75  # cell size of the test for visibility from above
 
 
@@ -25,8 +25,8 @@ _SEEN_MM = 0.75  # cell size of the test for visibility from above
 class ScanSurface:
     """A scan with shared vertices."""
 
-    vertices: Array  # [mm], shape (v, 3)
-    faces: NDArray[np.int64]  # shape (f, 3)
+    vertices: Array  # positions [mm], shape (v, 3)
+    faces: NDArray[np.int64]  # vertex indices, shape (f, 3)
     of_vertex: Indices  # index of the surface vertex for every scan vertex, shape (V,)
     piece: Indices  # index of the connected component of every vertex, shape (v,)
     merged: int  # number of coincident scan vertices

@@ -11,18 +11,19 @@ from scipy.spatial import ConvexHull, QhullError
 from jawusd.base.arrays import Array, Indices, Mask
 
 _CELL_MM = 0.75  # cell size of the height map
-# Largest distance in plan view of a crown's points from its highest point: half the width of a wide molar.
+# Maximum distance of a crown's points from its highest point in plan view: half the width of a wide molar.
 _REACH_MM = 4.5
-# Points up to this depth below the highest point nearby are crown: even worn crowns protrude by 3 mm.
+# Maximum depth below the highest point nearby of points that are certainly crown; even worn crowns protrude by 3 mm.
 _BAND_MM = 1.5
-# Largest depth of crown tops below the hull of the arch: a curve of Spee or an open bite causes 3 to 4 mm; ridges
+# Maximum depth of crown tops below the hull of the arch; a curve of Spee or an open bite causes 3 to 4 mm, and ridges
 # without teeth are deeper.
 _UNDER_HULL_MM = 4.5
-# Points farther than the first from every crown top in plan view, or deeper below it than the second, are not crown.
+# Points are not crown if they are farther than `_ASIDE_MM` from every crown top in plan view, or deeper than `_DEEP_MM`
+# below the hull of the arch.
 _ASIDE_MM, _DEEP_MM = 5.0, 13.0
-_LEVEL = 0.95  # cosine of the steepest slope of the hull between teeth
+_LEVEL = 0.95  # minimum vertical component of the normal of a hull facet that counts as level
 _ROUNDS = 3
-_MIDDLE_CELLS = 2  # cells around a component's centre, in plan view, that are searched for components above it
+_MIDDLE_CELLS = 2  # search radius for components above a component's centre, in cells in plan view
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +31,9 @@ class Tops:
     """Depth of an arch's vertices below its highest points, and vertices that are certainly crown or gum."""
 
     below: Array  # depth below the highest point nearby [mm], shape (v,)
-    top_depth: Array  # depth of that point below the hull of the arch [mm], shape (v,)
-    crown: Mask  # certainly crown, shape (v,)
-    gum: Mask  # certainly gum, shape (v,)
+    top_depth: Array  # depth of that highest point below the hull of the arch [mm], shape (v,)
+    crown: Mask  # vertices that are certainly crown, shape (v,)
+    gum: Mask  # vertices that are certainly gum, shape (v,)
 
 
 def biting_direction(points: Array, towards: Array | None) -> Array:
@@ -115,7 +116,7 @@ def _height_map(points: Array, up: Array) -> tuple[Indices, Array, Array]:
 
 
 def _hull_height(heights: Array) -> Array:
-    """Return the height of the level part of the upper convex hull over every cell of a map."""
+    """Return the height of the upper convex hull over every cell of a map, with its level facets extended."""
     filled = np.argwhere(np.isfinite(heights))
     places = np.column_stack([filled * _CELL_MM, heights[tuple(filled.T)]])
     out = np.full(heights.shape, np.nan)

@@ -17,12 +17,12 @@ from jawusd.meshes.scan_surface import ScanSurface
 
 # Step weights decay with inward curvature like exp(-_CREASE_DECAY_MM * curvature).
 _CREASE_DECAY_MM = 2.5
-_SHARPEST = 3.0  # upper limit of the curvature in this decay [1/mm]
+_SHARPEST = 3.0  # maximum curvature used in the step weights [1/mm]
 # Fraction of steps after which a walk ends in crown or gum at random, with the probability given by the local colour.
 _COLOUR_WEIGHT = 0.02
-_COLOUR_STEP = 0.3  # difference in crown probability between neighbours above which colour supports a border
+_COLOUR_STEP = 0.3  # minimum difference in crown probability between neighbours for colour to support a border
 _TOLERANCE, _STEPS = 1e-3, 600
-# Borders count as weak if no crease of at least this curvature [1/mm] lies within this distance [mm].
+# A border counts as weak without a crease of at least curvature `_EVIDENCE` [1/mm] within `_EVIDENCE_REACH_MM`.
 _EVIDENCE, _EVIDENCE_REACH_MM = 0.6, 0.5
 
 
@@ -41,7 +41,7 @@ class CreaseWalk:
 
         Args:
             up, down: seeds of crown and gum, shape (v,).
-            most_leaving: largest rate at which walks leave a part of `up` for the gum, per mm of its outline [1/mm],
+            most_leaving: maximum rate at which walks leave a part of `up` for the gum, per mm of its outline [1/mm],
                 shape (v,). Parts with a higher rate have no crease around them: they are gum ridges and are discarded
                 as seeds.
         """

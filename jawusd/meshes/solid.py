@@ -19,10 +19,10 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.meshes.spreading import spread
 
 _BUCKET_MM = 1.0  # cell size in the (x, z) plane of the triangle lookup
-_BAND_CELLS = 3.0  # distance from triangles, in cells, up to which nearest triangles are exact; beyond, propagated
+_BAND_CELLS = 3.0  # band around triangles in which nearest triangles are exact; they are propagated from there
 _DIAGONAL_CELLS = 3.0**0.5
-_OFF_FACE_MM = 0.01  # offset from a face for testing its outside
-_JITTER_MM = np.array([1.23e-4, 0.0, 2.71e-4])  # keeps lines from hitting vertices and edges at round coordinates
+_OFF_FACE_MM = 0.01  # offset of the test point for the outside of a face
+_JITTER_MM = np.array([1.23e-4, 0.0, 2.71e-4])  # line offset that avoids vertices and edges at round coordinates
 _MOST_CROSSINGS = 256
 
 
@@ -128,12 +128,12 @@ def _columns_of(corners: Array) -> _Columns:
 
 @numba.njit(nogil=True, cache=True)
 def _crossing(corners: Array, f: int, x: float, z: float) -> tuple[int, float]:
-    """Intersect a vertical line with a triangle; return 1 entering, -1 leaving, 0 no hit, and the height."""
+    """Intersect a vertical line with a triangle; return 1 (enters), -1 (leaves) or 0 (misses), and the height."""
     ax, ay, az = corners[f, 0, 0] - x, corners[f, 0, 1], corners[f, 0, 2] - z
     bx, by, bz = corners[f, 1, 0] - x, corners[f, 1, 1], corners[f, 1, 2] - z
     cx, cy, cz = corners[f, 2, 0] - x, corners[f, 2, 1], corners[f, 2, 2] - z
     u, v, w = bx * cz - cx * bz, cx * az - ax * cz, ax * bz - bx * az
-    area = u + v + w  # y of the normal is minus this
+    area = u + v + w  # minus the y component of the normal
     if not ((u >= 0 and v >= 0 and w >= 0) or (u <= 0 and v <= 0 and w <= 0)) or area == 0:
         return 0, 0.0
     return (1 if area > 0 else -1), (u * ay + v * by + w * cy) / area

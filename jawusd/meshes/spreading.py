@@ -1,4 +1,4 @@
-"""Feature transform: assign every cell of a grid the number of the nearest numbered cell, and its distance.
+"""Feature transform: assign the number of the nearest numbered cell, and its distance, to every cell of a grid.
 
 The method of Maurer et al. (2003), IEEE TPAMI 25:265, axis by axis. Working in integers and in place, it takes a
 fraction of the time and memory of scipy's transform, which stores three coordinates per cell.
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 @numba.njit(nogil=True, cache=True)
 def spread(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Replace negative numbers of cells by the number of the nearest other cell, in place; ties use the first in order.
+    """Replace negative cell numbers by that of the nearest numbered cell, in place; ties use the first cell in order.
 
     Args:
         numbers: numbers of the cells, shape (nx, ny, nz).
@@ -76,7 +76,7 @@ def _along_line(
         before[y], squared[y] = numbers[y], away[y]
         if numbers[y] < 0:
             continue
-        while last >= 1:  # remove sites that are nearest to no cell
+        while last >= 1:  # remove sites that are not nearest to any cell
             a, b = site[last] - site[last - 1], y - site[last]
             u, v, w = squared[site[last - 1]], squared[site[last]], squared[y]
             if (a + b) * v - b * u - a * w - a * b * (a + b) <= 0:

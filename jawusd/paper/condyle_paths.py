@@ -16,10 +16,10 @@ PRINCIPAL = "principal component 1"
 
 _STEPS = 121
 _SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # fractions of the path at which the condyle's outline is drawn
-_AROUND_MM = 24.0  # distance from the condyle's centre up to which bone is drawn
+_AROUND_MM = 24.0  # radius around the condyle's centre within which bone is drawn
 _NEAR_CLOSED_MM = 5.0
-_HABITUAL_MM = 1.5  # captured poses with smaller |d2| and |d3| count as plain opening
-_BESIDE_MM = 0.75  # distance in z within which captured condyles limit the height of a condyle below the eminence
+_HABITUAL_MM = 1.5  # maximum |d2| and |d3| of captured poses that count as plain opening
+_BESIDE_MM = 0.75  # maximum difference in z of captured condyles that limit the height of a condyle
 _FEWEST_BESIDE = 3
 
 
@@ -105,7 +105,7 @@ def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
         return np.empty((0, 2, 2))
     height = cut[:, :, 0] - centre[0]
     above = height > 0
-    # One of the three corners is alone on its side of the plane; the cut connects points on its two edges.
+    # One of the three corners is alone on its side of the plane; the cut connects points on that corner's two edges.
     alone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
     rows = np.arange(len(cut))
     ends = []

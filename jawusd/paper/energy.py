@@ -20,8 +20,8 @@ from jawusd.meshes.meshio import winding
 from jawusd.meshes.raster import Bits, Singles, count_and_not, draw_silhouette, pack_bits, project
 from jawusd.tracking.contour.views import View
 
-_MARGIN_PX = 48  # margin of the screen buffer around the initial scan: 7 mm, farther than any search moves the scan
-_FARTHEST_PX = 1024  # largest extent of the buffer beyond the masks
+_MARGIN_PX = 48  # margin of the screen buffer around the initial scan: 7 mm, more than any search moves it
+_FARTHEST_PX = 1024  # maximum extent of the buffer beyond the masks
 
 _MATRICES = types.Array(types.float32, 3, "C", readonly=True)
 _SCREENS = types.Array(types.uint64, 3, "C", readonly=True)
@@ -34,7 +34,7 @@ class PixelCounter(Protocol):
     """Renderer of a scan that counts pixels: `RasterCounter` or `paper.gl.GlCounter`."""
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
-        """Set the masks of one instant: matrices (C, 3, 4), masks and free (C, h, w)."""
+        """Set the masks of one frame: matrices (C, 3, 4), masks and free (C, h, w)."""
 
     def counts(self, poses: Array) -> NDArray[np.int64]:
         """Return E_SP and E_BND of poses (N, 4, 4) in every view, shape (N, C, 2)."""
@@ -52,7 +52,7 @@ class PaperScan:
 
 
 def paper_scan(mesh: Mesh, name: str) -> PaperScan:
-    """Extract the red and green regions of a painted teeth scan; a face belongs to the region of two of its corners.
+    """Extract the red and green regions of a painted teeth scan; a face is green if at least two of its corners are.
 
     Args:
         mesh: the scan with vertex colours.
@@ -93,7 +93,7 @@ class PaperEnergy:
 
     Every view is rendered into its own screen buffer around the teeth, undistorted and at the working resolution. There
     is no depth buffer: a pixel is red or green if any triangle of that colour covers its centre. With back-face
-    culling, the count differs by about ten pixels from one with a depth buffer.
+    culling, the counts differ by about ten pixels from those with a depth buffer.
     """
 
     def __init__(self, counter: PixelCounter, scan: PaperScan, boundary_weight: float) -> None:
@@ -108,7 +108,7 @@ class PaperEnergy:
         self.evaluations = 0
 
     def show(self, views: Sequence[View], row: int, start: Array, other_row_hides: bool) -> None:
-        """Set the masks of one instant.
+        """Set the masks of one frame.
 
         Args:
             views: views with a mask of this arch.
@@ -213,7 +213,7 @@ class RasterCounter:
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
-        """Set the masks of one instant.
+        """Set the masks of one frame.
 
         Args:
             matrices: world [mm] to homogeneous px, per view, shape (C, 3, 4).
@@ -231,9 +231,9 @@ class RasterCounter:
         self._free = np.stack([pack_bits(mask) for mask in free])
 
     def counts(self, poses: Array) -> NDArray[np.int64]:
-        """Return the numbers of disagreeing pixels for T_world_scan (N, 4, 4), shape (N, C, 2).
+        """Return E_SP and E_BND, the numbers of disagreeing pixels, for T_world_scan (N, 4, 4), shape (N, C, 2).
 
-        Counted are mask pixels not covered by the scan (E_SP, eq. 8) and boundary pixels outside `free` (E_BND, eq. 9).
+        E_SP counts mask pixels not covered by the scan (eq. 8), E_BND boundary pixels outside `free` (eq. 9).
         """
         matrices = np.einsum("cij,njk->ncik", self._matrices, poses).reshape(-1, 3, 4).astype(np.float32)
         counts = np.empty((len(matrices), 2), np.int64)

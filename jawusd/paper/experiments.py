@@ -38,7 +38,7 @@ QUICK = ("additive", DEFAULT, LINEAR)
 RECONSTRUCTION, SYNTHESIS = "reconstruction", "synthesis"
 
 _LARGEST = "largest vertex distance"
-_OPENING_QUANTILE = 0.995  # quantile of d1 at which the sweep of Fig. 5 ends, robust to single frames
+_OPENING_QUANTILE = 0.995  # quantile of d1 at which the sweep of Fig. 5 ends; below 1 to ignore single frames
 _SKULL_AROUND_MM = 30.0
 _GRID_MM = 0.5
 _SLICES = 60

@@ -31,11 +31,11 @@ FIGURES = ("fig5_condyle_path", "fig12_reconstruction", "fig13_synthesis", "cove
 
 _HEADS = (PALE, SKY, BLUE, BLACK)  # colours of the condyle outlines from closed to wide open
 _BINS = 40
-_SCALE_QUANTILE = 0.8  # quantile over the models' 95 % quantiles at which the histograms' shared axis ends
-_BONES_MM, _CLOSE_MM = 12.0, 1.5  # margins around the paths
+_SCALE_QUANTILE = 0.8  # the histograms' shared axis ends at this quantile of the models' 95 % quantiles
+_BONES_MM, _CLOSE_MM = 12.0, 1.5  # margins around the paths, with bones and enlarged
 _ADVICE_LETTERS = 140  # characters per line of advice above the coverage plot
-_FEW_MM = 1.0  # smallest range of the histograms' axis
-_MANY = 2500  # number of points above which they are rasterised to limit the file size
+_FEW_MM = 1.0  # minimum range of the histograms' axis
+_MANY = 2500  # more points than this are rasterised to limit the file size
 _MOVES = ("opening d1", "laterotrusion d2", "protrusion d3")
 
 

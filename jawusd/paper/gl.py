@@ -27,8 +27,8 @@ except ModuleNotFoundError as error:
 
 
 _LAYER_EXTENSION = "GL_ARB_shader_viewport_layer_array"
-_MOST_PIXELS = 1 << 26  # largest number of pixels in one layered texture: 64 MB
-_TILE_PX = 64  # side of the tile that one work group of 16 x 16 counts
+_MOST_PIXELS = 1 << 26  # maximum number of pixels in one layered texture, 64 MB
+_TILE_PX = 64  # side of the tile in which one work group of 16 x 16 counts pixels
 _ROUND_PX = 64  # texture sizes are rounded up to a multiple of this, so that frames can share textures
 
 _VERTEX = f"""#version 430
@@ -80,7 +80,7 @@ void main() {{
 
 
 def open_context() -> moderngl.Context:
-    """Open an OpenGL 4.3 context without a window, bound to the calling thread; the caller must release it.
+    """Open a windowless OpenGL 4.3 context bound to the calling thread; the caller must release it.
 
     Raises:
         MissingDependencyError: EGL, a driver, or an extension of the driver is missing.
@@ -105,7 +105,7 @@ def open_context() -> moderngl.Context:
 
 
 def describe_graphics() -> str:
-    """Return the OpenGL version and renderer, or why OpenGL cannot be used."""
+    """Return the OpenGL version and renderer, or the reason why OpenGL cannot be used."""
     try:
         context = open_context()
     except JawusdError as error:
@@ -174,7 +174,7 @@ class GlCounter:
         return resource
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
-        """Set the masks of one instant; arguments as for `RasterCounter.show`.
+        """Set the masks of one frame; arguments as for `RasterCounter.show`.
 
         Raises:
             ValueError: the shapes do not agree, or the masks are too large for the device.

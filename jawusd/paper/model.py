@@ -41,7 +41,7 @@ COMPONENTS = 5
 _LITERAL_GROUPS: Groups = ((0,), (1, 2), (3, 4))
 _SWEEP_PERCENT = (2.0, 98.0)
 _REST_STEPS, _REST_HALVINGS = 50, 10
-_ALL_STAGES, _SEARCH_STAGES = 7, 4  # training stages of the one-dimensional networks
+_ALL_STAGES, _SEARCH_STAGES = 7, 4  # number of training stages of the one-dimensional networks
 
 
 @dataclass(frozen=True)
@@ -115,14 +115,14 @@ def fit_paper(
     """Fit the paper's model.
 
     Args:
-        shown: parameters that the data show, shape (3,).
+        shown: parameters that the data exercise, shape (3,).
         literal: whether to keep the paper's groups (1), (2, 3), (4, 5), whichever motion the components describe.
         starts: number of random initialisations; the sum with the smallest training error is kept.
         seed: seed of the first initialisation.
         nets: cache of trained networks with five components, by seed, updated in place.
 
     Raises:
-        FittingError: the data do not show a parameter, or no component moves the incisal point in its direction.
+        FittingError: the data do not exercise a parameter, or no component moves the incisal point in its direction.
     """
     from jawusd.paper.nlpca import train_nlpca  # imports torch, which takes two seconds
 

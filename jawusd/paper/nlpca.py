@@ -21,9 +21,9 @@ from jawusd.base.arrays import Array
 
 _SCALED_SD = 0.1
 _WEIGHT_DECAY = 1e-3
-_WITHOUT_FIRST = 0.01  # weight of the reconstruction error from components 2..k
+_WITHOUT_FIRST = 0.01  # weight of the error of the reconstruction from components 2..k
 _START = 0.1
-_STAGES = (60, 100, 150, 200, 300, 400, 1800)  # iterations between reorderings of the components, 3000 in all
+_STAGES = (60, 100, 150, 200, 300, 400, 1800)  # iterations between reorderings of the components, 3010 in all
 _MEMORY = 20
 _GRADIENT_TOLERANCE, _COST_TOLERANCE = 1e-7, 1e-12
 Values = TypeVar("Values", Array, torch.Tensor)
@@ -35,8 +35,8 @@ class Nlpca:
 
     # weights and biases, input to output: (D, h), (h,), (h, k), (k,), (k, h), (h,), (h, D), (D,)
     layers: tuple[Array, ...]
-    scale: float  # factor on the centred data, the input of the network
-    centre: Array  # subtracted from the data first, shape (D,)
+    scale: float  # factor that scales the centred data to the input of the network
+    centre: Array  # offset subtracted from the data before scaling, shape (D,)
     cost: float  # final value of the training cost
 
     @property

@@ -28,7 +28,7 @@ class PaperConfig:
     The other values were tuned on a synthetic take; none of them changes the error by a factor of two.
     """
 
-    # lambda of eq. 7.
+    # Weight of the boundary term, lambda of eq. 7.
     boundary_weight: float = 0.4
     # Resolution at the teeth [px/mm]: about that of the paper's 940 x 480 buffer and of the default solver.
     working_px_per_mm: float = 7.2
@@ -41,9 +41,9 @@ class PaperConfig:
     # Interval length at which the golden-section search stops: a motion of a tenth of a pixel.
     tolerance_rad: float = radians(0.01)
     tolerance_mm: float = 0.01
-    # Largest number of rounds of rotation and translation; most frames need fewer than ten.
+    # Maximum number of rounds of rotation and translation; typical frames need fewer than ten.
     most_rounds: int = 40
-    # Dense samples: number per degree of freedom (odd), and spacing.
+    # Dense search: number of samples per degree of freedom (odd), and their spacing.
     dense_samples: int = 3
     dense_rad: float = radians(0.2)
     dense_mm: float = 0.1
@@ -54,15 +54,15 @@ class PaperConfig:
 
 @dataclass(frozen=True, eq=False)
 class PaperSolution:
-    """Result for one arch at one instant."""
+    """Result for one arch in one frame."""
 
     pose: Array  # T_world_scan, shape (4, 4)
-    energy: float  # E of eq. 6 there [px]
-    rounds: int  # rounds of rotation and translation
+    energy: float  # E of eq. 6 at this pose [px]
+    rounds: int  # number of rounds of rotation and translation
 
 
 def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig) -> PaperSolution:
-    """Minimise the energy of one arch at one instant.
+    """Minimise the energy of one arch in one frame.
 
     The six parameters are those of eq. 6, R = Rz(theta_z) Ry(theta_y) Rx(theta_x) and t, relative to the start: zero is
     the pose of the previous frame, and rotations are about the centroid of the teeth. The paper does not specify this.

@@ -17,7 +17,7 @@ from jawusd.fitting.metric import MandibleMetric
 POSES = 1000
 BOX, POLYGONS, SLICES = "static: box", "dynamic: two polygons", "dynamic: slice hull"
 
-_BATCH, _BATCHES = 4000, 50  # rejection sampling; bounds that fill less than 0.5 % of their box yield fewer poses
+_BATCH, _BATCHES = 4000, 50  # rejection sampling; bounds that fill less than 0.5 % of their box give fewer than `POSES`
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +25,8 @@ class Bounds:
     """Bounds of one model."""
 
     box: Array  # captured range of each parameter [mm], shape (3, 2)
-    polygons: PolygonBound  # the paper's alpha shapes
-    rings: tuple[tuple[Array, ...], tuple[Array, ...]]  # their outlines in (d1, d2) and (d1, d3) [mm], each ring (n, 2)
+    polygons: PolygonBound  # alpha shapes as in the paper
+    rings: tuple[tuple[Array, ...], tuple[Array, ...]]  # rings of `polygons` in (d1, d2) and (d1, d3) [mm], each (n, 2)
     slices: SliceHull  # the slice hull
     slices_box: Array  # bounding box of the slice hull [mm], shape (3, 2)
 

@@ -1,4 +1,4 @@
-"""Tracking of a whole take with the paper's method: from the picks on, each frame starts at its neighbour's pose."""
+"""Track a whole take with the paper's method: outwards from the picks, each frame starts at its neighbour's pose."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.initialization.bootstrap import pose_from_picks
 
-_FEWEST_MASKS = 2  # depth is ambiguous in one view
+_FEWEST_MASKS = 2  # minimum number of masks of an arch; depth is ambiguous in one view
 
 Backend = Literal["cpu", "gl"]
 
 
 @dataclass(frozen=True, eq=False)
 class _Record:
-    """Result of one instant: poses (2, 4, 4), status (2,), coverage error (2, C)."""
+    """Result of one frame: poses (2, 4, 4), status (2,), coverage error (2, C)."""
 
     poses: Array
     status: NDArray[np.int8]
@@ -163,7 +163,7 @@ def _instant(
         energy = energies[r]
         energy.show([v for v, there in zip(views, present) if there], r, last[r], config.other_row_hides)
         poses[r] = solve_paper(energy, last[r], scans[r].centre, config).pose
-        with np.errstate(invalid="ignore"):  # a mask may be empty at the working resolution
+        with np.errstate(invalid="ignore"):  # a mask may become empty at the working resolution
             coverage[r, present] = energy.uncovered_px(poses[r]) / energy.mask_px
         status[r] = TRACKED if present.all() else PARTIAL
     return _Record(poses, status, coverage)

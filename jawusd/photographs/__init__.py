@@ -1,4 +1,4 @@
-"""The bite estimated from photographs of closed teeth taken with an uncalibrated camera.
+"""Estimate the bite from photographs of closed teeth taken with an uncalibrated camera.
 
 Uses scans and contours of `tracking`. Only `pipeline` imports it; it must not import other stages.
 """

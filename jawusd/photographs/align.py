@@ -1,4 +1,4 @@
-"""Alignment of photographs of closed teeth: pose and focal length of each, and the bite they have in common."""
+"""Align photographs of closed teeth: pose and focal length of each, and the bite they have in common."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from jawusd.photographs.search import ArchPair, PhotoStart, find_first, find_nex
 from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, match, middle_of, seen_outlines
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan, prepare_scan
 
-# Resolutions of the coarse-to-fine alignment, with the gates of its steps [mm].
+# Stages of the coarse-to-fine alignment: image scale, and the gate of each step [mm].
 _STAGES = (
     (0.25, (3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 2.0, 2.0)),
     (0.5, (2.0, 2.0, 1.5, 1.5, 1.2, 1.2, 1.0, 1.0)),
     (1.0, (1.0,) * 8),
 )
-_AT_WIDTH_PX = 1440.0  # reference width; distances in px are scaled to it
-_TURN_PX = 10.0  # distance equivalent to a difference in direction when lines are matched to outlines, at that width
-_CLEAR_MISFIT = 0.2  # misfit below which the bite of a photograph is used to start the others
-_GATE_MM, _MOST_MISFIT = 0.5, 0.45  # gate of the final misfit, and limit above which scans are another subject's
-_SAME_HAND = 1.15  # ratio of the misfits with wrong and with chosen mirroring, below which the choice is ambiguous
-_APART_MM = 1.5  # largest plausible distance between the bite of a single photograph and that of all
+_AT_WIDTH_PX = 1440.0  # reference image width, to which distances in px are scaled
+_TURN_PX = 10.0  # weight of direction when lines are matched to outlines, see `features`, at that width
+_CLEAR_MISFIT = 0.2  # maximum misfit of a photograph whose bite is used to start the others
+_GATE_MM, _MOST_MISFIT = 0.5, 0.45  # final misfit: its gate, and its maximum for scans of the same subject
+_SAME_HAND = 1.15  # minimum ratio of misfits with the other and the chosen mirroring; below it, the choice is ambiguous
+_APART_MM = 1.5  # maximum plausible distance between the bite from one photograph and that from all
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class PhotoAlignment:
     """Result of an alignment, with the data needed to render it."""
 
     result: AlignedPhotos
-    bite: Bite  # poses at the full size of the photographs
+    bite: Bite  # bite and poses for the full-size photographs
     rows: ArchPair
 
 
@@ -71,7 +71,7 @@ def align_photographs(
 def _starts(
     drawings: Sequence[Drawing], scans: Sequence[Scan], contact: Contact, progress: Callable[[str, int, int], None]
 ) -> list[PhotoStart]:
-    """Return the start of each photograph: the first is found with an unknown bite, the others with its bite."""
+    """Return the initial pose of each photograph: of the first with an unknown bite, of the others with its bite."""
     usual = typical_bites(scans)
     leads: list[tuple[int, PhotoStart]] = []
     for k, drawing in enumerate(drawings):
@@ -107,7 +107,7 @@ def _refined(bite: Bite, lines: Sequence[Drawing], rows: ArchPair, contact: Cont
 
 
 def _together(alone: Sequence[Bite], lines: Sequence[Drawing], rows: ArchPair, contact: Contact) -> Bite:
-    """Return all photographs aligned to one bite: the best of the results started from each single bite."""
+    """Return all photographs aligned to one bite: the best result of starts from the bite of each photograph."""
     if len(alone) == 1:
         return alone[0]
     photos = tuple(bite.photos[0] for bite in alone)
@@ -152,7 +152,7 @@ def _result(
 
 
 def _line_distances(photo: Photo, joint: Bite, rows: ArchPair) -> tuple[Array, Array]:
-    """Return the distances of all drawn points (N,), and of those off the gum line (M,), from outlines [px of 1440]."""
+    """Return distances from the outlines of all drawn points (N,), and of those off the gum line (M,) [px of 1440]."""
     to_usual = _AT_WIDTH_PX / photo.drawing.size_px[0]
     found = match(seen_outlines(rows.fine, photo, joint), photo.drawing, _TURN_PX / to_usual)
     distance = to_usual * np.linalg.norm(found.outlines.pixels - photo.drawing.pixels, axis=1)

@@ -16,11 +16,11 @@ from jawusd.geometry import transform_points
 from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.tracking.contour.scan import Faces, Scan
 
-_FEWEST_FACES = 50  # smaller pieces are scanning artefacts
-_MOST_TEETH = 120  # per arch, as labels of both arches share one byte
-# Substitute wall for missing gum: segments along the arch, start as a fraction of the crown height [-], height [mm].
+_FEWEST_FACES = 50  # minimum number of faces of a piece; smaller ones are scanning artefacts
+_MOST_TEETH = 120  # maximum number of pieces per arch, since labels of both arches share one byte
+# Substitute wall for missing gum: number of segments, start as a fraction of the crown height [-], height [mm].
 _WALL_PARTS, _WALL_FROM, _WALL_MM = 24, 0.75, 15.0
-_SMOOTH_PX = 2.0  # standard deviation of the Gaussian over which the direction of an outline is averaged
+_SMOOTH_PX = 2.0  # standard deviation of the Gaussian that averages the direction of an outline
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Outlines:
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
     """Return the crowns of a scan as connected pieces, with a substitute wall if the scan has no gum.
 
-    Without the wall, teeth of the far side would be rendered where gum hides them.
+    Without the wall, teeth on the far side would be rendered where gum would hide them.
 
     Args:
         scan: one arch.
@@ -134,7 +134,7 @@ def draw_teeth(
 def outlines_of(
     crowns: Sequence[Crowns], matrices: Sequence[Array], depth: NDArray[np.float32], labels: NDArray[np.uint8]
 ) -> Outlines:
-    """Return the outlines of teeth rendered by `draw_teeth`: between pixels, assigned to the tooth in front."""
+    """Return the outlines of teeth rendered by `draw_teeth`; they run between pixels and belong to the nearer tooth."""
     found = [_ends(depth, labels), _ends(depth.T, labels.T)]
     (x, y, inside_x, inside_y), (y2, x2, inside_y2, inside_x2) = found
     pixels = np.column_stack([np.r_[x, x2], np.r_[y, y2]])

@@ -13,8 +13,8 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 
 _WIDTH_PX = 1.8  # standard deviation of the Gaussian that turns lines a few pixels wide into a single ridge
-_FAINT = 0.12  # threshold of the ridge strength, relative to the strongest ridges
-_SHORTEST_PX = 60  # shorter isolated strokes are ignored
+_FAINT = 0.12  # minimum ridge strength relative to that of the strongest ridges
+_SHORTEST_PX = 60  # minimum length of isolated strokes; shorter ones are ignored
 _FEWEST_POINTS = 300
 
 
@@ -94,6 +94,6 @@ def features(pixels: Array, normals: Array, turn_px: float) -> Array:
 
 
 def nearest(these: Array, others: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the distance to the nearest of the features `others`, and its index, for each of the features `these`."""
+    """Return the distance and index of the nearest of the features `others` for each of the features `these`."""
     distance, index = cKDTree(others).query(these)
     return distance, index

@@ -19,23 +19,23 @@ from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, PhotoPose
 from jawusd.tracking.contour.scan import Scan, thinned
 
 _PX_PER_MM = 2.5
-_DISTANCE_MM = 200.0  # typical distance of dental photographs
-_FRONT_MM = np.array([0.0, 0.0, 15.0])  # offset of the front edges from the centre of rotation of the views
+_DISTANCE_MM = 200.0  # typical camera distance of dental photographs
+_FRONT_MM = np.array([0.0, 0.0, 15.0])  # position of the front edges relative to the views' centre of rotation
 _YAW = np.radians(np.arange(-75, 76, 15.0))
 _PITCH = np.radians(np.arange(-20, 21, 10.0))
 _ROLL = np.radians([-10.0, 0.0, 10.0])
 # Candidate widths of the field of view at the teeth [mm].
 _WIDTHS_MM = 38.0 * 1.1 ** np.arange(9)
 _ROWS_APART_MM = 10.0
-_SECTORS = 4  # direction bins: lines match only outlines of the same bin
+_SECTORS = 4  # number of direction bins; lines match only outlines in the same bin
 _NEAR_PX = 2.0  # distance from an outline at which a line counts half
 # Typical bite: overjet and overbite of the front teeth [mm].
 _OVERJET_MM, _OVERBITE_MM = 2.5, 2.0
 
 _WIDTH_PX = 360  # image width at which candidates are aligned
-_FACES = 6000  # crown faces per arch, sufficient at this resolution
-_CANDIDATES, _FINALISTS = 20, 4  # numbers with and without mirroring, each
-# Gates of the steps [mm], from one tooth width down to half of it: for the given bite, and for shifted bites.
+_FACES = 6000  # number of crown faces per arch, sufficient at this resolution
+_CANDIDATES, _FINALISTS = 20, 4  # each number applies to mirrored and to not mirrored views
+# Gates of the steps [mm] with the given bite and with shifted bites; the first is half a tooth width or more.
 _WIDE_GATES, _SLID_GATES = (4.0, 4.0, 3.5, 3.5, 3.0, 3.0, 2.5, 2.5), (3.0, 3.0, 2.5, 2.0, 2.0, 2.0)
 # Shifts of the lower arch from a typical bite: all are scored, and the best `_SLIDES` are aligned.
 _ASIDE_MM, _UP_MM, _AHEAD_MM = (-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-4.0, -2.0, 0.0, 2.0, 4.0)
@@ -48,7 +48,7 @@ class Candidate:
     """A candidate view of a photograph."""
 
     share: float  # fraction of the drawn lines that are near an outline [-]
-    T_cam_upper: Array  # shape (4, 4)
+    T_cam_upper: Array  # upper scan to camera [mm], shape (4, 4)
     focal_px: float
     mirrored: bool
 
@@ -58,7 +58,7 @@ class TypicalBite:
     """Poses of two arches in a typical bite."""
 
     T_anatomical_upper: Array  # upper scan to (left, up, front) axes, shape (4, 4)
-    T_anatomical_lower: Array  # shape (4, 4)
+    T_anatomical_lower: Array  # lower scan to the same axes, shape (4, 4)
 
     @property
     def frames(self) -> tuple[Array, Array]:
@@ -83,7 +83,7 @@ def typical_bites(scans: Sequence[Scan]) -> list[TypicalBite]:
 
 
 def _sides(scan: Scan, arch: int) -> list[float]:
-    """Return the signs with which an arch's smallest principal axis may point up."""
+    """Return the possible signs of an arch's smallest principal axis that let it point up."""
     if len(scan.gum_faces) < len(scan.crown_faces) // 10:
         return [1.0, -1.0]
     gum = scan.vertices[np.unique(scan.gum_faces)].mean(0) - scan.centre
@@ -100,7 +100,7 @@ def _row_frame(scan: Scan, arch: int, side: float) -> Array:
     """Return T_anatomical_scan of one arch, with its origin at the edges of the front teeth, shape (4, 4)."""
     points = scan.crown_vertices(4000)
     up = side * _least_axis(scan)
-    # Computed as the frame of a bite whose other arch is a shifted copy of this one.
+    # Computed as the anatomical frame of a bite whose other arch is a shifted copy of this one.
     T = anatomical_frame(points, points - _ROWS_APART_MM * up)
     x, y, z = (points @ T[:3, :3].T).T
     edge = np.percentile(y[z > np.percentile(z, 90)], 2 if arch == 0 else 98)

@@ -20,31 +20,32 @@ from jawusd.tracking.contour.equations import motion_about
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.initialization.occlusion import crown_surface
 
-#: Unknowns of a photograph: twist of the upper teeth about their centre [rad, mm], log focal length, distortion. A step
-#: in focal length also changes the distance so that the teeth keep their size in the image, which permits large steps.
+#: Number of unknowns of a photograph: twist of the upper teeth about their centre [rad, mm], log focal length,
+#: distortion. A step in focal length also changes the distance so that the teeth keep their size in the image, which
+#: permits large steps.
 UNKNOWNS = 8
 
 _SIGMA_MM = 0.15  # standard deviation of gap or penetration of scanned teeth in contact
-_SHARE = 0.04  # fraction of the lower crowns on a side that is in contact
-_REACH_MM = 3.0  # largest penetration: deeper points are beyond the base of a crown
-# Prior distance, with the standard deviation of its logarithm, and standard deviation of the distortion [-]: phones are
+_SHARE = 0.04  # fraction of the lower crown points on each side that are assumed in contact
+_REACH_MM = 3.0  # maximum penetration; deeper points are beyond the base of a crown
+# Priors: camera distance, standard deviation of its logarithm, and standard deviation of the distortion [-]. Phones are
 # held 80 to 200 mm from the teeth, macro lenses 200 to 400 mm.
 _DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02
 _LOG_FOCAL = 0.05  # standard deviation of the log focal length between photographs of one camera, due to focusing
-_BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)  # bite prior, at the centre of the lower teeth [rad, mm]
-# Prior standard deviation of a step [rad, mm, log, -]: damps directions that the lines do not determine.
+_BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)  # standard deviations of the bite prior [rad, mm]
+# Prior standard deviations of a step [rad, mm, log, -]; damp the unknowns that the lines do not determine.
 _LARGEST_STEP = np.array([0.1] * 3 + [3.0, 3.0, 30.0] + [0.2, 0.02])
-# Standard deviation of a drawn line from tooth edges and from the gum line, and correlation length of its error.
+# Standard deviations of drawn lines from tooth edges and from gum lines, and correlation length of these errors.
 _LINE_MM, _GUM_LINE_MM, _STRETCH_MM = 0.15, 0.3, 2.0
 _GUM_MM = 0.5  # standard deviation of the difference between the gum lines of scan and photograph
-_SHARED = 8  # shared unknowns: twist of the bite about the centre of the lower teeth, gum-line offset per arch
+_SHARED = 8  # number of shared unknowns: twist of the bite about the lower teeth's centre, gum-line offset per arch
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoPose:
     """Pose and lens of a photograph."""
 
-    T_cam_upper: Array  # shape (4, 4)
+    T_cam_upper: Array  # upper scan to camera [mm], shape (4, 4)
     focal_px: float  # focal length at the size of the image
     distortion: float  # k1 of x (1 + k1 r^2), with r the distance from the centre over half the image width
 
@@ -165,7 +166,7 @@ class Bite:
     """Poses of photographs and the bite they have in common."""
 
     photos: tuple[Photo, ...]
-    T_upper_lower: Array  # shape (4, 4)
+    T_upper_lower: Array  # lower to upper scan [mm], shape (4, 4)
     gum_mm: Array  # offset of drawn gum lines from the edges of the crowns towards the gum, upper and lower, shape (2,)
 
 
@@ -212,7 +213,7 @@ class Aligner:
         self._crowns, self._usual, self._contact = crowns, usual_bite, contact
 
     def aligned(self, bite: Bite, gates_mm: Sequence[float]) -> Bite:
-        """Return photographs and bite after one step per gate [mm], the residual above which lines are ignored."""
+        """Return photographs and bite after one step per gate, the maximum residual [mm] of the lines used."""
         for gate_mm in gates_mm:
             bite = self._step(bite, gate_mm)
         return bite
@@ -302,7 +303,7 @@ def _lens_prior(pose: PhotoPose, centre: Array) -> tuple[Array, Array, Array]:
 
 
 def _one_lens(photos: Sequence[Photo]) -> tuple[Array, Array, Array]:
-    """Return derivatives, residuals and weights of the prior that all log focal lengths are near their mean."""
+    """Return derivatives, residuals and weights of the prior that keeps all log focal lengths near their mean."""
     logs = np.log([photo.pose.focal_px / photo.drawing.size_px[0] for photo in photos])
     return np.eye(len(logs)) - 1.0 / len(logs), logs - logs.mean(), np.full(len(logs), _LOG_FOCAL**-2)
 

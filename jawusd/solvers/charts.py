@@ -32,7 +32,7 @@ from jawusd.evaluator.schema import ADDITIVE, ANCHORED
 from jawusd.solvers.motion import OPERATIONS, MotionModule
 from jawusd.solvers.solution import applied, attached, capturing, finished, inverse
 
-_STEPS_CAPTURED = 7  # iterations of the inverse gauge in a captured graph; 5 suffice for anatomical parameters
+_STEPS_CAPTURED = 7  # number of iterations of the inverse gauge in a captured graph; anatomical parameters need 5
 _GAUGE_NUMBERS = 26  # number of scalars in `GaugeNumbers`
 _SERIES_SQUARED = 0.09  # [rad^2] below this, derivatives of the angle coefficients use series
 

@@ -15,8 +15,8 @@ from jawusd.solvers.solution import applied, attached, capturing, finished, inve
 Residual = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 _STEPS_CAPTURED = 6
-_NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # after Gauss-Newton, which converges slowly for poses off the model
-# added to the Hessian, relative to its diagonal; keeps encodings differentiable where a parameter hardly moves the
+_NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # Newton steps after Gauss-Newton, which is slow for poses off the model
+# addition to the Hessian, relative to its diagonal; keeps encodings differentiable where a parameter hardly moves the
 # landmarks
 _MIN_CURVATURE = 1e-9
 
@@ -76,7 +76,7 @@ def _nearest(chart: Chart, residual: Residual, target: Tensor, u: Tensor) -> tup
             break
         r_trial, J_trial = residual(x - step, target)
         g_trial = applied(J_trial.transpose(1, 2), r_trial)
-        # this close to the minimum, changes of the residual are below rounding: compare gradients
+        # near the minimum, changes of the residual are below rounding: compare gradients instead
         better = g_trial.square().sum(dim=1) <= g.square().sum(dim=1)
         x, r = torch.where(better[:, None], x - step, x), torch.where(better[:, None], r_trial, r)
         J, g = torch.where(better[:, None, None], J_trial, J), torch.where(better[:, None], g_trial, g)
@@ -116,7 +116,7 @@ def _descended(residual: Residual, x: Tensor, target: Tensor) -> tuple[Tensor, T
 
 
 def _curvature(residual: Residual, x: Tensor, target: Tensor) -> Tensor:
-    """Return the Hessian (n, 3, 3) in x of half the squared residual, by central differences of its exact gradient."""
+    """Return the Hessian (n, 3, 3) of half the squared residual, by central differences of its exact gradient in x."""
     h = 1e-4 if x.dtype == torch.float64 else 2e-2
     shifts = h * torch.eye(3, dtype=x.dtype, device=x.device)
     around = torch.cat([x[:, None] + shifts, x[:, None] - shifts], dim=1)

@@ -32,9 +32,9 @@ from jawusd.solvers.solution import applied, capturing, finished, inverse
 
 _STEPS_CAPTURED, _PULLS_CAPTURED = 12, 2
 _START_DAMPING = 1e-3
-_POLISHING, _POLISH_MM = 2, 0.01  # number of final Newton steps, and their largest accepted length
+_POLISHING, _POLISH_MM = 2, 0.01  # number of final Newton steps, and their maximum accepted length
 _VALLEYS = 4
-_ROWS = 512  # rows compared with all candidates at once
+_ROWS = 512  # number of rows compared with all candidates at once
 
 
 class Expansion(NamedTuple):
@@ -220,7 +220,7 @@ class Hull(Formula):
         return identity + multiplier[:, None, None] * (at.rounding + at.bending), multiplier, at
 
     def _pulled_inside(self, x: Tensor) -> Tensor:
-        # deep enough that a rounding error of the margin cannot put the point outside again
+        # deep enough that rounding of the margin cannot put the point outside again
         depth_mm = INSIDE_MM if x.dtype == torch.float64 else 1e-5
         for _ in range(_PULLS_CAPTURED if capturing() else PULL_BACKS):
             distance, gradient = self.slope(x)

@@ -18,7 +18,7 @@ from jawusd.solvers.motion import OPERATIONS, Formula
 from jawusd.solvers.solution import capturing, finished
 
 _STEPS, _STEPS_CAPTURED = 60, 12
-_SOFTNESS_MM = 1.0  # rounding used to find the centre of a section: keeps the centre line straight
+_SOFTNESS_MM = 1.0  # rounding of the sections whose centres are sought; keeps the centre line straight
 _CHECKED = 400  # number of openings at which the centre line is checked
 _NEWTON_STEPS, _SMALLEST_SHARE, _STIFFNESS = 200, 1e-9, 1e-12
 _END_TOLERANCE_MM = 1e-13
@@ -92,9 +92,9 @@ class Interior(Formula):
 
 
 def _middles(bound: SliceHull) -> Array:
-    """Return a point (2,) [mm] inside the section at each of k knots, at the first and last knot the deepest.
+    """Return a point (2,) [mm] inside the section at each of k knots; at the first and last knot, the deepest one.
 
-    Beyond these two knots, sections only shrink by the rounding of the ends, towards the deepest point.
+    Beyond these two knots, sections shrink towards the deepest point, by the rounding of the ends alone.
     """
     reach = bound.supports.values
     found = np.zeros((len(reach), 2))

@@ -185,7 +185,7 @@ class JawLayer(nn.Module):
     def project(self, d: Tensor) -> Tensor:
         """Return the nearest jaw parameters (..., 3) [mm] with margin >= 0 to d (..., 3) [mm], as `JawRig.project`.
 
-        The derivative is the identity inside the bound, and outside that of the nearest point on the bound.
+        The derivative is the identity inside the bound; outside, it is that of the nearest point on the bound.
         """
         rows = self._rows(d, (3,), "d")
         x, by_d = solved(self.bound.nearest, rows)

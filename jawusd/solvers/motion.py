@@ -19,7 +19,7 @@ from jawusd.evaluator.operations import Rows, polynomial, triple
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, Triple, angle_quotients, angle_series
 from jawusd.solvers.precision import check_precision, full_precision
 
-_TINY = 1e-30  # keeps the derivative of sqrt at zero finite
+_TINY = 1e-30  # added to the argument of sqrt, which keeps the derivative at zero finite
 
 
 class TensorOperations:

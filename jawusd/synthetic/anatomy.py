@@ -15,9 +15,9 @@ from jawusd.synthetic.dental_arch import ArchShape, DentalArch, build_arch
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.teeth import LOWER, UPPER
 
-# Heights of edges and cusps above the edges of the upper central incisors [mm], first incisor to second molar.
+# Heights of edges and cusps relative to the edges of the upper central incisors [mm], first incisor to second molar.
 _UPPER_TIPS_MM = -np.array([0.0, 0.5, 0.2, 0.3, 0.4, 0.6, 1.0])
-# Heights of the lower front teeth above the lower central incisors [mm].
+# Heights of the lower front teeth relative to the lower central incisors [mm].
 _LOWER_FRONT_MM = np.array([0.0, -0.2, -0.3])
 _CONTACT_GAP_MM = 0.05
 _OPENING_STEP = 0.002
@@ -65,7 +65,7 @@ class PersonAnatomy:
 
     upper: DentalArch
     lower: DentalArch
-    mandible: Mesh  # without teeth
+    mandible: Mesh  # mandible bone without teeth
     skull: Mesh  # sockets of the joint, cheekbones, upper jaw bone
     occlusion: Occlusion  # contact of the two arches
 
@@ -83,7 +83,7 @@ def build_anatomy(person: Person) -> PersonAnatomy:
     upper_shape = ArchShape(quadratic, quartic, 0.0, np.tile(_UPPER_TIPS_MM, (2, 1)), 0.0)
     upper = build_arch(UPPER, upper_shape, cusp_slope, True, person.seed)
     tips = np.tile(np.concatenate([y + _LOWER_FRONT_MM, np.full(4, y - 1.0)]), (2, 1))
-    for _ in range(2):  # the second round corrects for the raised teeth
+    for _ in range(2):  # the second round accounts for teeth raised in the first
         lower = build_arch(LOWER, ArchShape(quadratic, quartic, -z, tips, x), cusp_slope, False, person.seed)
         gaps = Occlusion(upper, lower).gaps(np.eye(4))
         tips = tips + np.where(np.arange(7) >= 3, gaps - _CONTACT_GAP_MM, np.minimum(gaps - _CONTACT_GAP_MM, 0.0))

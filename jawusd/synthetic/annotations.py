@@ -1,4 +1,4 @@
-"""Annotations of a synthetic capture: masks with the defects of manual segmentation, and initial picks."""
+"""Annotations of a synthetic capture: masks with the defects of manual segmentation, and bootstrap picks."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from jawusd.geometry.points import meet_triangles
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.surfaces import vertex_normals
 
-# Amplitude and cell size of the jitter [px] at an image height of 1080; the fraction of its variance that is constant
-# over time, and the frame-to-frame correlation of the rest.
+# Outline jitter: amplitude and cell size [px] at an image height of 1080, fraction of the variance that is constant
+# over time, and frame-to-frame correlation of the rest.
 _WOBBLE_PX, _CELL_PX = 0.7, 36.0
 _REFERENCE_HEIGHT = 1080.0
 _CONSTANT_SHARE = 0.5
 _KEEP = 0.6
 _HOLE_CHANCE, _SPECK_CHANCE = 0.12, 0.08
 _FINE = 4
-# Smallest distance of a pick to the image border, and smallest cosine between ray and normal (about 70 degrees).
+# Minimum distance of a pick from the image border, and minimum cosine between ray and normal (about 70 degrees).
 _BORDER_PX = 10.0
 _FACING = 0.35
-# A surface occludes a point if it is closer to the camera by more than this.
+# A surface occludes a point if it is nearer to the camera by more than this.
 _CLEARANCE_MM = 0.05
 _TIPS_PER_TOOTH = 6
 

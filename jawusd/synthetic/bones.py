@@ -38,7 +38,7 @@ def build_skull(joint: Joint) -> Mesh:
 
 
 def articular_surface(joint: Joint, side: int, slide_mm: Array) -> Array:
-    """Return the sagittal section (y, z) of the socket's bone [mm], shape (..., 2), at forward slides (...).
+    """Return points (y, z) of the socket's sagittal section [mm], shape (..., 2), at forward slides (...).
 
     It is the condyle's path offset by the joint space; side 0 is left, 1 right.
     """
@@ -171,7 +171,7 @@ def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
         ],
         -1,
     )
-    # thick in the middle, thin at the edges, domed over the fossa
+    # slab thickness: large in the middle, small at the edges, domed over the fossa
     along = np.linspace(-1.0, 1.0, 40)[:, None]
     thick = np.sqrt((1.0 - along**6) * (1.0 - (across / 12.0) ** 6) + 0.01)
     dome = 3.0 * np.exp(-(((slide[:, None] - 2.0) / 9.0) ** 2)) * np.cos(across / 12.0 * np.pi / 2)

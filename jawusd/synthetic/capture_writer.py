@@ -40,14 +40,14 @@ from jawusd.synthetic.take import (
 
 Progress = Callable[[int, int], None]
 
-# Frame k of a camera was exposed at the same instant as frame k + offset of the first camera.
+# Offset of each camera: its frame k is simultaneous with frame k + offset of the first camera.
 _OFFSETS = (0, 5, -3)
 _SCANS = ("upper_teeth", "lower_teeth", "mandible", "skull")
 _PICKS = 4
 _PICK_NOISE_PX = 1.0
 _PICTURES_PER_BOARD = 2
-# Standard deviation of the sensor noise [grey levels of 255]. Every image gets a randomly shifted copy of one of a few
-# patterns.
+# Sensor noise: standard deviation [grey levels of 255], and number of patterns; every image gets a randomly shifted
+# copy of one pattern.
 _SENSOR_NOISE = 1.3
 _NOISE_PATTERNS = 5
 
@@ -83,7 +83,7 @@ def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Pro
     folder = Path(folder)
     person = Person(config.seed)
     cameras = build_cameras(config.size_px)
-    with Renderer(cameras) as renderer:  # fails early without OpenGL
+    with Renderer(cameras) as renderer:  # fails before any file is written if there is no OpenGL
         anatomy = build_anatomy(person)
         take = perform(person, anatomy.occlusion, config.frames, _OFFSETS, config.seed)
         recorder = _Recorder(folder, config, cameras, renderer, progress)

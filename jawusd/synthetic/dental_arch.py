@@ -17,7 +17,7 @@ from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
 
 RED, GREEN, GREY = (215, 45, 40), (40, 190, 60), (150, 150, 150)
-# Depth of the contact points behind the incisal edges and buccal cusp tips [mm]; teeth are aligned at contact points.
+# Depth of the contact points, at which teeth are aligned, behind the incisal edges and buccal cusp tips [mm].
 CONTACT_MM = 0.9
 CONTACT_OVERLAP_MM = 0.22
 _BOUNDARY_MM = 2.5
@@ -33,18 +33,18 @@ class ArchShape:
     """Shape and position of one arch."""
 
     quadratic_per_mm: float  # a of the curve z = -(a x^2 + b x^4) outside the edges and buccal cusps [1/mm]
-    quartic_per_mm3: float  # b of this curve [1/mm^3]
-    setback_mm: float  # distance by which the edges and buccal cusps lie inside this curve
+    quartic_per_mm3: float  # b of the same curve [1/mm^3]
+    setback_mm: float  # distance by which the edges and buccal cusps lie inside the curve
     # height of edge or highest cusp of each tooth, first incisor to second molar, left then right, shape (2, 7)
     tips_mm: Array
-    midline_mm: float  # x of the midline
+    midline_mm: float  # x coordinate of the midline
 
 
 @dataclass(frozen=True, eq=False)
 class DentalArch:
     """One arch with gum in the scan frame."""
 
-    mesh: Mesh  # crowns first, then gum; red, green and grey
+    mesh: Mesh  # crown vertices, red and green, then gum vertices, grey
     tooth: NDArray[np.int8]  # tooth of each vertex, 1..7 left and -1..-7 right from the midline, 0 gum, shape (V,)
 
 
@@ -168,7 +168,7 @@ def gum_ridge(line: ArchLine, s: Array, margin: Array, crowns: Array) -> tuple[A
     """
     crown_s, crown_n = line.coordinates(crowns[:, [0, 2]])
     facial, lingual = _crown_extent(s, margin, crown_s, crown_n, crowns[:, 1])
-    # Near the crest the gum follows every crown, further down only the arch.
+    # The gum follows every crown near the crest, and only the arch farther down.
     follow = np.clip(1.0 + _GUM_SIDE[:, 1] / 5.0, 0.0, 1.0)
     sides = []
     for extent, sign in ((facial, 1.0), (lingual, -1.0)):

@@ -19,7 +19,7 @@ from jawusd.synthetic.person import Person
 
 Kind = Literal["training", "hidden"]
 
-# Order of the exercises, repeated until the recording is long enough.
+# Orders of the exercises, repeated until the recording is long enough.
 _SCHEDULES: dict[str, tuple[str, ...]] = {
     "training": (
         "open", "lateral", "protrude", "open", "lateral", "sagittal border", "lateral half open",
@@ -41,7 +41,7 @@ class Recording:
     controls: Array  # opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3)
     phase: NDArray[np.str_]  # name of the exercise of each frame, shape (F,)
     T_manifold: Array  # poses that follow from the controls alone
-    T_true: Array  # the same with small additional movements
+    T_true: Array  # `T_manifold` with small movements outside the controls
     T_noisy: Array  # `T_true` with tracking noise
 
 

@@ -32,24 +32,24 @@ class Joint:
     eminence_height_mm: Array  # drop of each eminence from fossa to crest, shape (2,)
     eminence_width_mm: Array  # half width of the slope, shape (2,)
     eminence_start_mm: Array  # forward distance from rest to the steepest point, shape (2,)
-    medial_slope: Array  # drop per medial mm, shape (2,)
+    medial_slope: Array  # drop of a condyle per mm towards the midline, shape (2,)
     bennett_rad: Array  # angle of each condyle's path to the sagittal plane on the balancing side, shape (2,)
-    side_shift_mm: Array  # immediate side shift for each working side, shape (2,)
-    lateral_max_mm: Array  # largest difference of the two slides for each working side, shape (2,)
-    lateral_shrink: float  # fraction by which that difference shrinks at full opening
+    side_shift_mm: Array  # immediate side shift towards each working side, shape (2,)
+    lateral_max_mm: Array  # maximum difference of the two slides for each working side, shape (2,)
+    lateral_shrink: float  # fraction by which `lateral_max_mm` shrinks at full opening
     working_share: float  # fraction of the difference that is the balancing condyle's slide when closed
     rotation_max_rad: float  # pitch at full opening
     rotation_bend: float  # curvature of pitch over opening (0: proportional)
     slide_open_mm: float  # forward slide at full opening
-    slide_limit_mm: float  # largest forward slide of a condyle
+    slide_limit_mm: float  # maximum forward slide of a condyle
     slide_early: float  # fraction of the slide that follows the rotation from the start
-    slide_onset: float  # opening (0..1) over which that fraction ramps up
+    slide_onset: float  # opening (0..1) over which that early fraction ramps up
     protrusion_max_mm: float  # forward slide in full protrusion, closed
     retrusion_max_mm: float  # backward slide in full retrusion, closed
     hinge_share: float  # fraction of the opening slide reversed by retrusion below half opening
     deviation_mm: Array  # lateral deviation of the opening path: S-shaped and one-sided part, shape (2,)
-    protrusive_guidance: Array  # tooth guidance: initial slope, later slope, transition length [mm], shape (3,)
-    lateral_guidance: Array  # the same for lateral movements, shape (3,)
+    protrusive_guidance: Array  # tooth guidance: initial slope, later slope, transition length [mm], (3,)
+    lateral_guidance: Array  # lateral tooth guidance, in the same order, shape (3,)
 
     @property
     def lever_mm(self) -> float:
@@ -145,7 +145,7 @@ def controlled_pose(
 
 
 def _coupling(joint: Joint, opening: Array) -> Array:
-    """Return the fraction of the full slide at an opening: translation starts early but lags behind rotation."""
+    """Return the fraction of the full slide at an opening; translation starts early but lags behind rotation."""
     onset = joint.slide_onset
     early = opening**2 * (1.0 + onset) / (opening + onset)
     return joint.slide_early * early + (1.0 - joint.slide_early) * smoothstep(opening)
@@ -188,7 +188,7 @@ def _side_shift(joint: Joint, opening: Array, difference_mm: Array, balancing: A
 
 
 def _guided(joint: Joint, pitch: Array, slides: Array, forward_mm: Array, difference_mm: Array) -> Array:
-    """Return the pitch with tooth contact: near closure, guidance alone determines the height of the incisors."""
+    """Return the pitch including tooth contact; near closure, guidance alone determines the height of the incisors."""
     lateral_mm = difference_mm * joint.lever_mm / joint.condylar_distance_mm
     drop_mm = _glide(joint.protrusive_guidance, _soft_positive(forward_mm))
     drop_mm = drop_mm + _glide(joint.lateral_guidance, np.hypot(lateral_mm, _CUSP_ROUNDING_MM) - _CUSP_ROUNDING_MM)

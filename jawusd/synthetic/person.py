@@ -26,10 +26,10 @@ PoseFunction = Callable[[Array, Array, Array], Array]
 _LOWER = np.array([0.0, -1.0, -1.0])
 _UPPER = np.array([1.0, 1.0, 1.0])
 _GRID = (13, 9, 9)
-# Poses near zero protrusion need the most steps, since the manifold has a kink there.
+# Number of Gauss-Newton steps, as needed near zero protrusion, where the manifold has a kink.
 _STEPS = 30
 _DIFFERENCE = 1e-5
-# Damping relative to the scale of each control, since their gradients differ by a factor of ten.
+# Damping relative to the scale of each control, since the controls' gradients differ by a factor of ten.
 _DAMPING = 1e-3
 _CHUNK = 2000
 EnvelopeKind = Literal["box", "competing"]
@@ -242,7 +242,7 @@ class Person:
     def is_valid(self, T_skull_mandible: ArrayLike, tolerance_mm: float = 1.0) -> Mask:
         """Return which poses (..., 4, 4) are possible: all mandible points within the tolerance of a possible pose.
 
-        The movements outside the three controls alone reach 0.7 mm.
+        Movements outside the three controls alone displace points by up to 0.7 mm.
         """
         return self.nearest(T_skull_mandible)[1] <= tolerance_mm
 

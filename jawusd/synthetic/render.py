@@ -98,7 +98,7 @@ class Renderer:
         Args:
             camera: index of the camera.
             T_world_part: poses of the surfaces to draw, (4, 4) each; other surfaces are hidden.
-            T_world_head: pose of the skull, shape (4, 4), from which depth inside the mouth is measured for shading.
+            T_world_head: pose of the skull, shape (4, 4); shading uses the depth inside the mouth in its frame.
             light: brightness factor.
             jitter_px: displacement fields of the upper and the lower mask [px], shape (gh, gw, 2) each, stretched over
                 the image; None is zero.

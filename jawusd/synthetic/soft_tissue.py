@@ -33,7 +33,7 @@ _PROFILE = np.array(
         [60.0, 12.0],
     ]
 )  # fmt: skip
-# Rings of the mouth's lining: depth, half width, height up and down [mm].
+# Rings of the mouth lining: depth, half width, height above and below the centre [mm].
 _LINING_RINGS = ((-78.0, 0.05, 0.05, 0.05), (-60.0, 36.0, 16.0, 16.0), (-24.0, 35.5, 18.0, 18.0))
 
 # Cross-section of a lip, from the wet side to the skin: distance outwards from the edge, height over the plane of the
@@ -52,7 +52,7 @@ class LipState:
 
     upper_mm: float  # height of the upper lip's midpoint above the upper incisal edge
     lower_mm: float  # distance of the lower lip's midpoint below the lower incisal edge, which moves with the jaw
-    width_mm: float  # half distance between the corners
+    width_mm: float  # half the distance between the mouth corners
     slant: float  # rise of the mouth line per mm to the left
 
 
@@ -117,7 +117,7 @@ class Face:
         reach = np.ones(self.rows)
         reach[-_SKIN_ROWS:] = np.linspace(1.0, 0.75, _SKIN_ROWS)
         weight = self._follow * reach[:, None]
-        weight[0] = 0.4  # the throat stays closed
+        weight[0] = 0.4  # the throat ring stays closed
         weight = weight[..., None]
         moved = transform_points(np.asarray(T_skull_mandible, dtype=np.float64), rest.reshape(-1, 3))
         return (rest + weight * (moved.reshape(rest.shape) - rest)).reshape(-1, 3)
@@ -193,7 +193,7 @@ def palate() -> Surface:
 
 
 def tongue(forward_mm: float, up_mm: float, side_mm: float) -> Surface:
-    """Return the tongue in the mandible frame: moved forward, with its tip raised and moved to the left."""
+    """Return the tongue in the mandible frame: moved forward, its tip raised and moved to the left by given lengths."""
     around, along = 40, 26
     u = 2 * np.pi * np.arange(around) / around
     t = np.linspace(0.0, 1.0, along)

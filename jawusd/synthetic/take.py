@@ -1,7 +1,7 @@
-"""The studio, a performance in front of its cameras, and the scene at any instant.
+"""The studio, a performance in front of its cameras, and the scene in any frame.
 
 A studio has three cameras about 200 mm from the mouth and a chessboard. A take samples jaw, head, lips, tongue and
-light over time; the scene poses the subject's surfaces at an instant and renders them.
+light once per frame; the scene poses the subject's surfaces in a frame and renders them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jawusd.synthetic.surfaces import grid_faces
 #: Scan frame to world with the head at rest; the world is the first camera's frame: x right, y down, z forward.
 T_WORLD_SCAN = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, -14.0, 214.0])
 BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM = 9, 6, 8.0
-# Focal length over image width. Per camera: direction from the mouth [deg left, deg up], radial and tangential
+# Focal length over image width; then, per camera: direction from the mouth [deg left, deg up], radial and tangential
 # distortion, and offsets of principal point and focal length relative to the image width.
 _FOCAL = 1.494
 _CAMERAS = (
@@ -35,9 +35,9 @@ _CAMERAS = (
     ((-38.0, -6.0), (-0.034, 0.015, 0.0002, 0.0005, 0.0), (0.0026, 0.0048), 0.994),
 )
 FPS = 24.0
-#: Numbers of frames before the first and after the last tracked frame, which contain the flashes.
+#: Numbers of frames, with flashes, before the first and after the last tracked frame.
 LEAD, TAIL = 20, 16
-#: Numbers of frames with the mouth slightly open and with the bite closed at the start of the tracked range.
+#: Numbers of frames with the mouth slightly open, then with closed teeth, at the start of the tracked range.
 OPEN_HOLD, REST_HOLD = 10, 12
 _DARK_FRAMES = 4
 _FLASH_START, _FLASH_BEFORE_END = 8, 10
@@ -108,17 +108,17 @@ def board_poses(n: int, rng: np.random.Generator) -> Array:
 class Take:
     """A performance sampled at the frames of the reference camera."""
 
-    first_instant: int  # reference frame number of the first instant; negative when another camera started earlier
-    tracked: tuple[int, int]  # first and one past the last reference frame to be tracked
+    first_instant: int  # first sampled frame of the reference camera; negative if another camera started earlier
+    tracked: tuple[int, int]  # first and one past the last tracked frame of the reference camera
     rest_frame: int  # reference frame with the teeth in occlusion
     dark: NDArray[np.int64]  # dark intervals [first, last) in reference frames, shape (2, 2)
     controls: Array  # opening, lateral, protrusion, shape (I, 3)
     phase: NDArray[np.str_]  # name of the exercise, shape (I,)
     T_skull_mandible: Array  # shape (I, 4, 4)
     T_world_skull: Array  # shape (I, 4, 4)
-    lips: list[LipState]  # one per instant
-    tongue_mm: Array  # forward, up, left, shape (I, 3)
-    light: Array  # brightness, shape (I,)
+    lips: list[LipState]  # one per frame
+    tongue_mm: Array  # displacement of the tongue forward, up and left, shape (I, 3)
+    light: Array  # brightness factor, shape (I,)
 
 
 def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[int, ...], seed: int) -> Take:
@@ -126,7 +126,7 @@ def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[in
 
     Args:
         occlusion: tooth contacts, which guide closed movements.
-        frames: number of tracked frames, more than the two holds at the start take.
+        frames: number of tracked frames, more than `OPEN_HOLD + REST_HOLD`.
         offsets: camera offsets; the take covers the frames of all cameras.
         seed: seed of exercises, head motion, lips and tongue.
     """
@@ -162,7 +162,7 @@ def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[in
 def _controls(
     person: Person, frames: int, start: int, n: int, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.str_], Mask]:
-    """Return controls and phase of every instant, and a weight of 1 where the jaw is held in the closed bite."""
+    """Return controls and phase of every frame, and a weight that is 1 where the jaw is held in the closed bite."""
     exercises = frames - OPEN_HOLD - REST_HOLD
     curves, names = schedule(_EXERCISES, exercises, rng, tempo=1.5)
     still = np.array([_HALF_OPEN, 0.0, 0.0])
@@ -194,7 +194,7 @@ def _head(n: int, rng: np.random.Generator) -> Array:
 
 
 def _lips(controls: Array, phase: NDArray[np.str_], rng: np.random.Generator) -> list[LipState]:
-    """Return the lips of every instant: retracted to show the teeth, less so in chewing and speech."""
+    """Return the lips in every frame: retracted to show the teeth, less so in chewing and speech."""
     drift = _drift(len(controls), rng, 4)
     relaxed = smoothed(np.isin(phase, ["chew", "speech"]).astype(np.float64)[:, None])[:, 0]
     wide = smoothstep(controls[:, 0])
@@ -231,7 +231,7 @@ class Scene:
         renderer.add("tongue", tongue(0.0, 0.0, 0.0))
 
     def pose(self, take: Take, index: int) -> dict[str, Array]:
-        """Deform lips and tongue for an instant of a take; return the poses T_world_part (4, 4) of all surfaces."""
+        """Deform lips and tongue for a frame of a take; return the poses T_world_part (4, 4) of all surfaces."""
         T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
         self._renderer.move("face", self._face.posed(take.lips[index], T_jaw))
         self._renderer.move("tongue", tongue(*take.tongue_mm[index]).vertices)
@@ -244,11 +244,11 @@ class Scene:
     def draw(
         self, camera: int, take: Take, index: int, poses: dict[str, Array], jitter_px: tuple[Array, Array] | None
     ) -> Picture:
-        """Render an instant, with `poses` from `pose` and `jitter_px` as in `Renderer.render`."""
+        """Render a frame, with `poses` from `pose` and `jitter_px` as in `Renderer.render`."""
         return self._renderer.render(camera, poses, take.T_world_skull[index], float(take.light[index]), jitter_px)
 
     def occluders(self, take: Take, index: int) -> list[Mesh]:
-        """Return all meshes that can hide a tooth at an instant, in world coordinates [mm]."""
+        """Return all meshes that can occlude a tooth in a frame, in world coordinates [mm]."""
         T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
         tongue_now = tongue(*take.tongue_mm[index])
         parts = (
@@ -271,7 +271,7 @@ def _arch_surfaces(arch: DentalArch) -> tuple[Surface, Surface]:
     for k in np.unique(arch.tooth[:first_gum]):
         own = arch.tooth[:first_gum] == k
         height = np.abs(vertices[:first_gum][own, 1])
-        share = (height - height.min()) / np.ptp(height)  # 0 at the occlusal end
+        share = (height - height.min()) / np.ptp(height)  # relative distance from the occlusal end
         colors[own] *= 1.0 - 0.16 * share[:, None] * np.array([0.6, 0.8, 1.3])
         if abs(k) == 3:
             colors[own] *= _CANINE_TINT

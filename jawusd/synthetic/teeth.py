@@ -28,9 +28,9 @@ _CUSP_SHARPNESS_PER_MM = 4.0
 class CrownForm:
     """Shape of one kind of tooth."""
 
-    width_mm: float  # mesio-distal
-    depth_mm: float  # facio-lingual
-    height_mm: float  # gum line to the highest cusp or the edge
+    width_mm: float  # mesio-distal crown width
+    depth_mm: float  # facio-lingual crown depth
+    height_mm: float  # height of the highest cusp or the edge above the gum line
     torque_deg: float  # tilt of the occlusal end towards the facial side
     # cusps of premolars and molars: x and z relative to half the width and half the depth, and distance below the
     # highest cusp [mm]; empty for incisors and canines
@@ -82,7 +82,7 @@ _BACK_LINGUAL = (-0.72, -0.82, -0.98, -1.06, -0.98, -0.68)
 
 
 def _bezier(control: tuple[float, ...], t: Array) -> Array:
-    """Evaluate a scalar Bezier curve at t in 0..1, any shape."""
+    """Evaluate a scalar Bezier curve at t in 0..1, an array of any shape."""
     n = len(control) - 1
     return sum((c * comb(n, i) * t**i * (1.0 - t) ** (n - i) for i, c in enumerate(control)), np.zeros_like(t))
 
@@ -111,7 +111,7 @@ def _front_rings(form: CrownForm, angle: Array, rng: np.random.Generator) -> Arr
     half = 0.5 * form.width_mm * _relative_width(_FRONT_WIDTH, t)
     facial, lingual = form.depth_mm * _bezier(_FRONT_FACIAL, t), form.depth_mm * _bezier(_FRONT_LINGUAL, t)
     level = low + (high - low) * t
-    # quarter round at the edge
+    # quarter circle that rounds the edge
     turn = np.linspace(0.0, np.pi / 2, 4)[1:]
     inset = _EDGE_ROUNDING_MM * (1.0 - np.cos(turn))
     half = np.concatenate([half, half[-1] - inset])
