@@ -155,7 +155,7 @@ def _seconds_and_frame(code: str, named: str, path: Path) -> tuple[int, float]:
 
 
 def _spread(codes: Array) -> Array:
-    """Return the frame within the second of every row; rows that repeat a time code are spread evenly.
+    """Return the frame number of each row within its second; rows that repeat a time code are spread evenly.
 
     Rows are spread only if most time codes are repeated. If a time code has fewer rows than usual, its last rows are
     assumed to be missing, or its first rows if it begins the recording.

@@ -42,7 +42,7 @@ class Sync(Strict):
     offsets: Annotated[
         dict[str, int] | None,
         Key(
-            "Per camera: its frame k shows the same instant as frame k + offset of the reference camera.",
+            "Per camera: its frame k is simultaneous with frame k + offset of the reference camera.",
             "{ left = 0, right = 5 }",
             "frames",
         ),
@@ -89,7 +89,7 @@ class MotionSection(Strict):
 
     rest_frame: Annotated[
         Annotated[int, Field(ge=0)] | None,
-        Key("A frame with the teeth together; default: the most closed frames are found automatically.", "46"),
+        Key("A frame with the teeth together; default: frames in occlusion are found automatically.", "46"),
     ] = None
 
 

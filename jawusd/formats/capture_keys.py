@@ -48,7 +48,7 @@ _NEEDED = (
 
 @dataclass(frozen=True)
 class Key:
-    """Documentation of one key, in the annotation of the model's field."""
+    """Documentation of one key, stored in the annotation of the model's field."""
 
     meaning: str
     example: str = ""  # example value, as written in the file

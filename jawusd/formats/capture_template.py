@@ -17,9 +17,9 @@ class CameraSketch:
 
     name: str
     video: PurePath | None = None
-    masks: Mapping[str, PurePath] = field(default_factory=dict)  # by arch, "upper" and "lower"
+    masks: Mapping[str, PurePath] = field(default_factory=dict)  # masks by arch, "upper" and "lower"
     board: PurePath | None = None
-    remark: str = ""  # on its footage, written as a comment
+    remark: str = ""  # remark on the footage, written as a comment
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class CaptureSketch:
 
     name: str
     fps: float | None = None
-    scans: Mapping[str, PurePath] = field(default_factory=dict)  # by key of [scans]
+    scans: Mapping[str, PurePath] = field(default_factory=dict)  # files by key of [scans]
     cameras: tuple[CameraSketch, ...] = ()
     calibration: PurePath | None = None
     board: BoardSketch | None = None

@@ -80,7 +80,7 @@ class Experiments:
     condyle_paths: tuple[CondylePath, ...]  # one per model
     distances: tuple[Distances, ...]  # everything measured, in the order of the table
     coverage: Coverage  # captured part of the envelope
-    # remarks: number of frames that each model excluded, models that could not be fitted, experiments not requested
+    # remarks: numbers of frames excluded by each model, models that could not be fitted, experiments not requested
     notes: tuple[str, ...]
     parameter_paths: tuple[ParameterPath, ...] = ()  # paths of the linear and the default model, for each parameter
 

@@ -41,7 +41,7 @@ class Surface:
 
     name: str
     vertices: Array  # positions [mm], shape (V, 3)
-    normals: Array  # unit, shape (V, 3)
+    normals: Array  # unit vectors, shape (V, 3)
     parts: Mapping[str, NDArray[np.int32]]  # faces (F, 3) by the names of their materials
     colors: Array | None = None  # linear RGB per vertex, multiplied by the material's, shape (V, 3)
     uv: Array | None = None  # texture coordinates, u to the right, v upwards, shape (V, 2)

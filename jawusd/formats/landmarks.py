@@ -32,7 +32,7 @@ _MAX_BYTES = 1 << 20
 class LandmarkFile:
     """Content of a landmarks file."""
 
-    landmarks: Array  # in the order of `geometry.LANDMARKS` [mm], shape (5, 3)
+    landmarks: Array  # positions in the order of `geometry.LANDMARKS` [mm], shape (5, 3)
     T_anatomical_skull: Array | None  # the file's frame to the anatomical frame, shape (4, 4), or None
 
 

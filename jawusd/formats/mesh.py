@@ -50,7 +50,7 @@ class Mesh:
 def without_loose(
     vertices: Array, faces: NDArray[np.int64] | NDArray[np.int32], colors: NDArray[np.uint8] | None
 ) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Return vertices (V, 3) and colours with unused vertices moved onto used ones, spread evenly over them.
+    """Return vertices (V, 3) and colours with the unused vertices moved onto used ones, evenly distributed.
 
     Indices stay valid for picks, and unused vertices do not affect sizes, centres and labels.
     """

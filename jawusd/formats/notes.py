@@ -64,7 +64,7 @@ class TakeNotes(TypedDict, total=False):
 class TracksMeta(TakeNotes, total=False):
     """Header of tracks; tables by camera name, pairs are (upper, lower)."""
 
-    tracking: dict[str, object]  # configuration
+    tracking: dict[str, object]  # configuration of the tracker
     correlation_px: float
     delays_frames: dict[str, float]
     delays_sigma_frames: dict[str, float]

@@ -230,11 +230,11 @@ def write_table(
 class JointDelta:
     """The joint transform of one ARKit shape."""
 
-    shape: str  # ARKit's name
-    weight: float  # 0 .. 1
+    shape: str  # ARKit's name of the shape
+    weight: float  # weight of the shape, 0 .. 1
     d: Array  # parameters of the pose [mm], shape (3,)
     translation_mm: Array  # translation of the joint, skull axes, shape (3,)
-    rotation: Array  # skull axes, shape (3, 3)
+    rotation: Array  # rotation of the joint, skull axes, shape (3, 3)
     clamped_mm: float  # distance by which d was clamped to the bound
 
 

@@ -17,7 +17,7 @@ from jawusd.formats.tracks import Tracks
 class Origin:
     """Provenance of a build; strings are empty if not recorded."""
 
-    finished: str  # date and time
+    finished: str  # date and time of the end of the build
     command: str  # the command line; "" if called from Python
     versions: Mapping[str, str]  # versions by package
 

@@ -91,7 +91,7 @@ class Tracks:
         masks_used: masks used for the raw poses, shape (F, 2, C); others are missing or outliers.
         covariance_upper, covariance_lower: covariance of the left twist xi [rad, mm] with T_true = exp(xi) T, world
             frame, about the world origin, shape (F, 6, 6).
-        covariance_relative: the same of T_upper_lower in the skull frame, shape (F, 6, 6).
+        covariance_relative: covariance of T_upper_lower, defined likewise in the skull frame, shape (F, 6, 6).
         sigma_mm: standard deviation of the landmarks' position in the skull frame [mm], shape (F, 5).
         residual_px: rms distance of matched contour samples at the working size [px], shape (F, 2).
         matched_px: matched contour length at the working size [px], shape (F, 2).

@@ -16,7 +16,7 @@ from jawusd.media.pixels import Colour, ColourPicture, Slices
 from jawusd.media.timeline import Timeline
 
 #: Message and hint for interlaced clips.
-INTERLACED = "its pictures are marked as interlaced: each combines two instants, half a frame apart"
+INTERLACED = "its pictures are marked as interlaced: each combines two fields, half a frame apart"
 INTERLACED_HINT = (
     "Record progressive video; or convert every field to a frame and double fps, for all clips: "
     "ffmpeg -i IN -vf bwdif=mode=send_field -c:v libx264 -crf 12 OUT.mp4."

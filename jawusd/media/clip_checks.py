@@ -80,7 +80,7 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
 
 
 def _parts(video: Clip) -> list[tuple[int, int]]:
-    """Return the ranges of images to decode: all, or for long clips both ends, which `sync` uses, and parts between."""
+    """Return the ranges of images to decode: all, or both ends of a long clip, which `sync` uses, and parts between."""
     most = int(_DECODED_PX / (video.size_px[0] * video.size_px[1]))
     if video.count <= most:
         return [(0, video.count)]
@@ -90,7 +90,7 @@ def _parts(video: Clip) -> list[tuple[int, int]]:
 
 
 def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
-    """Return the mean difference of each gray image (h, w) from the one before, NaN for the first [of 255 levels]."""
+    """Return the mean difference [of 255 levels] of each gray image (h, w) from its predecessor; NaN for the first."""
     before, changes = None, []
     for picture in pictures:
         shown = picture[::_SPARSE, ::_SPARSE].astype(np.int16)
@@ -104,7 +104,7 @@ def repeated_runs(changes: Array) -> list[tuple[int, int]]:
 
     Encoders also repeat images of static scenes, but there the changes fade out and in. In a freeze they stop and
     resume abruptly, and after one or two repeated images the next change is larger than usual. If a light was switched
-    off, the change before the run is the larger one. Scenes that hardly change are skipped.
+    off instead, the change before the run is larger. Scenes that hardly change are skipped.
 
     Args:
         changes: result of `picture_changes`, shape (n,).

@@ -93,7 +93,7 @@ def _has(name: str) -> bool:
 class Sound(NamedTuple):
     """The sound of a file."""
 
-    samples: NDArray[np.float32]  # one channel, shape (n,)
+    samples: NDArray[np.float32]  # samples of a single channel, shape (n,)
     rate_hz: int  # samples per second
     start_s: float  # presentation time of the first sample in the file [s]
 

@@ -26,7 +26,7 @@ class SourceLevels:
     """The meaning of one source's values.
 
     `levels` is None if all images are empty. `palette_numbers`: use palette indices, because all palette colours are
-    equal. `sizes_px` are the (width, height) of the sampled files, with one file of each size.
+    equal. `sizes_px` lists the sizes (width, height) of the sampled files, with one file per size.
     """
 
     levels: MaskLevels | None

@@ -108,9 +108,9 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
             Finding(
                 "masks_soft",
                 "warning",
-                f"{levels.soft:.0%} of the content of the masks of {rows} teeth is between background "
-                f"({levels.background:g}) and teeth ({levels.teeth:g}), at most {MOST_SOFT:.0%} is usual; the outline "
-                "is placed at half.",
+                f"in the masks of {rows} teeth, {levels.soft:.0%} of the segmented pixels lie between background "
+                f"({levels.background:g}) and teeth ({levels.teeth:g}), usually at most {MOST_SOFT:.0%}; the outline "
+                "is placed midway.",
                 value=round(levels.soft, 3),
                 limit=MOST_SOFT,
                 camera=source.name,

@@ -66,7 +66,7 @@ def draw_overlay(
 
 
 def arch_colours(tracks: Tracks, row: int) -> tuple[Colour, Colour]:
-    """Return the colours of upper and lower arch in a row of tracks; of a solved performance, by its state."""
+    """Return the colours of the upper and lower arch at a row of tracks; by state for a solved performance."""
     if tracks.solved is None:
         return UPPER_COLOUR, LOWER_COLOUR
     whole = SolveState(int(tracks.solved.state[row]))

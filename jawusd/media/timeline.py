@@ -39,7 +39,7 @@ class Timeline:
 
     @property
     def is_numbered(self) -> bool:
-        """Whether the images are numbered other than 0, 1, 2, ..."""
+        """Whether the numbers of the images differ from 0, 1, 2, ..."""
         return bool(self.stored[0] != 0 or self.stored[-1] != len(self.stored) - 1)
 
     def number(self, frame: int) -> int | None:

@@ -61,7 +61,7 @@ class WorkingView:
             ValueError: the working size is larger than the recorded one, or empty.
         """
         if not (0 < size_px[0] <= source.size_px[0] and 0 < size_px[1] <= source.size_px[1]):
-            raise ValueError(f"working size {size_px} px must be within 1 x 1 and the recorded {source.size_px} px")
+            raise ValueError(f"working size {size_px} px must be between 1 x 1 and the recorded {source.size_px} px")
         self.source = source
         self.camera = replace(source.scaled(size_px), distortion=np.zeros(0))
         self._samples = ceil(max(source.size_px[0] / size_px[0], source.size_px[1] / size_px[1]))

@@ -46,7 +46,7 @@ class VideoWriter:
         """
         suffix = ".mkv" if lossless else ".mp4"
         if not str(path).endswith(suffix):
-            raise ValueError(f"{path}: a {'lossless' if lossless else 'H.264'} video is written to a {suffix} file")
+            raise ValueError(f"{path}: a {'lossless' if lossless else 'H.264'} video must be a {suffix} file")
         if min(size_px) < 2 or (not lossless and (size_px[0] % 2 or size_px[1] % 2)):
             raise ValueError(f"size {size_px} px: H.264 needs even sides of at least 2 px")
         if not fps > 0:

@@ -163,7 +163,7 @@ class PickingLayout:
         return np.concatenate([flat, np.zeros((*flat.shape[:-1], 1))], axis=-1)
 
     def pixel(self, origin: ArrayLike, direction: ArrayLike) -> tuple[float, float] | None:
-        """Return the pixel hit by a ray, origin and direction (3,); None outside the image."""
+        """Return the pixel where a ray, origin and direction (3,), hits the image; None outside it."""
         o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
         if abs(d[2]) < 1e-9 or -o[2] / d[2] <= 0:
             return None

@@ -158,7 +158,7 @@ class Session:
             RuntimeError: nothing is grabbed.
         """
         if self._handle is None:
-            raise RuntimeError("drag_to before grab")
+            raise RuntimeError("drag_to was called before grab")
         target = np.asarray(p_skull, dtype=np.float64)
         handles = np.array([self._handle, *(pin.p_mandible for pin in self.work.pins)])
         targets = np.array([target, *(pin.p_skull for pin in self.work.pins)])

@@ -236,7 +236,7 @@ def write_woven(folder, images, order):
 @pytest.mark.parametrize("order", ["tff", "bff"])
 def test_the_board_is_not_blamed_for_woven_pictures(tmp_path, order):
     videos = write_woven(tmp_path, pictures(board()), order)
-    with pytest.raises(CalibrationError, match=r"marked as interlaced: each combines two instants") as error:
+    with pytest.raises(CalibrationError, match=r"marked as interlaced: each combines two fields") as error:
         find_boards(NAMES, board(videos=videos), quiet)
     assert "boards" not in str(error.value) and "bwdif" in error.value.hint
 
@@ -244,7 +244,7 @@ def test_the_board_is_not_blamed_for_woven_pictures(tmp_path, order):
 def test_boards_held_still_in_interlaced_clips_are_used_and_named(tmp_path):
     still = [[camera[0]] * 6 for camera in pictures(board(), T_world_board=POSES[:1])]
     found = find_boards(NAMES, board(videos=write_woven(tmp_path, still, "tff")), quiet)
-    assert len(found.notes) == 2 and all("combines two instants" in note for note in found.notes)
+    assert len(found.notes) == 2 and all("combines two fields" in note for note in found.notes)
 
 
 def test_clips_of_variable_rate_are_matched_by_time(tmp_path):
