@@ -18,8 +18,8 @@ from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 OTHER, UPPER, LOWER = 0, 1, 2
 _TAU = _SIGMA = 0.35  # step sizes of the primal-dual iteration; convergence needs tau sigma 8 < 1
 _NEVER = 30.0  # log-odds of a hard constraint
-_FEWEST_OPEN = 20  # number of undecided pixels between the arches from which their border is re-estimated
-_ARCH_BLUR_PX = 0.8  # blur that gives the border between the arches fractional coverage
+_FEWEST_OPEN = 20  # minimum number of undecided pixels between the arches for re-estimating their border
+_ARCH_BLUR_PX = 0.8  # sigma of the blur of the border between the arches, for fractional coverage
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class ScanSurface:
 
     @classmethod
     def of(cls, mesh: Mesh) -> ScanSurface:
-        """Split a teeth scan into faces with mostly tooth corners and the others."""
+        """Split the faces of a teeth scan into teeth and the rest, by the majority of their corners."""
         crown = crown_face_mask(mesh)
         return cls(mesh.vertices, mesh.faces[crown], mesh.faces[~crown])
 
@@ -57,7 +57,7 @@ def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: 
 
 
 def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> NDArray[np.uint8]:
-    """Return the label of the visible crown per pixel, OTHER, UPPER or LOWER, shape (h, w)."""
+    """Return the label of every pixel: OTHER, or the visible crown, UPPER or LOWER; shape (h, w)."""
     width, height = camera.size_px
     inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     for scan, pose, label in zip(scans, poses, (UPPER, LOWER), strict=True):
@@ -88,7 +88,7 @@ def _iterate(
     """Run the first-order primal-dual iteration (Chambolle and Pock 2011) of the relaxed Potts energy.
 
     Shapes: cost (3, h, w); edge (2, h, w), weights of the links to the right and down; u (3, h, w), updated in place;
-    spans (h, 2), the range of free columns in each row, outside which pixels are fixed.
+    spans (h, 2), the range of free columns in each row; pixels outside it are fixed.
     """
     n, h, w = cost.shape
     px, py = np.zeros_like(u), np.zeros_like(u)
@@ -216,7 +216,7 @@ def cut_arches(
     """Segment an image (h, w, 3); return the coverage of both arches, 0 .. 1, shape (2, h, w).
 
     Args:
-        reach_mm: largest distance of teeth outside their projection.
+        reach_mm: maximum distance of tooth pixels from the projected crowns.
         seeds: annotations, which act as hard constraints.
     """
     inside = expected.inside_px / px_per_mm
@@ -246,11 +246,11 @@ def separate_arches(
     config: SegmentationConfig,
     px_per_mm: float,
 ) -> NDArray[np.float32]:
-    """Return the coverage of both arches, shape (2, h, w), with the border between them re-estimated from edges.
+    """Return the coverage of both arches, shape (2, h, w), after re-estimating the border between them from edges.
 
-    The sum of both is unchanged. Edges between upper and lower teeth are much weaker than those between teeth and lips.
-    With a common edge weight, these weak edges would have no effect: the border would stay at its predicted position,
-    and bias the poses towards the prediction.
+    The sum of the two coverages is unchanged. Edges between upper and lower teeth are much weaker than those between
+    teeth and lips. With a common edge weight, these weak edges would have no effect: the border would stay at its
+    predicted position, and bias the poses towards the prediction.
     """
     inside = expected.inside_px / px_per_mm
     teeth = shares.sum(0)

@@ -12,17 +12,17 @@ from jawusd.base.arrays import Mask
 from jawusd.segmentation.colours import SegmentationConfig, log_chroma
 
 _EVEN = 1e-4  # variance added to log colours [-]: half an 8-bit step
-_FEWEST = 100  # minimum number of pixels for a covariance of colours
-_ARCH_BLUR_PX = 0.8  # blur that gives the border between the arches fractional coverage
-_FAR_BLUR_PX = 2.0  # blur that assigns new tooth pixels to the nearer arch
+_FEWEST = 100  # minimum number of pixels near the border for estimating the covariance of colours
+_ARCH_BLUR_PX = 0.8  # sigma of the blur of the border between the arches, for fractional coverage
+_FAR_BLUR_PX = 2.0  # sigma of the blur that assigns tooth pixels far from both coverages to the nearer arch
 
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Comparison of every pixel with the colours on both sides of the border."""
+    """Classification of every pixel by the local colours on both sides of the border."""
 
     share: NDArray[np.float32]  # tooth coverage, 0.5 midway between the sides, shape (h, w)
-    # separation of the sides in standard deviations, 0 without both sides nearby, shape (h, w)
+    # separation of the colours of both sides in standard deviations, 0 unless both sides are nearby, shape (h, w)
     contrast: NDArray[np.float32]
 
 
@@ -31,11 +31,11 @@ def refine_borders(
 ) -> tuple[NDArray[np.float32], Mask]:
     """Return coverages (2, h, w) with soft borders, 0.5 at the outline, and a mask of visible borders, shape (h, w).
 
-    Along the border, teeth are separated from their surroundings again by the local colours on both sides. The colours
-    learned over the take determine which parts are teeth, but not their exact borders, since the midpoint between two
-    colours varies locally. Fisher's discriminant between the local means determines the border (local region
-    statistics, Lankton & Tannenbaum 2008). Where the colours of both sides do not differ, the border is unchanged;
-    parts with mostly such borders are discarded.
+    Pixels along the border are reclassified by the local colours on both sides. The colours learned over the take
+    determine which parts are teeth, but not their exact borders, since the midpoint between two colours varies locally.
+    Fisher's discriminant between the local means determines the border (local region statistics, Lankton & Tannenbaum
+    2008). Where these colours are too similar, the border is invisible and stays unchanged; parts with hardly any
+    visible border are discarded.
     """
     colours = _blurred(log_chroma(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1
@@ -82,7 +82,7 @@ def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], wi
 
 
 def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[NDArray[np.float32], Mask]:
-    """Return the local mean colour of one side at every pixel, and the pixels that have enough of that side nearby."""
+    """Return the local mean colour of one side at every pixel, and a mask of pixels with enough of that side nearby."""
     weight = side.astype(np.float32)
     count = cv2.boxFilter(weight, -1, (window, window), normalize=False)
     total = cv2.boxFilter(colours * weight[..., None], -1, (window, window), normalize=False)
@@ -90,7 +90,7 @@ def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[N
 
 
 def _spurious(teeth: Mask, clear: Mask, config: SegmentationConfig) -> Mask:
-    """Return the pixels of specks and of parts with hardly any visible border, shape (h, w)."""
+    """Return a mask of specks and of parts with hardly any visible border, shape (h, w)."""
     count, parts, stats, _ = cv2.connectedComponentsWithStats(teeth.astype(np.uint8))
     outline = teeth & (cv2.erode(teeth.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     length = np.bincount(parts[outline], minlength=count)

@@ -20,7 +20,7 @@ from jawusd.segmentation.learn import Example, cut_picture
 from jawusd.segmentation.picture import PictureFrame, Window
 
 _ARCHES = (0, 1)
-_EVERY = 20  # stride of the crown vertices projected to find the window
+_EVERY = 20  # stride over the crown vertices: only every 20th is projected to find the window
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Segment:
     camera: Camera  # pinhole camera of the window
     masks: NDArray[np.uint8]  # coverage of the upper and lower arch, 0..255, uint8, shape (2, h, w)
     present: Mask  # whether each arch is visible, shape (2,)
-    # difference of tooth likelihood across the outline, per arch, -1 .. 1; NaN without an outline
+    # tooth probability just inside the outline minus that just outside, per arch, -1 .. 1; NaN without an outline
     contrast: Array
     # fraction of each arch's mask outside the expected crowns; NaN without a mask
     unexpected: Array
@@ -42,7 +42,7 @@ class Segment:
     expected: Expectation
 
     def only(self, arches: Mask) -> Segment:
-        """Return the segment with only the masks of some arches, shape (2,)."""
+        """Return the segment with only the masks of the arches selected by a boolean array, shape (2,)."""
         if arches.all():
             return self
         masks = np.where(arches[:, None, None], self.masks, np.uint8(0))
@@ -88,7 +88,7 @@ class CameraSegmenter:
 
         Args:
             poses: expected T_world_upper, T_world_lower, shape (2, 4, 4).
-            turn: iteration: 0 for predicted poses, then 1 and so on for refined ones.
+            turn: number of the iteration: 0 with predicted poses, 1 or more with refined ones.
         """
         c = self._config
         window = self._frame.window(image, self._around(poses), c.margin_mm)
@@ -99,8 +99,8 @@ class CameraSegmenter:
         if turn == 0 or not self.colours.is_trained():
             self._learn(window, expected, keys, seeds)
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
-        # Computed outlines are more consistent over time than annotated ones, which the tracker needs: a finished mask
-        # replaces a computed one only if the computed one is wrong.
+        # The tracker needs outlines that are consistent over time, and computed ones are more so than annotated ones: a
+        # finished mask therefore replaces a computed one only if the computed one is wrong.
         drawn = seeds.share if seeds is not None and seeds.known.all() else None
         guide = None if drawn is not None else seeds
         # Refine borders in the first iteration too: with rough outlines, the tracker reports a lost arch.
@@ -146,7 +146,7 @@ class CameraSegmenter:
         return Seeds(known | all(key is not None and key.finished for key in keys), share)
 
     def _learn(self, window: Window, expected: Expectation, keys: Sequence[Key | None], seeds: Seeds | None) -> None:
-        """Update the colours with an image, with a higher weight for annotations."""
+        """Update the colours with an image, with annotated pixels weighted higher."""
         c = self._config
         if not all(key is not None and key.finished for key in keys):
             learn_colours(self.colours, window.rgb, expected, c, self._frame.px_per_mm)
@@ -157,7 +157,7 @@ class CameraSegmenter:
             self.colours.learn(window.rgb, cv2.erode(teeth, kernel) > 0, outer, c.key_weight)
 
     def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> Array:
-        """Return the difference of tooth likelihood just inside an arch's outline and just outside both arches."""
+        """Return the tooth probability just inside an arch's outline minus that just outside both arches."""
         odds = self.colours.log_odds(window.rgb)
         share = 1 / (1 + np.exp(-odds))
         teeth = (masks.max(0) > 127).astype(np.uint8)
@@ -174,7 +174,7 @@ class CameraSegmenter:
 
 
 def _overlap(shares: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
-    """Return the smaller intersection over union of both arches with the annotation."""
+    """Return the intersection over union with the annotation, of the worse arch."""
     a, b = shares > 0.5, drawn > 0.5
     return float(((a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)).min())
 

@@ -20,13 +20,14 @@ from jawusd.base.npz import DAMAGED
 from jawusd.formats.atomic import write_npz_atomic
 
 _BINS = 32  # histogram bins per channel
-_FLOOR = 12.0  # added to every channel before ratios [8-bit steps], since dark pixels have noisy hues
+_FLOOR = 12.0  # offset of every channel [8-bit steps], which damps the noisy colour ratios of dark pixels
 _RATIO_STEP = 0.03  # bin width of the log ratios [-]; the bins cover red over green from 0.6 to more than 1.6
-_MOST = 6.0  # bound of the log-odds by colour alone [-]
-_ROUNDS, _STEPS = 5, 8  # reclassifications of pixels under crowns, and Newton steps per round
+_MOST = 6.0  # maximum magnitude of the log-odds from colour alone [-]
+_ROUNDS, _STEPS = 5, 8  # number of reclassifications of the pixels under crowns, and of Newton steps for each
 _LIGHT = 1  # index of the lightness term
-_RIDGE = 0.01  # regularisation, which keeps weights finite for separable colours
-# Used alternately, since a run may be killed between saving the colours of a frame and recording the frame as done.
+_RIDGE = 0.01  # ridge penalty on the weights, which keeps them finite if the colours are separable
+# Two files are written in turn, since a run may be killed between saving the colours of a frame and recording the frame
+# as done.
 _FILES = ("colours_0.npz", "colours_1.npz")
 
 
@@ -42,7 +43,7 @@ class SegmentationConfig:
     inner_mm: float = 0.4
     # Distance outside the projected crowns from which pixels train the colours of the surroundings [mm].
     outer_mm: float = 1.0
-    # Largest distance of tooth pixels outside the projected crowns [mm]: in the first iteration, and after alignment.
+    # Maximum distance of tooth pixels outside the projected crowns [mm], in the first iteration and after alignment.
     reach_mm: tuple[float, ...] = (1.6, 1.0)
     # Time constant of the colour histograms [frames]: light changes slowly, as the head moves.
     memory_frames: float = 24.0
@@ -55,13 +56,13 @@ class SegmentationConfig:
     # Log-odds of tooth per mm inside the projected outline [1/mm], and their limits outside and inside [-].
     place_per_mm: float = 2.0
     place_most: tuple[float, float] = (1.5, 1.0)
-    # Cost of a border per pixel of length, in log-odds [-], and the fraction of it that remains on the strongest edges.
+    # Cost of a border per pixel of its length, in log-odds [-], and the fraction of this cost on the strongest edges.
     border: float = 4.0
     border_on_edge: float = 0.15
-    # Log-odds between the arches per mm from their projected common border [1/mm]; segment.json uses the name of this
-    # setting.
+    # Log-odds of upper against lower arch per mm of distance from their projected common border [1/mm]; segment.json
+    # uses the name of this setting.
     rows_per_mm: float = 2.0
-    # Largest displacement of a border by refinement [mm], and distance on both sides over which colours are compared
+    # Maximum displacement of a border by refinement, and width of the area on either side in which colours are compared
     # [mm].
     border_band_mm: float = 0.4
     border_side_mm: float = 0.8
@@ -71,19 +72,20 @@ class SegmentationConfig:
     # Outward shift of the outlines of the upper and lower arch [-], learned from annotated masks; 1 is the width of the
     # soft border, about 3 px.
     wider: tuple[float, float] = (0.0, 0.0)
-    # Fraction of a part's outline that must be on visible edges [-], and the smallest area of a part [px].
+    # Minimum fraction of a part's outline on visible edges [-], and minimum area of a part [px]; other parts are
+    # discarded.
     founded_share: float = 0.5
     speck_px: int = 25
-    # Iterations of the cut [-].
+    # Number of iterations of the cut.
     steps: int = 40
-    # Search range of the border between the arches [mm], and iterations of its cut [-].
+    # Search range of the border between the arches [mm], and number of iterations of its cut.
     arch_band_mm: float = 1.0
     arch_steps: int = 60
     # Weight of an annotated mask in the colour histograms, as a number of frames.
     key_weight: float = 12.0
     # Intersection over union with a finished mask below which the finished mask replaces the segmentation [-].
     key_overlap: float = 0.8
-    # Smallest area of a mask [px]: 4 square millimetres.
+    # Minimum area of a mask [px]: 4 square millimetres.
     least_px: int = 200
 
 
@@ -91,9 +93,9 @@ class ColourModel:
     """Colour model of teeth and their surroundings: log-odds of tooth by colour.
 
     Pixels under projected crowns are teeth or, where lips, cheeks or tongue hide them, surroundings; all other pixels
-    are surroundings. A logistic regression on the colours, their squares and products separates the two. Pixels under
-    the crowns that it classifies as surroundings change class, and the regression is repeated. With so few terms, it
-    cannot overfit lip colours that occur only under crowns.
+    are surroundings. A logistic regression on the colours, their squares and products separates the two classes. Pixels
+    under crowns that it classifies as surroundings are relabelled, and the regression is repeated. With so few terms,
+    it cannot overfit lip colours that occur only under crowns.
 
     Colours are lightness and the logs of red and blue over green. Shading scales all channels equally, so the ratios
     are invariant to it (Finlayson et al. 2006), and shaded back teeth have the same ratios as lit front teeth.
@@ -183,7 +185,7 @@ def _terms() -> Array:
 
 
 def _fitted_weights(under: Array, beyond: Array) -> Array:
-    """Fit the weights of the terms to the counts of every bin, shape (7,); that of lightness is never negative."""
+    """Fit the weights of the terms to the counts of every bin, shape (7,); the lightness weight is never negative."""
     seen = np.flatnonzero(under + beyond)
     x = _terms()[seen]
     under, beyond = (c[seen] / max(c.sum(), 1e-12) for c in (under, beyond))
@@ -195,7 +197,7 @@ def _fitted_weights(under: Array, beyond: Array) -> Array:
 
 
 def _regress(x: Array, under: Array, beyond: Array) -> Array:
-    """Fit the weights of terms (N, 7) that separate two classes with weights (N,), the first of which is a mixture."""
+    """Fit coefficients of terms (N, 7) that separate two classes, given as weights (N,); the first has outliers."""
     weights, ridge = np.zeros(x.shape[1]), _RIDGE * np.eye(x.shape[1])
     ridge[0, 0] = 1e-9
     tooth = np.ones(len(x))

@@ -1,4 +1,4 @@
-"""Learn the weights of the energy, and the annotator's outline offset, from finished masks of a few frames."""
+"""Learn the weights of the energy, and the offset of the annotator's outlines, from finished masks of a few frames."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from jawusd.segmentation.border import refine_borders
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.picture import Window
 
-_FACTORS = (0.5, 2.0)  # factors tried on every weight
+_FACTORS = (0.5, 2.0)  # factors by which every weight is multiplied in turn
 _NUMBERS = ("border", "place_per_mm", "rows_per_mm")
-_DOUBTS = (-1.0, 1.0)  # changes tried on `doubt`
-_WIDER = np.arange(-6, 7) * 0.05  # outward shifts tried on outlines
-_LEAST_GAIN = 0.01  # smallest relative improvement that counts as significant
+_DOUBTS = (-1.0, 1.0)  # values added to `doubt` in turn
+_WIDER = np.arange(-6, 7) * 0.05  # candidate outward shifts of the outlines, in widths of the soft border
+_LEAST_GAIN = 0.01  # minimum relative improvement for a change to be kept
 
 
 class LearnedNumbers(TypedDict):
@@ -68,7 +68,7 @@ def cut_picture(
 
 
 def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tuple[SegmentationConfig, LearnedNumbers]:
-    """Optimise the weights one after the other for agreement with annotated masks; also return what changed."""
+    """Optimise the weights one by one for agreement with annotated masks; return them and a summary of the changes."""
     best, cuts = config, [example.cut(config) for example in examples]
     before = least = _disagreement(examples, cuts)
     for trial in _trials(config):
@@ -97,7 +97,7 @@ def _trials(config: SegmentationConfig) -> Iterator[SegmentationConfig]:
 
 
 def _widened(shares: NDArray[np.float32], wider: tuple[float, float]) -> NDArray[np.float32]:
-    """Return coverages with outlines moved by fractions of their soft border, except between the arches."""
+    """Return coverages with outlines moved by fractions of the soft border's width, but not between the arches."""
     if not any(wider):
         return shares
     alone = shares[::-1] < 0.05

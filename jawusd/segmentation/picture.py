@@ -1,4 +1,4 @@
-"""Images of all cameras at each instant, and windows around the teeth, undistorted and downscaled."""
+"""Images of all cameras by frame, and windows around the teeth, undistorted and downscaled."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from jawusd.media.pixels import ColourPicture
 from jawusd.media.working_view import WorkingView, remap
 
 _NODE_PX = 8  # grid spacing of the undistortion map
-_CHUNK = 16  # instants buffered when reading backwards: 50 MB per full HD camera
+_CHUNK = 16  # number of frames buffered when reading backwards: 50 MB per full HD camera
 
 Pictures: TypeAlias = "dict[str, ColourPicture | None]"
-_Frames = range  # needed because `range` is a method of the class below
+_Frames = range  # built-in type, since `range` is a method of the class below
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class ColourFootage:
         return self._videos[name].timeline.number(frame - self._offsets[name])
 
     def range(self) -> tuple[int, int]:
-        """Return the first frame with images of two cameras, and one past the last."""
+        """Return the first frame with images of at least two cameras, and the end of the range (exclusive)."""
         starts = sorted(self._offsets[name] for name in self._videos)
         stops = sorted(self._offsets[name] + video.timeline.count for name, video in self._videos.items())
         return max(0, starts[min(1, len(starts) - 1)]), stops[-min(2, len(stops))]

@@ -16,20 +16,22 @@ from scipy import ndimage
 from jawusd.base.arrays import Array, Mask
 
 _WIDTH_PX = 480  # working width
-# Teeth are found by thresholding lightness minus redness, CIELAB L* - 2.5 a*: weight of a*, thresholds to try, as
+# Teeth are found by thresholding lightness minus redness, CIELAB L* - 2.5 a*: weight of a*, candidate thresholds as
 # percentiles of the image, and the percentile that counts as white.
 _REDNESS, _LEVELS, _BRIGHTEST = 2.5, (40, 55, 65, 72, 78, 83, 87, 90, 92, 94, 96), 99.5
-# Fraction of the surroundings that must be redder than teeth, by this difference of a*, or darker, by this factor.
+# Minimum fraction of the surroundings that is redder or darker than the teeth; minimum difference of a* to count as
+# redder, and maximum ratio of brightness to count as darker.
 _UNLIKE, _REDDER, _DARKER = 0.6, 3.0, 0.3
-_LEAST_AREA, _MOST_AREA = 0.0015, 0.2  # limits of the image fraction covered by teeth
-_CLOSE_PX, _NEAR_PX, _FAR_PX = 4, 3, 12  # closing radius, and ring around teeth used as surroundings
-# Largest distance between the rows, in row widths; smallest area of a part relative to a row; and smallest brightness
-# and contrast of a part relative to the teeth found first, which wet lips and chins do not reach.
+_LEAST_AREA, _MOST_AREA = 0.0015, 0.2  # minimum and maximum fraction of the image covered by teeth
+# radius of the closing; inner and outer distance of the ring around teeth that samples their surroundings
+_CLOSE_PX, _NEAR_PX, _FAR_PX = 4, 3, 12
+# Maximum distance between the rows, in row widths; minimum area of a part relative to a row; minimum brightness and
+# contrast of a part relative to the teeth found first, above those of wet lips and chins.
 _ROWS_APART, _LEAST_PART, _AS_BRIGHT, _LIKE = 1.0, 0.02, 0.65, 0.5
-# Candidate lines between the rows: tilts relative to half the width, sags relative to the height, and the smallest
-# fraction of the teeth on either side of a line.
+# Candidate lines between the rows: tilts relative to half the width, sags relative to the height, and minimum fraction
+# of the tooth pixels on either side.
 _TILTS, _SAGS, _LEAST_SHARE = np.linspace(-0.3, 0.3, 21), np.linspace(-0.4, 0.4, 13), 0.2
-_LINE_PX = (-1, 0, 1)  # pixel rows around a line that should belong to the gap
+_LINE_PX = (-1, 0, 1)  # offsets of the pixel rows around a line that are averaged when testing for a gap
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +40,7 @@ class Rows:
 
     Attributes:
         masks: upper and lower row, 0 or 255, shape (2, H, W).
-        bridged: fraction of the line between the rows that is not in a gap, 0 .. 1; 0 if the rows are apart.
+        bridged: fraction of the dividing line that crosses teeth instead of a gap, 0 .. 1; 0 if the rows do not touch.
     """
 
     masks: NDArray[np.uint8]
@@ -67,7 +69,7 @@ def tooth_rows(rgb: NDArray[np.uint8]) -> Rows | None:
 
 
 def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
-    """Return the pixels of the teeth and their threshold."""
+    """Return a mask of the teeth, and the threshold that separates them."""
     best: tuple[float, float, float, Mask] | None = None
     for level in np.percentile(toothlike, _LEVELS).tolist():
         above = ndimage.binary_opening(toothlike > level, np.ones((2, 2)))
@@ -84,7 +86,7 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
     if best is None:
         return None
     _, inside, outside, group = best
-    level = (inside + outside) / 2  # above the lower of both, since highlights on lips exceed that
+    level = (inside + outside) / 2  # midway between both, since highlights on lips are brighter than the surroundings
     parts, count = ndimage.label(toothlike > level)
     like = ndimage.median(toothlike, parts, np.arange(count + 1)) > outside + _AS_BRIGHT * (inside - outside)
     own = np.bincount(parts.ravel(), group.ravel(), count + 1) > 0.5 * np.bincount(parts.ravel())
@@ -125,7 +127,7 @@ def _group_contrast(
     toothlike: Array,
     redness: Array,
 ) -> tuple[float, float]:
-    """Return brightness inside and around a group of teeth; zeros if its ring is neither redder nor darker."""
+    """Return brightness inside and around a group of teeth; zeros if its surroundings are neither redder nor darker."""
     rows, columns = box
     around = (
         slice(max(rows.start - _FAR_PX, 0), rows.stop + _FAR_PX),
@@ -144,7 +146,7 @@ def _group_contrast(
 
 
 def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
-    """Return the parts above, below and inside a group of teeth that may be teeth by size and position."""
+    """Return the numbers of parts in and near a group of teeth that may be teeth, by size and position."""
     rows, columns = np.nonzero(group)
     reach = _ROWS_APART * (np.ptp(columns) + 1)
     around = np.zeros(parts.shape, bool)
@@ -158,7 +160,7 @@ def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
 
 
 def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None:
-    """Split teeth into upper and lower row (2, h, w) at the least bridged line; also return its bridged fraction."""
+    """Split teeth into upper and lower row (2, h, w) at the line with the lowest bridged fraction; also return that."""
     rows, columns = np.nonzero(teeth)
     first, last, top, bottom = columns.min(), columns.max(), rows.min(), rows.max()
     lines = top + _lines(int(last - first + 1), int(bottom - top + 1))  # (N, width)
@@ -181,7 +183,7 @@ def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None
 
 @lru_cache(maxsize=8)
 def _lines(width: int, height: int) -> NDArray[np.int64]:
-    """Return candidate lines across a box as the row at each column, shape (N, width)."""
+    """Return candidate lines across a box, as the pixel row at every column, shape (N, width)."""
     place = np.linspace(-1.0, 1.0, width)
     middles = np.arange(0.15 * height, 0.9 * height, 1.0)
     middle, tilt, sag = (grid.reshape(-1, 1) for grid in np.meshgrid(middles, _TILTS * width / 2, _SAGS * height))

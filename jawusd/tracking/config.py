@@ -28,109 +28,120 @@ class TrackingConfig:
     sample_step_px: float = 3.0
     # Residual gate of each iteration [px]. Narrow at the end: wider gates also match lip and gum edges 0.5 mm away.
     wide_gates_px: tuple[float, ...] = (14.0, 10.0, 8.0, 6.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0)
-    # First gate when motion is easy to predict [px]; wider gates are used for fast motion and as fallback.
+    # First gate if motion is predictable [px]; wider gates are used for fast motion and as fallback.
     first_gate_px: float = 6.0
     # Ratio of the first gate to the recent prediction error [-]: above 1, since the next error may be larger.
     gate_per_miss: float = 1.5
-    # Smallest and largest final gate [px]. The gate adapts to the spread of the residuals: 2 px for good hand-drawn
+    # Minimum and maximum of the final gate [px], which adapts to the spread of the residuals: 2 px for good hand-drawn
     # masks.
     final_gate_px: tuple[float, float] = (1.2, 4.0)
     # Residual beyond which a sample adds nothing to the score [px]; the same for all poses, so scores are comparable.
     score_gate_px: float = 2.5
     # Tukey gate in standard deviations: 95 % efficiency for normal noise (Huber & Ronchetti 2009).
     gate_sigmas: float = 4.685
-    # Weight of contour samples deep inside the mask while gates are wide [-]: moves a model outwards if it is too far
-    # in.
+    # Weight of contour samples deep inside the mask while gates are wide [-]: pushes out contours that start inside the
+    # mask.
     pull: float = 0.3
-    # Gate [px] up to which that weight is zero: near the solution it would favour gum over teeth.
+    # Gate up to which the weight `pull` is zero [px]: near the solution, it would favour gum over teeth.
     pull_above_px: float = 4.0
     # Minimum cosine between contour and mask normals at a matched edge [-]: lips cross the contour at larger angles.
     normal_cosine: float = 0.7
-    # Largest decrease in depth from a contour point to the pixel inside it [mm]: a cusp curves by less, another tooth
-    # is nearer by more.
+    # Maximum decrease in depth from a contour point to the pixel just inside it [mm]: a cusp curves by less, and
+    # another tooth in front is nearer by more.
     depth_tolerance_mm: float = 1.5
-    # Depth difference from which one arch hides the other [mm]: above the error of the poses.
+    # Minimum depth difference for one arch to hide the other [mm]: above the error of the poses.
     overlap_tolerance_mm: float = 0.4
-    # Update below which iterations stop [mm at the crowns]: a tenth of the attainable accuracy.
+    # Pose update below which iterations stop [mm at the crowns]: a tenth of the attainable accuracy.
     converged_mm: float = 0.004
-    # Update below which the intermediate gates are skipped [mm at the crowns]: only larger steps need them.
+    # Pose update below which the intermediate gates are skipped [mm at the crowns]; 0 never skips them.
     settled_mm: float = 0.0
-    # Size of the last update up to which residuals are not recomputed at the final pose [mm at the crowns].
+    # Last pose update up to which residuals are not recomputed at the final pose [mm at the crowns]; 0 always
+    # recomputes them.
     judged_mm: float = 0.0
-    # Motion after which a scan is rendered again [px]: occlusion is accurate to this distance.
+    # Image motion after which a scan is rendered again [px]: the maximum error of occlusion boundaries.
     redraw_px: float = 1.0
     # Parallax between near and far parts of a scan above which it is rendered again instead of warped [px]: at 4 px,
     # corrections of knocked cameras become biased.
     parallax_px: float = 2.0
-    # Standard deviation of an arch about its prediction [mm]: a weak prior for motions that masks do not constrain.
+    # Standard deviation of an arch about its predicted position [mm]: a weak prior on motions that masks do not
+    # constrain.
     prediction_mm: float = 0.5
-    # Outline variance times correlation length assumed by that prior [px^3]: 0.4 px over 18 px, as in drawn masks.
+    # Outline variance times correlation length assumed by the prediction prior [px^3]: 0.4 px squared times 18 px, as
+    # in drawn masks.
     typical_noise_px3: float = 3.0
     # Correlation length of outline errors along the contour [px], until it is measured on the take.
     correlation_px: float = 18.0
-    # Correlation length [px] if residuals cannot reveal it; None uses the measured value.
+    # Known correlation length of outline errors [px], for residuals that cannot reveal it; None uses the measured
+    # value.
     known_correlation_px: float | None = None
-    # Side of the tiles over which errors are summed to measure that length [px]: estimates change little from 20 to 45.
+    # Side of the tiles over which errors are summed to measure the correlation length [px]: estimates change little
+    # from 20 to 45.
     tile_px: int = 30
     # Ratio of true to measured correlation length [-]: the fit absorbs part of the error, and the Tukey weight loses
     # efficiency.
     tile_factor: float = 2.2
-    # History of good frames for residuals and coverage [frames]: about a second.
+    # Number of recent good frames that define the usual residual and coverage: about a second.
     history_frames: int = 31
-    # History of good frames for scores [frames]: shorter than closing lips take, longer than losing a pose takes.
+    # Number of recent good frames that define the usual score: fewer than closing lips take, more than losing a pose
+    # takes.
     score_frames: int = 7
     # Fraction of the recent median score below which an arch is suspect [-]: closing lips seldom hide so much in a few
     # frames.
     suspect_score: float = 0.6
-    # Fraction of that median below which closing lips cannot be the cause [-].
+    # Fraction of the recent median score below which closing lips cannot be the cause [-].
     alarming_score: float = 0.3
     # Multiple of the recent median residual spread above which an arch is suspect [-].
     suspect_residual: float = 1.4
-    # Excess of a mask's uncovered fraction over its recent median from which the mask or its arch is suspect [-].
+    # Excess of a mask's uncovered fraction over its recent median above which the mask or its arch is suspect [-].
     suspect_coverage: float = 0.04
     # Multiple of the arch's recent median residual above which the mask of one view is suspect [-].
     uneven_residual: float = 1.6
-    # Fraction of its recent median score below which a mask is of something other than the arch [-].
+    # Fraction of a mask's recent median score below which it does not show the arch [-].
     dead_score: float = 0.03
-    # Penalty per uncovered mask pixel, in px of contour [1/px]: rejects wrong local minima where few edges are visible.
+    # Penalty per uncovered mask pixel, in px of contour [1/px]: rejects wrong local minima if few edges are visible.
     uncovered_price: float = 0.5
-    # Gain in the objective of the other masks, relative to their score, that proves an excluded mask wrong [-].
+    # Minimum gain in the objective of the other masks, relative to their score, for a mask to be excluded as wrong [-].
     conflict_gain: float = 0.15
-    # Gain in the objective over the first attempt, relative to the score, that marks a frame as recovered [-].
+    # Minimum gain in the objective over the first attempt, relative to the score, for a frame to be marked as recovered
+    # [-].
     recovery_gain: float = 0.05
-    # Offsets of the multi-start search [mm, rad]: prediction errors of a fast chewing stroke, and after an occlusion.
+    # Offsets of the starts of the multi-start search [mm, rad]: prediction errors in fast chewing, and after an
+    # occlusion.
     search_rings: tuple[tuple[float, float], ...] = ((2.0, 0.05), (4.0, 0.12))
     # Gates of the short trial alignment from every start [px], and number of starts that are refined fully.
     trial_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4
     # Matched contour length below which an arch is lost [px]: 8 mm of tooth edge.
     least_matched_px: float = 60.0
-    # Multiple of the suspect residual above which an arch is lost [-]; with a low score, the suspect limit suffices.
+    # Multiple of the suspect residual above which an arch is lost [-]; if the score is low too, a suspect residual
+    # suffices.
     lost_residual: float = 1.3
     # Uncovered fraction of a mask above which its arch is lost [-]: good poses leave about 0.01.
     lost_coverage: float = 0.12
     # Position uncertainty of the crowns above which an arch is lost [mm].
     lost_sigma_mm: float = 0.5
     # Minimum matched fraction of the visible contour in the first frame [-]: correct poses reach 0.15 with nearly
-    # closed lips, and 0.07 with scans without gum. Wrong poses above it are rejected because masks stay uncovered.
+    # closed lips, and 0.07 with scans without gum. Wrong poses can exceed it, but are rejected for their uncovered
+    # masks.
     first_share: float = 0.05
     # Delay between cameras [frames] and mask bias [px] above which all frames are aligned again with both corrected:
-    # below, they matter less than the noise of single frames.
+    # smaller values matter less than the noise of single frames.
     refine_delay_frames: float = 0.03
     refine_bias_px: float = 0.1
-    # Delay that is corrected before camera poses are tested [frames]: more than free-running cameras can differ.
+    # Delay above which it is corrected before camera poses are tested [frames]: more than free-running cameras can
+    # differ.
     late_frames: float = 0.6
-    # Maximum rounds of realignment [-]: each leaves a tenth of the delay.
+    # Maximum number of rounds of realignment: each leaves a tenth of the delay.
     refine_rounds: int = 2
-    # Maximum rounds while a camera still has a delay: matches converge slowly then.
+    # Maximum number of rounds while a camera still has a delay, since matches then converge slowly.
     late_rounds: int = 4
     # Contour shift by wrong camera poses above which they are corrected [px]: smaller shifts are annotator bias.
     refine_shift_px: float = 0.15
-    # Prior standard deviation per axis of camera motion between calibration and take [rad, mm]: a knock.
+    # Prior standard deviation of a camera's motion between calibration and take, per axis [rad, mm]: a knock.
     refine_turn_rad: float = 0.0035
     refine_move_mm: float = 0.5
-    # Frames on which these corrections are iterated before all frames are aligned again [-], maximum iterations, and
-    # the fraction of the preceding limits below which iteration stops.
+    # Number of frames on which delays, mask bias and camera poses are iterated before all frames are aligned again;
+    # maximum number of iterations; and fraction of the `refine` limits below which iteration stops.
     settle_frames: int = 40
     settle_rounds: int = 6
     settled_share: float = 0.2
@@ -154,13 +165,13 @@ class TrackingConfig:
         )
 
     def gates_from(self, reach_px: float) -> tuple[float, ...]:
-        """Return the gates for a start that is off by about reach_px, from at least `first_gate_px` on."""
+        """Return the gates for a start that is off by about reach_px, with a first gate of at least `first_gate_px`."""
         return tuple(g for g in self.wide_gates_px if g <= max(reach_px, self.first_gate_px))
 
 
 #: For takes of several cameras: scans are rendered half as often. Searches with a single camera need the default.
 FOR_TAKES = TrackingConfig(redraw_px=2.0)
 
-#: For masks made by jawusd. They vary more between frames than hand-drawn ones, and become rougher as lips close, so
-#: the limits for lost arches are wider. Their errors are correlated along whole teeth, hence the larger `tile_factor`.
+#: For masks made by jawusd. They vary more between frames than hand-drawn ones, and get rougher as lips close, so the
+#: limits for lost arches are wider. Their errors are correlated along whole teeth, hence the larger `tile_factor`.
 FOR_AUTO_MASKS = replace(FOR_TAKES, suspect_residual=3.0, suspect_score=0.25, tile_factor=20.0)

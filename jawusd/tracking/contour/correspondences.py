@@ -97,7 +97,7 @@ def search_edges(
         mask, other_mask: masks of this arch and of the other one, 255 = teeth, shape (h, w).
         other_inverse_depth: rendered inverse depth of the other arch's scan [1/mm], 0 = empty, shape (h, w).
         reach_px: search distance in both directions.
-        tolerance_mm: depth difference from which one arch hides the other.
+        tolerance_mm: minimum depth difference for one arch to hide the other.
         cos_limit: minimum cosine between the sample's normal and the mask's normal at the edge.
         out: receives the distances, positive outwards, shape (n,). NaN if the sample is hidden, or no edge of its own
             object is near; +inf if the mask extends over the whole reach.
@@ -115,7 +115,7 @@ def search_edges(
             gx = _sample(mask, ex + 1, ey) - _sample(mask, ex - 1, ey)
             gy = _sample(mask, ex, ey + 1) - _sample(mask, ex, ey - 1)
             if -(gx * nx + gy * ny) < cos_limit * np.sqrt(gx * gx + gy * gy):
-                continue  # crosses the contour: a lip or a neighbouring tooth
+                continue  # this mask edge crosses the contour: a lip or a neighbouring tooth
             if _sample(other_mask, ex + 2 * nx, ey + 2 * ny) > _EDGE:
                 other = _at(other_inverse_depth, ex + 2 * nx, ey + 2 * ny)
                 if other == 0.0 or other * (1 - 0.25 * tolerance_mm * own) > own:
@@ -165,8 +165,8 @@ def accumulate(
 
     Args:
         samples, distances: input and output of `search_edges`, shapes (n, COLUMNS) and (n,).
-        gate_px: residual beyond which the Tukey weight is zero.
-        score_gate_px: residual beyond which a sample adds nothing to the score.
+        gate_px: residual above which the Tukey weight is zero.
+        score_gate_px: residual above which a sample adds nothing to the score.
         pull: weight at the gate of samples deep inside the mask; 0 ignores them.
         pose: scan to world, shape (4, 4).
         matrix: world [mm] to homogeneous px, shape (3, 4).
@@ -262,9 +262,9 @@ def scatter_of_tiles(
     shape: tuple[int, int],
     tile_px: int,
 ) -> tuple[Array, Array]:
-    """Return the sum over image tiles of s s^T, shape (6, 6); s is the sum of w J d over the samples in the tile.
+    """Return the sum of s s^T over image tiles, shape (6, 6); s is the sum of w J d over the samples in a tile.
 
-    The second result uses the gum fraction in place of d: the effect of a gum line drawn one pixel off within one tile.
+    The second result uses the gum fraction in place of d: the effect of a gum line drawn one pixel off in single tiles.
 
     Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The
     ratio to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).

@@ -38,8 +38,8 @@ def twist_between(start: Array, end: Array, centre: Array) -> Array:
 class OutlineSums(NamedTuple):
     """Sums over matched contour samples per arch and view: weight w, distance d to the mask edge [px], derivative J.
 
-    The habits of the annotator shift the outline by h . (edge px, gum px, gum mm), with the last three columns h of a
-    sample: at free edges, at the gum line in the image, and at the gum line along the crown surface.
+    The annotator's habits (edge px, gum px, gum mm), at free edges, at the gum line in the image, and at the gum line
+    along the crown surface, shift the outline by their product with h, the last three columns of a sample.
 
     Attributes:
         precision: sum w J^T J, shape (2, C, 6, 6).
@@ -48,7 +48,7 @@ class OutlineSums(NamedTuple):
         habit_distance, habit_weight: sum w h d and sum w h h^T, shapes (2, C, 3) and (2, C, 3, 3).
         weight, square: sum w and sum w d^2, shape (2, C).
         matched_px: contour length within the gate, shape (2, C).
-        score_px: contour length, each sample counted by 1 minus Tukey's loss at the score gate, shape (2, C).
+        score_px: contour length weighted by 1 minus Tukey's loss at the score gate, shape (2, C).
     """
 
     precision: Array
@@ -98,8 +98,8 @@ class NormalEquations:
         matrix: precision, arches in the order (upper, lower), shape (12, 12); `upper`, `lower` and `coupling` are
             views of its blocks.
         right: right-hand side, shape (12,).
-        outline_weight: weight of the outline sums per arch [1/px^3], shape (2,): 1, or the inverse of outline variance
-            times correlation length if other terms are log-likelihoods.
+        outline_weight: weight of the outline sums per arch [1/px^3], shape (2,): 1, or 1 / (outline variance times
+            correlation length) if other terms are log-likelihoods.
     """
 
     def __init__(self, outline_weight: Array | None = None) -> None:

@@ -21,7 +21,7 @@ from jawusd.tracking.contour.quality import residual_px, score_px
 
 
 class Loss(NamedTuple):
-    """The check an arch failed, with the measured value and its limit in the unit of `LostReason`."""
+    """The check that an arch failed, with the measured value and its limit, both in the unit of the `LostReason`."""
 
     reason: LostReason
     value: float
@@ -75,25 +75,25 @@ class FrameSummary:
 
 
 _KEPT_FRAMES = 32
-_IN_MEMORY = 16 << 20  # bytes kept in memory before a file is used: enough for a minute or two
+_IN_MEMORY = 16 << 20  # maximum number of bytes held in memory before a file is used: enough for a minute or two
 # Shapes of the sums per arch and view; the first is a symmetric 6 x 6 matrix.
 _SUM_SHAPES = tuple(table.shape[2:] for table in OutlineSums.zeros(1))
 _LOWER = np.tril_indices(6)
-_MIRROR = np.empty((6, 6), np.int64)  # index into the lower triangle for every entry of the full matrix
+_MIRROR = np.empty((6, 6), np.int64)  # index of every entry of the full matrix in the lower triangle
 _MIRROR[_LOWER] = _MIRROR[_LOWER[::-1]] = np.arange(len(_LOWER[0]))
 
 
 class PackedRecords(MutableMapping[int, FrameRecord]):
     """A mapping of frames to records that packs them into a temporary file, so that long takes need little memory.
 
-    Poses and quality figures keep double precision. Sums over samples are stored in single precision: they are sums of
-    thousands of distances that are accurate to 0.01 px. Not thread-safe.
+    Poses and quality figures keep double precision. Sums over samples are stored in single precision, which suffices
+    for thousands of distances accurate to 0.01 px. Not thread-safe.
     """
 
     def __init__(self) -> None:
         self._store = _Store()
         self._places: dict[int, int] = {}
-        self._unpacked: dict[int, FrameRecord] = {}  # cache of the records last used: mostly neighbouring frames
+        self._unpacked: dict[int, FrameRecord] = {}  # cache of recently used records: mostly neighbouring frames
 
     def __getitem__(self, frame: int) -> FrameRecord:
         if frame not in self._unpacked:
@@ -112,7 +112,7 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
         self._unpacked.pop(frame, None)
 
     def __contains__(self, frame: object) -> bool:
-        return frame in self._places  # the default would unpack the record
+        return frame in self._places  # the inherited method would unpack the record
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._places)
@@ -129,7 +129,7 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
 
 
 class _Store:
-    """An append-only file of packed records; replaced ones remain in it, because other mappings may refer to them."""
+    """An append-only file of packed records; replaced records remain in it, since other mappings may refer to them."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115  # open as long as this object exists
@@ -179,7 +179,8 @@ def _packed(record: FrameRecord) -> tuple[Array, NDArray[np.float32]]:
 
 
 def _unpacked(figures: Array, sums: NDArray[np.float32]) -> FrameRecord:
-    # Poses, centres, status, losses and iterations have fixed sizes; three more arrays have an entry per arch and view.
+    # Poses, centres, status, losses and iterations have fixed sizes; the other three arrays have one entry per arch and
+    # view.
     views = (len(figures) - 2 * 16 - 2 * 3 - 2 - 2 * 3 - 1) // (2 * 3)
     of_figures, of_sums = _places(views)
     poses, centres, visible, status, used, coverage, losses, iterations = _split(figures, of_figures)
@@ -201,7 +202,7 @@ _Places = list[tuple["slice[int, int, int]", tuple[int, ...]]]
 
 @lru_cache(maxsize=8)
 def _places(views: int) -> tuple[_Places, _Places]:
-    """Return slices and shapes of the arrays in a packed record, of figures and of sums."""
+    """Return slices and shapes of the arrays in a packed record, first those of figures, then those of sums."""
     half = (len(_LOWER[0]),)
     figures = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
     sums = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Indices, Mask
 
-_SHORTEST_MM = 1e-3  # shorter segments have no reliable direction
+_SHORTEST_MM = 1e-3  # minimum length of a segment: shorter ones have no reliable direction
 
 
 def crown_gum_segments(
@@ -92,7 +92,7 @@ def _grid(triangles: Array, low: Array, cell: float, count: Indices) -> tuple[In
 def _cut(
     crown: Array, gum: Array, low: Array, cell: float, count: Indices, starts: Indices, items: Indices
 ) -> tuple[Array, Indices]:
-    """Return the intersections of crown and gum triangles, and their crown triangles; each pair is tested once."""
+    """Return the segments where crown and gum triangles intersect, and their crown triangles; test each pair once."""
     first = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
     first_g = np.empty(3, np.int64)
@@ -110,7 +110,7 @@ def _cut(
                     for q in range(starts[c], starts[c + 1]):
                         g = items[q]
                         _box(gum[g], low, cell, count, first_g, last_g)
-                        # Both boxes may share many cells; the pair is tested in the lowest one.
+                        # Both boxes may share several cells; the pair is tested only in the first of them.
                         if (
                             i != max(first[0], first_g[0])
                             or j != max(first[1], first_g[1])

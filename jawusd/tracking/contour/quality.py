@@ -15,9 +15,10 @@ from jawusd.tracking.contour.equations import NormalEquations, ResidualTerm, Sol
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
-# Standard deviation of the gum-line error that is independent between teeth [px].
+# Standard deviation of the part of the gum-line error that differs from tooth to tooth [px].
 _GUM_BY_TOOTH_PX = 0.3
-# E[w d^2] / E[w] of a unit normal residual under the Tukey weight at 4.685 standard deviations, by quadrature.
+# Variance of a standard normal residual after Tukey weighting at 4.685 standard deviations, E[w d^2] / E[w], by
+# quadrature.
 _TUKEY_VARIANCE = 0.828
 
 
@@ -47,7 +48,7 @@ def view_residual_px(solution: Solution) -> Array:
 
 
 def _weight_and_square(solution: Solution) -> tuple[Array, Array]:
-    """Return the weight and square sums over all matched samples, without adding the other sums."""
+    """Return the sums `weight` and `square` over all matched samples, without computing the other sums."""
     edge, gum = solution.silhouette, solution.gingival_margin
     return edge.weight + gum.weight, edge.square + gum.square
 
@@ -55,9 +56,9 @@ def _weight_and_square(solution: Solution) -> tuple[Array, Array]:
 def uncovered_px(
     scans: Sequence[Scan], poses: Array, views: Sequence[View], in_threads: Mapper = map
 ) -> tuple[Array, Array]:
-    """Return E_SP (eq. 8 of the paper), the mask pixels not covered by the projected crowns, and all mask pixels.
+    """Return the numbers of mask pixels not covered by projected crowns (E_SP in eq. 8 of the paper), and of all.
 
-    Both are counts per arch and view, shape (2, C).
+    Both have a value per arch and view, shape (2, C).
     """
     uncovered, total = np.zeros((2, len(views))), np.zeros((2, len(views)))
 
@@ -80,7 +81,7 @@ def coverage_error(uncovered: Array, total: Array) -> Array:
 def arch_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], uncovered_price: float) -> Array:
     """Return the matched fraction of each arch's visible contour, less the penalty for uncovered mask, shape (2,) [-].
 
-    The median over the views, so that one wrong mask of three is ignored; -inf where nothing is visible.
+    It is the median over the views, so that one wrong mask of three is ignored; -inf if nothing is visible.
     `uncovered_price` is the penalty of an uncovered pixel in px of contour [1/px].
     """
     uncovered, _ = uncovered_px(scans, solution.poses, views)
@@ -142,8 +143,8 @@ def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, c
 def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
     """Return the correlation length of outline errors along the contour, estimated from one frame [px], shape (2,).
 
-    It is tr(H^-1 S) / (6 sigma^2) times the configured factor, with the scatter S of tiles; NaN if the matches do not
-    constrain every motion.
+    It is tr(H^-1 S) / (6 sigma^2) times `tile_factor`, with precision H and scatter S of the tiles; NaN if the matches
+    do not constrain every motion.
     """
     out = np.full(2, np.nan)
     sigma = residual_px(solution)

@@ -16,9 +16,9 @@ from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
-_AROUND_PX = 24  # margin rendered around the window, since the window follows the masks
-_LARGEST_ZOOM = 1.02  # change of scale up to which a drawing is warped
-_MOST_KEPT = 64  # drawings in the cache; every camera correction adds new ones
+_AROUND_PX = 24  # margin rendered around the window, since the window moves with the masks
+_LARGEST_ZOOM = 1.02  # maximum change of scale for which a drawing is warped instead of rendered again
+_MOST_KEPT = 64  # maximum number of drawings in the cache; every camera correction adds new ones
 
 _Kept = tuple[Array, int]
 
@@ -35,7 +35,7 @@ class Contour:
     def samples(
         self, matrix: Array, eye: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32]
     ) -> tuple[Array, int]:
-        """Return the samples in a drawing of the scan; arguments and result as for `contour_samples`."""
+        """Return the contour samples in a drawing of the scan; arguments and result as for `contour_samples`."""
         limits = (self.step_px, self.depth_tolerance_mm)
         return contour_samples(self.scan, matrix, eye, labels, inverse_depth, *limits, self.towards_gum)
 
@@ -43,7 +43,7 @@ class Contour:
 class Drawing:
     """A rendering of a scan for one camera, which is warped for small motions.
 
-    Visibility and outline of a scan depend only on the position of the eye in scan coordinates.
+    Warping is accurate because visibility and outline of a scan depend only on the camera centre in scan coordinates.
     """
 
     def __init__(self, scan: Scan, matrix: Array, eye: Array, shape: tuple[int, int]) -> None:
@@ -64,14 +64,15 @@ class Drawing:
         self._contours: dict[Contour, _Kept] = {}
         self._probes = scan.probes[:: max(1, len(scan.probes) // 24)]
         drawn_at = np.column_stack([projected(self._matrix, self._probes), np.ones(len(self._probes))])
-        self._least_squares = np.linalg.pinv(drawn_at)  # fits affine maps from the drawn points, shape (3, n)
+        # pseudo-inverse that fits affine maps to the motion of the drawn points, shape (3, n)
+        self._least_squares = np.linalg.pinv(drawn_at)
 
     def shows(self, matrix: Array, eye: Array, shape: tuple[int, int], parallax_px: float) -> bool:
         """Return whether this drawing can be warped to another pose.
 
         Args:
             matrix, eye, shape: as for the constructor.
-            parallax_px: allowed motion between near and far parts.
+            parallax_px: maximum relative motion of near and far parts.
         """
         centre, radius_mm = self._scan.centre, self._scan.radius_mm
         before, now = self._eye - centre, eye - centre
@@ -138,7 +139,7 @@ class Drawing:
 
 
 class Drawings:
-    """A cache with the last drawing of every arch for every camera."""
+    """A cache of the last drawing of every arch for every camera."""
 
     def __init__(self, scans: Sequence[Scan], parallax_px: float) -> None:
         """Start empty; `parallax_px` as for `Drawing.shows`."""
@@ -221,15 +222,15 @@ def projected(matrix: Array, points: Array) -> Array:
     return np.asarray(h[:, :2] / h[:, 2:])
 
 
-# Points of the unit sphere whose projections are compared to measure motion.
+# Points on the unit sphere whose projections are compared to measure motion.
 _CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
 
 
 class Rendering:
-    """Renderings and contours of both scans in every view of one instant, redrawn only after the scans have moved.
+    """Renderings and contours of both scans in every view of one frame, redrawn only after the scans have moved.
 
-    In between, the points of a contour move with the scan. The error is of second order: the contour of a rotated scan
-    runs through other points.
+    Between redraws, the points of a contour move with the scan. The contour of a rotated scan runs through other
+    points, an error of second order.
     """
 
     def __init__(
@@ -238,9 +239,9 @@ class Rendering:
         """Start without drawings.
 
         Args:
-            views: the views of the instant.
+            views: the views of the frame.
             contours: contours of the upper and lower arch, sampled while drawing.
-            drawings: cache shared between instants.
+            drawings: cache shared between frames.
             redraw_px: motion after which an arch is rendered again.
             map: distributes the drawing among threads.
         """
@@ -291,6 +292,7 @@ class Rendering:
         T_world_scan = view.T_delay[r] @ pose
         matrix = view.matrix @ T_world_scan
         drawing = self._drawings.of(r, c, view.eye, T_world_scan, matrix, labels.shape)
-        drawing.find_samples(self._contours[r])  # sampled here, because threads run this for several views in parallel
+        # sampled here, because threads run this method for several views in parallel
+        drawing.find_samples(self._contours[r])
         at = projected(view.matrix @ pose, self._corners[r])
         self._shown[r, c] = (at, drawing, drawing.show(matrix, labels, depth))

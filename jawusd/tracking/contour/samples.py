@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.tracking.contour.scan import CROWN, GUM, Faces, Scan
 
-# Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the image, represented contour
-# length [px], inverse depth [1/mm]; then the effect of annotator habits on the outline along the normal: fraction of
-# free edge and of gum line [-], and pixels per mm by which the gum line is moved along the crown surface.
+# Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the image, contour length that the
+# sample represents [px], inverse depth [1/mm]; then the effect of annotator habits on the outline along the normal:
+# fraction of free edge and of gum line [-], and pixels per mm by which the gum line is moved along the crown surface.
 X, Y, Z, U, V, NX, NY, LENGTH, INVERSE_DEPTH, EDGE_SHARE, GUM_SHARE, GUM_SLOPE = range(12)
 COLUMNS = 12
 HABITS = slice(EDGE_SHARE, COLUMNS)  # an outline shifts by samples[:, HABITS] @ (edge px, gum px, gum mm)
 
-# Distance from visible gum at which an outline starts to count as gum line, and counts fully [mm]: painted labels blur
-# the boundary, since brushes are half a millimetre wide.
+# Distances from visible gum at which an outline starts to count as gum line, and at which it counts fully [mm]:
+# boundaries of painted labels are blurred, since brushes are half a millimetre wide.
 _GUM_FAR_MM, _GUM_NEAR_MM = 1.0, 0.55
-# For scans without gum: cosine to the gum direction at which an outline starts to count as gum line, and counts fully
-# [-]. Only biting edges are certainly no gum line, since papillae hide the sides of crowns.
+# For scans without gum: cosines to the gum direction at which an outline starts to count as gum line, and at which it
+# counts fully [-]. Only biting edges are certainly free of gum, since papillae hide the sides of crowns.
 _LEAST_FACING, _FULL_FACING = -0.6, -0.2
 # Two samples are on the same outline if they lie within `_BESIDE_PX` and the cosine between their normals is at least
 # `_SAME_WAY`. The inner one is dropped if the other is farther out by `_OUTSIDE_PX` plus `_OUTSIDE_SLOPE` times their
@@ -51,8 +51,9 @@ def contour_samples(
         eye: camera centre in scan coordinates [mm], shape (3,).
         labels: visible label of every pixel of the region: CROWN, GUM or 0, shape (h, w).
         inverse_depth: inverse depth [1/mm], shape (h, w).
-        step_px: largest distance between samples.
-        depth_tolerance_mm: how much nearer the surface just inside the contour may be without hiding the contour.
+        step_px: maximum distance between samples.
+        depth_tolerance_mm: maximum decrease in depth from a contour point to the surface just inside it; beyond that,
+            the surface hides the point.
         towards_gum: unit vector in scan coordinates, shape (3,), for scans without gum: outlines facing this direction
             are gum line.
     """
@@ -176,7 +177,7 @@ def _silhouette(
             sample[NX], sample[NY] = nx, ny
             sample[LENGTH] = length / pieces
             sample[INVERSE_DEPTH] = 1.0 / w
-            # A border of the crown lies at the gum, or was cut off there.
+            # A border of the crown mesh adjoins the gum, or was cut off there.
             sample[GUM_SHARE] = 1.0 if g < 0 else 0.0
             sample[GUM_SLOPE] = _border_slope(vertices, i, j, k, sample, matrix, w) if g < 0 else 0.0
             n += 1
@@ -185,7 +186,7 @@ def _silhouette(
 
 @numba.njit(nogil=True, cache=True)
 def _border_slope(vertices: Array, i: int, j: int, k: int, sample: Array, matrix: Array, w: float) -> float:
-    """Return the motion of a border ij along its normal per mm within its triangle, away from corner k [px/mm]."""
+    """Return the image motion of border ij along its normal per mm away from corner k in its triangle [px/mm]."""
     ex, ey, ez = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
     tx, ty, tz = sample[X] - vertices[k, 0], sample[Y] - vertices[k, 1], sample[Z] - vertices[k, 2]
     along = (tx * ex + ty * ey + tz * ez) / max(ex * ex + ey * ey + ez * ez, 1e-18)
@@ -205,7 +206,7 @@ def _shift_px(sample: Array, matrix: Array, w: float, tx: float, ty: float, tz: 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def pixel_of(coordinate: float) -> int:
-    """Return the index of the pixel a coordinate falls into."""
+    """Return the index of the pixel that contains a coordinate."""
     return int(np.floor(coordinate + 0.5))
 
 
@@ -218,7 +219,7 @@ def _visible(
     px_per_mm: float,
     facing_gum: Array,
 ) -> Array:
-    """Keep samples whose own surface is visible inside and no crown outside; classify edge and gum line."""
+    """Keep samples with their own surface visible just inside and no crown just outside; classify edge and gum line."""
     out = np.empty_like(samples)
     height, width = labels.shape
     shows_gum = facing_gum[0] == 0.0 and facing_gum[1] == 0.0
@@ -291,19 +292,19 @@ def _has_one_outside(samples: Array, s: int, last: NDArray[np.int32], before: ND
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _nearer(seen: float, own: float, tolerance_mm: float) -> bool:
-    """Return whether the rendered surface is nearer than a sample by more than the tolerance, from inverse depths."""
+    """Return whether a rendered surface hides a sample, by more than the depth tolerance; depths are inverse."""
     return seen * (1.0 - tolerance_mm * own) > own
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _gum_distance_px(labels: NDArray[np.uint8], u: float, v: float, reach_px: float) -> float:
-    """Return the distance to the nearest pixel with gum [px], at most the reach."""
+    """Return the distance to the nearest gum pixel [px], clipped at `reach_px`."""
     i = pixel_of(u)
     j = pixel_of(v)
     height, width = labels.shape
     n = int(reach_px)
     best = reach_px * reach_px
-    for dy in range(n + 1):  # outwards, until no nearer pixel can follow
+    for dy in range(n + 1):  # outwards, until no remaining pixel can be nearer
         if dy * dy >= best:
             break
         for y in (j - dy, j + dy):
@@ -331,7 +332,7 @@ def _gingival_margin(
     tolerance_mm: float,
 ) -> Array:
     """Sample the gingival margin where crown is visible on one side and gum on the other; normals point to the gum."""
-    reach = 1.5  # px: the nearest pixels that lie entirely on one side
+    reach = 1.5  # distance in px to the nearest pixels that lie entirely on one side
     out = np.empty((len(segments), COLUMNS))
     height, width = labels.shape
     n = 0
@@ -345,7 +346,7 @@ def _gingival_margin(
         up, vp, wp = _pixel(matrix, p[0], p[1], p[2])
         uq, vq, wq = _pixel(matrix, q[0], q[1], q[2])
         length = np.sqrt((uq - up) ** 2 + (vq - vp) ** 2)
-        if length < 0.05:  # px: viewed end-on, the direction is undefined
+        if length < 0.05:  # length in px below which a segment is viewed end-on and its direction undefined
             continue
         nx = reach * (vq - vp) / length
         ny = reach * (up - uq) / length
@@ -363,7 +364,7 @@ def _gingival_margin(
         out[n, X], out[n, Y], out[n, Z], out[n, U], out[n, V] = x, y, z, u, v
         out[n, NX], out[n, NY], out[n, LENGTH], out[n, INVERSE_DEPTH] = nx / reach, ny / reach, length, 1.0 / w
         out[n, EDGE_SHARE], out[n, GUM_SHARE] = 0.0, 1.0
-        # Positive towards the gum, like the normal, whichever way the direction points.
+        # Positive towards the gum, like the normal, whatever the sign of the direction.
         out[n, GUM_SLOPE] = abs(_shift_px(out[n], matrix, w, directions[s, 0], directions[s, 1], directions[s, 2]))
         n += 1
     return out[:n]

@@ -26,12 +26,12 @@ ARCHES = (0, 1)
 ARCH_NAMES = ("upper", "lower")
 CROWN, GUM = 1, 2  # labels of a rendered scan; 0 is empty
 
-_PROBES = 300  # vertices: enough for means over the crowns that are accurate to one per cent
-# Crown faces above which most steps use a decimated scan, and crown faces of the decimated scan: the loss of accuracy
-# is below 0.002 mm, and time is proportional to the faces.
+_PROBES = 300  # number of vertices at which motion is measured: enough for means accurate to one per cent
+# Number of crown faces above which all but the last steps use a decimated scan, and number of crown faces of the
+# latter: run time is proportional to it, and the loss of accuracy is below 0.002 mm.
 _DENSE_FACES, _THIN_FACES = 60_000, 20_000
-_GUM_SHARE = 0.02  # gum faces per crown face below which they are remnants of removed gum
-_FEWEST_CROWN_FACES = 100  # fewer have no contour in several directions
+_GUM_SHARE = 0.02  # ratio of gum to crown faces below which gum faces are remnants of removed gum
+_FEWEST_CROWN_FACES = 100  # minimum number of crown faces: fewer have no contour in several directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +50,10 @@ class Scan:
     probes: Array  # vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
     centre: Array  # centroid of the crown vertices [mm], shape (3,)
     radius_mm: float  # largest distance of a crown vertex from the centre
-    # whether labels or paint separate crown from gum; otherwise the whole scan counts as crown. Painted crowns have
-    # outward normals, so back faces are culled
+    # whether labels or paint separate crown from gum (back faces of separated crowns are culled); otherwise the whole
+    # scan counts as crown
     painted: bool
-    # the same arch with fewer faces, for all but the last steps; None if this one has few enough
+    # the same arch with fewer faces, for all but the last steps; None if this scan has few enough
     thin: Scan | None = None
 
     @property
@@ -62,7 +62,7 @@ class Scan:
         return len(self.gum_faces) > _GUM_SHARE * len(self.crown_faces)
 
     def crown_vertices(self, limit: int | None = None) -> Array:
-        """Return all or about `limit` vertices of the crowns [mm], shape (N, 3)."""
+        """Return the vertices of the crowns [mm], all or about `limit` of them, shape (N, 3)."""
         points = self.vertices[np.unique(self.crown_faces)]
         return points if limit is None else points[:: max(1, len(points) // limit)]
 
@@ -135,7 +135,7 @@ def thinned(scan: Scan, crown_faces: int) -> Scan:
         return scan
     parts = decimated_scan(scan.vertices, scan.crown_faces, scan.gum_faces, crown_faces)
     thin = _with_tables(scan.name, *parts, scan.painted)
-    # Twists are about the centre, so both scans must share it.
+    # Twists are about the centre, so the decimated scan must have the same one.
     return replace(thin, probes=scan.probes, centre=scan.centre, radius_mm=scan.radius_mm)
 
 
@@ -185,7 +185,7 @@ def _weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
 def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
     """Return the faces, with connected components of negative volume flipped.
 
-    Volumes are taken about each component's own centre, so the open base of a crown adds little.
+    Volumes are taken about each component's own centre, so the missing base of a crown changes them little.
     """
     links = coo_array(
         (np.ones(3 * len(faces)), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), [len(vertices)] * 2
@@ -204,7 +204,7 @@ def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
 def _edge_table(faces: Faces) -> Faces:
     """Return vertex, vertex, face, other face (-1 at a border) of every edge, shape (E, 4).
 
-    If more than two faces share an edge, the remaining ones are paired as separate edges.
+    If more than two faces share an edge, further pairs of faces form separate edges.
     """
     pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(len(faces), dtype=np.int32), 3)

@@ -1,4 +1,4 @@
-"""Gauss-Newton alignment of both arches with their masks in all views at one instant."""
+"""Gauss-Newton alignment of both arches with their masks in all views of one frame."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
-_ROUGH_FACES = 6_000  # crown faces of an arch in short trials: a third of a decimated scan
-_DENSE_STEPS = 2  # steps with all faces of a dense scan, after the decimated one has converged
+_ROUGH_FACES = 6_000  # number of crown faces of an arch in short trials: a third of those of a decimated scan
+_DENSE_STEPS = 2  # number of steps with all faces of a dense scan, after the decimated scan has converged
 
 # Samples, number of silhouette samples, distances to the mask edge, visible contour length [px].
 _Match = tuple[Array, int, Array, float]
@@ -61,7 +61,7 @@ class ContourSolver:
         towards_gum = _towards_gum(self.scans)
         self.contours = tuple(Contour(scan, *limits, way) for scan, way in zip(self.scans, towards_gum, strict=True))
         thin = [scan.thin or scan for scan in self.scans]
-        #: A solver of the decimated scans; None if no scan is dense.
+        #: A solver with decimated scans; None if no scan is dense.
         self.thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
         self._executor = executor
         #: Cache of the last drawings.
@@ -69,25 +69,25 @@ class ContourSolver:
 
     @cached_property
     def rough(self) -> ContourSolver:
-        """A solver of coarse scans, for short trials."""
+        """A solver with coarse scans, for short trials."""
         scans = [thinned(replace(scan.thin or scan, thin=None), _ROUGH_FACES) for scan in self.scans]
         return ContourSolver(scans, self.config, self._executor)
 
     def exact(self) -> ContourSolver:
-        """Return a solver of the same scans that never warps drawings.
+        """Return a solver with the same scans that never warps drawings.
 
         Searches need it: they rank poses by uncovered pixels in small images, and jump between poses.
         """
         return ContourSolver(self.scans, replace(self.config, parallax_px=0.0), self._executor)
 
     def rendering(self, views: Sequence[View]) -> Rendering:
-        """Return a rendering of both scans in the views of one instant, to be shared by all alignments there."""
+        """Return a rendering of both scans in the views of one frame, to be shared by all its alignments."""
         return Rendering(views, self.contours, self.drawings, self.config.redraw_px, self.map)
 
     def forget_drawings(self) -> None:
         """Clear the drawing cache, so that poses do not depend on earlier alignments."""
         self.drawings.forget()
-        for solver in (self.thin, self.__dict__.get("rough")):  # the property would create it
+        for solver in (self.thin, self.__dict__.get("rough")):  # the property `rough` would create the solver
             if solver is not None:
                 solver.forget_drawings()
 
@@ -147,7 +147,7 @@ class ContourSolver:
             for r in ARCHES:
                 poses[r] = motion_about(state.centres[r], step[r]) @ poses[r]
             left = self.config.gates_after(left, self._motion_mm(step))
-        if iterations:  # without this, rounding errors accumulate, as predictions multiply poses frame after frame
+        if iterations:  # prevents accumulation of rounding errors, as predictions multiply poses frame after frame
             poses = orthonormalise(poses)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
@@ -168,8 +168,8 @@ class ContourSolver:
         Args:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
             views, use: one view per camera, and the masks to use, shape (2, C).
-            gate: residual beyond which a sample has no weight [px].
-            rendering: rendering of these views, shared by all steps at an instant.
+            gate: residual above which a sample has no weight [px].
+            rendering: rendering of these views, shared by all steps of a frame.
             final: also compute the sums for the covariance.
             matched: receives the samples that were summed.
         """
@@ -235,7 +235,7 @@ class ContourSolver:
         return min(max(self.config.gate_sigmas * 1.4826 * median, low), high)
 
     def _motion_mm(self, step: Array) -> float:
-        """Return an upper bound of the motion of crown vertices under twists about the centres [mm]."""
+        """Return an upper bound on the motion of crown vertices under twists about the centres [mm]."""
         return max(
             float(np.linalg.norm(step[r, :3]) * self.scans[r].radius_mm + np.linalg.norm(step[r, 3:])) for r in ARCHES
         )
@@ -257,7 +257,7 @@ _Result = TypeVar("_Result")
 class ParallelMap:
     """A parallel `map` for short tasks that wakes one thread per core instead of one per item.
 
-    The calling thread works too. Tasks of the tracker take about a millisecond, waking a thread a tenth of that.
+    The calling thread works too. Tasks of the tracker take about a millisecond; waking a thread takes a tenth of that.
     """
 
     def __init__(self, executor: Executor) -> None:
@@ -266,7 +266,7 @@ class ParallelMap:
         self._more_threads = (os.cpu_count() or 1) - 1
 
     def __call__(self, function: Callable[[_Item], _Result], items: Iterable[_Item], /) -> list[_Result]:
-        """Return the results in the order of the items; an error is raised, and no further task is started."""
+        """Return the results in the order of the items; if a task fails, raise its error and start no further task."""
         left = deque(enumerate(items))
         results: dict[int, _Result] = {}
 

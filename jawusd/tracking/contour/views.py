@@ -1,4 +1,4 @@
-"""Masks of a capture at working resolution, as one set of views per instant."""
+"""Masks of a capture at working resolution, as one set of views per frame."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from jawusd.media.mask_survey import ARCHES, odd_pictures, survey_masks
 from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
 
-#: Cameras needed if only the masks determine the depth of the teeth.
+#: Minimum number of cameras if only the masks determine the depth of the teeth.
 FEWEST_CAMERAS = 2
 
-_BORDER_PX = 20  # margin around the masks: more than the widest search
-_CHUNK = 48  # instants buffered when iterating backwards: about 20 MB
+_BORDER_PX = 20  # margin of a view around the masks: more than the widest search
+_CHUNK = 48  # number of frames buffered when iterating backwards: about 20 MB
 
 
 class EdgeSearch(Protocol):
@@ -49,32 +49,32 @@ class Drawn:
 
     own: NDArray[np.uint8]  # labels of the arch alone: CROWN, GUM or 0, shape (h, w)
     other: NDArray[np.uint8]  # labels of the other arch, shape (h, w)
-    other_inverse_depth: NDArray[np.float32]  # [1/mm], 0 = empty, shape (h, w)
+    other_inverse_depth: NDArray[np.float32]  # inverse depth of the other arch [1/mm], 0 = empty, shape (h, w)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The masks of one camera at one instant, undistorted, at working resolution."""
+    """The masks of one camera in one frame, undistorted, at working resolution."""
 
     matrix: Array  # world [mm] to homogeneous px of this image, shape (3, 4)
     eye: Array  # camera centre in the world [mm], shape (3,)
     # masks of the upper and lower arch, uint8, 255 = teeth, shape (2, h, w); zeros without a mask
     masks: NDArray[np.uint8]
     present: Mask  # whether each of the two masks exists, shape (2,)
-    # world motion of the arches from the reference instant to this camera's own, shape (2, 4, 4)
+    # motion of the arches in the world from the reference camera's exposure to this camera's, shape (2, 4, 4)
     T_delay: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
     # outward mask bias at free edges [px], at the gum line [px], along the gum [mm], shape (2, 3)
     habits: Array = field(default_factory=lambda: np.zeros((2, 3)))
-    # finds outlines by colour if there are no masks
+    # search for outlines by colour, used instead of masks
     edges: EdgeSearch | None = None
 
 
 class MaskViews:
-    """Reads the masks of all cameras at instants of the reference camera; a context manager.
+    """Reads the masks of all cameras by frame of the reference camera; a context manager.
 
     Attributes:
         cameras: the cameras with masks that are not all black, in capture order.
-        frames: first instant at which any camera may have a mask, and one past the last.
+        frames: first frame in which any camera may have a mask, and one past the last.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class MaskViews:
             offsets: reference frame minus own frame number of every camera.
             centre_world: position of the teeth at the start [mm], shape (3,).
             working_px_per_mm: resolution at the teeth; images are never enlarged.
-            fewest: required number of cameras with masks.
+            fewest: minimum number of cameras with masks.
 
         Raises:
             TrackingError: fewer cameras have masks, or a camera is not calibrated or not synchronised.
@@ -130,7 +130,7 @@ class MaskViews:
         return out
 
     def at(self, frame: int) -> list[View]:
-        """Return the views of an instant of the reference camera.
+        """Return the views of one frame of the reference camera.
 
         Raises:
             CaptureError: a mask cannot be decoded.
@@ -141,7 +141,7 @@ class MaskViews:
         ]
 
     def around(self, frame: int, reach: int) -> list[list[View]]:
-        """Return the views of the instants up to `reach` frames before and after one, in order.
+        """Return the views of a frame and of up to `reach` frames before and after it, in order.
 
         Masks are decoded once, in file order, since each jump reopens the files.
 
@@ -156,7 +156,7 @@ class MaskViews:
         return [list(views) for views in zip(*cameras, strict=True)]
 
     def walk(self, first: int, stop: int, step: int = 1) -> Iterator[tuple[int, list[View]]]:
-        """Yield the instants of a range with their views; with step -1 backwards, reading forwards in chunks."""
+        """Yield the frames of a range with their views; step -1 goes backwards, but reads forwards in chunks."""
         if step > 0:
             for frame in range(first, stop):
                 yield frame, self.at(frame)
@@ -182,7 +182,8 @@ def masked_sources(
     """Return the cameras with masks that are not all black.
 
     Raises:
-        TrackingError: fewer than `fewest` have such masks, or one of them is not calibrated or not synchronised.
+        TrackingError: fewer than `fewest` cameras have such masks, or one of these is not calibrated or not
+            synchronised.
         CaptureError: masks are missing, corrupt, of the wrong size, or not masks.
     """
     masked = []
@@ -212,7 +213,7 @@ def masked_sources(
 
 
 def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple[int, int]:
-    """Return the image size at which a point is imaged at a given resolution, at most the recorded size.
+    """Return the image size that gives a world point the desired resolution, at most the recorded size.
 
     Raises:
         TrackingError: the point lies behind the camera.

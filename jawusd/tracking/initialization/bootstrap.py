@@ -28,11 +28,11 @@ _FEWEST = 3
 # error of a careless click (5 px where a pixel is 0.07 mm).
 TOLERANCE_MM = 1.1
 _CLICK_MM = TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
-_GAP_MM = 0.8  # largest distance between the lines of sight of a careless pick
-# Deviation from 1 of the scan size estimated from the picks, above which a wrong size may explain contradictions:
-# clicks 0.4 mm off on picks 40 mm apart cause 0.01.
+_GAP_MM = 0.8  # maximum distance between the lines of sight of a careless pick
+# Minimum relative error of the scan size, estimated from the picks, for it to explain contradictions: clicks 0.4 mm off
+# on picks 40 mm apart cause 0.01.
 _SIZE_SHARE = 0.03
-_MOST_TRIPLES = 500  # number of triples tried: more do not improve the consensus
+_MOST_TRIPLES = 500  # maximum number of triples tried: more do not improve the consensus
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ def pose_from_picks(
 ) -> tuple[Array, list[int]]:
     """Return T_world_scan from the picks, shape (4, 4), and the numbers of rejected picks.
 
-    Pick numbers start at 1. `vertices` are those of the scan file [mm], shape (V, 3); `arch` is the name of the scan in
+    Pick numbers start at 1. `vertices` are those of the scan file [mm], shape (V, 3); `arch` is the arch's name for
     messages.
 
     Raises:
@@ -71,7 +71,7 @@ def pose_from_picks(
         try:
             pose = rigid_fit(points[k], places[k])
         except ValueError:
-            continue  # three collinear picks do not determine a rotation
+            continue  # these three picks are collinear and do not determine a rotation
         cost = sum(min(_miss_mm(s, pose), TOLERANCE_MM) ** 2 for s in sightings)
         if cost < best_cost:
             best, best_cost = pose, cost
@@ -106,7 +106,7 @@ def pose_from_picks(
 def _other_size(sightings: Sequence[_Sighting], places: Array) -> float | None:
     """Return the factor by which the scan is too large if that explains the contradictions, otherwise None.
 
-    `places` are the triangulated picks, world coordinates [mm], shape (P, 3).
+    `places` are the triangulated picks in world coordinates [mm], shape (P, 3).
     """
     points = np.stack([s.point for s in sightings])
     spread, seen = (float(np.std(x - x.mean(0))) for x in (points, places))
@@ -128,7 +128,7 @@ def _wrong_sight(
 ) -> str | None:
     """Describe swapped cameras that explain the contradictions, or lines of sight that do not meet; otherwise None.
 
-    `places` are the triangulated picks, world coordinates [mm], shape (P, 3).
+    `places` are the triangulated picks in world coordinates [mm], shape (P, 3).
     """
     for a, b in combinations(cameras, 2):
         other = {a: b, b: a}
@@ -144,7 +144,7 @@ def _wrong_sight(
         pose = rigid_fit(points, meets)
         if all(_miss_mm(s, pose) < TOLERANCE_MM for s in seen):
             return f"cameras {a} and {b} are exchanged, in the picks or in the calibration"
-    # Lines of sight of neighbouring cameras may meet even if different points at the same height were picked.
+    # If different points at the same height were picked, lines of sight of neighbouring cameras may meet all the same.
     gaps = [_miss_mm(replace(s, point=place), np.eye(4)) for s, place in zip(sightings, places, strict=True)]
     if float(np.median(gaps)) < _GAP_MM:
         return None
@@ -166,7 +166,7 @@ def picked_sigma_mm(
     pose: Array,
     probes: Array,
 ) -> float:
-    """Return the rms position uncertainty of the crowns for careless clicks [mm].
+    """Return the rms position uncertainty of the crowns, assuming careless clicks [mm].
 
     `picks` are those from which the pose T_world_scan, shape (4, 4), was computed; `probes` are points spread over the
     crowns, scan coordinates [mm], shape (N, 3).
@@ -193,7 +193,7 @@ def picks_miss_mm(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, 
 def picked_size(
     picks: Sequence[Sequence[Pick]], vertices: Sequence[Array], cameras: Mapping[str, Camera]
 ) -> tuple[float, float]:
-    """Return the ratio of the scans' size to that of the triangulated picks, and its sigma for careless clicks [-].
+    """Return the size ratio of scans to triangulated picks, and its sigma, assuming careless clicks [-].
 
     `picks` and `vertices` are those of the upper and the lower scan.
 
@@ -209,7 +209,7 @@ def picked_size(
         try:
             turned = given @ rigid_fit(given, places)[:3, :3].T
         except ValueError:
-            continue  # collinear picks
+            continue  # the picks are collinear
         product += float((turned * (places - places.mean(0))).sum())
         square += float((turned**2).sum())
     return square / max(product, 1e-9), _CLICK_MM / np.sqrt(max(square, 1e-9))

@@ -19,15 +19,17 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.magnification import magnified, measure_magnification
 
-# Minimum `arch_fit` of a first frame [-]: above wrong poses, below correct ones with most of the lower teeth hidden.
+# Minimum `arch_fit` of a first frame [-]: wrong poses fit worse; correct ones fit better, even with most lower teeth
+# hidden.
 _LEAST_FIT = 0.03
-# Minimum fit without one of the cameras, which must be unambiguous; see `start_causes.CLEAR_FIT`.
+# Minimum `arch_fit` [-] of a first frame that fits only without one of the cameras: an unambiguous fit, as in
+# `start_causes.CLEAR_FIT`.
 _CLEAR_FIT = 0.3
-# Magnification of a camera above which it explains a failed start [-]; deviation of a camera from the others above
-# which it is corrected [-]; and number of iterations, since contours far from their masks are not matched at first.
+# Minimum magnification error of a camera for it to explain a failed start [-]; minimum deviation from the other cameras
+# for it to be corrected [-]; and number of iterations, since contours far from their masks are not matched at first.
 _LEAST_SCALE, _OWN_SCALE, _SIZE_ROUNDS = 0.02, 0.015, 3
 _SIZE_HINT = "Check the scans' scale, the board's square size, and that each calibration is for the lens and zoom used."
-_FEWEST_MASKS = 2  # required per arch: one view does not determine the depth
+_FEWEST_MASKS = 2  # minimum number of masks of an arch: one view does not determine the depth
 
 
 def first_record(
@@ -40,7 +42,7 @@ def first_record(
 ) -> FrameRecord:
     """Align the first frame from its views, starting from given T_world_upper and T_world_lower, shape (2, 4, 4).
 
-    With `explain`, which takes longer, the error message states a wrong focal length if that is the cause.
+    With `explain`, which takes longer, the error message names a wrong focal length if that is the cause.
 
     Raises:
         TrackingError: too few masks on this frame, or the alignment failed.
@@ -73,11 +75,11 @@ def first_record(
 
 @dataclass(frozen=True, eq=False)
 class _Aligned:
-    """An alignment with the masks used and its quality, per arch and view."""
+    """An alignment, the masks that it uses, and its quality."""
 
     solution: Solution
-    use: Mask  # shape (2, C)
-    coverage: Array  # shape (2, C)
+    use: Mask  # masks used, shape (2, C)
+    coverage: Array  # uncovered fraction of every mask, shape (2, C)
     fit: Array  # `arch_fit`, shape (2,)
 
 
@@ -90,7 +92,7 @@ def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views:
         poses = np.where(better[:, None, None], wide.poses, best.poses)
         best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
-    for _ in range(2):  # exclude uncovered masks, and include those again that are now covered
+    for _ in range(2):  # excludes uncovered masks, and includes previously excluded ones that are now covered
         kept = _without_spoiled(whole, coverage, config.lost_coverage)
         if (kept == use).all():
             break
@@ -149,7 +151,7 @@ def _without_camera(use: Mask, camera: int) -> Mask:
 def _without_spoiled(use: Mask, coverage: Array, limit: float) -> Mask:
     """Exclude uncovered masks of arches with at least two covered ones, shape (2, C).
 
-    The limit is that of a lost arch, so an excluded mask would have made every frame lost.
+    The limit is that for lost arches, so with an excluded mask, the arch would have been lost in every frame.
     """
     kept = use & ~(coverage > limit)
     return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)

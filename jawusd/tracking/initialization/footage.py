@@ -1,4 +1,4 @@
-"""Survey of mask files before tracking: position and size of the masks, and the frames in which they are largest."""
+"""Survey of the masks before tracking: their positions and sizes, and the frames in which they are largest."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
-_BESIDE = 2  # surveyed frames on either side of a chosen one that are redundant
+_BESIDE = 2  # number of surveyed frames on either side of a chosen frame that are redundant
 _WIDTH_PX = 320  # width of the surveyed images: enough for mask centres accurate to a tenth of a millimetre
 
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """The masks to be tracked: cameras with masks, and frames from first to one past the last, or all.
+    """The masks to be tracked: cameras with masks, and the range of frames (end exclusive), or None for all.
 
     `offsets` are reference frame minus own frame number, by camera name.
     """
@@ -101,7 +101,7 @@ def survey_masks(
     """Measure the masks of at most `count` evenly spaced frames; other arguments as in `Footage`.
 
     Raises:
-        TrackingError: no frame has masks of both arches in enough cameras.
+        TrackingError: no surveyed frame has masks of both arches in enough cameras.
         CaptureError: a mask cannot be read.
     """
     with ExitStack() as stack:

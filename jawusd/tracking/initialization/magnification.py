@@ -20,16 +20,16 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z, 
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import Drawn, View
 
-# Search distance about contours [px]: an error of 5 % in focal length moves molars by 9 px at 7 px/mm.
+# Search distance about contours [px]: an error of 5 % in focal length shifts molars by 9 px at 7 px/mm.
 _REACH_PX = 16.0
-# Distance from the optical axis at which distortion is reported [mm]: that of the outermost visible teeth.
+# Distance from the optical axis at which distortion is reported [mm]: the distance of the outermost visible teeth.
 _RADIUS_MM = 25.0
 # Prior standard deviations: magnification and distortion [-], rotation [rad] and motion [mm] of a camera per axis,
 # outline bias [px].
 _PRIORS = (0.1, 0.1, *(0.01,) * 3, *(2.0,) * 3, 1.0, 1.0)
 _UNKNOWNS = len(_PRIORS)
 _ROUNDS = 5
-_LENGTH_FACTOR = 1.5  # correction of the correlation length for the Tukey weight and the fit
+_LENGTH_FACTOR = 1.5  # factor on the correlation length, for losses by the Tukey weight and the fit
 _LEAST_SPREAD_PX = 0.3
 
 
@@ -42,8 +42,9 @@ class Magnification:
             expected.
         bend, sigma_bend: change of `scale` from the optical axis to a radius of 25 mm at the teeth, shape (C,).
         bias_px, sigma_bias_px: outward mask bias at working resolution, per arch, shape (C, 2).
-        turn_rad, move_mm: rotation and motion of each camera relative to the mean of all, shape (C,).
-        motion_clear: length of that motion in standard deviations (Mahalanobis), shape (C,).
+        turn_rad, move_mm: angle of rotation and distance of motion of each camera relative to the mean of all, shape
+            (C,).
+        motion_clear: significance of rotation and motion together, in standard deviations (Mahalanobis), shape (C,).
         spread_px: robust standard deviation of the residuals.
     """
 
@@ -60,7 +61,7 @@ class Magnification:
 
     @property
     def common(self) -> float:
-        """The magnification common to all cameras [-], their median."""
+        """The magnification error common to all cameras, their median [-]."""
         return float(np.median(self.scale))
 
 
@@ -101,7 +102,7 @@ def measure_magnification(
 def _rows(
     scans: Sequence[Scan], r: int, c: int, poses: Array, view: View, pivot: Array, config: TrackingConfig
 ) -> _Rows | None:
-    """Match the contour of an arch in one view with a large search distance; None if nothing matches."""
+    """Match the contour of an arch in one view within a large search distance; None if nothing matches."""
     scan, pose = scans[r], view.T_delay[r] @ poses[r]
     samples, distance = _matched(scans, r, view, poses, config)
     if not len(samples):
@@ -134,10 +135,11 @@ def _rows(
 
 
 def _matched(scans: Sequence[Scan], r: int, view: View, poses: Array, config: TrackingConfig) -> tuple[Array, Array]:
-    """Return the contour samples of an arch with an edge in reach (n, COLUMNS), and their distances (n,) [px]."""
+    """Return the contour samples of an arch in reach of an edge (n, COLUMNS), and their distances to it (n,) [px]."""
     labels = np.zeros((2, *view.masks.shape[1:]), np.uint8)
     depth = np.zeros(labels.shape, np.float32)
-    drawn = [r] if view.edges is None else ARCHES  # masks already separate the arches
+    # the other arch need not be drawn, as masks already separate the arches
+    drawn = [r] if view.edges is None else ARCHES
     for arch in drawn:
         scans[arch].draw(view.matrix @ view.T_delay[arch] @ poses[arch], depth[arch], labels[arch])
     pose = view.T_delay[r] @ poses[r]

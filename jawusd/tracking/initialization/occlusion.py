@@ -12,20 +12,21 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal
 from jawusd.tracking.contour.scan import Scan
 
-_SAMPLES = 8000  # surface samples per arch: one per half millimetre
-_SHARE = 0.002  # fraction of the crown surface ignored as outliers, such as spikes of the mesh
-_DEEPEST_MM = 5.0  # largest depth inside a crown: deeper points lie beyond an open border
+_SAMPLES = 8000  # number of surface samples per arch: about half a millimetre apart
+_SHARE = 0.002  # fraction of the crown surface that is ignored as outliers, such as spikes of the mesh
+_DEEPEST_MM = 5.0  # maximum depth of a point inside a crown: deeper points lie beyond an open border
 _DEEP_MM = 1.0
 _SAME_MM = 0.05
-_BESIDE_MM = 4.0  # distance in the bite plane up to which crowns oppose one another: half of a molar
+_BESIDE_MM = 4.0  # maximum distance in the bite plane between opposed crown points: half the width of a molar
 _CELL_MM = 1.0
-_THROUGH_MM = 2.0  # vertical overlap of arches that passed through one another; cusps overlap less
+_THROUGH_MM = 2.0  # minimum vertical overlap of arches that passed through one another; cusps overlap less
 _SLAB_MM = 3.0
-_FEWEST = 50  # surface samples required on a side of an arch
-_ASIDE_MM = 6.0  # minimum distance of left and right from the midline: nearer, they belong to the same tooth
+_FEWEST = 50  # minimum number of surface samples on a side of an arch
+# minimum distance from the midline of points on the left or right side: nearer points may be on the central incisors
+_ASIDE_MM = 6.0
 _OPEN = 0.08  # minimum ratio of directed area to area for a surface to count as open
-# Minimum area of the gum relative to the crowns, and minimum distance below them, for the gum to indicate the
-# orientation of a scan.
+# For the gum to indicate the orientation of a scan: minimum area relative to the crowns, and minimum vertical distance
+# from them.
 _GUM_SHARE, _GUM_BELOW_MM = 0.3, 2.0
 
 
@@ -36,18 +37,21 @@ class Occlusion:
     gap_mm: float  # smallest distance between the crowns, 0 if they touch
     side_gaps_mm: tuple[float, float]  # gaps left and right of the midline, negative if crowns overlap
     depth_mm: float  # largest overlap of the crowns
-    deep_share: float  # fraction of the opposed crown surface that overlaps by more than 1 mm
-    through: float  # fraction of the common area in the bite plane on which lower crowns end 2 mm above upper ones
-    same: float  # fraction of the surfaces that coincide
+    deep_share: float  # fraction of the opposed crown surface that is more than 1 mm inside the other arch
+    # fraction of the common area in the bite plane in which lower crowns reach more than 2 mm above the lowest point of
+    # the upper ones
+    through: float
+    same: float  # fraction of the lower surface that coincides with the upper one
     opposite: float  # fraction of the arch with fewer teeth that has crowns of the other arch above or below it
     aside_mm: float  # distance between the centres of the arches along the bite plane
     turn_rad: float  # angle in the bite plane between the forward directions of both arches
-    turned_over: tuple[bool | None, bool | None]  # whether gum lies between crowns and other arch
-    opens_towards: tuple[bool, bool]  # whether the open side of the crowns faces the other arch
+    # per arch, whether its gum lies between its crowns and the other arch; None if unknown
+    turned_over: tuple[bool | None, bool | None]
+    opens_towards: tuple[bool, bool]  # per arch, whether the open side of its crowns faces the other arch
     midlines_mm: float  # lateral distance of the midlines, where both arches have teeth left and right
     width_ratio: float  # ratio of the widths of upper and lower arch, measured at equal depth
     widths_mm: tuple[float, float]  # largest width of each arch
-    lower_ahead_mm: float  # distance of the lower front teeth in front of the upper ones
+    lower_ahead_mm: float  # distance by which the lower front teeth lie in front of the upper ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +74,8 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
     axes = np.stack([left, normal, np.cross(left, normal)])
     upper, lower = (points @ axes.T for points in crowns)
     middle = float(np.mean([np.percentile(points[:, 0], [1, 99]).mean() for points in (upper, lower)]))
-    # In both directions: the finer surface finds contacts that the coarser one misses.
+    # Distances are computed in both directions: samples of the finer surface find contacts that those of the coarser
+    # one miss.
     signed = [_signed_distances(surfaces[k], surfaces[1 - k]) for k in (0, 1)]
     nearest = [_weighted_quantile(d, surfaces[k].areas, _SHARE) for k, d in enumerate(signed)]
     stand = [_beside(a, b) for a, b in ((upper, lower), (lower, upper))]
@@ -112,13 +117,13 @@ def _signed_distances(these: CrownSurface, others: CrownSurface) -> Array:
     """Return the distance of each sample to the other arch, negative inside [mm], shape (N,)."""
     distance, nearest = cKDTree(others.points).query(these.points)
     behind = np.einsum("ij,ij->i", these.points - others.points[nearest], others.normals[nearest])
-    # Points behind the surface, and not just beyond its border.
+    # Points are inside if they lie behind the surface, and not merely beyond its border.
     inside = (behind < -0.7 * distance) & (distance < _DEEPEST_MM) & ~others.border[nearest]
     return np.where(inside, -distance, distance)
 
 
 def _through(upper: Array, lower: Array) -> float:
-    """Return the fraction of the common area in the bite plane where lower crowns end far above upper ones.
+    """Return the fraction of the common area in the bite plane where the lower crowns reach far above the upper ones.
 
     Args:
         upper, lower: crown points (left, up, front) [mm], shapes (N, 3) and (M, 3).
@@ -145,7 +150,7 @@ def _beside(these: Array, others: Array) -> Array:
 
 
 def _side_gap(signed: Sequence[Array], surfaces: Sequence[CrownSurface], aside: Array, middle: float) -> float:
-    """Return the gap of the crowns on the side that `aside` points to [mm]; NaN if an arch has no teeth there."""
+    """Return the gap between the crowns on the side that `aside` points to [mm]; NaN if an arch has no teeth there."""
     gaps = []
     for distance, surface in zip(signed, surfaces, strict=True):
         there = surface.points @ aside - middle > _ASIDE_MM
@@ -158,7 +163,7 @@ def _side_gap(signed: Sequence[Array], surfaces: Sequence[CrownSurface], aside: 
 def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
     """Return the lateral distance of the midlines [mm], and the ratio of the widths; NaN if unknown.
 
-    They are measured in slabs across the arches where both have teeth on both sides.
+    They are measured in transverse slabs in which both arches have teeth on both sides.
     """
     middle = 0.5 * (upper[:, 0].mean() + lower[:, 0].mean())
     apart, ratios = [], []
@@ -178,9 +183,9 @@ def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
 
 
 def _forward(flat: Array) -> Array:
-    """Return the direction of the closed end of a horseshoe of points (N, 2), shape (2,).
+    """Return the forward direction, towards the closed end, of a horseshoe of points (N, 2), shape (2,).
 
-    It is the direction for which both legs widen symmetrically.
+    It is the axis along which both legs diverge symmetrically.
     """
     flat = flat[:: max(1, len(flat) // 2000)]
     best, found = -np.inf, np.array([0.0, 1.0])
@@ -198,7 +203,7 @@ def _forward(flat: Array) -> Array:
 
 
 def _widest_mm(points: Array) -> float:
-    """Return the larger extent of an arch in its own plane [mm]."""
+    """Return the larger of the two extents of an arch in its own plane [mm]."""
     axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
     return float(np.ptp(points @ axes[:2].T, axis=0).max())
 
@@ -224,7 +229,8 @@ def _turned_over(scan: Scan, surface: CrownSurface, towards: Array) -> bool | No
 def _opens_towards(surface: CrownSurface, towards: Array) -> bool:
     """Return whether the open side of a surface faces the other arch.
 
-    The directed area of an open surface points away from its opening, which is where crowns were cut from the gum.
+    The directed area of an open surface, the area integral of its normal, points away from the opening, where crowns
+    were cut from the gum.
     """
     directed = (surface.normals * surface.areas[:, None]).sum(0) / surface.areas.sum()
     return bool(towards @ directed < -_OPEN)

@@ -1,6 +1,6 @@
 """Mistakes in scans, calibration, masks or picks that can make picks and masks contradict one another.
 
-Each mistake comes with the inputs after undoing it, so that `pick_checks` can test whether these agree.
+Each mistake is yielded with the inputs after undoing it, so that `pick_checks` can test whether these agree.
 """
 
 from __future__ import annotations
@@ -18,17 +18,19 @@ from jawusd.formats.capture import Pick
 from jawusd.geometry import Camera, rigid_fit, se3_exp, transform_points, triangulate
 from jawusd.tracking.initialization.bootstrap import picked_size
 
-_SIZE_SHARE = 0.02  # deviation from 1 of the scan size estimated from the picks, above which the size may be a mistake
+# minimum relative error of the scan size, estimated from the picks, for it to count as a possible mistake
+_SIZE_SHARE = 0.02
 # Prior standard deviations of a camera's errors: shift as a fraction of the image width, and relative focal length; and
 # standard deviation of a click [mm].
 _SHIFT, _FOCAL, _CLICK_MM = 0.05, 0.1, 0.3
-_MOST_ZOOM = np.log(2.0)  # limit of the log focal length factor, without which random clicks would make it overflow
-_STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # scale of the pose unknowns: about their usual error [rad, mm]
+# bound on the log of the focal-length factor, which random clicks would otherwise make overflow
+_MOST_ZOOM = np.log(2.0)
+_STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # scale of the pose unknowns, about their usual error [rad, mm]
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """All inputs that determine where the scans project to, as given or with a mistake undone.
+    """All inputs that determine the projections of the scans, as given or with a mistake undone.
 
     Attributes:
         picks: those on the upper and on the lower arch.
@@ -36,7 +38,7 @@ class Setting:
         crowns: some points of both scans' crowns [mm].
         cameras: by name.
         sources: the camera whose masks are used for each camera; by default its own.
-        exchanged: cameras in which the masks of the two arches are swapped.
+        exchanged: cameras for which the masks of the two arches are swapped.
     """
 
     picks: tuple[Sequence[Pick], Sequence[Pick]]
@@ -55,7 +57,7 @@ class Mistake:
     message: str
     hint: str
     setting: Setting
-    correctable: bool = False  # whether tracking estimates it, provided that the picks agree with one another
+    correctable: bool = False  # whether tracking corrects the mistake, provided that the picks agree with one another
     camera: str | None = None
 
 
@@ -83,7 +85,7 @@ def possible_mistakes(given: Setting) -> Iterator[Mistake]:
 
 
 def _exchanged_scans(given: Setting) -> Iterator[Mistake]:
-    """Yield the swap of the two scans, if all picked vertices exist after it."""
+    """Yield the swap of the two scans, if all picked vertices also exist in the swapped scans."""
     vertices = given.vertices[::-1]
     if all(pick.vertex < len(own) for own, picks in zip(vertices, given.picks, strict=True) for pick in picks):
         yield Mistake(
@@ -219,7 +221,7 @@ def fitted_camera(
     sights = [_sights(own, points) for own, points in zip(picks, vertices, strict=True)]
 
     def residuals(x: Array) -> Array:
-        """Return pick errors and the change of the camera, each divided by its prior standard deviation."""
+        """Return pick errors and camera changes, each divided by its prior standard deviation."""
         table = {**cameras, name: changed(x)}
         out = [x[:2]]
         for k, (start, seen) in enumerate(zip(starts, sights, strict=True)):

@@ -22,22 +22,26 @@ from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.initialization.bootstrap import TOLERANCE_MM, picks_miss_mm, pose_from_picks
 from jawusd.tracking.initialization.pick_causes import Mistake, Setting, possible_mistakes
 
-_CLOSE_MM = 1.0  # mask pixels this near to a projected crown point count as covered
-_ON = 0.85  # fraction of a camera's mask pixels on the scans from which its masks count as consistent with the picks
-# Misfit of the given inputs above which mistakes are tested; exceeded by 1 of 60 valid subjects.
+_CLOSE_MM = 1.0  # maximum distance of a covered mask pixel from a projected crown point
+_ON = 0.85  # minimum fraction of a camera's mask pixels on the scans for its masks to be consistent with the picks
+# Misfit of the given inputs above which mistakes are tested [-]; exceeded by 1 of 60 valid subjects.
 _SUSPECT_MISFIT = 1.7
-# Largest ratio of the misfit after undoing a mistake to that of the given inputs, for the mistake to be reported. The
-# second value applies to mistakes that tracking corrects, which are only warnings, if rejected picks then fit.
+# Maximum ratio of the misfit after undoing a mistake to that of the given inputs, for the mistake to be reported: in
+# general, and for mistakes that make rejected picks fit and that tracking corrects, which are only warnings.
 _PROOF, _PROOF_BY_PICKS = 0.5, 0.75
-_OFF, _MISS_MM = 0.05, 0.3  # fraction of masks off the scans, and rms pick error [mm], that each add 1 to the misfit
-_UNSEEN = 0.25  # fraction off the scans assumed for a camera without masks at this instant, which may contradict picks
+# fraction of mask pixels off the scans that adds 1 to the misfit, and rms pick error that adds 1
+_OFF, _MISS_MM = 0.05, 0.3
+# fraction of mask pixels off the scans assumed for a camera without masks in this frame, as these might contradict the
+# picks
+_UNSEEN = 0.25
 _SURE = 1.0  # misfit below which swapped inputs are reported without testing mistakes of single cameras
-_ALIKE = 0.15  # excess misfit up to which other mistakes are reported in addition to the most likely one
-_MOST_TRIED = 400  # mistakes tested: all those of 15 cameras; the 6,000 of 64 cameras would take most of an hour
-_FEWEST = 3  # picks on an arch
+_ALIKE = 0.15  # maximum excess of another mistake's misfit over the smallest one for it to be reported as well
+# maximum number of mistakes tested: all those of 15 cameras; the 6,000 of 64 cameras would take most of an hour
+_MOST_TRIED = 400
+_FEWEST = 3  # minimum number of picks on an arch
 
-#: Pixels of the masks of both arches at the instant of the picks, shape (N, 2) each, N = 0 without a mask. Arguments:
-#: the camera whose masks are read, and the camera whose frame numbers are used.
+#: Returns the mask pixels of both arches in the frame of the picks, shape (N, 2) each, N = 0 without a mask. Arguments:
+#: names of the camera whose masks are read, and of the camera whose frame numbers are used.
 Seen = Callable[[str, str], tuple[Array, Array]]
 
 
@@ -46,7 +50,7 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
 
     Args:
         given: the inputs as in the capture.
-        seen: readers of the masks, one per candidate for the time offsets.
+        seen: readers of the masks, one per candidate set of time offsets.
         masked: cameras that have masks.
         frame: frame of the picks, for the findings.
 
@@ -60,7 +64,7 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
         problem = error
     cause = None
     if found is None or not found.good or found.misfit > _SUSPECT_MISFIT:
-        with contextlib.suppress(TrackingError):  # an invalid pick
+        with contextlib.suppress(TrackingError):  # raised for an invalid pick
             cause = _explanation(given, found, seen, masked) if _valid(given) else None
     if cause is not None:
         yield _explained(*cause, found, frame)
@@ -78,17 +82,17 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """How well picks and masks agree with a setting."""
+    """How well the picks and masks of a setting agree."""
 
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     wrong: Mapping[str, list[int]]  # numbers of the rejected picks, by arch
     miss_mm: float  # rms error of the picks, clipped at the rejection limit
     on: Mapping[str, float]  # fraction of each camera's mask pixels on the scans; cameras without masks are omitted
-    unseen: int  # number of cameras without masks at this instant
+    unseen: int  # number of cameras without masks in this frame
 
     @property
     def misfit(self) -> float:
-        """The total disagreement: 0.2 to 1.5 for correct inputs."""
+        """The total disagreement [-]: 0.2 to 1.5 for correct inputs."""
         off = np.array([1.0 - on for on in self.on.values()] + [_UNSEEN] * self.unseen)
         return float(off.mean() if self.on else 0.0) / _OFF + self.miss_mm / _MISS_MM
 
@@ -111,7 +115,7 @@ class _Evidence:
 def _evidence(setting: Setting, seen: Sequence[Seen], masked: Sequence[str]) -> _Evidence:
     """Estimate poses from the picks of a setting, and measure how well the masks of `masked` cameras agree.
 
-    `seen` reads the masks for each candidate for the time offsets; for each camera, the best candidate is used.
+    `seen` reads the masks for each candidate set of time offsets; for each camera, the best candidate is used.
 
     Raises:
         TrackingError: the picks contradict one another.
@@ -160,7 +164,7 @@ def _explanation(
     tried: list[tuple[Mistake, _Evidence]] = []
     for mistake in islice(possible_mistakes(given), _MOST_TRIED):
         if mistake.camera is not None and any(not m.correctable and e.misfit < _SURE for m, e in tried):
-            break  # mistakes of single cameras come last and take longest
+            break  # mistakes of single cameras follow, which take longest to test
         try:
             undone = _evidence(mistake.setting, seen, masked)
         except TrackingError:

@@ -2,7 +2,7 @@
 
 For one orientation, a small translation mostly shifts the image of the arch. Its fit to the mask as a function of the
 shift is a correlation, which the fast Fourier transform computes for all shifts together. The objective of a
-translation is the sum over the cameras.
+translation is the sum of the correlations of all cameras.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.scan import CROWN, Scan, prepare_scan
 from jawusd.tracking.contour.views import View
 
-_CELL_MM = 1.2  # vertices in cells of this size are merged
+_CELL_MM = 1.2  # size of the cells in which vertices are merged
 _BLUR_MM = 0.9  # blur of the outlines, so that the coarse grid does not miss the optimum
 # Penalty per mm^2 of uncovered mask, in mm of matched outline [1/mm].
 _UNCOVERED_PRICE = 1.0
@@ -34,7 +34,7 @@ class Grid:
 
     Attributes:
         yaw_rad, pitch_rad, roll_rad: rotations about the up, left and front axes of the arch.
-        reach_mm: largest translation along left, up and front, in both directions.
+        reach_mm: maximum translation along left, up and front, in both directions.
         step_mm: spacing of the translations.
     """
 
@@ -77,11 +77,11 @@ def coarse_scan(mesh: Mesh, name: str) -> Scan:
 
 
 class ShiftCorrelation:
-    """Correlates the drawn arch with its mask in one image, for all shifts at once."""
+    """Correlates the rendered arch with its mask in one image, for all shifts at once."""
 
     def __init__(self, view: View, arch: int, px_per_mm: float, shifts: Array, at: Array) -> None:
         """Prepare the correlation for world translations `shifts` (N, 3) of a world point `at` (3,) [mm]."""
-        # Rounded, since sub-pixel shifts do not matter for blurred outlines.
+        # Shifts are rounded, since blurred outlines are insensitive to fractions of a pixel.
         pixels = np.rint(shifts @ _slope(view.matrix, at).T).astype(np.int64)
         picture = _template(view.masks[arch], view.masks[1 - arch], px_per_mm)
         some = np.abs(picture) > 1e-3
@@ -126,9 +126,10 @@ def search_arch(
     Args:
         scan: the arch, coarse.
         arch: 0 upper, 1 lower.
-        views: views of one instant; those without a mask of the arch are ignored.
-        px_per_mm: their resolution at the teeth.
-        base: guessed T_world_axes with (left, up, front) axes of the arch at the centre of rotation, shape (4, 4).
+        views: views of one frame; those without a mask of the arch are ignored.
+        px_per_mm: resolution of the views at the teeth.
+        base: guessed T_world_axes of (left, up, front) axes of the arch with origin at the centre of rotation, shape
+            (4, 4).
         hinge: T_axes_scan to the same axes, shape (4, 4).
         map_: distributes the orientations among threads.
     """
@@ -156,7 +157,7 @@ def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: floa
     straight edge. Moving both derivatives to the mask turns it into -div(w grad m), with w = 0 where the outline is
     that of the other arch.
     """
-    sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # blur of both outlines combined
+    sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # blur of both outlines combined [px]
     inside = mask / 255.0
     own = 1.0 - ndimage.binary_dilation(other > 127, iterations=max(1, round(px_per_mm)))
     smooth = ndimage.gaussian_filter(inside, sigma)
@@ -179,14 +180,15 @@ def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
         T_anatomical_scan: scan to anatomical axes, shape (4, 4).
     """
     points = transform_points(T_anatomical_scan, crowns)
-    front = points[points[:, 2] > points[:, 2].max() - 15.0]  # incisors to first premolars, which cameras can see
+    # front teeth up to the first premolars, which are usually visible
+    front = points[points[:, 2] > points[:, 2].max() - 15.0]
     return make_transform(np.eye(3), -front.mean(0)) @ T_anatomical_scan
 
 
 def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], use: Mask) -> Array:
-    """Return the translation across the line of sight that moves the centre of the crowns to that of their masks [mm].
+    """Return the translation across the line of sight that aligns the centres of crowns and masks [mm].
 
-    It moves teeth that were out of view back near their masks. Lips hide different teeth in every view, so a depth
+    It moves teeth that were out of view close to their masks. Lips hide different teeth in every view, so a depth
     estimate would be off by a centimetre or two; depth is therefore not changed. Perpendicular to the line of sight,
     the result is accurate to a few millimetres, enough to start a search.
 

@@ -1,7 +1,7 @@
 """Search for the world scale at which masks and scans agree best.
 
-Images of a calibration board do not reveal the size of its squares. A wrong size scales the whole world, and no pose
-of the teeth fits their masks in several views until the distances between cameras are corrected.
+Images of a calibration board do not reveal the size of its squares. A wrong size scales the whole world, and then no
+pose of the teeth fits their masks in several views.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start_search import StartSearch
 
-# World scales at which poses are searched for from scratch; from the nearest one, the fit improves steadily towards the
-# true scale.
+# World scales at which poses are searched for from scratch: from the nearest one, the fit increases monotonically up to
+# the true scale.
 _STARTS = (1.0, 1 / 1.15, 1.15, 1 / 1.32, 1.32)
 _STEPS = (0.03, 0.01, 0.005)
 _SMALLEST, _LARGEST = 0.5, 2.0
 _SURVEYED, _FRAMES_TRIED = 24, 2
 # Maximum number of evaluations of a hill climb: the whole range in the widest steps, plus the finer steps.
 _MOST_SIZES = 64
-_CLEAR_FIT = 0.3  # minimum fit, as for the start of a take: wrong poses have fits below 0.1 for one arch
+_CLEAR_FIT = 0.3  # minimum fit, as for the start of a take [-]: wrong poses stay below 0.1 in one arch
 
 
 def seen_size(
@@ -43,7 +43,7 @@ def seen_size(
     meshes: Sequence[Mesh],
     map_: Mapper = map,
 ) -> float:
-    """Return the ratio of the teeth's size in the calibrated world to that of the scans, accurate to half a per cent.
+    """Return the size of the teeth in the calibrated world relative to the scans, accurate to half a per cent.
 
     Args:
         capture: provides masks, frame range and anatomical axes.
@@ -69,7 +69,7 @@ def seen_size(
                 continue
             size, fit = sizes.climb(frame, start, poses)
             if fit >= _CLEAR_FIT:
-                return 1.0 / size  # the world must grow by the factor by which the teeth appear too small
+                return 1.0 / size  # the world is too small by the factor by which the teeth appear too small
             best_fit = max(best_fit, fit)
     raise TrackingError(
         f"the scans do not fit the masks of frames {', '.join(map(str, frames))} at any size from {_SMALLEST:g} to "
@@ -78,7 +78,7 @@ def seen_size(
 
 
 class _Sizes:
-    """Fits the teeth with the calibrated world scaled by a factor."""
+    """Fits the teeth in a calibrated world that is scaled by a factor."""
 
     def __init__(
         self, capture: Capture, cameras: Sequence[Camera], offsets: Mapping[str, int], search: StartSearch
@@ -87,7 +87,7 @@ class _Sizes:
         self.search, self._solver = search, search.solver
 
     def footage(self, size: float) -> Footage:
-        """Return the masks with camera distances multiplied by a factor."""
+        """Return the masks, viewed by cameras whose positions are multiplied by a factor."""
         cameras = {}
         for camera in self._cameras:
             T = camera.T_cam_world.copy()
@@ -120,7 +120,7 @@ class _Sizes:
                     size, (objective, fit, poses) = there, other
         if left == 0:
             return size, -np.inf
-        if {1, -1} <= beside.keys():  # the vertex of a parabola through the last three
+        if {1, -1} <= beside.keys():  # vertex of a parabola through the objectives at the last size and its neighbours
             bend = beside[1] - 2 * objective + beside[-1]
             size *= (1 + _STEPS[-1]) ** (0.5 * (beside[-1] - beside[1]) / bend if bend < 0 else 0.0)
         return size, fit

@@ -14,17 +14,17 @@ from jawusd.geometry import anatomical_frame
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusion
 
-# The limits lie outside the range of all valid bites measured (docs/explanation/constants.md). Impossible bites:
-# distance of the arches, fraction that passed through, fraction of coinciding surface, minimum opposed fraction,
-# rotation about the bite normal, range of widths.
+# The limits lie outside the range of all valid bites measured (docs/explanation/constants.md). Limits of impossible
+# bites: distance between the arches, fraction of the bite passed through, fraction of coinciding surface, minimum
+# opposed fraction, rotation about the bite normal, maximum and minimum width.
 _APART_MM = 4.0
 _THROUGH_SHARE = 0.5
 _SAME_SHARE = 0.5
 _BESIDE_SHARE = 0.35
 _FACING_BACK_RAD = np.pi / 2
 _WIDEST_MM, _NARROWEST_MM = 100.0, 20.0
-# Unusual bites: gap, overlap, difference between the sides, distance of the midlines, range of widths, range
-# of width ratios, lower teeth in front of upper ones, tilt of the given axes.
+# Limits of usual bites: gap, overlap, difference between the gaps of both sides, distance of the midlines, maximum and
+# minimum width, range of width ratios, lower front teeth in front of the upper ones, tilt of the given axes.
 _LOOSE_MM = 0.8
 _TIGHT_MM = 1.3
 _ONE_SIDED_MM = 1.0
@@ -42,7 +42,7 @@ _LOOK = "View both scans together, and correct them if this is not the subject's
 def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
     """Check that both arches are in one frame, in occlusion; return T_anatomical_scan (4, 4) and warnings.
 
-    `T_anatomical_scan` maps the scan frame to (left, up, front) axes; None derives it.
+    `T_anatomical_scan` maps the scan frame to (left, up, front) axes; None derives it from the scans.
 
     Raises:
         TrackingError: the scans cannot form a bite: apart, beside or inside one another, upside down, identical, or not
@@ -58,7 +58,7 @@ def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) 
 def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
     """Return T_anatomical_scan (4, 4), given or derived, and findings about two scans in one frame.
 
-    Only an impossible bite is an error. It is then the only finding, since others would be its consequences.
+    Only impossible bites are errors. Warnings are then omitted, since they would be consequences.
     """
     given = T_anatomical_scan is not None
     derived = anatomical_frame(*(scan.crown_vertices(6000) for scan in scans))

@@ -32,7 +32,7 @@ from jawusd.tracking.initialization.start_causes import (
 )
 from jawusd.tracking.initialization.start_search import SearchResult, StartSearch
 
-#: Frames surveyed, which takes two seconds and covers every exercise of a usual take.
+#: Number of frames surveyed: takes two seconds, and covers every exercise of a usual take.
 SURVEYED = 24
 #: Maximum number of frames on which the teeth are searched for.
 FRAMES_TRIED = 5
@@ -44,21 +44,21 @@ class Start:
 
     frame: int  # reference camera frame
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
-    notes: dict[str, object]  # how it was found, for the meta data of the tracks
-    findings: tuple[Finding, ...] = ()  # about scans and picks
+    notes: dict[str, object]  # how the start was found, for the meta data of the tracks
+    findings: tuple[Finding, ...] = ()  # findings about scans and picks
     T_anatomical_scan: Array = field(default_factory=lambda: np.eye(4))  # scan frame to (left, up, front) axes
 
 
 def search_start(search: StartSearch, footage: Footage, suspects: Collection[str] = (), explain: bool = True) -> Start:
     """Find a frame on which both arches can be aligned, and their poses.
 
-    Uses the first frame with a clear fit, or else the one with the best fit. If neither arch fits acceptably there, but
-    both fit clearly with a mistake undone, that mistake is an error.
+    Uses the first frame with a clear fit, or else the one with the best fit. If neither arch fits acceptably in the
+    latter, but both fit clearly with a mistake undone, that mistake is an error.
 
     Args:
         search: search for the scans.
         footage: the masks.
-        suspects: hint texts of the mistakes that the scans suggest.
+        suspects: hints of the mistakes that the scans suggest, which identify them.
         explain: whether to look for a mistake if no frame fits, which takes several times as long.
 
     Raises:
@@ -75,7 +75,7 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
         try:
             found = search.at(footage, frame)
             fits[frame] = found.fits
-            # If most masks are correct, so are the poses, and the poses reveal the wrong masks. Poor poses are no
+            # If most masks are correct, so are the poses, which then reveal the wrong masks. Poor poses are no
             # evidence.
             exchange = likely_exchange(footage, search.solver, found.poses, frame)
             if exchange is None:
@@ -128,7 +128,7 @@ def search_near(search: StartSearch, footage: Footage, frame: int, poses: Array)
 def fit_without_a_camera(
     search: StartSearch, footage: Footage, frame: int, poses: Array, found: SearchResult
 ) -> tuple[str, SearchResult] | None:
-    """Return a camera whose masks contradict the others, and the poses found without it; None if all masks agree.
+    """Return a camera whose masks contradict the others', and the poses found without it; None if there is none.
 
     A camera is excluded only if the others then fit clearly.
     """
@@ -167,8 +167,8 @@ def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Sea
         )
 
 
-_PICKS_OFF_MM = 3.0  # distance between picked and found poses that causes a warning: half a tooth
-# Uncertainty of picked poses up to which the contour solver converges from them [mm].
+_PICKS_OFF_MM = 3.0  # minimum distance between picked and found poses for a warning: half a tooth
+# Maximum uncertainty of picked poses for the contour solver to converge from them [mm].
 _SURE_MM = 0.8
 
 
@@ -262,7 +262,7 @@ def _picked(
 
 
 def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mapping[str, float]) -> tuple[Finding, ...]:
-    """Return warnings for arches that the search found far from accurate picks."""
+    """Return warnings for arches that the search found far from their picks, although these are accurate."""
     out = []
     for scan, picked, found in zip(search.solver.scans, start.poses, poses, strict=True):
         off = float(np.linalg.norm(transform_point(found, scan.centre) - transform_point(picked, scan.centre)))
@@ -280,7 +280,7 @@ def _elsewhere(
     start: Start,
     reason: str = "the picks do not fit the masks of their frame",
 ) -> Start:
-    """Return a start on another frame that fits, since lips may hide the teeth on the picked one.
+    """Return a start on another frame that fits, since lips may hide the teeth on the picked frame.
 
     If there is none, return the start unchanged; it then fails with its own error.
     """
@@ -314,7 +314,7 @@ def _near_on_another_frame(search: StartSearch, footage: Footage, start: Start) 
 
 
 def _fits(search: StartSearch, footage: Footage, start: Start) -> bool:
-    """Return whether a start passes the checks of a first frame; hidden teeth may cause wrong local minima nearby."""
+    """Return whether a start passes the checks of a first frame; hidden teeth may cause wrong local minima near it."""
     try:
         aligned(search, footage, start.poses, start.frame)
     except TrackingError:

@@ -18,7 +18,7 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_search import StartSearch
 
-# Largest ratio of the uncovered mask after undoing a swap to that before, for the swap to be reported.
+# Maximum ratio of the uncovered mask fraction after undoing a swap to that before, for the swap to be reported.
 _PROOF = 0.5
 # Uncovered fraction of a camera's masks from which swapped masks are suspected: good poses leave 0.01, and swapped
 # masks of similar cameras as little as 0.1.
@@ -30,8 +30,8 @@ class MaskExchange:
     """A possible swap of masks."""
 
     finding: str  # description of the swap
-    hint: str  # what to do
-    sources: tuple[CameraSource, ...]  # the cameras, with the swap undone
+    hint: str  # instruction for undoing the swap
+    sources: tuple[CameraSource, ...]  # sources of the cameras' masks, with the swap undone
 
     def error(self, frame: int) -> TrackingError:
         """Return the error that reports the swap."""
@@ -72,7 +72,7 @@ def possible_exchanges(sources: Sequence[CameraSource]) -> list[MaskExchange]:
 
 
 def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> MaskExchange | None:
-    """Return the swap that best explains masks off their scans, with its evidence; None if none does.
+    """Return the swap that best explains why masks lie off their scans, with its evidence; None if none does.
 
     `poses` are T_world_upper and T_world_lower of the frame, accurate to about 1 mm, shape (2, 4, 4).
     """
@@ -86,7 +86,7 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
         try:
             shares = _uncovered_shares(replace(footage, sources=exchange.sources), solver, poses, frame)
         except CaptureError:
-            continue  # mask videos with another length than the clips of those cameras
+            continue  # mask videos differ in length from the clips of the cameras they would be assigned to
         # A swap that leaves a camera without masks on this frame is not evidence against it.
         both = np.isfinite(given) & np.isfinite(shares)
         if (given[both] >= _ODD_SHARE).any():
@@ -108,7 +108,7 @@ def _uncovered_shares(footage: Footage, solver: ContourSolver, poses: Array, fra
 
 
 def _masks(source: CameraSource) -> Masks:
-    """Return the masks of a camera chosen by `masked_sources`."""
+    """Return the masks of a camera that was chosen by `masked_sources`."""
     if source.masks is None:
         raise TrackingError("there are no masks", camera=source.name)
     return source.masks
@@ -129,12 +129,12 @@ def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
 CLEAR_FIT = 0.3
 #: Minimum acceptable fit with a mistake undone [-]: wrong poses do not reach it.
 EXPLAINS = 0.1
-_MOST_CAMERAS = 4  # number of cameras up to which swaps are tried; each costs a search
-#: Maximum images searched [-], separately for the start and for mistakes; each takes 2 to 3 s of CPU time. The limit
-#: covers all mistakes of four cameras, and those of eight except swaps. Work is counted instead of time, so that
+_MOST_CAMERAS = 4  # maximum number of cameras for which swaps are tried, since each swap costs a search
+#: Maximum number of images searched, separately for the start and for mistakes; each takes 2 to 3 s of CPU time. The
+#: limit covers all mistakes of four cameras, and those of eight except swaps. Work is counted instead of time, so that
 #: messages do not depend on the machine.
 MOST_PICTURES = 120
-# Scan sizes that are tried [-]; each finds teeth whose size differs by up to 5 %.
+# Scan sizes that are tried [-]; each also finds teeth whose size differs from it by up to 5 %.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
 #: Hint for scans of a wrong size; if the size is suspected, sizes are tried first.
 SIZE_HINT = "Check the scans' unit and scaling, and the square size of the calibration board."
@@ -178,10 +178,10 @@ def raise_cause(
     can miss the teeth on a frame.
 
     Args:
-        search, footage: that failed.
-        frames: tried in this order.
+        search, footage: the search that failed, and its footage.
+        frames: frames to try, in this order.
         fits: `arch_fit` of both arches by frame, as found by the search [-], shape (2,).
-        suspected: hint texts of suspected mistakes.
+        suspected: hints of the suspected mistakes, which identify them.
         only_clear: whether only a clear fit counts.
 
     Returns:
@@ -209,7 +209,7 @@ def raise_cause(
 
 
 def _raise_cause_on(frame: int, groups: Sequence[Sequence[_Cause]], only_clear: bool) -> int:
-    """Raise an error for a mistake if undoing it makes the search succeed on a frame; return the number tried."""
+    """Raise an error for a mistake if undoing it makes the search succeed on a frame; return how many were tried."""
     tried, pictures = 0, 0
     for causes in groups:
         explained: list[tuple[float, _Cause]] = []
@@ -280,7 +280,7 @@ def _exchanges(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
     for exchange in possible_exchanges(footage.sources):
         yield _Cause(exchange.finding, exchange.hint, search, replace(footage, sources=exchange.sources))
     for a, b in combinations([source.name for source in footage.sources], 2):
-        if footage.offsets[a] != footage.offsets[b]:  # otherwise identical to a swap of masks
+        if footage.offsets[a] != footage.offsets[b]:  # would otherwise be identical to a swap of masks
             cameras = {**footage.cameras, a: footage.cameras[b], b: footage.cameras[a]}
             message = f"the calibrations of cameras {a} and {b} are exchanged"
             hint = f"Exchange the names {a} and {b} in the calibration."

@@ -20,30 +20,31 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_arch
 
-_PX_PER_MM = 2.0  # search resolution: a pixel is a third of the step between orientations at the canines
-_FINALISTS = 5  # poses per arch that are refined
-_DISTINCT_MM = 2.0  # poses closer than this converge to the same local minimum
+# resolution of the search: a pixel is a third of the motion of the canines between neighbouring orientations
+_PX_PER_MM = 2.0
+_FINALISTS = 5  # number of poses per arch that are refined
+_DISTINCT_MM = 2.0  # minimum distance of distinct poses: closer ones converge to the same local minimum
 # Rotations and translations about a guess in which the teeth face the cameras with the upper arch above the lower one.
-# Lateral movements and lips mostly bias its roll. With retracted lips, the centre of the masks lies up to 20 mm behind
-# the front teeth.
+# Lateral movements and lips bias mostly the roll of the guess. With retracted lips, the centre of the masks lies up to
+# 20 mm behind the front teeth.
 _GRID = Grid(
     yaw_rad=np.radians(np.arange(-50, 51, 10.0)),
     pitch_rad=np.radians(np.arange(-40, 41, 10.0)),
     roll_rad=np.radians(np.arange(-50, 51, 10.0)),
     reach_mm=(13.0, 9.0, 22.5),
 )
-# Rotations and translations about picked poses: possible errors of four careless clicks close together.
+# Rotations and translations about picked poses: possible errors after four careless clicks close together.
 _NEAR_GRID = Grid(
     yaw_rad=np.radians(np.arange(-20, 21, 10.0)),
     pitch_rad=np.radians(np.arange(-20, 21, 10.0)),
     roll_rad=np.radians(np.arange(-20, 21, 10.0)),
     reach_mm=(6.0, 6.0, 6.0),
 )
-# Jaw openings that are tried to place the other arch relative to one found alone [mm], and position of the hinge axis
-# above and behind the front teeth [mm]: a single arch also fits when shifted by a tooth, but jaws do not move that way.
+# Jaw openings [mm] for placing one arch relative to the other, and height and depth [mm] of the hinge axis relative to
+# the front teeth. A single arch also fits when shifted by a tooth, but jaws do not move that way.
 _OPENINGS_MM, _CONDYLES_MM = (0.0, 6.0, 14.0, 24.0, 36.0), (40.0, -90.0)
-_WIDEST_JAW_RAD = 0.8  # largest possible rotation between the arches
-_FARTHEST_JAW_MM = 75.0  # largest distance between the front teeth of the arches
+_WIDEST_JAW_RAD = 0.8  # maximum rotation between the arches
+_FARTHEST_JAW_MM = 75.0  # maximum distance between the front teeth of the arches
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ class SearchResult:
     """The result of a search on a frame."""
 
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
-    objective_px: float  # matched contour less the penalty for uncovered mask, both arches
+    objective_px: float  # matched contour of both arches less the penalty for uncovered mask
     fits: Array  # `arch_fit` of both arches [-], shape (2,)
 
     @property
@@ -194,7 +195,7 @@ class StartSearch:
     def _objective(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> Array:
         """Return the matched contour less the penalty for uncovered mask per arch [px], shape (2,)."""
         uncovered, _ = uncovered_px(solver.scans, solution.poses, views)
-        # The penalty is proportional to the area, and coarse images have larger pixels.
+        # The penalty is per area, and pixels of coarse images are larger.
         price = self._config.uncovered_price
         if solver is self._coarse_solver:
             price *= self._config.working_px_per_mm / _PX_PER_MM

@@ -1,4 +1,4 @@
-"""Alignment attempts at one instant, and their acceptance."""
+"""Alignment attempts on one frame, and their acceptance."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
 from jawusd.tracking.performance.views import Growth
 
-#: Upper bounds on the standard deviations of head and jaw after many frames without visible teeth [rad, mm, mm].
+#: Upper bounds on the standard deviations of head rotation, head translation and jaw after many frames without visible
+#: teeth [rad, mm, mm].
 LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
-# Matched contour below which an arch is not accepted [px]: 2 mm of tooth edge. Tracking without a rig requires more.
+# Matched contour below which an arch is rejected [px]: 2 mm of tooth edge. Tracking without a rig requires more.
 _LEAST_MATCHED_PX = 15.0
-_TYPICAL_PX = 0.4  # residual of hand-drawn masks at the working resolution
+_TYPICAL_PX = 0.4  # typical residual of hand-drawn masks at the working resolution
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +32,8 @@ class FrameFit:
 
     Attributes:
         pose: measured or extrapolated pose of head and jaw.
-        solution: matched outlines at the pose, None without any mask.
-        use: masks that are used, shape (2, C): those present, of arches that were found.
+        solution: matched outlines at the pose; None without any mask.
+        use: masks used, shape (2, C): available masks of arches that were found.
         present: available masks, shape (2, C).
         uncovered: fraction of every mask not covered by the scan, NaN without a mask, shape (2, C).
         growth: derivatives of the outlines with respect to unknown focal lengths.
@@ -80,7 +81,7 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """Views of one instant and the rendering shared by all attempts."""
+    """Views of one frame and the rendering shared by all attempts."""
 
     views: Sequence[View]
     rendering: Rendering
@@ -88,7 +89,7 @@ class Instant:
 
 
 class Attempts:
-    """Aligns instants, and accepts or rejects results by comparison with the usual residual of the take."""
+    """Aligns single frames, and accepts or rejects results by comparison with the usual residual of the take."""
 
     def __init__(self, instants: InstantSolver, outline_weight: Array, usual_px: Array | None = None) -> None:
         """Start with a known usual residual per arch, shape (2,), if given.
@@ -110,14 +111,14 @@ class Attempts:
             self._residuals.append(residual_px(fit.solution))
 
     def near(self, start: Pose, instant: Instant, sigma: Array = LARGEST_SIGMA) -> FrameFit:
-        """Align an instant near a start with standard deviations of shape (9,); reject arches that do not fit."""
+        """Align a frame near a start with standard deviations of shape (9,); reject arches that do not fit."""
         if not instant.present.any():
             return empty_fit(start, instant)
         expected = Expected(start, sigma**-2.0)
         return self.judged(self.attempt(start, expected, instant, instant.present, self.config.wide_gates_px), instant)
 
     def attempt(self, start: Pose, expected: Expected, instant: Instant, use: Mask, gates: Sequence[float]) -> Trial:
-        """Align a subset of the masks, shape (2, C), from a start."""
+        """Align with a subset of the masks, shape (2, C), from a start."""
         views, rendering = instant.views, instant.rendering
         aligned = self.instants.align(start, views, use, gates, expected, self._weight, rendering)
         uncovered, total = np.zeros(use.shape), np.zeros(use.shape)
@@ -137,13 +138,13 @@ class Attempts:
         return np.asarray(trial.use.any(1) & (rough | uncovered | few))
 
     def judged(self, trial: Trial, instant: Instant) -> FrameFit:
-        """Return the attempt as a frame fit, without arches that do not match their masks."""
+        """Return the attempt as a frame fit, excluding arches that do not fit their masks."""
         use = trial.use & ~self.bad(trial)[:, None]
         return FrameFit(trial.pose, trial.solution, use, instant.present, trial.uncovered)
 
 
 def empty_fit(pose: Pose, instant: Instant) -> FrameFit:
-    """Return the fit of an instant without masks, at the expected pose."""
+    """Return the fit of a frame without masks, at the expected pose."""
     none = np.zeros_like(instant.present)
     return FrameFit(pose, None, none, instant.present, np.full(none.shape, np.nan))
 

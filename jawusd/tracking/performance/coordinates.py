@@ -41,7 +41,7 @@ class Coordinates:
 
     Attributes:
         jaw: the subject's rig.
-        pivot: point of the upper scan the head turns about [mm], shape (3,).
+        pivot: point of the upper scan about which the head rotates [mm], shape (3,).
     """
 
     def __init__(self, jaw: JawRig, scans: Sequence[Scan]) -> None:

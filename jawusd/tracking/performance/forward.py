@@ -17,8 +17,9 @@ from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected
 from jawusd.tracking.performance.motion import STEADY, Prediction
 
-_KEPT_JAWS = 12  # jaw parameters remembered as starts after a loss
-_APART_MM = 3.0  # minimum distance of the lower incisal point between them, within the solver's basin of convergence
+_KEPT_JAWS = 12  # maximum number of jaw poses remembered as starts after a loss
+# minimum distance of the lower incisal point between remembered poses: the solver converges from this far
+_APART_MM = 3.0
 _FINALISTS = 3
 
 
@@ -62,7 +63,7 @@ class ForwardPass:
         return attempts.judged(alone, instant)
 
     def _other_starts(self, expected: Expected, instant: Instant) -> list[Pose]:
-        """Return further starts: the prediction, last pose, and earlier jaw poses with the head moved to its masks."""
+        """Return further starts: the prediction, the last pose, and earlier jaw poses with the head on its masks."""
         jaws = [expected.pose.d, *(self._jaws if self._motion.blind.any() else ())]
         arch = 0 if instant.present[0].any() else 1
         scan, shifted = self._attempts.instants.solver.scans[arch], []
@@ -82,7 +83,7 @@ class ForwardPass:
         return trial.objective(config.uncovered_price)
 
     def _remember(self, fit: FrameFit) -> None:
-        """Update the usual residual, and remember the jaw as a start if it differs from those remembered."""
+        """Update the usual residual, and remember the jaw pose as a start if it differs from those remembered."""
         self._attempts.remember(fit)
         if not fit.found.all():
             return

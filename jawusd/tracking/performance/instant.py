@@ -1,4 +1,4 @@
-"""Alignment of head and jaw with the masks of one instant."""
+"""Alignment of head and jaw with the masks of one frame."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from jawusd.tracking.contour.solver import ContourSolver, Matched
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
 
-# Standard deviation of the rig's soft bound [mm]. The bound comes from the take that the rig was fitted to; a hard
-# bound would lose jaws that move beyond it.
+# Standard deviation of the rig's soft bound [mm]. The bound is the range of motion in the take that the rig was fitted
+# to; with a hard bound, jaws that exceed this range would be lost.
 BOUND_MM = 1.0
 _QUICK_FACES, _QUICK_REDRAW_PX = 6_000, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Prior of head and jaw at an instant."""
+    """Prior on head and jaw in a frame."""
 
     pose: Pose
-    precision: Array  # inverse variances of the step from the expected pose, shape (9,)
+    precision: Array  # inverse variances of the deviation from the expected pose, shape (9,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Aligned:
 
 
 class InstantSolver:
-    """Gauss-Newton in head pose and jaw parameters; only renderings are kept between instants."""
+    """Gauss-Newton in head pose and jaw parameters; only renderings are kept between frames."""
 
     def __init__(self, solver: ContourSolver, coordinates: Coordinates) -> None:
         self.solver, self.coordinates = solver, coordinates
@@ -119,7 +119,7 @@ def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
 
 
 def quick(solver: ContourSolver) -> ContourSolver:
-    """Return a solver with decimated scans that redraws them less often, for the many steps of the first pass."""
+    """Return a solver with decimated scans and less frequent redraws, for the many steps of the first pass."""
     scans = [thinned(replace(scan.thin or scan, thin=None), _QUICK_FACES) for scan in solver.scans]
     return ContourSolver(scans, replace(solver.config, redraw_px=_QUICK_REDRAW_PX))
 

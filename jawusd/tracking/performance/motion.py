@@ -1,4 +1,4 @@
-"""Motion of head and jaw: the prediction of the next frame, and the variances behind the smoother's prior."""
+"""Motion of head and jaw: prediction of the next frame, and variances for the smoother's prior."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from jawusd.tracking.performance.attempts import LARGEST_SIGMA
 from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import Expected
 
-# Standard deviations of a prediction [rad, mm, mm], as for fast chewing at 24 frames per second. They only regularise
-# directions that the images do not determine; the smoother uses measured variances.
+# Standard deviations of a prediction of head rotation, head translation and jaw [rad, mm, mm], as in fast chewing at 24
+# frames per second. They only regularise directions that the images do not determine; the smoother uses measured
+# variances.
 _MISS = np.r_[[0.01] * 3, [0.7] * 3, [0.7] * 3]
-#: Factors on the standard deviations of a head that hardly moves relative to the cameras, and of a known head pose.
+#: Factors on the standard deviations of the head: if it hardly moves relative to the cameras, and if its pose is known.
 STEADY, KNOWN = 0.05, 1e-4
-_DAMPING = 0.8  # factor on the velocity per frame
+_DAMPING = 0.8  # factor on the velocity in every frame
 
-# Variance of the prior relative to the measured mean square [-]: motion is mostly smooth, with abrupt changes.
+# Ratio of the prior's variance to the measured mean square [-]: above 1, since motion is mostly smooth, but has abrupt
+# changes.
 _LOOSE = 4.0
 # Lower bounds on the variances of second differences [rad, mm].
 _LEAST_HEAD = np.r_[[1e-4] * 3, [0.01] * 3] ** 2
 _LEAST_JAW = np.full(3, 0.02**2)
-_FEWEST_BENDS = 20  # second differences needed for an estimate
-_USUAL_JAW = np.array([0.3, 0.2, 0.1]) ** 2  # default: exercises at 24 frames per second [mm]
+_FEWEST_BENDS = 20  # minimum number of second differences for an estimate
+# default mean squares of second differences, from exercises at 24 frames per second [mm^2]
+_USUAL_JAW = np.array([0.3, 0.2, 0.1]) ** 2
 _USUAL_HEAD = np.r_[[1e-3] * 3, [0.1] * 3] ** 2
-_OUTLIERS = 99.0  # percentile of the second differences above which they are assumed to span gaps
-# Variance of the second and fourth differences of white noise relative to its own.
+_OUTLIERS = 99.0  # percentile above which second differences are assumed to span gaps
+# Variance of the second and of the fourth differences of white noise, relative to the noise variance.
 _NOISE_BEND, _NOISE_FOURTH = 6.0, 70.0
 
 
@@ -38,21 +41,21 @@ class Prediction:
 
     Attributes:
         last: the pose of the last frame.
-        blind: frames since each arch was found, shape (2,).
+        blind: number of frames since each arch was found, shape (2,).
     """
 
     def __init__(self, coordinates: Coordinates, begin: Pose, found: Mask, *, head: float = 1.0) -> None:
-        """Start at rest with a frame and the arches found in it, shape (2,).
+        """Start at rest from the pose of a frame and the arches found in it, shape (2,).
 
         Args:
-            head: factor on the head's standard deviations.
+            head: factor on the standard deviations of the head.
         """
         self._coordinates, self._miss = coordinates, _MISS * np.r_[[head] * 6, [1.0] * 3]
         self.last, self._velocity, self._frames = begin, np.zeros(LOCAL), 1.0
         self.blind = np.where(found, 0, 1)
 
     def expected(self, frames: float = 1.0) -> Expected:
-        """Return the prediction some frames ahead; its variance grows while teeth are not visible."""
+        """Return the prediction `frames` ahead; its variance grows while teeth are not visible."""
         self._frames = frames
         sigma = frames * self._miss * np.sqrt(1.0 + np.r_[[self.blind[0]] * 6, [self.blind.max()] * 3])
         reach = _DAMPING * (1.0 - _DAMPING**frames) / (1.0 - _DAMPING)
@@ -69,7 +72,7 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Variances of the nine unknowns' second and first differences per frame, shape (9,) each."""
+    """Variances of the second and first differences of the nine unknowns per frame, shape (9,) each."""
 
     bend: Array
     step: Array
@@ -83,7 +86,7 @@ def head_bends(coordinates: Coordinates, poses: Sequence[Pose]) -> tuple[Array, 
 
 
 def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask, fps: float) -> Motion:
-    """Return the variances of a take's motion, or those of the take the rig was fitted to if too few frames are good.
+    """Return the variances of a take's motion, or those of the rig's own take if too few frames are good.
 
     Args:
         poses: poses of consecutive frames.
@@ -94,7 +97,7 @@ def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask,
     d = np.stack([pose.d for pose in poses])
     steps, bends = np.hstack([step, np.diff(d, axis=0)]), np.hstack([bend, np.diff(d, 2, axis=0)])
     least = np.concatenate([_LEAST_HEAD, _LEAST_JAW])
-    runs = good.copy()  # starts of runs of five good frames
+    runs = good.copy()  # first frames of runs of five good frames
     for k in range(1, 5):
         runs[:-k] &= good[k:]
         runs[-k:] = False
@@ -102,7 +105,7 @@ def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask,
         usual = np.concatenate([_USUAL_HEAD, _of_rig(coordinates.jaw, fps)])
         return Motion(bend=_LOOSE * usual, step=25 * usual)
     start = np.flatnonzero(runs)
-    # Fourth differences are dominated by noise, which separates it from motion.
+    # Fourth differences are dominated by noise, so noise can be separated from motion.
     noise = (np.diff(bends, 2, axis=0)[start] ** 2).mean(0) / _NOISE_FOURTH
     moving = (bends[start + 1] ** 2).mean(0) - _NOISE_BEND * noise
     return Motion(bend=_LOOSE * np.maximum(moving, least), step=np.maximum((steps[start] ** 2).mean(0), least))

@@ -32,12 +32,12 @@ def performance_of(
 
     Args:
         jaw: the subject's rig.
-        pivot: point of the upper scan the head turns about [mm], shape (3,).
+        pivot: point of the upper scan about which the head rotates [mm], shape (3,).
         frames: frame numbers of the reference camera, in the order of the fits.
         smoothed: the take after the second pass.
         camera_names: in view order.
         fps: frames per second.
-        free_focal: focal lengths were estimated, relative to those of the cameras.
+        free_focal: whether focal lengths were estimated, relative to those of the cameras.
     """
     fits = smoothed.fits
     d = np.stack([fit.pose.d for fit in fits])
@@ -80,8 +80,8 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     p = performance
     head, relative = p.T_world_upper, jaw.pose(p.d)
     lower = head @ relative
-    # Derivatives of left twists with respect to the nine unknowns: of the head in the world, of the mandible in the
-    # skull frame.
+    # Derivatives of left twists with respect to the nine unknowns: those of the head in the world, those of the
+    # mandible in the skull frame.
     turn = se3_adjoint(head @ make_transform(np.eye(3), p.pivot))
     by_d = se3_left_jacobian(jaw.twist(p.d)) @ jaw.jacobian(p.d)
     of_upper, of_lower = np.zeros((2, len(p.frames), 6, 9))
@@ -92,7 +92,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     meta = TracksMeta(solver="performance", tolerance_mm=jaw.tolerance_mm)
     meta.update(_known_notes(p))
     moved = jaw.meta.get("registration")
-    if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is registered as in the rig
+    if isinstance(moved, dict) and moved.get("applied"):  # the lower scan has the registration of the rig
         meta["registration"] = cast(Registration, moved)
     count, cameras = len(p.frames), len(p.camera_names)
     raw = {"upper": head.copy(), "lower": lower.copy(), "relative": relative.copy()}

@@ -1,4 +1,4 @@
-"""The solve of a shot: start, first pass in both directions, backward pass into gaps, then all frames jointly."""
+"""The solve of a shot: start, first pass in both directions, backward pass into gaps, joint refinement."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Shot:
         frames: range of reference-camera frames, end exclusive.
         start_frame, start: initial frame and pose.
         fps: frames per second.
-        fixed_head: the cameras are head-mounted, so the head pose is constant.
-        free_focal: estimate the focal lengths.
+        fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
+        free_focal: whether to estimate the focal lengths.
     """
 
     views: Views
@@ -126,7 +126,7 @@ class _Take:
         self._close_gaps()
 
     def _close_gaps(self) -> None:
-        """Align backwards from the frame after each run of frames in which an arch was missed."""
+        """Align backwards into each run of frames in which an arch was missed, from the frame after it."""
         usual = usual_residual_px(self.fits.values())
         after: ForwardPass | None = None
         for frame in sorted(self.fits, reverse=True):
@@ -181,8 +181,8 @@ def solve_capture(
         upper, lower: teeth scans in one frame, the same as in the rig [mm].
         jaw: the subject's rig.
         config: settings of the tracker.
-        fixed_head: the cameras are head-mounted, so the head pose is constant.
-        free_focal: estimate the focal lengths, starting from those of the calibration.
+        fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
+        free_focal: whether to estimate the focal lengths, starting from those of the calibration.
         threads: number of threads of the start search; the result does not depend on it.
         progress: called after each frame with the number of frames done and the total.
 

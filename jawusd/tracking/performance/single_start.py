@@ -1,6 +1,6 @@
 """The start of a solve with one camera: a search for head and jaw in its masks.
 
-In a single view, distance follows from apparent size and perspective only, and lips hide an unknown part of the teeth.
+In a single view, only apparent size and perspective determine the distance, and lips hide an unknown part of the teeth.
 The search therefore tries all distances at which teeth could fill the masks, with all orientations, and then jaw poses
 for the most promising head poses.
 """
@@ -39,8 +39,9 @@ from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
 
 _PX_PER_MM = 2.0
-_ANYWHERE_MM = 200.0  # initial distance along the optical axis, which sets the resolution of the views
-_SURVEYED, _FRAMES_TRIED = 24, 4  # frames surveyed for large masks, and frames searched
+# initial distance of the teeth along the optical axis, which determines the resolution of the views
+_ANYWHERE_MM = 200.0
+_SURVEYED, _FRAMES_TRIED = 24, 4  # number of frames surveyed for large masks, and maximum number of frames searched
 # Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, in steps of an eighth.
 _WIDTHS_MM = 22.0 * 1.125 ** np.arange(10)
 _USUAL_WIDTH_MM = 42.0
@@ -51,14 +52,14 @@ _GRID = Grid(
     reach_mm=(9.0, 7.5, 0.1),
 )
 _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
-# Number of head poses kept, jaw poses tried with each, pairs aligned in a few steps, pairs aligned fully, and pairs
-# aligned at the working resolution.
+# Numbers of head poses kept, of jaw poses tried with each, of pairs aligned in a few steps, of pairs aligned fully, and
+# of pairs aligned at the working resolution.
 _HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 240, 32, 160, 24, 5
-# Penalty per crown pixel outside the mask, in px of contour. It is low, as lips may hide crowns.
+# Penalty per crown pixel outside the mask, in px of contour [1/px]: low, as lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
-_DISTINCT_MM = 3.0  # minimum mean distance of the teeth between head poses that are kept
-# Fit of the worse arch above which a start is accepted at once, and below which it is rejected [-]; see
-# `start_causes.CLEAR_FIT` for several cameras.
+_DISTINCT_MM = 3.0  # minimum distance between head poses that are kept, as mean displacement of the teeth
+# Fit of the worse arch above which a start is accepted at once, and fit below which it is rejected [-];
+# `start_causes.CLEAR_FIT` is for several cameras.
 _CLEAR_FIT, _LEAST_FIT = 0.3, 0.1
 _NEARBY = LARGEST_SIGMA / 3.0  # standard deviations of a candidate about its pose [rad, mm, mm]
 
@@ -73,7 +74,7 @@ class FoundPose:
 
 
 class SingleStart:
-    """Search for head and jaw in frames of one camera."""
+    """A search for head and jaw in frames of one camera."""
 
     def __init__(
         self, meshes: Sequence[Mesh], solver: ContourSolver, jaw: JawRig, T_anatomical_scan: Array, map_: Mapper = map
@@ -92,8 +93,8 @@ class SingleStart:
         self._coarse = tuple(coarse_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True))
         self._hinge = hinge_at_front(self._coarse[0].crown_vertices(), T_anatomical_scan)
         weight = np.full(2, 1.0 / solver.config.typical_noise_px3)
-        # Gates scale with the resolution. Otherwise they would be so wide in mm that teeth half hidden by lips would
-        # shrink to their visible part.
+        # Gates scale with the resolution. Otherwise they would be so wide in mm that teeth half hidden by lips would be
+        # fitted to their visible part, as if they were smaller.
         small = self._config.with_gates_scaled(_PX_PER_MM / self._config.working_px_per_mm)
         rough = ContourSolver(self._coarse, small)
         self._rough = Attempts(InstantSolver(rough, Coordinates(jaw, self._coarse)), weight)
@@ -152,7 +153,8 @@ class SingleStart:
     def _searched(self, views: Sequence[View], places: Array) -> list[Pose]:
         """Return the most promising head poses, each with its most promising jaw pose.
 
-        The upper arch alone hardly constrains the distance, so heads are ranked after a few steps with both arches.
+        The upper arch alone hardly constrains the distance, so head poses are ranked after a few steps with both
+        arches.
         """
         found: list[Candidate] = []
         for pair in places:

@@ -20,9 +20,10 @@ from jawusd.tracking.performance.system import TakeSystem
 from jawusd.tracking.performance.unknowns import DRAWN, HabitPrior, TakeState, Unknowns
 from jawusd.tracking.performance.views import Views, growth_of
 
-# Rounds of rematching; a third one changes less than 0.01 mm.
+# Number of rounds of rematching; a third round would change less than 0.01 mm.
 _ROUNDS = 2
-_FOCAL_ROUNDS = 6  # with unknown focal lengths, which couple strongly with the distance of the head
+# number of rounds if focal lengths are unknown, as they couple strongly with the distance of the head
+_FOCAL_ROUNDS = 6
 #: Ratio of true to computed variance of a frame's unknowns [-]: the equations ignore that outline errors persist over
 #: frames and that the rig deviates from the subject's anatomy.
 WIDER = 1.5**2
@@ -66,10 +67,10 @@ class Smoother:
             frames: frame numbers in temporal order.
             fps: frames per second.
             cameras: number of cameras.
-            fixed_head: the head pose is constant.
-            free_focal: estimate the focal lengths.
+            fixed_head: whether the head pose is constant.
+            free_focal: whether to estimate the focal lengths.
             length_px: correlation length of outline errors; default: estimated from the residuals.
-            habits: prior on the offset of outlines from the teeth's edges.
+            habits: prior on the offsets of outlines from the teeth's edges.
             wider: ratio of true to computed variance of a frame's unknowns.
         """
         self._wider = wider
@@ -114,7 +115,7 @@ class Smoother:
                 done(round_ * len(fits) + k + 1, total)
             weight = 1.0 / outline_variance(fits, config, self._length_px)
         sigma = np.zeros(self._cameras)
-        # Without the bound: as an inequality, it would make the covariance too small.
+        # The bound is omitted: as an inequality, it would make the covariance too small.
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, bounded=False))
         if self._unknowns.free_focal:
             sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
@@ -132,10 +133,10 @@ class Smoother:
             weak[unknowns.head] = LARGEST_SIGMA[HEAD] ** -2.0
         for k, fit in enumerate(fits):
             precision, right = unknowns.frame(fit, weight, bounded=bounded)
-            # Regularises unknowns without measurements.
+            # The weak prior regularises unknowns without measurements.
             system.add_frame(k, precision + np.diag(1e-3 * weak), right)
         system.add_shared(*unknowns.prior(state))
-        # In gaps, steps are penalised too, so that the jaw does not drift at constant velocity.
+        # In gaps, first differences are penalised too, so that the jaw does not drift at constant velocity.
         unseen = np.array([not fit.found.all() for fit in fits])
         gap = (unseen[1:] | unseen[:-1])[:, None]
         poses = [fit.pose for fit in fits]
@@ -161,7 +162,7 @@ class Smoother:
         return replace(fit, solution=solution, growth=growth)
 
     def _found_again(self, fits: list[FrameFit], weight: Array) -> list[FrameFit]:
-        """Retry, from smoothed poses, arches that have masks but were not found."""
+        """Realign, from smoothed poses, arches that have masks but were not found."""
         if self._views is None:
             return fits
         attempts = Attempts(self._instants, weight, usual_residual_px(fits))
@@ -190,7 +191,7 @@ class Smoother:
 
 
 def with_one_head(coordinates: Coordinates, fits: Sequence[FrameFit]) -> list[FrameFit]:
-    """Return the fits with one common head pose, the median of those found."""
+    """Return the fits with a common head pose, the median over frames with both arches found."""
     seen = [fit for fit in fits if fit.found.all()] or fits
     first = seen[0].pose.head
     away = np.median([coordinates.head_steps(first, fit.pose.head) for fit in seen], axis=0)

@@ -27,21 +27,21 @@ class TakeCovariance(NamedTuple):
 
 
 class _Eliminated(NamedTuple):
-    sides: Array  # solved, shape (N, L, S)
-    inverse_pivots: Array  # one per pair of frames, shape (M, 2 L, 2 L)
+    sides: Array  # solution for all right-hand sides, shape (N, L, S)
+    inverse_pivots: Array  # inverses of the eliminated diagonal blocks, one per pair of frames, shape (M, 2 L, 2 L)
     coupling: Array  # blocks that couple each pair with the next one, shape (M - 1, 2 L, 2 L)
 
 
 class TakeSystem:
     """Accumulated normal equations of N frames with L unknowns each and G unknowns of the take.
 
-    Frames are coupled with the next two only, so time and memory are linear in N.
+    Each frame is coupled only with the next two, so time and memory are linear in N.
     """
 
     def __init__(self, frames: int, local: int, shared: int) -> None:
         """Start with zero equations."""
         self.frames, self.local, self.shared = frames, local, shared
-        # Entry k has the blocks that couple each frame with frame + k.
+        # Entry k contains the blocks that couple each frame with the k-th frame after it.
         self._blocks = [np.zeros((max(frames - k, 0), local, local)) for k in range(3)]
         self._right = np.zeros((frames, local))
         self._cross = np.zeros((frames, local, shared))
@@ -65,7 +65,7 @@ class TakeSystem:
         """Penalise second differences.
 
         Args:
-            columns: unknowns of a frame.
+            columns: slice of a frame's unknowns.
             bend: current second differences at frames 1 to N - 2, shape (N - 2, w).
             weight: their precision, shape (w,) or (N - 2, w).
         """
@@ -111,8 +111,8 @@ class TakeSystem:
     def _eliminated(self, sides: Array) -> _Eliminated:
         """Solve the band for right-hand sides of shape (N, L, S).
 
-        Block elimination over pairs of frames. LAPACK's band solvers can be a thousand times slower when their threads
-        compete.
+        Uses block elimination over pairs of frames: LAPACK's band solvers can be a thousand times slower when their
+        threads compete.
         """
         diagonal, coupling = self._pairs()
         blocks, count = len(diagonal), sides.shape[-1]

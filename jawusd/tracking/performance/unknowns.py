@@ -19,7 +19,7 @@ from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinate
 from jawusd.tracking.performance.instant import bound_equations
 from jawusd.tracking.performance.views import PRIOR_LOG_FOCAL, with_focal
 
-_HABITS = 3  # number per arch, as in `OutlineSums`
+_HABITS = 3  # number of habits per arch, as in `OutlineSums`
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class HabitPrior:
     """Prior on an annotator's habits: the offsets of outlines from the teeth's edges.
 
     Attributes:
-        sigma: standard deviations at free edges [px], at the gum line [px], along the gum [mm].
-        frames: number of independent frames that a whole take is equivalent to for estimating the habits.
+        sigma: standard deviations at free edges [px], at the gum line [px], and along the gum surface [mm].
+        frames: number of independent frames with as much information about the habits as a whole take.
     """
 
     sigma: tuple[float, float, float]
     frames: float
 
 
-#: Habits of hand-drawn masks.
+#: Prior for hand-drawn masks.
 DRAWN = HabitPrior((0.15, 0.15, 0.05), 1.5)
 
 
@@ -85,7 +85,7 @@ class Unknowns:
         self._habits = slice(6 if fixed_head else 0, (6 if fixed_head else 0) + 2 * _HABITS)
         self.focal = slice(self._habits.stop, self._habits.stop + free_focal)
         self.shared = self.focal.stop
-        # Factor by which the frames, which are not independent, overstate the information about habits.
+        # Factor by which the number of frames overstates the information about habits, as frames are not independent.
         self.redundancy = np.ones(self.shared)
         self.redundancy[self._habits] = max(1.0, frames / habits.frames)
 
@@ -104,7 +104,7 @@ class Unknowns:
         Args:
             fit: the frame, with outlines matched at its pose.
             weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
-            bounded: include the bound of the rig.
+            bounded: whether to include the bound of the rig.
         """
         pose, solution, found, size = fit.pose, fit.solution, fit.found, LOCAL + 2 * _HABITS + self.free_focal
         matrix, right = np.zeros((size, size)), np.zeros(size)

@@ -1,4 +1,4 @@
-"""Views of a take: a compressed cache of them, and their dependence on unknown focal lengths."""
+"""Views of a take: a compressed cache, and the dependence of views on unknown focal lengths."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import View
 
-_FAST = 1  # zlib level; masks shrink to a fiftieth even at the fastest level
+_FAST = 1  # zlib level: even the fastest compresses masks to a fiftieth
 
-#: Prior standard deviation of the logarithm of an unknown focal length, guessed from the type of lens [-].
+#: Prior standard deviation of the logarithm of a focal length that was guessed from the type of lens [-].
 PRIOR_LOG_FOCAL = 0.1
 
 
 class Views(Protocol):
-    """Source of one view per camera at instants of the reference camera, such as `MaskViews`."""
+    """Source of one view per camera by frame of the reference camera, such as `MaskViews`."""
 
     def at(self, frame: int) -> list[View]:
         """Return one view per camera."""
@@ -85,7 +85,7 @@ def growth_of(matched: Sequence[Matched], poses: Array, centres: Array, views: S
     out = Growth(np.zeros((2, count, 6)), np.zeros((2, count, 3)), np.zeros((2, count)), np.zeros((2, count)))
     for found in matched:
         r, c = found.arch, found.camera
-        near = np.abs(found.distances) < found.gate_px  # False for NaN
+        near = np.abs(found.distances) < found.gate_px  # NaN counts as not near
         samples, d = found.samples[near], found.distances[near]
         weight = (1.0 - (d / found.gate_px) ** 2) ** 2 * samples[:, LENGTH]
         growth = ((samples[:, [U, V]] - principal_point(views[c].matrix)) * samples[:, [NX, NY]]).sum(1)

@@ -19,12 +19,13 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.colours import PATCHES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.view import Counts, RegionView
 
-# Distances that define the training areas of the initial colours [px]: inside crowns, outside, ring, background.
+# Distances that define the training areas of the initial colours [px]: minimum inside crowns, minimum and maximum
+# outside them, and minimum from all teeth for the background.
 _INSIDE_PX, _OUTSIDE_PX, _RING_PX, _BEYOND_PX = 2.0, 3.0, 30.0, 4.0
 
-#: Learning rates of tooth and background colours: usual ones, and those of the first frame.
+#: Learning rates of tooth and background colours [-], in general and in the first frame.
 RATES, FIRST_RATES = (0.1, 0.2), (0.5, 0.5)
-_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # learning rate [-] and bound [px] of the gum-line offset
+_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # learning rate [-] and maximum [px] of the gum-line offset
 #: Correlation length of border errors along the contour [px]: lips and shadows affect whole teeth.
 CORRELATION_PX = 110.0
 
@@ -36,12 +37,13 @@ class Picture(NamedTuple):
     rgb: NDArray[np.uint8]  # shape (h, w, 3)
 
 
-#: Crops the images of an instant, one per camera or None, around T_world_upper and T_world_lower, shape (2, 4, 4).
+#: Returns the images of a frame, one per camera or None, cropped around T_world_upper and T_world_lower, shape (2, 4,
+#: 4).
 Cut = Callable[[Array], Sequence[Picture | None]]
 
 
 def first_colours(picture: Picture, poses: Array, scans: Sequence[Scan]) -> CameraColours:
-    """Learn the colours of an image in which the scans have poses T_world_upper and T_world_lower (2, 4, 4)."""
+    """Learn the colours of an image with known poses T_world_upper and T_world_lower, shape (2, 4, 4)."""
     shape = picture.rgb.shape[:2]
     labels = np.zeros((2, *shape), np.uint8)
     for r in ARCHES:
@@ -56,7 +58,7 @@ def first_colours(picture: Picture, poses: Array, scans: Sequence[Scan]) -> Came
 
 
 class LearnedColours:
-    """Colour models of all cameras, and the offsets of observed gum lines from those of the scans."""
+    """Colour models of all cameras, and offsets between observed gum lines and those of the scans."""
 
     def __init__(self, scans: Sequence[Scan], cameras: Sequence[Camera], axes: Array) -> None:
         """Start without statistics.
@@ -84,7 +86,7 @@ class LearnedColours:
         self._colours = [None if p is None else first_colours(p, poses, self._scans) for p in pictures]
 
     def views(self, pictures: Sequence[Picture | None], before: Array) -> list[View]:
-        """Return the views of an instant.
+        """Return the views of a frame.
 
         Args:
             pictures: one image per camera.
@@ -110,7 +112,7 @@ class LearnedColours:
         return out
 
     def counting(self, views: Sequence[View]) -> list[View]:
-        """Return the same views with counters that collect colours beside borders, for `learn`."""
+        """Return the views with counters that collect the colours on both sides of borders, for `learn`."""
         return [
             replace(view, edges=replace(view.edges, counts=Counts.zeros()))
             if isinstance(view.edges, RegionView)
@@ -121,17 +123,17 @@ class LearnedColours:
     def learn(
         self, views: Sequence[View], pictures: Sequence[Picture | None], poses: Array, rates: tuple[float, float]
     ) -> None:
-        """Update the colours beside matched borders, and the offset of the gum line.
+        """Update the colour models from both sides of matched borders, and the offset of the gum line.
 
         Args:
             views: views of the images, with the counts of one alignment.
-            pictures, poses: images and poses of this instant.
+            pictures, poses: images and poses of the frame.
             rates: learning rates of tooth and background colours, 0 .. 1.
         """
         for c, view in enumerate(views):
             colours = self._colours[c]
             picture = pictures[c]
-            if picture is not None and colours is None:  # first image of this camera
+            if picture is not None and colours is None:  # this is the first image of the camera
                 self._colours[c] = first_colours(picture, poses, self._scans)
             if not isinstance(view.edges, RegionView) or view.edges.counts is None or colours is None:
                 continue

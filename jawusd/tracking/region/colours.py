@@ -13,20 +13,20 @@ from jawusd.base.arrays import Array, Mask
 
 PATCHES = 8  # per arch
 KINDS = 2  # free edges and gum line
-TABLES = PATCHES * KINDS  # per arch; table = KINDS * patch + kind
-_BITS = 4  # per channel; most finer bins would stay empty
+TABLES = PATCHES * KINDS  # number of colour tables per arch; table = KINDS * patch + kind
+_BITS = 4  # bits per channel; with more, most bins would stay empty
 BINS = 1 << (3 * _BITS)
 
 _BLUR = 0.7  # standard deviation of the blur of histograms [bins]
 _REACH = 2  # radius of the blur kernel [bins]
-# Blur matrix along one axis of the colour cube; the border is replicated.
+# Matrix that blurs along one axis of the colour cube; values are replicated at its border.
 _SPREAD = gaussian_filter1d(np.eye(1 << _BITS), _BLUR, axis=0, mode="nearest", radius=_REACH)
 _LOCAL = 0.5  # weight of a patch's own histogram
-_MOST = 3.0  # bound of the log ratios, as no colour is conclusive
+_MOST = 3.0  # maximum magnitude of the log ratios, as no colour is conclusive
 _LIPS = 0.2  # weight of skin and lips in the background model
-_EMPTY = 2e-5  # probability of unseen colours
-_ENOUGH = 200.0  # counts from which a new histogram has full weight
-_ROUNDS = 3  # iterations that separate lips from the pixels under crowns
+_EMPTY = 2e-5  # probability assigned to unseen colours
+_ENOUGH = 200.0  # minimum number of counts for a new histogram to have full weight
+_ROUNDS = 3  # number of iterations that separate lips from teeth among the pixels under crowns
 
 
 def colour_bins(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
@@ -48,7 +48,7 @@ def _write_bins(rgb: NDArray[np.uint8], out: NDArray[np.uint16]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Areas:
-    """Pixels of an image for training the initial model, each of shape (h, w)."""
+    """Masks of an image that select the training pixels of the initial model, shape (h, w) each."""
 
     crowns: Mask  # well inside projected crowns
     ring: Mask  # around projected crowns, within reach of the search
@@ -60,10 +60,10 @@ class CameraColours:
     """Colour model of teeth and surroundings: log likelihood ratios of colours."""
 
     def __init__(self, bins: NDArray[np.uint16], areas: Areas) -> None:
-        """Learn from a first image with colour bins of shape (h, w).
+        """Train on a first image, given as colour bins of shape (h, w).
 
-        Lips may hide projected crowns, and other teeth may lie beside them; repeated classification removes the pixels
-        of both.
+        Lips may hide the projected crowns, and other teeth may lie beside these; repeated classification removes the
+        pixels of both.
         """
 
         def count(where: Mask) -> Array:
@@ -89,7 +89,7 @@ class CameraColours:
         Args:
             rates: weight of new tooth and of new outside colours, 0 .. 1.
         """
-        # Free edges and gum line of a patch belong to the same teeth.
+        # Free edges and gum line of a patch belong to the same teeth, so their tooth colours are pooled.
         both = tooth.reshape(2, PATCHES, KINDS, BINS).sum(2)
         _blend(self._local_tooth.reshape(-1, KINDS, BINS), both.reshape(-1, BINS), rates[0])
         _blend(self._local_outside.reshape(-1, 1, BINS), outside.reshape(-1, BINS), rates[1])
@@ -161,7 +161,7 @@ def _blur(histogram: Array, out: Array) -> None:
 
 
 def _blended(known: Array, counts: Array, rate: float) -> Array:
-    """Return a histogram (BINS,) with new counts blended in if there are enough."""
+    """Return a histogram (BINS,) with new counts blended in, unchanged if they are too few."""
     total = counts.sum()
     return known if total < 2 * _ENOUGH else (1 - rate) * known + rate * _smooth(counts / total)
 

@@ -1,4 +1,4 @@
-"""Condylar motion of a whole take: it inflates the covariances of implausible frames and is fused with the poses.
+"""Fusion of poses with the condylar motion of a whole take; covariances of implausible frames are inflated.
 
 Masks generated around a wrong pose confirm it, and colours may favour it, but such poses rarely fit the condylar motion
 of this jaw. While a take is tracked, the condylar prior has a low weight, as few frames have trained it. Once all
@@ -17,15 +17,15 @@ from jawusd.geometry import orthonormalise, relative_pose, se3_adjoint, se3_exp
 from jawusd.tracking.contour.quality import landmark_sigmas
 from jawusd.tracking.region.jaw_priors import CondyleMotion
 
-_STRAINED = 2.0  # squared Mahalanobis distance of the condyles per coordinate above which a frame is implausible
-# Quantile of the take's distances that implausible frames are compared with, and its lower bound.
+_STRAINED = 2.0  # squared Mahalanobis distance of the condyles, per coordinate, above which a frame is implausible
+# Quantile of the take's squared distances that counts as usual, and lower bound of the usual squared distance.
 _USUAL, _LEAST = 0.9, 0.25
 
 
 def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) -> Array:
     """Train a condylar motion with all frames; return factors on the covariances (F,), 1 for plausible frames.
 
-    The factor is the squared distance relative to the usual one (Birge 1932).
+    The factor is the squared distance of the condyles from their prediction, relative to the usual one (Birge 1932).
 
     Args:
         motion: untrained.
@@ -101,7 +101,7 @@ class CondyleFusion:
 def _fused(motion: CondyleMotion, relative: Array, covariance: Array) -> tuple[Array, Array]:
     """Return the left twist (6,) from a measured to the fused T_upper_lower, and its covariance.
 
-    A single step suffices, as the prediction is nearly linear over pose errors.
+    A single step suffices, as the prediction is nearly linear within the range of pose errors.
     """
     residual, slope, variance = motion.residual(relative)
     pull = slope.T / variance
@@ -110,16 +110,16 @@ def _fused(motion: CondyleMotion, relative: Array, covariance: Array) -> tuple[A
 
 
 def _shared(poses: Array, covariance: Array, twist: Array, gained: Array) -> tuple[Array, Array]:
-    """Distribute a twist of T_upper_lower over both arches by their covariances; return poses and covariances.
+    """Distribute a twist of T_upper_lower over both arches by their covariances; return new poses and covariances.
 
     Args:
         poses: T_world_upper and T_world_lower, shape (2, 4, 4).
         covariance: covariance of their left twists about the world origin, shape (2, 6, 6).
         twist: left twist about the skull origin, shape (6,).
-        gained: reduction of the covariance of that twist, shape (6, 6).
+        gained: reduction of the covariance of T_upper_lower's left twist by the fusion, shape (6, 6).
     """
     to_world = se3_adjoint(poses[0])
-    gains = covariance @ np.linalg.inv(covariance.sum(0))  # the twist changes x_lower - x_upper
+    gains = covariance @ np.linalg.inv(covariance.sum(0))  # the twist adds to x_lower - x_upper
     moves = gains @ to_world @ twist * np.array([[-1.0], [1.0]])
     less = gains @ (to_world @ gained @ to_world.T) @ np.swapaxes(gains, 1, 2)
     return orthonormalise(se3_exp(moves) @ poses), covariance - less

@@ -1,4 +1,4 @@
-"""Crown edges directly in front of the other arch's crowns, where tooth and background have the same colour.
+"""Edges of crowns in front of the other arch's crowns, where foreground and background have the same colour.
 
 All compiled functions release the GIL and are stateless.
 """
@@ -14,7 +14,8 @@ from jawusd.tracking.contour.samples import NX, NY, U, V, pixel_of
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.region.edges import colour_at
 
-# Search range of dark lines, and of edges about a dark line [px]; half-pixel steps over which a gradient is measured.
+# Search range of dark lines about a sample, and of edges about a dark line [px]; number of half-pixel steps to either
+# side from which a gradient is computed.
 _CREASE_PX, _BESIDE_PX, _CREASE_ARM = 6.0, 3.0, 3
 
 
@@ -30,9 +31,9 @@ def search_creases(
     out: Array,
     clearness: Array,
 ) -> None:
-    """Find crown edges in front of the other arch, where brightness changes most beside the dark line between both.
+    """Find crown edges in front of the other arch: the steepest brightness change beside the dark line between both.
 
-    Either crown may darken towards the line, but shading is gradual, whereas the edge is only blurred by the lens.
+    Shading may darken both crowns towards the line, but gradually, whereas the edge is sharp except for lens blur.
 
     Args:
         contrast: minimum difference between the brighter tooth and the line [8-bit steps].
@@ -44,7 +45,7 @@ def search_creases(
     line = np.empty(2 * n + 1)
     for s in range(len(samples)):
         sample = samples[s]
-        if clearness[s] != 0.0:  # border found, or sample hidden
+        if clearness[s] != 0.0:  # a border was found, or the sample is hidden
             continue
         u, v, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
         beyond_x, beyond_y = u + 3 * nx, v + 3 * ny
@@ -70,7 +71,7 @@ def search_creases(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _sharpest(line: Array, at: int, steps: int) -> float:
-    """Return the sub-sample index of the steepest change in a line near index `at`; NaN at an end."""
+    """Return the interpolated index of the steepest change near index `at` of a line; NaN without a local maximum."""
     best, place = 0.0, np.nan
     before, slope = np.nan, np.nan
     first = max(at - steps, _CREASE_ARM)

@@ -1,7 +1,7 @@
 """Tooth edges in a colour image: the most likely border along every contour normal.
 
 Pixels inside the border should have tooth colours, pixels outside background colours. The log ratios of both sides sum
-to the log likelihood of every position (as in Stoiber et al. 2022). No mask is computed.
+to the log likelihood of every border position (as in Stoiber et al. 2022). No mask is computed.
 
 All compiled functions release the GIL and are stateless.
 """
@@ -16,11 +16,12 @@ from jawusd.base.arrays import Array
 from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V, pixel_of
 from jawusd.tracking.contour.scan import CROWN
 
-_MOST_STEPS = 10  # search steps to either side of a sample
+_MOST_STEPS = 10  # maximum number of search steps to either side of a sample
 _LEAST_CLEAR = 0.15  # fraction of `clear_ratio` below which an edge is rejected
-_LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2  # range of compensated motion blur; gamma of the images
-_SMOOTH_PX = 1.0  # half the width over which gradients are measured
-_PER_CODE = 8  # linearisation table entries per 8-bit step
+# minimum and maximum motion blur that is compensated; gamma of the images
+_LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2
+_SMOOTH_PX = 1.0  # half the width over which gradients are computed
+_PER_CODE = 8  # entries of the linearisation table per 8-bit step
 _LIGHT = (np.arange(255 * _PER_CODE + 1) / (255 * _PER_CODE)) ** _GAMMA
 
 
@@ -35,7 +36,7 @@ def _ratio_at(bins: NDArray[np.uint16], table: NDArray[np.float32], x: float, y:
     """Interpolate the log ratio of a table bilinearly; 0, which is neutral, outside the image."""
     if not _within(bins, x, y):
         return 0.0
-    # Unsigned indices avoid numba's check for negative ones.
+    # Unsigned indices avoid numba's check for negative indices.
     i = np.uint32(x)
     j = np.uint32(y)
     one = np.uint32(1)
@@ -66,7 +67,7 @@ def search_borders(
 
     Args:
         samples: shape (n, COLUMNS).
-        tables: row of `ratio` for each sample, shape (n,).
+        tables: row index of every sample in `ratio`, shape (n,).
         bins: colour bin of every pixel, shape (h, w).
         ratio: bounded log likelihood ratio of tooth to background by colour bin [-], shape (T, B).
         own_labels, other_labels: rendered labels of this and of the other arch: CROWN, GUM or 0, shape (h, w).
@@ -74,7 +75,7 @@ def search_borders(
         reach_px: search distance on either side.
         tolerance_mm: minimum depth difference between the arches for occlusion.
         cos_limit: minimum cosine between the sample's normal and the direction in which the ratio falls.
-        clear_ratio: mean log ratio on both sides from which a border has full weight [-].
+        clear_ratio: minimum mean log ratio on both sides for full weight of a border [-].
         out: result, shape (n,): distance, positive outwards; NaN where the sample is hidden or no border is found.
         clearness: result, shape (n,): weight, 0 .. 1; NaN where the other arch hides the sample.
     """
@@ -102,7 +103,7 @@ def search_borders(
         gx = _ratio_at(bins, table, ex + e, ey) - _ratio_at(bins, table, ex - e, ey)
         gy = _ratio_at(bins, table, ex, ey + e) - _ratio_at(bins, table, ex, ey - e)
         if -(gx * nx + gy * ny) < cos_limit * np.sqrt(gx * gx + gy * gy):
-            continue  # crosses the contour: a lip or a neighbouring tooth
+            continue  # this border crosses the contour: a lip or a neighbouring tooth
         out[s] = d
         clearness[s] = min(1.0, clear)
 
@@ -128,7 +129,7 @@ def _read_line(
     own_labels: NDArray[np.uint8],
     other_labels: NDArray[np.uint8],
 ) -> None:
-    """Read the log ratios along a normal; 0 beyond the own crown inwards, and from the next crown on outwards."""
+    """Read the log ratios along a normal; 0 inside beyond the sample's own crown, and outside beyond the next one."""
     x, y, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
     r[:] = 0.0
     for i in range(n, 2 * n + 1):
@@ -150,7 +151,7 @@ def _read_line(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _likeliest(r: Array, n: int, step: float, reach_px: float) -> int:
-    """Return the index of the most likely border; -1 if it lies at the end of the line."""
+    """Return the index of the most likely border; -1 if it lies at an end of the line."""
     total = 0.0
     best = -np.inf
     at = -1
@@ -166,7 +167,7 @@ def _likeliest(r: Array, n: int, step: float, reach_px: float) -> int:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _zero_crossing(r: Array, n: int, step: float, k: int) -> float:
-    """Return the position where the ratio falls through 0 near index k, otherwise that of k [px]."""
+    """Return the position where the ratio falls below 0 near index k, or that of k if there is none [px]."""
     d = (k - n) * step
     near = np.inf
     for m in range(k - 2, k + 2):
@@ -214,16 +215,15 @@ def sharpen(
     out: Array,
     clearness: Array,
 ) -> None:
-    """Refine every border to the steepest colour change between its inside and outside.
+    """Move every border to the steepest colour change between its inside and outside.
 
     The midpoint between both colours would be biased, as crowns darken towards their edges.
 
     Args:
         contrast: minimum difference of both sides' mean colours [8-bit steps].
-        reach_px: how far a border may move.
-        blur_px: motion during the exposure along the normals, the width of a blurred edge, shape (n,).
-        out, clearness: as written by `search_borders`; borders without a steepest point lose most of their
-            weight.
+        reach_px: maximum distance by which a border is moved.
+        blur_px: motion along the normals during the exposure, which is the width of a blurred edge, shape (n,).
+        out, clearness: as written by `search_borders`; the weight of borders without a steepest point is reduced.
     """
     inner = np.empty(3)
     outer = np.empty(3)
@@ -272,12 +272,12 @@ def sharpen(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _steepest(line: Array, steps: int, arm: int) -> float:
-    """Return where a line falls most steeply, in samples from its middle; NaN if at an end, or if it never falls.
+    """Return the position of the steepest descent of a line, in samples from its middle; NaN without a local maximum.
 
     Args:
         line: 2 (steps + arm) + 1 samples.
         steps: search steps to either side.
-        arm: samples to either side whose linearly weighted difference is the gradient.
+        arm: number of samples to either side whose linearly weighted difference is the gradient.
     """
     before, slope = np.nan, np.nan
     best, place = 0.0, np.nan
@@ -310,7 +310,7 @@ def count_colours(
     """Count the colours on both sides of borders found within 2 px.
 
     Args:
-        near_px, far_px: range of distances from the contour that is counted.
+        near_px, far_px: minimum and maximum distance of counted pixels from the contour.
         tooth, outside: counts to update, shape (T, B).
     """
     for s in range(len(samples)):

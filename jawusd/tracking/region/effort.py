@@ -1,4 +1,4 @@
-"""Computational effort of the rig tracker per instant, for recorded and for live images."""
+"""Computational effort of the rig tracker per frame, for recorded and for live images."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ class Effort:
     """Steps of an alignment, conditions for searches, and their sizes.
 
     Attributes:
-        gates_px: residual gate of every step from a prediction.
+        gates_px: residual gates of the steps from a prediction.
         next_px: gates after one dropped frame.
         far_px: gates after several dropped frames.
         wide_px: gates from other starts and at the end of a search; None to use those from the prediction.
-        doubted, searched: fractions of the usual matched contour below which other starts are tried, and a search
-            starts, as long as hardly any frames were dropped.
-        jaws, finalists, heads: jaw poses tried by a search, those aligned fully, and head poses tried.
-        search_every: number of failed frames per search.
+        doubted, searched: fractions of the usual matched contour below which other starts are tried, and below which a
+            search starts, provided that hardly any frames were dropped.
+        jaws, finalists, heads: numbers of jaw poses tried by a search, of jaw poses aligned fully, and of head poses
+            tried.
+        search_every: number of failed frames from one search to the next.
         searches: number of failed frames after which teeth count as not visible.
-        later_every: number of failed frames per search from then on.
-        in_turn: from then on, search jaw and head in different frames, to limit the time per frame.
-        learn_every: number of frames per update of the colours.
+        later_every: like `search_every`, once teeth count as not visible.
+        in_turn: whether jaw and head are searched in different frames once teeth count as not visible, to limit the
+            time per frame.
+        learn_every: number of frames from one update of the colours to the next.
     """
 
     gates_px: _Gates
@@ -59,7 +61,7 @@ THOROUGH = Effort(
     in_turn=False,
     learn_every=1,
 )
-#: For live images. Frames are dropped during a search, so searches start after more failed frames.
+#: For live images. Frames are dropped during a search, so searches are less frequent.
 FAST = Effort(
     gates_px=(8.0, 3.0, 2.0),
     next_px=(16.0, 6.0, 2.5, 2.0),

@@ -1,8 +1,9 @@
 """Priors on the jaw: condyles that follow the incisal point, and teeth that do not interpenetrate.
 
-When the teeth touch, or lips hide most of them, the contour hardly constrains the rotation of the jaw that raises the
-front teeth and lowers the condyles. In a given jaw, the position of the incisal point nearly determines both condyles,
-as mandibles have about three degrees of freedom (Zoss et al. 2018). The relation is learned from earlier frames.
+When the teeth touch, or lips hide most of them, the contour hardly constrains rotations of the jaw that raise the front
+teeth and lower the condyles. In any one jaw, the position of the incisal point nearly determines those of both
+condyles, as mandibles have about three degrees of freedom (Zoss et al. 2018). The relation is learned from earlier
+frames.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from jawusd.geometry import hat, relative_pose, rigid_fit, se3_adjoint, se3_inve
 from jawusd.tracking.contour.equations import NormalEquations, Solution, translation
 from jawusd.tracking.contour.quality import landmark_sigmas
 
-_UNIT_MM = (5.0, 20.0, 5.0)  # normalisation of the incisal point's motion to the left, up and forwards
+_UNIT_MM = (5.0, 20.0, 5.0)  # scale of the incisal point's motion to the left, up and forwards
 # Mean motion of the left condyle to the left, up and forwards [mm] as coefficients of 1, x, y, z, xx, xy, xz, yy, yz,
 # zz, over 60 joints of `jawusd.synthetic.person`, whose ranges come from the literature. The right condyle mirrors it.
 _USUAL_MM = np.array(
@@ -26,19 +27,21 @@ _USUAL_MM = np.array(
         [0.0, -1.8, -7.1, 3.7, 0.0, -0.3, 0.0, 1.1, 0.5, 0.0],
     ]
 )
-_ODD = np.array([False, True, False, False, False, True, True, False, False, False])  # terms odd in x
-# Standard deviations of a subject's coefficients to the side, up and forwards [mm], their factor for the quadratic
-# terms, and the standard deviation of the constant term, which is an error of the scans' bite [mm].
+_ODD = np.array([False, True, False, False, False, True, True, False, False, False])  # whether each term is odd in x
+# Standard deviations of a subject's coefficients to the side, up and forwards [mm], factor on these for the quadratic
+# terms, and standard deviation of the constant term, which is an error of the bite registration of the scans [mm].
 _SPREAD_MM, _PRODUCTS, _CONSTANT_MM = (0.4, 1.5, 1.5), 0.5, 1.0
 # Standard deviations of the condyles about the polynomials of their own jaw, to the side, up and forwards [mm].
 _OFF_MM = (0.3, 0.8, 0.5)
-_NEWS = 0.1  # weight of a frame: below 1, as neighbouring frames are correlated
-_BACK = 0.25, 0.005  # backward motion of the incisal point in opening, per mm and per mm^2: mean over the same joints
-_DOUBT = 4.0  # squared distance per coordinate at which the weight of a frame is halved, as it may be wrong [-]
+_NEWS = 0.1  # weight of a frame in the regression: below 1, as neighbouring frames are correlated
+# backward motion of the incisal point per mm of opening and per mm^2 of its square: mean over the joints of `_USUAL_MM`
+_BACK = 0.25, 0.005
+# squared Mahalanobis distance per coordinate at which the weight of a frame is halved, as its pose may be wrong [-]
+_DOUBT = 4.0
 
-# Standard deviation of the height of lower teeth above the closed bite of the scans [mm], due to errors of the bite
-# registration; and the squared height in standard deviations [-] at which the weight is halved, as the scans' bite may
-# be wrong instead of the pose.
+# Standard deviation of the height of lower teeth above their position in the occlusion of the scans [mm], due to errors
+# of the bite registration; and the squared height in standard deviations [-] at which the penalty's weight is halved,
+# as the bite of the scans may be wrong instead of the pose.
 _ABOVE_MM, _BITE_DOUBT = 0.2, 4.0
 
 
@@ -50,7 +53,7 @@ class CondyleMotion:
     """
 
     def __init__(self, landmarks: Array, axes: Array) -> None:
-        """Start with the prior, which is the same for all jaws.
+        """Start from the prior, which is the same for all jaws.
 
         Args:
             landmarks: as in `geometry.LANDMARKS`, in scan coordinates [mm], shape (5, 3).
@@ -99,14 +102,14 @@ class CondyleMotion:
         return float((np.square(condyles - mean) / variance).sum())
 
     def placed(self, left_mm: float, down_mm: float, forward_mm: float) -> Array:
-        """Return T_upper_lower (4, 4) for an incisal point; `forward_mm` is relative to the path of plain opening."""
+        """Return T_upper_lower (4, 4) at a position of the incisal point; `forward_mm` is relative to plain opening."""
         back = _BACK[0] * down_mm + _BACK[1] * down_mm**2
         incisor = np.array([left_mm, -down_mm, forward_mm - back])
         moves = np.concatenate([incisor, self.expected(incisor)[0]]).reshape(3, 3)
         return rigid_fit(self._points, self._points + moves @ self.axes)
 
     def _shifts(self, relative: Array) -> tuple[Array, Array]:
-        """Return displacements of incisal point (3,) and condyles (6,) from the closed bite, anatomical axes [mm]."""
+        """Return displacements of incisal point (3,) and condyles (6,) from occlusion, anatomical axes [mm]."""
         moved = (transform_point(relative, self._points) - self._points) @ self.axes.T
         return moved[0], moved[1:].ravel()
 
@@ -124,10 +127,10 @@ class CondyleMotion:
 
 @dataclass(frozen=True, eq=False)
 class CondyleTerm:
-    """Penalise distances of both condyles from their predicted positions."""
+    """Penalises distances of both condyles from their predicted positions."""
 
     motion: CondyleMotion
-    noise_px3: float  # outline variance times correlation length
+    noise_px3: float  # border variance times correlation length
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the squared distances at the solution's poses, in units of the outline sums."""
@@ -149,7 +152,7 @@ def _features(incisor: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class BiteTerm:
-    """Penalise lower teeth above the closed bite of the scans.
+    """Penalises lower teeth above their position in the occlusion of the scans.
 
     Attributes:
         points: points on the lower teeth, in scan coordinates [mm], shape (N, 3).
@@ -162,7 +165,7 @@ class BiteTerm:
     noise_px3: float
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the squared heights above the closed bite at the solution's poses, in units of the outline sums."""
+        """Add the squared heights above occlusion at the solution's poses, in units of the outline sums."""
         skull = state.poses[0]
         up = skull[:3, :3] @ self.up
         for point in self.points:
@@ -170,7 +173,7 @@ class BiteTerm:
             height = float(up @ (here - closed))
             if height <= 0:
                 continue
-            # The point moves with the lower arch, its limit with the upper arch.
+            # The point moves with the lower arch, and its upper limit with the upper arch.
             moves = [up @ np.hstack([-hat(here - centre), np.eye(3)]) for centre in state.centres]
             slope = np.concatenate([-moves[0], moves[1]])
             trust = _BITE_DOUBT / (_BITE_DOUBT + (height / _ABOVE_MM) ** 2)

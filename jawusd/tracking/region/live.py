@@ -25,7 +25,7 @@ from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import fitting_share
 
 _FACES = 3_000
-# Coarser than for recorded images, since dropped frames reduce accuracy more than coarse settings.
+# Settings are coarser than for recorded images, since dropped frames reduce accuracy more than coarse settings.
 _SETTINGS = replace(TrackingConfig(), sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
 _WIDER = 1.5  # ratio of true to computed standard deviation, as in the smoother
 
@@ -50,7 +50,7 @@ class LiveTake:
             scans: upper and lower teeth, prepared.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
             cameras: cameras in the order of the images.
-            fixed_head: the cameras are head-mounted, so the head hardly moves relative to them.
+            fixed_head: whether the cameras are head-mounted, so that the head hardly moves relative to them.
             executor: thread pool that matches the contours of all cameras in parallel.
         """
         self._scans, self._axes, self._cameras = [thinned(scan, _FACES) for scan in scans], axes, cameras
@@ -60,7 +60,7 @@ class LiveTake:
         self._tracker: RigTracker | None = None
 
     def begin(self, cut: Cut, near: Pose) -> float:
-        """Learn the colours of an instant near a pose; return the matched fraction of the visible contour, 0 .. 1."""
+        """Learn the colours of a frame near a pose; return the matched fraction of the visible contour, 0 .. 1."""
         colours = LearnedColours(self._scans, self._cameras, self._axes)
         self._tracker = RigTracker(self._instants, colours, head=self._head, effort=FAST)
         solution = self._tracker.begin(cut, near).solution
@@ -69,7 +69,7 @@ class LiveTake:
         return float(fitting_share(solution).min())
 
     def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
-        """Align the next instant, `frames` frames later.
+        """Align the images taken `frames` frames after the previous ones.
 
         Raises:
             ValueError: `begin` was not called.
@@ -79,7 +79,7 @@ class LiveTake:
         return self._tracker.step(cut, frames)
 
     def sigma_d(self, fit: FrameFit) -> Array:
-        """Return the standard deviations of d of the last step [mm], shape (3,).
+        """Return the standard deviations of the jaw parameters of the last step [mm], shape (3,).
 
         Raises:
             ValueError: `begin` was not called.

@@ -28,22 +28,23 @@ from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import fitting_share
 
-#: Crops the images of a range of frames. Arguments: cameras, possibly with changed focal lengths; a world point near
-#: the teeth, which determines the resolution [mm], shape (3,); and the frames.
+#: Returns the cropped images of a range of frames. Arguments: cameras, possibly with changed focal lengths; a world
+#: point near the teeth, which determines the resolution [mm], shape (3,); and the frames.
 Cuts = Callable[[Sequence[Camera], Array, range], Iterator[Cut]]
 Progress = Callable[[int, int], None]
 
-# Faces of the crowns before and in the last step; spacing of contour samples, and motion that triggers a redraw [px];
-# step below which intermediate gates are skipped [mm].
+# Number of crown faces before and in the last step; spacing of contour samples, and motion that triggers a redraw [px];
+# pose update below which intermediate gates are skipped [mm].
 _ROUGH_FACES, _FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 6_000, 20_000, 2.0, 2.0, 0.08
-# Frames used to estimate a fixed head and unknown focal lengths in advance, and rounds for focal lengths.
+# Number of frames from which a fixed head pose and unknown focal lengths are estimated in advance, and number of rounds
+# for focal lengths.
 _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 # Prior on the offsets of colour borders from the teeth's edges in a take, and correlation length of the residual errors
 # [px]. Teeth darken towards their free edges, where borders lie up to half a pixel inside; gum-line offsets are learned
 # while tracking.
 _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
-_ALONE = 2.0  # inflation of the variance with a single camera, as no other view reveals shifted borders [-]
-_CLEARLY = 1.05  # ratio of matched contour above which another pose replaces a trusted one
+_ALONE = 2.0  # factor on the variance if there is a single camera, as no other view reveals shifted borders [-]
+_CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +52,12 @@ class PictureShot:
     """Input of a solve.
 
     Attributes:
-        cuts: crops the images.
+        cuts: source of the cropped images.
         cameras: cameras in the order of the images.
         frames: frame numbers of the reference camera.
         fps: frames per second.
-        fixed_head: the cameras are head-mounted, so the head pose is constant.
-        free_focal: estimate the focal lengths.
+        fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
+        free_focal: whether to estimate the focal lengths.
     """
 
     cuts: Cuts
@@ -68,7 +69,7 @@ class PictureShot:
 
 
 class PictureTake:
-    """Solver of a shot by the colours of its images."""
+    """Solves a shot from the colours of its images."""
 
     def __init__(
         self,
@@ -182,7 +183,7 @@ class PictureTake:
     def _turned(
         self, cameras: Sequence[Camera], one: RigTracker, fits: dict[int, FrameFit], frame: int, before: range
     ) -> Iterator[FrameFit]:
-        """Yield the fits of frames tracked from one frame in the opposite direction to a tracker's."""
+        """Yield the fits of frames, tracked from one frame in the direction opposite to that of a tracker."""
         turned = one.reversed_from(fits[frame])
         for cut in self._shot.cuts(cameras, self._centre(fits[frame].pose), before):
             yield turned.step(cut)
@@ -229,7 +230,7 @@ def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, rang
 
 
 def _trust(fit: FrameFit) -> int:
-    """Return 0 for teeth that were not found, 1 for doubtful fits, 2 otherwise."""
+    """Return the trust in a fit: 0 if the teeth were not found, 1 if it is doubtful, 2 otherwise."""
     return int(fit.found.all()) * (1 if fit.doubtful else 2)
 
 

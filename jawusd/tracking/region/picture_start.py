@@ -45,7 +45,7 @@ class ArchStart:
         """Prepare the search.
 
         Args:
-            meshes, scans: upper and lower teeth in one frame, in occlusion [mm]; the same after `prepare_scan`.
+            meshes, scans: upper and lower teeth in one frame, in occlusion [mm], before and after `prepare_scan`.
             T_anatomical_skull: scan frame to (left, up, front) axes, shape (4, 4); None if unknown.
             map_: map function that may run orientations in parallel.
 

@@ -28,17 +28,18 @@ from jawusd.tracking.region.search import fitting_share, head_shifts, rank_by_co
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _LAST_GATES_PX = (2.0,)
-_TRIAL_GATES_PX = (8.0, 6.0)  # gates for the many candidates of a search
-# Time since the last step, in frames, up to which no frame counts as dropped, and up to which motion is extrapolated.
+_TRIAL_GATES_PX = (8.0, 6.0)  # gates of the short trial alignments of a search
+# Maximum time since the last step for which no frame counts as dropped, and for which only one does [frames].
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
-_FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of a millimetre
-# Fractions of the usual matched contour below which a pose is doubted, a search starts, an arch is lost, and a lost
-# arch is not accepted again. `Effort` overrides the first two as long as no frames are dropped.
+_FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some tenths of a millimetre
+# Fractions of the usual matched contour below which a pose is doubtful, a search starts, an arch is lost, and a lost
+# arch stays lost. `Effort` overrides the first two unless several frames were dropped.
 _DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
-_UNSURE_FRAMES = 3.0  # frames since the last step after which an arch that fits badly counts as lost
-_USUAL_FRAMES = 15  # window of the usual matched fraction
+# number of frames since the last step above which an arch must fit as well as a lost one to be accepted
+_UNSURE_FRAMES = 3.0
+_USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
 _LEAST_USUAL = 0.7  # lower bound of the usual matched fraction, relative to the first frame
-_JAWS = 96  # jaw poses that a search ranks by colour
+_JAWS = 96  # number of jaw poses that a search ranks by colour
 
 
 class RigTracker:
@@ -62,9 +63,9 @@ class RigTracker:
 
         Args:
             head: factor on the head's standard deviations, see `Prediction`.
-            free_focal: compute derivatives with respect to focal lengths.
-            effort: computational effort per instant.
-            whole: solver with more faces of the scans for the last step; default: none.
+            free_focal: whether to compute derivatives with respect to focal lengths.
+            effort: computational effort per frame.
+            whole: solver whose scans have more faces, for the last step; default: none.
         """
         self._whole = whole
         self._instants, self._coordinates, self._colours = instants, instants.coordinates, colours
@@ -77,7 +78,7 @@ class RigTracker:
         self._failed = self._frame = 0
 
     def begin(self, cut: Cut, pose: Pose) -> FrameFit:
-        """Learn the colours of a first frame from a pose accurate to some tenths of a millimetre; return its fit."""
+        """Learn the colours of a first frame at a pose accurate to some tenths of a millimetre; return its fit."""
         arches = self._coordinates.arches(pose)
         self._colours.begin(cut(arches), arches)
         sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
@@ -103,7 +104,7 @@ class RigTracker:
         return out
 
     def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
-        """Align the next frame, `frames` frames later."""
+        """Align the images taken `frames` frames after the previous ones."""
         self.expected = expected = self._motion.expected(frames)
         look = self._look(cut, self._coordinates.arches(expected.pose))
         if not look.use.any():
@@ -189,7 +190,7 @@ class RigTracker:
         return found, look
 
     def _with_head_searched(self, found: Aligned, expected: Expected, look: _InstantImages) -> Aligned:
-        """Try shifted head poses with an unchanged jaw."""
+        """Try shifted head poses with an unchanged jaw pose."""
         shifts = head_shifts(expected.pose.head, self._colours.axes)
         order = rank_by_colour(list(shifts @ expected.pose.head), look.views, self._instants.solver.scans, 0)
         order = order[: self._effort.heads]
@@ -218,7 +219,7 @@ class RigTracker:
 
 
 class _InstantImages:
-    """Images of one instant and the rendering shared by all alignments."""
+    """Images of one frame and the rendering shared by all alignments."""
 
     def __init__(
         self,
@@ -247,19 +248,19 @@ class _InstantImages:
         return self._whole.align(found.pose, views, self.use, _LAST_GATES_PX, expected, weight, self._rendering)
 
     def upper_crowns(self, pose: Pose) -> list[Mask]:
-        """Return the pixels of each view that upper crowns cover at a pose."""
+        """Return masks of the pixels that upper crowns cover at a pose, one per view."""
         self._instants.linearise(pose, self.views, self.use, self._rendering, self._instants.config.final_gate_px[1])
         return [labels[0] == CROWN for labels in self._rendering.labels]
 
     def learn(self, pose: Pose, rates: tuple[float, float]) -> None:
-        """Update the colours beside the borders matched at a pose."""
+        """Update the colour models from both sides of the borders matched at a pose."""
         if self._whole is None:
             self._counting, gate = self._colours.counting(self.views), self._instants.config.final_gate_px[1]
             self._instants.linearise(pose, self._counting, self.use, self._rendering, gate)
         self._colours.learn(self._counting, self._pictures, self._instants.coordinates.arches(pose), rates)
 
     def fit(self, found: Aligned, trusted: Mask, free_focal: bool) -> FrameFit:
-        """Return the frame fit, of which only the trusted arches, shape (2,), are used."""
+        """Return the frame fit, restricted to the trusted arches, shape (2,)."""
         use = self.use & trusted[:, None]
         unknown = np.full(use.shape, np.nan)
         if not free_focal or not trusted.any():

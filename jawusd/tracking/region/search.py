@@ -23,8 +23,8 @@ from jawusd.tracking.region.jaw_priors import BiteTerm, CondyleMotion, CondyleTe
 from jawusd.tracking.region.view import RegionView
 from jawusd.tracking.sequence.history import MotionPredictor
 
-_POINTS = 400  # scan points at which image colours are read to rank starts
-# Candidate rotations of the jaw, opening and sideways [degrees].
+_POINTS = 400  # number of scan points at which image colours are read to rank starts
+# Candidate rotations of the jaw about the condyles, in opening and to the side [degrees].
 _OPENED, _ASIDE = (-6.0, -4.5, -3.0, -1.5, 1.5, 3.0, 4.5, 6.0), (-4.0, -2.0, 2.0, 4.0)
 # Candidate positions of the incisal point: left, down, and forward of the path of plain opening [mm]. The solver
 # converges from about 1.7 mm. In a lateral excursion, the jaw rotates about the condyle of that side, so the point
@@ -44,21 +44,21 @@ _SHIFTS_MM = [
     *((0.0, far, 0.0) for far in _FAR_MM),
 ]
 
-# Gates of an alignment from the prediction, from farther away, of a trial, and of the final step with all faces [px];
-# spacing of contour samples, and motion that triggers a redraw [px].
+# Gates of an alignment from the prediction, of one from farther away, of a trial, and of the final step with all faces
+# [px]; spacing of contour samples, and motion that triggers a redraw [px].
 _NEAR_GATES_PX, _FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _TRIAL_GATES_PX, _LAST_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
-_FACES = 6_000  # crown faces of the scans before the final step
+_FACES = 6_000  # number of crown faces of the scans before the final step
 # Border variance times correlation length that sets the weight of the condylar prior [px^3]: for a clearly visible jaw,
 # and in doubtful frames, where a lower weight would let a hidden jaw drift.
 _LOOSE_PX3, _FIRM_PX3 = 3.0, 15.0
-_BORDER_PX3 = 0.7**2 * CORRELATION_PX  # the same product, as estimated from residuals
-# Matched contour equivalent to one squared standard deviation of the condyles [px]: a sample beyond the gate costs
-# Tukey's loss of 4.685^2 / 6, and samples are correlated over `CORRELATION_PX`.
+_BORDER_PX3 = 0.7**2 * CORRELATION_PX  # border variance times correlation length, as estimated from residuals
+# Penalty per unit of the condyles' squared Mahalanobis distance, as length of matched contour [px]: Tukey's loss of a
+# sample beyond the gate is 4.685^2 / 6, and samples are correlated over `CORRELATION_PX`.
 _STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
-_FAST_MM = 1.0  # predicted motion above which other starts are tried
-# Number of starts that a search tries, near the last poses and anywhere in the human range, and number that it aligns
-# fully. Colours rank the correct start among the first 22 of 57.
+_FAST_MM = 1.0  # predicted motion per frame above which other starts are tried
+# Number of starts that a search tries near the last poses, number that it tries anywhere in the human range, and number
+# that it aligns fully. Colours rank the correct start among the first 22 of 57.
 _HOPEFUL_NEAR, _HOPEFUL, _FINALISTS = 12, 24, 3
 
 
@@ -77,7 +77,7 @@ def turned_starts(condyles: CondyleMotion, bases: Sequence[Array]) -> list[Array
 
 
 def starts_everywhere(condyles: CondyleMotion) -> list[Array]:
-    """Return poses T_upper_lower (4, 4) over the range of human jaws."""
+    """Return poses T_upper_lower (4, 4) throughout the human range of motion."""
     return [condyles.placed(*place) for place in _PLACES_MM]
 
 
@@ -107,14 +107,14 @@ def rank_by_colour(
 
 
 class InstantViews(NamedTuple):
-    """Views of an instant, and the rendering shared by its alignments."""
+    """Views of a frame, and the rendering shared by its alignments."""
 
     views: Sequence[View]
     rendering: Rendering
 
 
 class PoseSearch:
-    """Alignment of both arches in the views of an instant."""
+    """Alignment of both arches in the views of a frame."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ class PoseSearch:
         """Align from a start accurate to some tenths of a millimetre, T_world_upper and T_world_lower (2, 4, 4).
 
         Args:
-            firm: use a high weight of the condylar prior, for doubtful frames.
+            firm: whether to use a high weight of the condylar prior, for doubtful frames.
         """
         return self._align(start, look, _FAR_GATES_PX, firm)
 
@@ -159,7 +159,7 @@ class PoseSearch:
         return solution
 
     def from_farther(self, solution: Solution, start: Array, last: Array, look: InstantViews) -> Solution:
-        """Align with wide gates and from the poses of the previous frame; return the best solution."""
+        """Align from a start with wide gates, and from the poses of the previous frame; return the best solution."""
         solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
         return self._better(solution, self._align(last, look, _NEAR_GATES_PX))
 
@@ -172,7 +172,7 @@ class PoseSearch:
         motion: MotionPredictor,
         everywhere: bool,
     ) -> Solution:
-        """Try earlier jaw poses, rotated ones and, if `everywhere`, the whole human range, with the head as found."""
+        """Try earlier and rotated jaw poses and, if `everywhere`, the whole human range; the head is not changed."""
         near = [se3_inverse(poses[0]) @ poses[1] for poses in (last, *motion.pose_history())]
         near += turned_starts(self.condyles, (se3_inverse(predicted[0]) @ predicted[1], near[0]))
         anywhere = starts_everywhere(self.condyles) if everywhere else []
@@ -187,12 +187,12 @@ class PoseSearch:
         return solution
 
     def with_head_alone(self, solution: Solution, start: Array, look: InstantViews) -> Solution:
-        """Align the head alone if it then fits better: a wrong jaw pose biases the head through the condylar prior."""
+        """Align the head alone if that improves its fit: a wrong jaw pose biases it through the condylar prior."""
         alone = self._align(start, look, _FAR_GATES_PX, use=_upper_alone(look.views))
         return max((solution, alone), key=lambda trial: float(fitting_share(trial)[0]))
 
     def with_head_searched(self, solution: Solution, predicted: Array, look: InstantViews, alone: bool) -> Solution:
-        """Try shifted head poses with an unchanged jaw; `alone` ignores the contour of the jaw."""
+        """Try shifted head poses with an unchanged jaw pose; `alone` ignores the contour of the jaw."""
         shifts, use = head_shifts(predicted[0], self._axes), _upper_alone(look.views) if alone else None
         order = rank_by_colour(list(shifts @ predicted[0]), look.views, self._thin.scans, 0)[: _HOPEFUL // 2]
         brief = [self._align(shifts[k] @ predicted, look, _TRIAL_GATES_PX, True, use) for k in order]
@@ -203,7 +203,7 @@ class PoseSearch:
         return max((solution, *best), key=self.objective_px)
 
     def look(self, views: Sequence[View]) -> InstantViews:
-        """Return the views of an instant with a shared rendering."""
+        """Return the views of a frame with a shared rendering."""
         return InstantViews(views, self._thin.rendering(views))
 
     def polished(self, solution: Solution, views: Sequence[View], look: InstantViews, *, firm: bool) -> Solution:

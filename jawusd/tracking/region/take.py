@@ -30,11 +30,11 @@ from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings, mirror_findings
 from jawusd.tracking.sequence.time_checks import time_findings
 
-_LEAST_SHARE = 0.3  # matched fraction of the contour, relative to the best camera, below which a camera is reported
+_LEAST_SHARE = 0.3  # matched fraction of a camera's contour, relative to the best camera, below which it is reported
 # Standard deviation of the lower teeth above which a frame is uninformative [mm], and the fractions of such frames
-# above which a take is doubtful, and unusable.
+# above which a take is doubtful, and above which it is unusable.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
-_MOST = 0.6  # fraction of frames in one run of good ones from which trimming the ends of the take is suggested
+_MOST = 0.6  # minimum length of a run of good frames, as a fraction of the take, for suggesting to trim the take's ends
 
 #: Prior on the offsets of colour borders from the teeth's edges. Borders lie up to half a pixel inside, as teeth darken
 #: towards their edges; gum-line offsets are learned while tracking.
@@ -82,7 +82,7 @@ def scan_findings(
 
     Args:
         left: unit vector in scan coordinates, shape (3,).
-        looks: T_world_upper and T_world_lower (2, 4, 4) of a frame, and its views, one per camera.
+        looks: for each frame, T_world_upper and T_world_lower (2, 4, 4), and its views, one per camera.
     """
 
     def shown(views: Sequence[View]) -> Mask:
@@ -106,7 +106,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def footage_doubts(tracks: Tracks) -> list[Finding]:
-    """Return a warning if in too many frames the jaw is lost or uncertain by more than a millimetre.
+    """Return a warning if the jaw is lost, or uncertain by more than a millimetre, in too many frames.
 
     Kind: "footage_doubtful" [%].
     """
@@ -140,7 +140,7 @@ class TakeFacts:
         landmarks: mandible coordinates [mm], shape (5, 3).
         axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
         rest_frame: frame with closed teeth, as specified in the capture, or None.
-        registers: whether to register the lower scan by the closed bite of the take.
+        registers: whether to register the lower scan by the frames with closed teeth.
     """
 
     cameras: Sequence[Camera]

@@ -20,15 +20,16 @@ from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES
 from jawusd.tracking.region.search import InstantViews, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 
-_FIRST_ROUNDS = 3  # refinements of the start, whose error may be some tenths of a millimetre
-# Fractions of the usual matched contour below which wider gates are tried, the jaw is searched for, a lost arch is not
-# accepted again, and an arch is lost. The usual matched contour is the median over the last frames, but at least
-# `_LEAST_USUAL` times that of the first frame, so that slowly closing lips do not become usual.
+_FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some tenths of a millimetre
+# Fractions of the usual matched contour below which wider gates are tried, the jaw is searched for, a lost arch stays
+# lost, and an arch is lost. The usual matched contour is the median over the last frames, but at least `_LEAST_USUAL`
+# times that of the first frame, so that slowly closing lips do not redefine it.
 _DOUBTED, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = 0.8, 0.6, 0.5, 0.25, 0.7
-_USUAL_FRAMES = 15  # window of the usual matched fraction
+_USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
 _EAGER, _OFTEN = 6, 4
-_RESTING = 4  # frames in which wide gates are not tried after they have failed, since lips stay closed for a while
-_WIDE_MM = 40.0  # largest expected opening of a jaw that was not visible
+# number of frames in which wide gates are not tried again after they have failed, since lips stay closed for a while
+_RESTING = 4
+_WIDE_MM = 40.0  # maximum expected opening of a jaw that was not visible
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,8 @@ class RegionPose:
     objective_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
     solution: Solution | None = None  # the alignment; None for poses read from a file
     usual: Array = field(default_factory=lambda: np.ones(2))  # matched fraction relative to the usual one, shape (2,)
-    least: Array = field(default_factory=lambda: np.zeros(2))  # minimum of `usual` for an arch to be found, shape (2,)
+    # minimum of `usual` for an arch to count as found, shape (2,)
+    least: Array = field(default_factory=lambda: np.zeros(2))
 
 
 class RegionTracker:
@@ -82,11 +84,11 @@ class RegionTracker:
         return RegionPose(poses, np.ones(2, bool), _covariance(solution), objective_px, solution)
 
     def views(self, pictures: Sequence[Picture | None], poses: Array) -> list[View]:
-        """Return the views of an instant by the colours learned so far.
+        """Return the views of a frame, with the colours learned so far.
 
         Args:
             pictures: one image per camera.
-            poses: T_world_upper and T_world_lower there, shape (2, 4, 4).
+            poses: T_world_upper and T_world_lower in that frame, shape (2, 4, 4).
         """
         return self._colours.views(pictures, poses)
 
@@ -108,7 +110,7 @@ class RegionTracker:
 
 
 class _Instant:
-    """Images of one instant and their alignment."""
+    """Images of one frame and their alignment."""
 
     def __init__(
         self, search: PoseSearch, colours: LearnedColours, pictures: Sequence[Picture | None], before: Array
@@ -122,7 +124,7 @@ class _Instant:
         return self._search.polished(solution, self._counting, self.look, firm=firm)
 
     def learn(self, poses: Array, rates: tuple[float, float]) -> None:
-        """Update the colours beside the borders matched in the refined alignment."""
+        """Update the colour models from both sides of the borders matched in the refined alignment."""
         self._colours.learn(self._counting, self._pictures, poses, rates)
 
 
@@ -137,7 +139,7 @@ class _DirectionTracker:
         self._found, self._missed, self._absent, self._rest = np.ones(2, bool), 0, 0, 0
 
     def follow(self, cuts: Iterator[Cut]) -> Iterator[RegionPose]:
-        """Yield the poses of consecutive instants."""
+        """Yield the poses of consecutive frames."""
         for cut in cuts:
             starts = self._motion.starts()
             head, wide = starts[0][0], self._search.condyles.placed(0.0, _WIDE_MM, 0.0)
@@ -173,7 +175,7 @@ class _DirectionTracker:
         return solution, searched
 
     def _least(self) -> Array:
-        """Return the fraction of the usual matched contour below which an arch is not found, shape (2,)."""
+        """Return the fraction of the usual matched contour below which an arch counts as not found, shape (2,)."""
         return np.where(self._found, _LOST, _AGAIN)
 
     def _taken(self, instant: _Instant, rough: Solution, searched: bool, usual: Array, seen: bool) -> RegionPose:
@@ -196,8 +198,8 @@ class _DirectionTracker:
 def _is_due(count: int, found: bool) -> bool:
     """Return whether to search for an arch that fits badly for the `count`-th frame in a row.
 
-    One that disappears is searched for at doubling intervals, a lost one in each of the first `_EAGER` frames, then in
-    every `_OFTEN`-th one.
+    For an arch that was found in the previous frame, searches are due at doubling intervals; for a lost arch, in each
+    of the first `_EAGER` frames, then in every `_OFTEN`-th one.
     """
     return count > 0 and (count & (count - 1) == 0 if found else count <= _EAGER or count % _OFTEN == 0)
 

@@ -19,19 +19,19 @@ from jawusd.tracking.region.colours import BINS, KINDS, TABLES
 from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
 
-_AHEAD_PX = 2.0  # distance outside a crown's silhouette at which the label is tested for gum
+_AHEAD_PX = 2.0  # distance outside a crown's silhouette at which the rendered label is tested for gum
 
 _SHUTTER = 0.5  # assumed exposure as a fraction of the frame time, typical of film
 # Motion during the exposure at which the weight of a border is halved [px]: the variance of an edge grows with the
-# square of its blur. Applied in the final alignment only, since in earlier ones the matched fraction of the contour
-# decides whether teeth are lost.
+# square of its blur. Applied only in the final alignment: in earlier ones, the matched fraction of the contour
+# determines whether teeth are lost.
 _BLURRED_PX = 10.0
-_LEARNED_PX = (2, 7)  # range of distances from borders in which colours are learned
+_LEARNED_PX = (2, 7)  # minimum and maximum distance from the contour of pixels whose colours are learned
 # For estimating the gum-line offset: minimum weight of a border [-], largest distance [px], minimum number of samples.
 _SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
-_CLEAR_RATIO = 1.0  # mean log ratio on both sides from which a border has full weight [-]
-_SHARPEN_PX = 5.0  # search range up to which borders are refined by colour
-_CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # minimum contrast of refined borders [8-bit steps], largest refinement
+_CLEAR_RATIO = 1.0  # minimum mean log ratio on both sides for full weight of a border [-]
+_SHARPEN_PX = 5.0  # maximum search range for which borders are refined by colour
+_CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # minimum contrast of refined borders [8-bit steps]; maximum refinement
 _CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
 
 
@@ -52,7 +52,7 @@ def choose_tables(
     for s in range(len(samples)):
         sample = samples[s]
         kind = 1
-        if s < count:  # a silhouette in front of its own gum has the edge of a gum line
+        if s < count:  # a silhouette in front of its own gum looks like a gum line
             i = min(max(pixel_of(sample[U] + _AHEAD_PX * sample[NX]), 0), width - 1)
             j = min(max(pixel_of(sample[V] + _AHEAD_PX * sample[NY]), 0), height - 1)
             kind = 1 if labels[j, i] == GUM else 0
@@ -109,7 +109,7 @@ class RegionView:
     patches: Array  # centres of the patches of both arches, left and front [mm], shape (2, PATCHES, 2)
     axes: Array  # rotation from scan to anatomical axes, shape (3, 3)
     before: Array  # projections of both arches to this image in the previous frame, shape (2, 3, 4)
-    counts: Counts | None = None  # statistics to collect, in the final alignment of an instant
+    counts: Counts | None = None  # statistics to collect in the final alignment of a frame
 
     def likeness(self, arch: int) -> NDArray[np.float32]:
         """Return the mean log ratio of tooth to background of every pixel for an arch, shape (h, w)."""

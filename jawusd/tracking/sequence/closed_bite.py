@@ -1,10 +1,10 @@
-"""Frames with the teeth together: the registration error of the scans, and the constant error of a take.
+"""Frames with the teeth together, which reveal registration errors of the scans and constant errors of a take.
 
-The scans are exported in occlusion, so T_upper_lower is the identity in a closed bite, up to three errors: the scans'
-registration, outlines drawn with the same bias in every frame, and the noise of single frames. Each has a known spread,
-so linear least squares divides the measured deviation among them. Most registrations are accurate to some hundredths of
-a millimetre, but outliers are large: registration errors follow a Student distribution, which is fitted by reweighting
-(Lange, Little & Taylor 1989).
+The scans are exported in occlusion, so T_upper_lower is the identity with the teeth together, up to three errors: the
+scans' registration, outlines drawn with the same bias in every frame, and the noise of single frames. Each has a known
+spread, so linear least squares attributes the measured deviation to them. Most registrations are accurate to some
+hundredths of a millimetre, but outliers are large: registration errors follow a Student distribution, which is fitted
+by reweighting (Lange, Little & Taylor 1989).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import TakeEquations, pose_response
 
-# Teeth in contact are still: largest relative motion [mm/frame at the teeth], and largest distance from the most
-# closed frame [mm].
+# Criteria for frames with the teeth at rest in contact: maximum relative motion [mm/frame at the teeth], and maximum
+# distance from their pose in the named or most closed frame [mm].
 _STILL_MM, _SAME_BITE_MM = 0.12, 0.2
-_LONGEST_REST = 24  # frames used on either side; more add no information
+_LONGEST_REST = 24  # maximum number of frames used on either side; more add no information
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class RestFrames:
 
     Attributes:
         frames: frame numbers.
-        named: whether the capture specifies one of them.
+        named: whether the capture specifies one of these frames.
         point, lower: centre of the teeth, and of the lower crowns, in scan coordinates [mm], shape (3,).
         apply: whether to correct the position of the lower scan.
     """
@@ -55,10 +55,10 @@ class RestFrames:
 def rest_frames(
     records: Mapping[int, FrameRecord], named: int | None, up: Array, point: Array, probes: Array
 ) -> tuple[int, ...]:
-    """Return the frames in which the teeth rest together, around a named frame or the most closed one.
+    """Return the frames in which the teeth rest together, around a named frame or the frame with the most closed jaw.
 
     Args:
-        named: frame named in the capture; None searches.
+        named: frame named in the capture; if None, the most closed frame is searched for.
         up: unit vector from the lower to the upper teeth in scan axes, shape (3,).
         point, probes: centre of the teeth (3,), and points spread over the lower ones (N, 3), scan coordinates [mm].
     """
@@ -92,19 +92,20 @@ def _moved_mm(one: Array, other: Array, probes: Array) -> float:
     return float(np.linalg.norm(gap, axis=1).mean())
 
 
-# Standard deviation of the closed bite relative to the occlusion of the scans, due to registration and bite force [mm];
-# and lever arm that converts it to a rotation [mm].
+# Scale of the Student distribution of the registration error, which includes the effect of bite force [mm]; lever arm
+# that converts it to a rotation [mm].
 _BITE_MM = 0.03
 _ARCH_MM = 25.0
-_DEGREES_OF_FREEDOM = 4.0  # of that Student distribution: about one registration in a hundred is off by ten sigmas
+# degrees of freedom of the Student distribution: about one registration in a hundred is off by ten sigmas
+_DEGREES_OF_FREEDOM = 4.0
 #: Fraction of the outline error variance that is constant over a take, in addition to annotator habits [-]: if it were
 #: larger, noise in a few closed frames would shift the whole take.
 STEADY = 0.3
 _FEWEST_FRAMES = 2
-# Effective independent measurements added per closed frame, and their maximum in all [-]: neighbouring frames have
-# nearly the same outline error.
+# Number of effectively independent measurements per closed frame, and its maximum for all together: neighbouring frames
+# have nearly the same outline error.
 _NEW_PER_FRAME, _MOST_FRAMES = 0.25, 3.0
-_USUAL_FRAMES = 2000  # evenly spread frames from which the median error of a long take is computed
+_USUAL_FRAMES = 2000  # number of evenly spread frames from which the median covariance of a long take is computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +117,8 @@ class ClosedBite:
         point: centre of the teeth, scan coordinates [mm], shape (3,).
         registration: left twist that corrects the lower scan, shape (6,), and its covariance (6, 6).
         steady: constant errors of the poses of both arches as right twists, shape (2, 6).
-        spread, remaining: covariance of the constant errors of upper arch, lower arch, and lower relative to upper,
-            before and after the correction, shape (3, 6, 6).
+        spread, remaining: covariances before and after the correction of the constant errors of upper arch, lower arch,
+            and lower arch relative to upper, shape (3, 6, 6).
     """
 
     frames: tuple[int, ...]
@@ -196,7 +197,7 @@ def steady_part(outline: Array, habits: Array) -> Array:
 def closed_bite(
     frames: NDArray[np.int64], poses: Array, outline: Array, habits: Array, rest: RestFrames
 ) -> ClosedBite | None:
-    """Attribute the deviation of the closed bite to its causes; None if too few of the rest frames are tracked.
+    """Attribute the deviation from occlusion in the rest frames to its causes; None if too few of these are tracked.
 
     Args:
         frames: shape (F,).
@@ -238,12 +239,12 @@ def closed_bite(
     )
 
 
-# Registration error that causes a warning, if it is also significant [mm, deg, sigmas].
+# Registration error above which a warning is given [mm, deg], and its minimum significance [sigmas].
 _OFF_MM, _OFF_DEG, _OFF_SIGMAS = 0.2, 0.5, 3.0
 
 
 def registration_findings(found: Registration) -> list[Finding]:
-    """Return a warning if the registration of the scans contradicts the closed bite, a note if it was corrected."""
+    """Return a warning if the registration of the scans contradicts the rest frames, a note if it was corrected."""
     shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
     shifted = shift > max(_OFF_MM, _OFF_SIGMAS * math.hypot(*found["shift_sigma_mm"]))
     turned = turn > max(_OFF_DEG, _OFF_SIGMAS * math.hypot(*found["turn_sigma_deg"]))
@@ -254,7 +255,8 @@ def registration_findings(found: Registration) -> list[Finding]:
     off = f"the lower scan is {shift:.2f} mm and {turn:.1f} degrees off the bite of the take {where}"
     if found["applied"]:
         return [Finding("scan_registration", "note", f"{off}: corrected", value=shift, limit=_OFF_MM)]
-    severity: Severity = "warning" if found["named"] else "note"  # a mouth may not have closed in an unnamed frame
+    # without a named frame, the mouth may never have closed
+    severity: Severity = "warning" if found["named"] else "note"
     hint = 'Register the scans again, or set registration = "take" in [scans] if the teeth are together there.'
     return [Finding("scan_registration", severity, off, value=shift, limit=_OFF_MM, hint=hint)]
 
@@ -268,7 +270,7 @@ def registration_unknown(rest: RestFrames) -> Finding:
     return Finding("registration_unknown", "note", f"{where}: the bite of the scans was not checked", hint=hint)
 
 
-# Largest possible registration error; beyond it the mouth was not closed [mm, deg].
+# Maximum registration error [mm, deg]; beyond it, the mouth cannot have been closed.
 _MOST_MM, _MOST_DEG = 3.0, 8.0
 
 
@@ -295,9 +297,9 @@ def observe_bite(
     extrinsics: Extrinsics,
     variance_px3: Array,
 ) -> None:
-    """Add to a take the observation that the teeth are together: habits that separate them are unlikely.
+    """Add the observation that the teeth are together to a take, which makes habits that separate them unlikely.
 
-    `variance_px3` is outline variance times correlation length per arch [px^3], shape (2,).
+    `variance_px3` is the outline variance times correlation length per arch [px^3], shape (2,).
     """
     used = [f for f in rest.frames if f in records and (records[f].status != LOST).all()]
     if len(used) < _FEWEST_FRAMES:
@@ -319,7 +321,7 @@ def observe_bite(
 
 
 def _registration_spread(found: Array, others: Array) -> Array:
-    """Return the covariance of the registration given a deviation (6,) and other covariances (6, 6), shape (6, 6)."""
+    """Return the covariance of the registration, given the deviation (6,) and the covariance of other errors (6, 6)."""
     bite = np.diag(np.r_[np.full(3, (_BITE_MM / _ARCH_MM) ** 2), np.full(3, _BITE_MM**2)])
     spread = bite
     for _ in range(50):

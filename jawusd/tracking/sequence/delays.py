@@ -1,4 +1,4 @@
-"""Motion of the teeth within a frame, for cameras with a delay below a frame."""
+"""Motion of the teeth within a frame, for cameras with a delay of a fraction of a frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jawusd.tracking.contour.scan import ARCHES
 
 
 def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:
-    """Return the motion of both arches from the reference instant to each camera's own, shape (C, 2, 4, 4)."""
+    """Return the motion of both arches from the reference exposure to each camera's own, shape (C, 2, 4, 4)."""
     out = np.tile(np.eye(4), (len(delays), 2, 1, 1))
     for arch in ARCHES:
         motion = _motion_twists(records, frame, arch)
@@ -26,11 +26,11 @@ def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array)
 
 
 def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
-    """Return the twist per frame about the arch's centre and its change per frame, shapes (6,): a parabola in time.
+    """Return the twist per frame about the arch's centre, and its change per frame, shapes (6,), of a parabola in time.
 
-    The parabola passes through both neighbours, or through two on one side if the other is not tracked. More frames
-    would smooth too much, since a jaw starts and stops within a frame or two. Across a gap the motion is uniform. None
-    without tracked frames nearby.
+    The parabola passes through both neighbouring frames, or through two frames on one side if the other is not tracked.
+    More frames would smooth too much, since a jaw starts and stops within a frame or two. Across a gap, uniform motion
+    is assumed. None without tracked frames nearby.
     """
 
     def step(frames: int) -> Array:
@@ -62,7 +62,7 @@ def interpolation_errors(records: Mapping[int, FrameRecord], frame: int, arch: i
     steps = [twist_between(here, there, centre) for here, there in zip(poses[:-1], poses[1:], strict=True)]
     third = steps[2] - 2.0 * steps[1] + steps[0]
     offset = frame - first
-    nodes = np.array([0, 1, 2] if offset < 2 else [1, 2, 3])  # interpolation nodes of the parabola
+    nodes = np.array([0, 1, 2] if offset < 2 else [1, 2, 3])  # frame offsets of the nodes of the parabola
     share = np.prod(delays[:, None] + (offset - nodes), axis=1) / 6.0
     return np.asarray(share[:, None] * third, np.float64)
 
@@ -83,7 +83,7 @@ def _is_tracked(records: Mapping[int, FrameRecord], frame: int, arch: int) -> bo
     return frame in records and bool(records[frame].status[arch] != LOST)
 
 
-#: Frames searched on either side: a quarter of a second at 24 fps.
+#: Maximum number of frames from a lost frame to a tracked one on either side: a quarter of a second at 24 fps.
 BRIDGE_FRAMES = 6
 
 

@@ -19,7 +19,7 @@ class Extrinsics:
     """Corrections of camera poses.
 
     For camera c, the world is moved by exp(twists[c]) about the pivot; this motion multiplies T_cam_world from the
-    right. A motion common to all cameras is a motion of the world, so the twists sum to zero.
+    right. A motion common to all cameras would be a motion of the world, so the twists are constrained to sum to zero.
     """
 
     T_cam_world: Array  # the calibrated poses, shape (C, 4, 4)
@@ -57,7 +57,8 @@ class Extrinsics:
     def precision(self, turn_rad: float, move_mm: float) -> Array:
         """Return the prior precision of the twists of each camera, shape (C, 6, 6).
 
-        Cameras rotate about their centres and move with the given standard deviations per axis.
+        The priors are on rotations about the camera's centre and on its translations, with the configured standard
+        deviations per axis.
         """
         A = se3_adjoint(translation(-self.pivot) @ se3_inverse(self.T_cam_world))
         variance = np.r_[np.full(3, turn_rad**2), np.full(3, move_mm**2)]
@@ -96,7 +97,7 @@ def corrected_cameras(cameras: Sequence[Camera], meta: TracksMeta) -> list[Camer
 def _with_focal(camera: Camera, factor: float) -> Camera:
     """Return a camera with its focal length multiplied by a factor, keeping the distortion of each pixel.
 
-    The distortion acts on x' = f x instead of x: k1 becomes f^2 k1, and p1 becomes f p1, in OpenCV's formula.
+    Normalised coordinates x become x / f, so k1 becomes f^2 k1, and p1 becomes f p1, in OpenCV's formula.
     """
     K = camera.K.copy()
     K[:2, :2] *= factor

@@ -28,12 +28,14 @@ from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.pose_search import shift_to_masks
 from jawusd.tracking.sequence.history import History
 
-_FEWEST_MASKS = 2  # with one view, depth depends on the size of the outline, which a wrong mask changes
+# minimum number of masks of an arch: with one view, depth depends on the size of the outline, which a wrong mask
+# changes
+_FEWEST_MASKS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A solution and the number of uncovered mask pixels; arrays per arch and view, shape (2, C)."""
+    """A solution with its uncovered and total mask pixels, and the masks used, per arch and view, shape (2, C)."""
 
     solution: Solution
     uncovered: Array
@@ -42,7 +44,7 @@ class _Trial:
 
     @property
     def coverage(self) -> Array:
-        """E_SP over mask pixels, NaN without a mask."""
+        """The uncovered fraction of every mask, NaN without a mask."""
         return coverage_error(self.uncovered, self.mask_px)
 
     def objective(self, price: float) -> Array:
@@ -52,7 +54,7 @@ class _Trial:
 
 @dataclass(frozen=True, eq=False)
 class _Instant:
-    """Inputs shared by all attempts at one instant; see `FrameTracker.track`."""
+    """Inputs shared by all attempts on one frame; see `FrameTracker.track`."""
 
     starts: Sequence[Array]
     views: Sequence[View]
@@ -60,13 +62,13 @@ class _Instant:
 
 
 class FrameTracker:
-    """Tracks instants from predictions, with increasingly expensive attempts if an alignment looks wrong."""
+    """Tracks frames from predictions, with increasingly expensive attempts if an alignment looks wrong."""
 
     def __init__(self, solver: ContourSolver, config: TrackingConfig, history: History) -> None:
         self._solver = solver
         self._config = config
         self.history = history
-        self.searched = False  # whether the multi-start search ran on the last instant
+        self.searched = False  # whether the multi-start search ran on the last frame
 
     def track(
         self,
@@ -75,7 +77,7 @@ class FrameTracker:
         pose_history: Sequence[Array] | None,
         reach_px: float = 0.0,
     ) -> FrameRecord:
-        """Align one instant.
+        """Align one frame.
 
         Args:
             starts: predicted T_world_upper and T_world_lower, the most likely first, each shape (2, 4, 4).
@@ -97,17 +99,17 @@ class FrameTracker:
             if bad.any() and (attempt != self._search_many_starts or pose_history is not None):
                 trial = attempt(trial, bad, instant)
         kept = trial.use & ~self._spoiled(trial, 1)
-        if (kept != trial.use).any():  # a mask that biased the first attempt
+        if (kept != trial.use).any():  # excludes masks that biased the first attempt
             trial = self._try(trial.solution.poses, views, gates, kept)
         return self._record(first, trial)
 
     def align_once(self, start: Array, views: Sequence[View], reach_px: float) -> FrameRecord:
-        """Align an instant from one prediction, shape (2, 4, 4), without further attempts; see `track`."""
+        """Align a frame from one prediction, shape (2, 4, 4), without further attempts; see `track`."""
         trial = self._begin(start, views, self._config.gates_from(reach_px))
         return self._record(trial, trial)
 
     def _begin(self, start: Array, views: Sequence[View], gates: Sequence[float]) -> _Trial:
-        """Align once, and again without wrong masks."""
+        """Align once and, if some masks are wrong, again without them."""
         use = present_masks(views)
         trial = self._try(start, views, gates, use)
         kept = use & ~self._spoiled(trial, 2)
@@ -158,17 +160,17 @@ class FrameTracker:
         return ~(residual_px(trial.solution) < self._config.suspect_residual * self.history.usual_residual())
 
     def _badly_covered(self, trial: _Trial) -> Mask:
-        """Return which masks are less covered than in recent frames, shape (2, C)."""
+        """Return which masks are covered less than in recent frames, shape (2, C)."""
         return trial.use & (trial.coverage - self.history.usual_coverage() > self._config.suspect_coverage)
 
     def _spoiled(self, trial: _Trial, fewest: int) -> Mask:
-        """Return the masks that the scan does not fit while it fits at least `fewest` others, shape (2, C)."""
+        """Return the masks that their scan does not fit while it fits at least `fewest` others, shape (2, C)."""
         dead = trial.use & (score_px(trial.solution) < self._config.dead_score * self.history.usual_score())
-        uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # enough for the arch to count as lost
+        uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # as for a lost arch
         wrong = self._badly_covered(trial) | uncovered | dead
         for r in ARCHES:
             if (trial.use[r] & ~wrong[r]).sum() < fewest:
-                wrong[r] = False  # the pose is more likely to be wrong than so many masks
+                wrong[r] = False  # it is likelier that the pose is wrong than that so many masks are
         return wrong
 
     def _losses(self, trial: _Trial) -> tuple[Loss, Loss]:
@@ -203,7 +205,7 @@ class FrameTracker:
         return trial
 
     def _drop_conflicting_masks(self, trial: _Trial, suspect: Mask, instant: _Instant) -> _Trial:
-        """Exclude a mask if the others of its arch then agree far better."""
+        """Exclude a mask if the other masks of its arch then agree far better."""
         c = self._config
         for r in np.flatnonzero(suspect):
             for k in np.flatnonzero(trial.use[r]):
@@ -243,14 +245,14 @@ class FrameTracker:
         return trial
 
     def _onto_masks(self, pose: Array, r: int, views: Sequence[View], use: Mask) -> Array:
-        """Return the pose moved onto its masks if they are out of reach of the search."""
+        """Return the pose, moved onto its masks if they are out of reach of the search."""
         shift = shift_to_masks(self._solver.scans[r], pose, r, views, use)
         if np.linalg.norm(shift) <= self._config.search_rings[0][0]:
             return pose
         return translation(shift) @ pose
 
     def _better(self, trial: _Trial, other: _Trial, arches: Mask, instant: _Instant) -> _Trial:
-        """Return the better of two poses of each of the given arches."""
+        """Combine two attempts by choosing the better pose of each of the given arches."""
         price = self._config.uncovered_price
         take = arches & (other.objective(price).sum(1) > trial.objective(price).sum(1))
         if not take.any():
@@ -262,7 +264,7 @@ class FrameTracker:
 
 
 def _around(pose: Array, centre: Array, rings: Sequence[tuple[float, float]]) -> Iterator[Array]:
-    """Yield a pose, and for each (mm, rad) its translations along and rotations about each axis, in both directions."""
+    """Yield a pose, and for each ring (mm, rad) its translations along and rotations about each axis, both ways."""
     yield pose
     c = transform_point(pose, centre)
     for mm, rad in rings:

@@ -26,11 +26,12 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History
 
-#: Makes the views of a frame of the reference camera. Arguments: the frame, expected T_world_upper and T_world_lower,
+#: Returns the views of a frame of the reference camera. Arguments: the frame, expected T_world_upper and T_world_lower,
 #: shape (2, 4, 4), and the round, which is 0 for poses not yet aligned with masks.
 MakeViews = Callable[[int, Array, int], Sequence[View]]
 
-_FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round removes most of the remaining error
+# number of rounds: picks are a few tenths of a millimetre off, and each round removes most of the remaining error
+_FIRST_ROUNDS = 3
 
 
 class GuidedTracker:
@@ -49,8 +50,8 @@ class GuidedTracker:
 
         Args:
             upper, lower: teeth scans in one frame, in occlusion [mm].
-            see: makes the masks; masks made around a wrong pose tend to confirm it.
-            rounds: number of times that masks and poses are updated in turn on a frame.
+            see: makes the masks of a frame; masks made around a wrong pose tend to confirm it.
+            rounds: number of times that masks and poses of a frame are updated in turn.
 
         Raises:
             TrackingError: a scan cannot be tracked.
@@ -98,7 +99,7 @@ class GuidedTracker:
     def follow(
         self, frames: range, guide: Mapping[int, Array], past: Sequence[FrameSummary]
     ) -> Iterator[tuple[int, FrameRecord]]:
-        """Yield frames with their records; lost arches get the poses of the guide.
+        """Yield frames with their records, in which lost arches have the poses of the guide.
 
         Args:
             frames: frame numbers in either direction, starting next to a frame in `past`.
@@ -110,7 +111,7 @@ class GuidedTracker:
             history.add_summary(before)
         tracker = FrameTracker(self._solver, self._config, history)
         for frame in frames:
-            self._solver.forget_drawings()  # so that resumed runs give the same poses as uninterrupted ones
+            self._solver.forget_drawings()  # makes the poses of resumed runs equal to those of uninterrupted ones
             start = guide[frame]
             record = tracker.track([start], self._see(frame, start, 0), None)
             for turn in range(1, self._rounds):
@@ -132,5 +133,5 @@ class GuidedTracker:
 
 
 def _without_lost(record: FrameRecord, otherwise: Array) -> Array:
-    """Return the poses of a record, shape (2, 4, 4), with substitutes for lost arches."""
+    """Return the poses of a record, shape (2, 4, 4), with those of lost arches replaced."""
     return np.where((record.status == LOST)[:, None, None], otherwise, record.solution.poses)

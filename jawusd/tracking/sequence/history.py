@@ -13,12 +13,12 @@ from jawusd.geometry import orthonormalise, se3_inverse, transform_points
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.scan import ARCHES
 
-_KEPT_POSES = 16  # earlier poses kept, enough to cover the range of motion of a jaw
-_APART_MM = 2.0  # poses closer than this converge to the same local minimum
-# Failed multi-start searches allowed in any take, and number of frames for which one more is allowed: at up to five
-# seconds each, all of them together take no longer than tracking.
+_KEPT_POSES = 16  # maximum number of earlier poses kept: enough to cover the range of motion of a jaw
+_APART_MM = 2.0  # minimum distance between poses kept: closer ones converge to the same local minimum
+# Number of failed multi-start searches allowed in any take, and number of frames for each further one: at up to five
+# seconds per search, all together take no longer than tracking.
 _FRUITLESS, _FRAMES_PER_FRUITLESS = 8, 32
-_RECENT = 8  # frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
+_RECENT = 8  # number of frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
 
 
 class MotionPredictor:
@@ -27,7 +27,7 @@ class MotionPredictor:
     def __init__(self, poses: Array, points: Array) -> None:
         """Start at rest. Prediction errors are measured at `points` of both arches, shape (2, N, 3)."""
         self._points = points
-        self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # two arches
+        self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # both arches add an entry per frame
         self._last = np.array(poses)
         self._step: list[Array | None] = [None, None]
         self._lost_for = np.zeros(2, int)
@@ -45,7 +45,7 @@ class MotionPredictor:
         return orthonormalise(out)
 
     def starts(self) -> list[Array]:
-        """Return predictions for the next frame, the most likely first: constant velocity, at rest, and half way."""
+        """Return predictions for the next frame, most likely first: constant velocity, at rest, and midway between."""
         moving = self.predict()
         if self._step[0] is None and self._step[1] is None:
             return [moving]
@@ -59,7 +59,7 @@ class MotionPredictor:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
             found: arches with reliable poses, shape (2,).
             seen: arches with any mask, shape (2,).
-            guessed: whether poses of arches not found are better guesses than predictions.
+            guessed: whether the poses given for arches not found are better guesses than predictions.
         """
         expected = self.predict()
         for r in ARCHES:
@@ -67,7 +67,7 @@ class MotionPredictor:
                 if not self._lost_for[r]:
                     gap = transform_points(expected[r], self._points[r]) - transform_points(poses[r], self._points[r])
                     self._misses.append(float(np.linalg.norm(gap, axis=1).max()))
-                # After a loss the last pose is a guess, from which no velocity can be computed.
+                # After a loss, the last pose is only a guess, from which no velocity can be computed.
                 self._step[r] = None if self._lost_for[r] else poses[r] @ se3_inverse(self._last[r])
             else:
                 self._step[r] = None
@@ -86,7 +86,7 @@ class MotionPredictor:
         return max(self._misses, default=0.0)
 
     def remember(self, poses: Array, found: Mask) -> None:
-        """Keep poses of both arches, shape (2, 4, 4), as later starts if they differ from those kept."""
+        """Keep poses of both arches, shape (2, 4, 4), as starts for later frames if they differ from those kept."""
         if not found.all():
             return
         new = se3_inverse(poses[0]) @ poses[1]
@@ -109,7 +109,7 @@ class MotionPredictor:
 
 
 class SearchBudget:
-    """A budget of failed multi-start searches in a take.
+    """A budget for failed multi-start searches in a take.
 
     A search takes as long as tracking ten to fifty frames, and wrong masks would trigger failing searches on every
     frame that has them, forwards and backwards. Work is counted instead of time, so results do not depend on the
@@ -142,7 +142,7 @@ class SearchBudget:
 
 
 class _Partial(NamedTuple):
-    """Quality of frames without one of the cameras, used if there are no complete ones."""
+    """Quality of frames in which a camera is missing, used if there are no complete frames."""
 
     scores: deque[Array]
     residuals: deque[Array]
@@ -160,11 +160,11 @@ class _Usual(NamedTuple):
 class History:
     """The quality of recent good frames, as reference for the next one.
 
-    If a camera is missing in the whole take, frames without it are the reference.
+    If a camera is missing throughout the take, frames without it are the reference.
     """
 
     def __init__(self, length: int, score_length: int) -> None:
-        """Start empty; keep at most `length` frames, but scores of at most `score_length`."""
+        """Start empty; use at most `length` recent frames, and at most `score_length` for scores."""
         self._scores: deque[Array] = deque(maxlen=score_length)
         self._residuals: deque[Array] = deque(maxlen=length)
         self._coverages: deque[Array] = deque(maxlen=length)

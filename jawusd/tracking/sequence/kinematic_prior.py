@@ -24,12 +24,12 @@ from jawusd.geometry import (
 )
 from jawusd.tracking.contour.equations import NormalEquations, Solution
 
-_NORMAL_DIRECTIONS = 3  # six degrees of freedom minus the three of the model
+_NORMAL_DIRECTIONS = 3  # number of directions off the model: six degrees of freedom minus the three of the model
 
 
 @dataclass(frozen=True, eq=False)
 class KinematicPrior:
-    """A prior that penalises the distance of relative poses from a jaw model, but not motion along the model.
+    """A prior that penalises the distance of relative poses from a jaw model, but not motion within the model.
 
     The deviation of a pose from the model, the left twist xi with T_upper_lower = exp(xi) pose(d), costs
     xi^T P xi after minimisation over d: P = 3 / s^2 (M - M J (J^T M J)^-1 J^T M) with the landmark metric M
@@ -61,24 +61,24 @@ class KinematicPrior:
     def _precision(self, d: Array, pose: Array) -> Array:
         """Return P at a model pose, shape (6, 6)."""
         M = mandible_metric(transform_points(pose, self.jaw.landmarks))
-        # The derivative of the logarithm becomes that of the pose by the left Jacobian (Barfoot 2017, eq. 7.85).
+        # The left Jacobian converts the derivative of the logarithm to that of the pose (Barfoot 2017, eq. 7.85).
         J = se3_left_jacobian(self.jaw.twist(d)) @ self.jaw.jacobian(d)
         along = M @ J
         normal = M - along @ np.linalg.solve(J.T @ along, along.T)
         return _NORMAL_DIRECTIONS / self.spread_mm**2 * normal
 
 
-_FEWEST = 15  # poses needed to estimate the spread about the model
-_ROUNDS = 3  # linearisations: the model is nearly linear over the range of pose errors
+_FEWEST = 15  # minimum number of poses for estimating the spread about the model
+_ROUNDS = 3  # number of linearisations: the model is nearly linear within the range of pose errors
 
 
 def weigh_with_model(tracks: Tracks, jaw: JawRig) -> Tracks:
     """Return tracks with final relative poses that are most likely under their covariance and the model.
 
-    For tracks from colours, whose errors extend over whole teeth: the model improves molars and condyles and hardly
-    changes the incisal point. The result is the mean of two Gaussians, relinearised `_ROUNDS` times; the spread of the
-    `KinematicPrior` is the rms distance of raw poses from the model. Upper teeth, raw poses, covariances and sigmas
-    remain as measured. The meta data store the width of the prior as `prior_spread_mm`.
+    Intended for tracks from colours, whose errors extend over whole teeth: the model improves molars and condyles, and
+    hardly changes the incisal point. The result is the mean of two Gaussians, relinearised `_ROUNDS` times; the spread
+    of the `KinematicPrior` is the rms distance of raw poses from the model. Upper teeth, raw poses, covariances and
+    sigmas remain as measured. The meta data store the width of the prior as `prior_spread_mm`.
 
     Args:
         tracks: tracks from colours, fitted without a model.

@@ -32,13 +32,13 @@ from jawusd.tracking.sequence.kinematic_prior import KinematicPrior
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
 # Standard deviation of the worst landmark above which a frame is tracked again [mm]: about the error of a
-# three-parameter model, so that below it masks are more accurate.
+# three-parameter model; with a smaller one, masks alone are more accurate.
 _HARD_MM = 0.3
-_FEWEST_GOOD = 15  # good frames needed to use the model as a prior
+_FEWEST_GOOD = 15  # minimum number of good frames for using the model as a prior
 
 
 def hard_frames(tracks: Tracks) -> Mask:
-    """Return the frames to refine with the model: lost, recovered, missing a camera, or uncertain; shape (F,)."""
+    """Return which frames to refine with the model: lost, recovered, missing a camera, or uncertain; shape (F,)."""
     sigma = tracks.sigma_mm.max(1)
     return (tracks.status != TRACKED).any(1) | ~(sigma <= _HARD_MM)
 
@@ -58,8 +58,8 @@ def refine_tracks(
 ) -> Tracks:
     """Track the hard frames again with the fitted model as a prior on the relative pose.
 
-    Changes final poses, `prior_aided`, and the uncertainties of lost frames. Raw poses are unchanged, so that no model
-    is fitted to or scored on poses influenced by its prior.
+    Changes final poses, `prior_aided`, and the uncertainties of lost frames. Raw poses are unchanged, so no model is
+    fitted to, or evaluated on, poses influenced by its own prior.
 
     Args:
         tracks: result of the first pass.
@@ -194,7 +194,7 @@ def _corrected_views(views: Sequence[View], tracks: Tracks, k: int, poses: Array
 
 
 def _relative_covariance(poses: Array, covariance: Array) -> Array:
-    """Return the covariance of the left twist of T_upper_lower from the joint one of both arches, shape (6, 6)."""
+    """Return the covariance of T_upper_lower's left twist, from the joint covariance of both arches, shape (6, 6)."""
     A = se3_adjoint(se3_inverse(poses[0]))
     slope = np.hstack([-A, A])
     return slope @ covariance @ slope.T

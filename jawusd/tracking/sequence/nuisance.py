@@ -21,14 +21,14 @@ class Nuisances:
     """Nuisance parameters common to all frames of a take.
 
     Attributes:
-        delays: images of camera c were taken at the instant frame + delays[c], in frames; 0 for the first camera, shape
-            (C,).
+        delays: exposure times relative to the first camera [frames], shape (C,): the image of camera c for a frame was
+            taken at time frame + delays[c].
         habits: outward mask bias, per arch and camera, shape (2, C, 3): at free edges and at the gum line [px
             at working resolution], and along the gum surface [mm]; see `OutlineSums`.
         shift_px: the resulting mean shift of edges and gum line, shape (2, C, 2).
         sigma_delays, sigma_habits, sigma_shift_px: their standard deviations.
         twists, sigma_twists: corrections of the camera poses as in `Extrinsics`, shape (C, 6).
-        contour_px: rms contour shift by the twists that poses of the teeth cannot compensate.
+        contour_px: rms of the contour shift by the twists that poses of the teeth cannot compensate.
         covariance: covariance of all unknowns in the order of `TakeEquations`, zero where not estimated, shape (U, U).
     """
 
@@ -44,12 +44,12 @@ class Nuisances:
     covariance: Array
 
     def plus(self, more: Nuisances) -> Nuisances:
-        """Return the sum with delays and habits estimated on top of these."""
+        """Return the sum of these estimates and further ones of delays and habits."""
         shift = self.shift_px + more.shift_px
         return replace(more, delays=self.delays + more.delays, habits=self.habits + more.habits, shift_px=shift)
 
     def matters(self, config: TrackingConfig) -> bool:
-        """Return whether any estimate exceeds its limit; delays and camera poses must be significant as well.
+        """Return whether any estimate exceeds its limit; those of delays and camera poses must also be significant.
 
         Habits have a prior, so even an insignificant estimate is the most likely value.
         """
@@ -61,7 +61,7 @@ class Nuisances:
         return bool((np.abs(self.delays) > np.maximum(config.refine_delay_frames, 4 * self.sigma_delays)).any())
 
     def settled(self, config: TrackingConfig) -> bool:
-        """Return whether all estimates are too small to need another iteration."""
+        """Return whether all estimates are small enough to need no further iteration."""
         late = np.abs(self.delays).max() / config.refine_delay_frames
         wide = np.abs(self.shift_px).max() / config.refine_bias_px
         return max(late, wide, self.contour_px / config.refine_shift_px) < config.settled_share
@@ -72,7 +72,7 @@ class Nuisances:
         return bool(clear and self.contour_px > config.refine_shift_px)
 
 
-# Prior standard deviation of the delays left after cameras are synchronised to whole frames.
+# Prior standard deviation of the delays that remain after cameras are synchronised to whole frames.
 _PRIOR_DELAY_FRAMES = 0.5
 
 
@@ -97,11 +97,11 @@ class AnnotatorPrior:
     frames: float
 
 
-#: Prior of hand-drawn masks.
+#: Prior for hand-drawn masks.
 DRAWN = AnnotatorPrior(edge_px=0.5, gum_px=0.4, gum_mm=0.1, arch_px=0.15, arch_mm=0.05, camera_px=0.1, frames=1.5)
 
-#: Prior of hand-drawn masks for scans without gum. Without gum, outlines at the neck of a tooth are classified by their
-#: direction, with some errors that recur in every frame.
+#: Prior for hand-drawn masks and scans without gum. For these scans, outlines at the neck of a tooth are classified by
+#: their direction, and classification errors recur in every frame.
 DRAWN_BESIDE_CROWNS = replace(DRAWN, frames=0.75)
 
 
@@ -137,7 +137,7 @@ class _Layout:
         return np.r_[np.full(self.cameras, _PRIOR_DELAY_FRAMES), habits, np.full(4 * self.cameras, of.camera_px)]
 
     def redundancy(self, frames: int) -> Array:
-        """Return the factor by which a number of frames overstates the information per unknown, shape (size,)."""
+        """Return the factor by which a number of frames overstates the information on each unknown, shape (size,)."""
         out = np.ones(self.size)
         out[self.cameras : self.twists] = max(1.0, frames / self._annotator.frames)
         return out
@@ -172,7 +172,8 @@ class TakeEquations:
         self._layout = _Layout(len(extrinsics.twists), annotator)
         size, C = self._layout.size, self._layout.cameras
         self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
-        self._gum = np.zeros((2, C, 2))  # gum line: sums of weights, and of weighted shifts per mm along the surface
+        # gum line: sums of weights, and of weighted image shifts per mm along the surface
+        self._gum = np.zeros((2, C, 2))
         self._frames = 0
         self._seen_S, self._seen_r = np.zeros((size, size)), np.zeros(size)
         for frame in sorted(records if frames is None else frames):
@@ -217,7 +218,7 @@ class TakeEquations:
         covariance = np.zeros((size, size))
         covariance[np.ix_(keep, keep)] = np.linalg.inv(S[np.ix_(keep, keep)])
         x = covariance @ (self._r + redundancy.max() * self._seen_r)
-        # A motion common to all cameras is one of the world, which is unobservable.
+        # A motion common to all cameras would be a motion of the world, which is unobservable.
         centred = np.eye(size)
         centred[first_twist:, first_twist:] -= np.kron(np.full((C, C), 1 / C), np.eye(6))
         x = centred @ x
@@ -242,7 +243,7 @@ class TakeEquations:
 
 
 def pose_response(records: Mapping[int, FrameRecord], frame: int, arch: int, extrinsics: Extrinsics) -> Array:
-    """Return the twist of a pose about its centre per unit of the nuisances, shape (6, U)."""
+    """Return the twist of a pose about its centre per unit of each nuisance parameter, shape (6, U)."""
     velocity = velocity_twist(records, frame, arch)
     solution, layout = records[frame].solution, _Layout(len(extrinsics.twists))
     velocity = np.zeros(6) if velocity is None else velocity
@@ -283,7 +284,7 @@ def _reduced(
     for c in range(layout.cameras):
         H, g = outline.precision[arch, c], outline.gradient[arch, c]
         habits = layout.habits(arch, c)
-        D = np.zeros((6, size))  # motion of the arch in this camera per unknown
+        D = np.zeros((6, size))  # twist of the arch in this camera per unit of each unknown
         D[:, c] = velocity
         D[:, layout.twist(c)] = to_centre
         slope = outline.habit_slope[arch, c].T @ habits

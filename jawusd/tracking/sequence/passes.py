@@ -21,10 +21,10 @@ from jawusd.tracking.sequence.history import History, MotionPredictor, SearchBud
 
 Progress = Callable[[int, int], None]
 
-# Maximum number of frames around a restart that initialise the tracker: without a limit, a long take with many gaps
-# would take quadratic time.
+# Maximum number of frames around a restart that initialise the tracker: without it, long takes with many gaps would
+# need quadratic time.
 _NEARBY_FRAMES = 4000
-_AGREED_MM = 0.05  # distance of arch centres up to which tracking in both directions agrees
+_AGREED_MM = 0.05  # maximum distance between arch centres for tracking in both directions to agree
 
 
 class Passes:
@@ -81,7 +81,8 @@ class Passes:
     def track_back_to(self, start: int) -> None:
         """Track to the first frame from one with a good fit, and past it until both directions agree.
 
-        The first frame was aligned without knowing the usual fit of this take, and its neighbours were tracked from it.
+        The first frame was aligned before the usual fit of this take was known, and its neighbours were tracked from
+        it.
         """
         seen = nearest_well_seen(self.records, start)
         if seen is None or seen == start:
@@ -102,7 +103,7 @@ class Passes:
                 self.records[frame] = record
 
     def close_gaps(self) -> None:
-        """Track backwards into every gap from the frame after it, and keep results with fewer lost arches."""
+        """Track backwards into every gap from the frame after it, and keep results that lose fewer arches."""
         for first, stop in _gaps(self.records):
             if stop not in self.records:
                 continue
@@ -162,12 +163,12 @@ def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
     return [(a, b) for a, b in runs]
 
 
-# Minimum score and largest residual of a frame with a good fit, relative to the medians of the take. They only
-# determine where tracking back to the first frame begins.
+# Minimum score and maximum residual of a frame with a good fit, relative to the medians of the take. They only
+# determine the frame from which tracking returns to the first frame.
 _LEAST_SCORE, _MOST_RESIDUAL = 0.8, 1.2
-# Matched fraction of the visible contour, and residual, both relative to the medians of the take: an arch beyond both
-# limits was matched with lip edges instead of teeth. Last, the number of frames needed for the medians. False-alarm
-# rate: at most 1.4 %.
+# Minimum matched fraction of the visible contour, and maximum residual, both relative to the medians of the take: an
+# arch that violates both was matched with lip edges instead of teeth. Last, minimum number of frames for the medians.
+# False-alarm rate: at most 1.4 %.
 _POOR_SHARE, _POOR_RESIDUAL, _TELLING_FRAMES = 0.5, 1.6, 6
 
 

@@ -115,14 +115,15 @@ def _columns(records: Mapping[int, FrameRecord], frames: NDArray[np.int64]) -> l
     rows = (_figures(records[frame]) for frame in frames.tolist())
     first = next(rows)
     columns = [np.empty((len(frames), *value.shape)) for value in first]
-    for k, row in enumerate(chain([first], rows)):  # one at a time: all records of a long take need much memory
+    # records are read one at a time, since all of a long take would need much memory
+    for k, row in enumerate(chain([first], rows)):
         for column, value in zip(columns, row, strict=True):
             column[k] = value
     return columns
 
 
 def _figures(record: FrameRecord) -> tuple[Array | Mask | NDArray[np.int8], ...]:
-    """Return the values of a frame that tracks store; the third has reason, value and limit of each loss."""
+    """Return the values of a frame that are stored in tracks; the third has reason, value and limit of each loss."""
     solution, losses = record.solution, np.array(record.losses, np.float64)
     quality = (residual_px(solution), matched_px(solution))
     return (solution.poses, record.status, losses, solution.centres, record.coverage, record.used, *quality)
@@ -144,7 +145,7 @@ def _measured(
     outline, habits = _covariances(records, correlation, nuisances, extrinsics)
     bite = closed_bite(frames, raw, outline, habits, rest)
     covariance, steady = outline + habits, steady_part(outline, habits)
-    del outline, habits  # as large as the tracks themselves
+    del outline, habits  # frees arrays as large as the tracks themselves
     relative = _relative_covariance(raw, covariance)
     if bite is None:
         return raw, covariance, relative, None
@@ -156,7 +157,7 @@ def _measured(
 
 
 def _bite_report(bite: ClosedBite | None, rest: RestFrames, findings: list[dict[str, str | float | int]]) -> TracksMeta:
-    """Return the meta data about the closed bite; its findings are appended to those given."""
+    """Return the meta data about the frames with closed teeth; their findings are appended to those given."""
     if bite is None:
         return {"findings": [*findings, registration_unknown(rest).as_json()]}
     registration = bite.report(rest)

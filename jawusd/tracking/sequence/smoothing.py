@@ -23,12 +23,12 @@ from jawusd.geometry import (
 )
 from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance
 
-# Frames on either side over which process noise is estimated: a third of a second at 24 fps.
+# Number of frames on either side over which process noise is estimated: a third of a second at 24 fps in all.
 _WINDOW = 4
-# Minimum acceleration variance, relative to that of independent noise: outline errors that neighbouring frames share
-# cancel in second differences.
+# Minimum variance of second differences, relative to that expected from independent noise [-]: outline errors common to
+# neighbouring frames cancel in second differences.
 _FLOOR = 0.5
-_SHORTEST = 5  # frames needed to estimate process noise
+_SHORTEST = 5  # minimum number of frames for estimating process noise
 
 
 def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, centre: Array) -> Array:
@@ -36,7 +36,7 @@ def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, cen
 
     Minimises sum x_k^T C_k^-1 x_k + sum a_k^T Q_k^-1 a_k over left twists x_k about a fixed point, with the second
     differences a_k of the poses: the smoother of a random walk in velocity (Rauch, Tung & Striebel 1965), with Q_k
-    estimated from nearby raw second differences less their noise, so that sudden stops stay sudden.
+    estimated from nearby raw second differences less their noise, so that sudden stops are preserved.
 
     Lost frames stay NaN, and runs of fewer than five frames stay unchanged.
 
@@ -66,7 +66,7 @@ def _runs(frames: NDArray[np.int64], known: Mask) -> list[NDArray[np.int64]]:
 
 
 def _corrections(poses: Array, covariance: Array) -> Array:
-    """Return the twists from one run of poses to the smooth ones, shape (N, 6)."""
+    """Return the twists from a run of poses to the smooth poses, shape (N, 6)."""
     count = len(poses)
     steps = se3_log(poses[1:] @ se3_inverse(poses[:-1]))
     bend = np.diff(steps, axis=0)  # second differences at frames 1 .. N-2
@@ -74,7 +74,8 @@ def _corrections(poses: Array, covariance: Array) -> Array:
     noise = variance[:-2] + 4 * variance[1:-1] + variance[2:]
     process_noise = uniform_filter1d(bend**2 - noise, 2 * _WINDOW + 1, axis=0, mode="nearest")
     weight = 1.0 / np.maximum(process_noise, _FLOOR * noise)
-    # Band storage: diagonal d of the upper triangle in row 17 - d; twists of three neighbours reach 17 entries.
+    # Band storage has diagonal d of the upper triangle in row 17 - d; each twist is coupled with the next two, up to 17
+    # entries away.
     bands = np.zeros((18, 6 * count))
     right = np.zeros(6 * count)
     information = np.linalg.inv(covariance)

@@ -38,10 +38,10 @@ from jawusd.tracking.sequence.take_checks import (
 )
 from jawusd.tracking.sequence.time_checks import frame_shifts, time_findings
 
-_SETTLED_REST = 6  # closed-bite frames among those on which nuisance parameters are iterated
-# If these errors are found, camera poses are not corrected, since corrected poses would hide them.
+_SETTLED_REST = 6  # number of frames with the teeth together among those on which nuisance parameters are iterated
+# If errors of these kinds are found, camera poses are not corrected, since the corrections would hide them.
 _SHOWN_AS_MOTION = ("focal_length", "scan_size", "lens_distortion", "scans_mirrored")
-_CHECKED_FRAMES = 8  # tested for wrong lenses and scan sizes, which takes half a second
+_CHECKED_FRAMES = 8  # number of frames tested for wrong lenses and scan sizes, which takes half a second
 
 
 def track_capture(
@@ -64,7 +64,7 @@ def track_capture(
         offsets: reference frame minus own frame number, per camera name.
         upper, lower: teeth scans in one frame, in occlusion [mm].
         landmarks: points whose uncertainty is reported, mandible (= scan) coordinates [mm], shape (5, 3).
-        threads: worker threads; the result does not depend on it.
+        threads: number of worker threads; the result does not depend on it.
         progress: called once per frame with the number of frames done, and their total.
 
     Raises:
@@ -126,7 +126,7 @@ class _Take(Passes):
     """Tracks a take, estimates its nuisance parameters, and aligns its frames again."""
 
     def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
-        """Estimate delays, habits and camera poses; if they matter, align all frames again with them corrected.
+        """Estimate delays, habits and camera poses; if they are significant, correct them and align all frames again.
 
         Camera poses are corrected only if `may_move`, since wrong lenses or scan sizes have effects similar to those of
         moved cameras.
@@ -152,7 +152,7 @@ class _Take(Passes):
             self._realign(found, extrinsics)
             residual = self._equations(extrinsics, rest).solve(c, cameras_moved)
             found, rounds = found.plus(residual), rounds + 1
-            # The correction of a late camera depends on the motion, which the first round improves.
+            # The correction of a late camera depends on the estimated motion, which the first round improves.
             late = residual.late(c) or (rounds == 1 and found.late(c))
             pending = late or (rounds < c.refine_rounds and residual.matters(c))
         return found, extrinsics
@@ -242,7 +242,8 @@ class _Take(Passes):
             status = np.where(found & unreliable, RECOVERED, record.status).astype(np.int8)
             self.records[frame] = replace(record, status=status)
             tracker.history.add(record)
-            before.pop(frame - BRIDGE_FRAMES, None)  # no longer needed: saves memory in long takes
+            # frees records that are no longer needed, which saves memory in long takes
+            before.pop(frame - BRIDGE_FRAMES, None)
 
 
 def _corrected_views(

@@ -25,10 +25,10 @@ from jawusd.tracking.sequence.history import SearchBudget
 
 @dataclass(frozen=True)
 class LensLimits:
-    """Limits of the magnification of cameras, beyond which a warning is given.
+    """Limits on the magnification of cameras, beyond which a warning is given.
 
     Attributes:
-        scale, common: of one camera relative to the others, and of all cameras [-].
+        scale, common: magnification error of one camera relative to the others, and of all cameras [-].
         bend: change of magnification over 25 mm at the teeth [-].
         bias_px: outline bias of a camera relative to the others [px].
         clear: minimum significance of `scale` and `common` [standard deviations].
@@ -43,21 +43,22 @@ class LensLimits:
     knock: float
 
 
-#: For drawn masks. Sigmas of magnifications allow for cameras that moved along their axis.
+#: Limits for drawn masks. Sigmas of magnifications include possible camera motion along the optical axis.
 OF_MASKS = LensLimits(0.02, 0.015, 0.002, 1.2, 3.0, 8.0)
-#: For tracking by colour, whose sigmas are larger, and which cannot detect lens distortion.
+#: Limits for tracking by colour, whose sigmas are larger, and which cannot detect lens distortion.
 OF_COLOURS = LensLimits(0.03, 0.015, np.inf, np.inf, 1.6, np.inf)
-# Magnification change of an uncalibrated lens with k1 = -0.4 at a distance of 130 mm [-]: larger changes are errors of
-# the masks of side teeth.
+# Maximum magnification change by distortion [-], that of an uncalibrated lens with k1 = -0.4 at a distance of 130 mm:
+# larger changes are due to wrong masks of side teeth.
 _MOST_BEND = 0.015
-# Motion of a camera since its calibration that causes a warning after its correction.
+# Rotation and motion of a camera since its calibration above which a warning is given, although they are corrected.
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
 _KNOCKED_MORE = 1.5  # minimum ratio of the motion of a knocked camera to that of any other
-_TELLING_CAMERAS = 3  # cameras needed to identify the wrong one: if two differ, either may be
-# Matched fraction of the visible contour, and residual, each relative to the other scan: a scan beyond both limits
-# belongs to another subject. Last, the number of frames needed for the decision. False-alarm rate: at most 14 %.
+_TELLING_CAMERAS = 3  # minimum number of cameras for identifying a wrong one: if two differ, either may be wrong
+# Minimum matched fraction of the visible contour, and maximum residual, both relative to the other scan: a scan that
+# violates both belongs to another subject. Last, minimum number of frames for the decision. False-alarm rate: at most
+# 14 %.
 _FITS_LESS, _FITS_ROUGHER, _TELLING_FRAMES = 0.35, 1.5, 3
-_CLEARLY = 4.0  # standard deviations
+_CLEARLY = 4.0  # minimum significance for a warning [standard deviations]
 
 
 def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits = OF_MASKS) -> list[Finding]:
@@ -69,7 +70,7 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
     out = []
     knocked = _knocked(found, limits)
     common = found.common
-    sigma = float(np.sqrt(np.mean(found.sigma_scale**2) / len(found.scale)))  # camera motions are independent
+    sigma = float(np.sqrt(np.mean(found.sigma_scale**2) / len(found.scale)))  # since camera motions are independent
     if abs(common) > max(limits.common, limits.clear * sigma) and (np.sign(found.scale) == np.sign(common)).all():
         out.append(
             Finding(
@@ -115,7 +116,7 @@ def _knocked(found: Magnification, limits: LensLimits) -> int | None:
 
 
 def _moved(name: str, turn_rad: float, move_mm: float, clear: float) -> Finding:
-    """Return a warning about a camera that moved too far for a correction."""
+    """Return a warning about a camera that moved too far to be corrected."""
     turn_deg = float(np.rad2deg(turn_rad))
     return _camera_moved(
         name,
@@ -256,7 +257,7 @@ def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) 
     ]
 
 
-_HALF = 0.5  # fraction of a camera's masks that must be used; below it, the camera mostly contradicts the others
+_HALF = 0.5  # minimum fraction of a camera's masks that are used; below it, the camera mostly contradicts the others
 
 
 def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -> list[Finding]:
@@ -265,7 +266,7 @@ def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -
     Kinds: "camera_not_used", with the number of frames that have masks; "camera_rarely_used", with the used fraction.
     """
     frames = sorted(records)
-    present = np.array([np.isfinite(records[frame].coverage) for frame in frames])  # (F, 2, C)
+    present = np.array([np.isfinite(records[frame].coverage) for frame in frames])  # shape (F, 2, C)
     used = np.array([records[frame].used for frame in frames])
     out = []
     for c, name in enumerate(names):
@@ -298,8 +299,9 @@ def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -
     return out
 
 
-_FRAMES = 4  # aligned with the scans and with their mirror images, which takes a second or two
-# Ratio of the contour matched by the mirror images to that matched by the scans: at most 0.98 for correct scans.
+_FRAMES = 4  # number of frames aligned with the scans and with their mirror images, which takes a second or two
+# Minimum ratio of the contour matched by the mirror images to that matched by the scans for a warning [-]; correct
+# scans reach at most 0.98.
 _LEAST_RATIO = 1.15
 
 
@@ -311,7 +313,7 @@ def mirror_findings(
     Args:
         scans: upper and lower.
         left: unit vector to the left in scan coordinates, shape (3,).
-        instants: some frames of the take, aligned.
+        instants: some aligned frames of the take.
     """
     ratio = mirror_ratio(scans, left, instants, config)
     if not ratio > _LEAST_RATIO:
@@ -329,7 +331,7 @@ def mirror_findings(
 
 
 def mirror_ratio(scans: Sequence[Scan], left: Array, instants: Iterable[Instant], config: TrackingConfig) -> float:
-    """Return the ratio of contour matched by the mirrored scans to that by the given ones; NaN without instants.
+    """Return the ratio of contour matched by the mirrored scans to that by the given ones; NaN without frames.
 
     Arguments as for `mirror_findings`.
     """

@@ -1,9 +1,9 @@
 """Synchronisation errors found in a tracked take: late cameras, and dropped or repeated frames.
 
-Delays below a frame are estimated by linear equations (`TakeEquations`). A whole frame is too much for these where the
-jaw moves fast, because masks of the wrong instant are rejected or bias the jaw pose. With masks, neighbouring frames of
-each camera are therefore compared with the pose estimated from the other cameras. Without masks, a step of the delay is
-fitted.
+Delays below a frame are estimated with linear equations (`TakeEquations`). Where the jaw moves fast, they fail for
+delays of a whole frame, because masks of the wrong frame are rejected or bias the jaw pose. With masks, neighbouring
+frames of each camera are therefore compared with the pose estimated from the other cameras. Without masks, a step of
+the delay is fitted.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
 from jawusd.tracking.sequence.results import outline_variance
 
 SHIFTS = (-1, 0, 1)  # frames
-_CHECKED_FRAMES = 18  # checked frames per take, which take a tenth of a second each
-_FEWEST = 3  # conclusive frames needed on either side of a step, since two masks in a row may be wrong
-# Minimum margin by which a shift must fit better than others, and value to which margins are clipped, as fractions of
-# the visible contour.
+_CHECKED_FRAMES = 18  # number of frames checked per take, which take a tenth of a second each
+_FEWEST = 3  # minimum number of conclusive frames on either side of a step, since two masks in a row may be wrong
+# Minimum margin by which a shift fits better than all others, and maximum to which margins are clipped, as fractions of
+# the visible contour [-].
 _LEAST_LEAD, _MOST_LEAD = 0.1, 0.5
-# Minimum fit of the masks of the correct instant [-]: below it, something other than the instant is wrong. False-alarm
+# Minimum fit of a camera's masks at the best shift [-]: below it, something other than the time is wrong. False-alarm
 # rate: at most 4 %.
 _LEAST_FIT = -0.1
-# Minimum margin over the best fit of the other cameras, required instead if these fit even worse, as when the jaw was
-# lost after a dropped frame [-].
+# Minimum margin over the best fit of the other cameras [-], which suffices if these fit badly, as when the jaw was lost
+# after a dropped frame.
 _BETTER_FIT = 0.15
 
 
 class Shift(NamedTuple):
-    """A camera whose masks are of the wrong instant.
+    """A camera whose masks are shifted in time.
 
     Attributes:
-        camera: its index.
-        frames: by how many frames it is late; negative if early.
+        camera: index of the camera.
+        frames: number of frames by which the camera is late; negative if it is early.
         frame: first frame with the shift; None for the whole take.
     """
 
@@ -69,7 +69,7 @@ class FrameShifts:
     fit: Array
 
     def clearest(self) -> Shift | None:
-        """Return the most significant shift; None if the masks of all cameras are of the correct instant.
+        """Return the most significant shift; None if the masks of all cameras are synchronous.
 
         The shift of one camera biases the poses that the other cameras are compared with, so they seem to be shifted as
         well.
@@ -78,11 +78,11 @@ class FrameShifts:
         return max(found, key=lambda entry: entry[0])[1] if found else None
 
     def is_timely(self, camera: int) -> bool:
-        """Return whether a camera's masks are clearly of the correct instant."""
+        """Return whether a camera's masks are clearly synchronous."""
         return _agree(self._conclusive(camera)[1][:, SHIFTS.index(0)])
 
     def _conclusive(self, c: int) -> tuple[NDArray[np.int_], Array]:
-        """Return the conclusive rows of a camera, and the lead of each shift there, shape (n, 3)."""
+        """Return the indices of frames conclusive for a camera, and the lead of each shift in them, shape (n, 3)."""
         leads = _leads(self.fit[:, c])
         rows = np.flatnonzero(np.isfinite(leads).all(1))
         return rows, np.clip(leads[rows], -_MOST_LEAD, _MOST_LEAD)
@@ -111,7 +111,7 @@ class FrameShifts:
 
 
 def _leads(fit: Array) -> Array:
-    """Return the lead of each shift (F, 3) over the best other one, same shape."""
+    """Return the lead of each shift over the best other shift, shape (F, 3)."""
     return np.stack([fit[:, k] - np.delete(fit, k, axis=1).max(1) for k in range(fit.shape[1])], axis=1)
 
 
@@ -123,10 +123,10 @@ def _agree(leads: Array, above: Array | None = None) -> bool:
 
 
 def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: ContourSolver) -> FrameShifts:
-    """Compare the masks of some frames with fast jaw motion with those of their neighbours.
+    """Compare the masks of some frames with fast jaw motion with those of neighbouring frames.
 
-    If all masks are of the correct instant at both ends of the take, the frames between are skipped: a step there would
-    have to be followed by its opposite.
+    If all masks are synchronous at both ends of the take, the frames between are skipped: a step there would have to be
+    followed by its opposite.
 
     Args:
         records: records of all frames of the take.
@@ -174,7 +174,7 @@ def _judged(poses: Array, view: View, masks: Sequence[NDArray[np.uint8]], shown:
 
 
 def _in_window(view: View, other: View) -> NDArray[np.uint8]:
-    """Return the masks of another instant of the same camera in the window of a view, shape (2, h, w)."""
+    """Return the masks of another frame of the same camera, cropped to the window of a view, shape (2, h, w)."""
     # Windows differ by whole pixels: cropping x columns subtracts x times row 2 of the matrix from row 0.
     axis = view.matrix[2]
     moved = np.rint((other.matrix[:2] - view.matrix[:2]) @ axis / (axis @ axis)).astype(int)
@@ -189,7 +189,7 @@ def _in_window(view: View, other: View) -> NDArray[np.uint8]:
 
 
 def _fast_frames(records: Mapping[int, FrameRecord]) -> list[int]:
-    """Return frames spread over the take: of every part, the one with the fastest motion of the lower arch."""
+    """Return frames spread over the take: from every part, the frame with the fastest motion of the lower arch."""
     centres = {frame: records[frame].solution.centres[1] for frame in sorted(records)}
     inner = [frame for frame in centres if frame - 1 in centres and frame + 1 in centres]
     if not inner:
@@ -200,7 +200,7 @@ def _fast_frames(records: Mapping[int, FrameRecord]) -> list[int]:
 
 
 _PRIOR_FRAMES = 1.0  # prior standard deviation of a step of the delay
-_LEAST_FRAMES = 2  # frames required on either side of a step
+_LEAST_FRAMES = 2  # minimum number of frames on either side of a step
 
 
 @dataclass(frozen=True)
@@ -228,8 +228,8 @@ def delay_steps(
         return []
     cameras = len(extrinsics.twists)
     S, right = TakeEquations(records, variance_px3, extrinsics, []).normal_equations()
-    # Terms of the delay of each frame, then cumulated in place from each frame to the last: tens of megabytes for long
-    # takes.
+    # Delay terms of each frame, then their sums from each frame to the last, computed in place: tens of megabytes for
+    # long takes.
     after_S = np.empty((len(frames), len(right), cameras))
     after_r = np.empty((len(frames), cameras))
     for k, frame in enumerate(frames):
@@ -256,9 +256,10 @@ def delay_steps(
     return out
 
 
-_CLEARLY = 4.0  # standard deviations
-_LATE_FRAMES = 0.7  # free-running cameras differ by up to half a frame
-# Step of a delay within a take without masks that causes a warning [frames]. Steps are missed where the jaw is fast.
+_CLEARLY = 4.0  # minimum significance of a delay or step [standard deviations]
+_LATE_FRAMES = 0.7  # minimum delay for a warning; free-running cameras differ by up to half a frame
+# Minimum step of a camera's delay for a warning, in a take without masks [frames]. Steps are missed where the jaw is
+# fast.
 _STEP_FRAMES = 0.5
 
 
@@ -319,8 +320,8 @@ def _step_of_delay(
 ) -> list[Finding]:
     """Return a warning if the delay of a camera changes within the take."""
     steps = delay_steps(records, outline_variance(records, config), extrinsics, whole_frames(records))
-    # Poses partly follow the camera whose delay steps, so the others seem to step the opposite way; the most
-    # significant step is its own.
+    # Poses partly follow the camera whose delay steps, so the other cameras seem to step the opposite way; the true
+    # step is the most significant one.
     clearest = max(range(len(steps)), key=lambda c: abs(steps[c].step) / steps[c].sigma, default=None)
     if clearest is None:
         return []
