@@ -56,7 +56,7 @@ def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ..
     for name, start in starts.items():
         offset = start - reference
         if by_code and abs(offset) > day // 2:
-            offset -= day if offset > 0 else -day  # the take was recorded over midnight
+            offset -= day if offset > 0 else -day  # the take was recorded across midnight
         if offset >= clips[capture.reference].timeline.count or -offset >= clips[name].timeline.count:
             raise SyncError(
                 f"starts {abs(offset)} frames {'after' if offset > 0 else 'before'} camera {capture.reference} by its "

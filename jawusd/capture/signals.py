@@ -2,8 +2,8 @@
 
 The mean brightness of an image falls and rises with the room light. The times of these steps, matched between two
 cameras, give their offset in whole frames. A step during an exposure results in an image of intermediate brightness,
-from which the fraction of a frame follows: always if the shutter never closes, otherwise only if the step falls into an
-exposure.
+from which the fraction of a frame follows. The step falls into an exposure always if the shutter never closes,
+otherwise only sometimes.
 
 Sounds are matched by generalised cross-correlation (Knapp & Carter 1976) with partial whitening: full whitening (PHAT)
 weights noisy bands as much as the voice, and without whitening hum dominates. The resolution is 1/16000 s, but sound

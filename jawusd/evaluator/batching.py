@@ -47,7 +47,7 @@ def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
 
 def usable_rows(rows: Array) -> Array:
     """Return the rows (n, ...), all NaN where a value is not finite or is above 1e9."""
-    usable = np.asarray((np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim))))  # False for NaN
+    usable = np.asarray((np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim))))  # comparison is false for NaN
     if usable.all():
         return rows
     return np.where(usable.reshape(-1, *(1,) * (rows.ndim - 1)), rows, np.nan)

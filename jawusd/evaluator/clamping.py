@@ -38,7 +38,7 @@ class Inside(NamedTuple):
         times: Sample times, shape (n,): the original ones, and more where straight lines between the original
             samples would leave the bound.
         d: Jaw parameters at these times [mm], linear in between, shape (n, 3).
-        given: Which samples are original, shape (n,).
+        given: Mask of the original samples, shape (n,).
     """
 
     times: Array
@@ -164,7 +164,7 @@ def _without_gaps(bound: SliceHull, spine: Spine, motion: Inside) -> Inside:
 
 
 def _leaves(bound: SliceHull, start: Array, end: Array) -> Mask:
-    """Return which straight lines (n, 3) between points inside leave the bound."""
+    """Return which straight lines, from points inside (n, 3) to others (n, 3), leave the bound."""
     length = np.linalg.norm(end - start, axis=1)
     margin = np.minimum(-distances(bound, start), -distances(bound, end))
     near = np.flatnonzero(margin < _STEEPEST * length)
@@ -187,7 +187,7 @@ def _leaves(bound: SliceHull, start: Array, end: Array) -> Mask:
 
 
 def _positions(marked: Mask, first: Indices, count: Indices) -> Indices:
-    """Return the position of a marked entry within each group of consecutive entries."""
+    """Return, for each group of consecutive entries, the position of its last marked entry within it."""
     place = np.where(marked, np.arange(len(marked)), -1)
     return np.maximum.reduceat(place, first) - first if len(count) else first
 

@@ -90,7 +90,7 @@ class ContactField:
             "first_mm": self.first_mm,
             "step_mm": self.step_mm,
             "shape": np.array(self.values.shape, dtype=np.float64),
-            "values": np.round(self.values.ravel() / UNIT_MM) + 0.0,  # no -0.0
+            "values": np.round(self.values.ravel() / UNIT_MM) + 0.0,  # + 0.0 turns -0.0 into 0.0
             "closed_mm": np.array(self.closed_mm),
             "error_mm": np.array(self.error_mm),
             "limit_mm": np.array(self.limit_mm),

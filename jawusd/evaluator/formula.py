@@ -49,10 +49,10 @@ class GaugeNumbers(NamedTuple):
         path_x: Coefficients of gx: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm].
         path_z: Coefficients of gz, likewise.
         path_scale_mm: Length that scales the argument of the polynomials to order one.
-        low_mm: Smallest d1 of the polynomials; beyond the limits they continue as straight lines.
+        low_mm: Smallest d1 of the polynomials, which continue as straight lines outside their limits.
         high_mm: Largest d1 of the polynomials.
-        arch: Coefficients of rho, 7.
-        drop: Coefficients of drop, 4.
+        arch: The 7 coefficients of rho.
+        drop: The 4 coefficients of drop.
         softness_mm: Radius of the softened absolute value and ramp.
         fade_mm: Opening over which the glide surface fades out.
         glide: Table of the glide surface, as `gauge.Elementary.glide` expects it; None without one.
@@ -243,7 +243,7 @@ class JawFormula(Protocol):
 
 
 class AnchoredNumbers(NamedTuple):
-    """The scalars of an anchored model, see `AnchoredModel`; linear: 3 inputs times 3 outputs [rad]."""
+    """The scalars of an anchored model, see `AnchoredModel`; `linear` has 3 inputs times 3 outputs [rad]."""
 
     gauge: GaugeNumbers
     incisor: Triple[float]

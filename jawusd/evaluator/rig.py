@@ -92,7 +92,7 @@ class JawRig(RigClearance, RigAuthoring):
         d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
-            if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
+            if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # comparison is false for NaN
                 return self.kernels.pose(d1, d2, d3)
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.poses(rows).reshape(*batch, 4, 4)
@@ -198,7 +198,7 @@ class JawRig(RigClearance, RigAuthoring):
         d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
-            if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
+            if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # comparison is false for NaN
                 return _scalar(self.kernels.margin(d1, d2, d3))
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.margins(rows).reshape(batch)

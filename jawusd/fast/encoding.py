@@ -261,7 +261,7 @@ def _finite(T: Array) -> bool:
     """Return whether all entries of T (4, 4) are finite and below `LARGEST`."""
     for i in range(4):
         for k in range(4):
-            if not abs(T[i, k]) < LARGEST:  # also false for NaN
+            if not abs(T[i, k]) < LARGEST:  # comparison is also false for NaN
                 return False
     return True
 

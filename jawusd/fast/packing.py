@@ -19,7 +19,7 @@ from jawusd.evaluator.schema import ADDITIVE, ANCHORED, KINDS
 # offsets into the model, of any kind
 KIND = 0  # index into `schema.KINDS`
 COUNT = 1  # number of spline centres; 0 for an additive model
-INCISOR = 2  # (3,) [mm]
+INCISOR = 2  # incisal point at rest (3,) [mm]
 FROM_ANATOMICAL = 5  # (4, 4), row-major: L in pose = L M Q
 CLOSED = 21  # (4, 4): Q in pose = L M Q
 TO_ANATOMICAL = 37  # (4, 4): L^-1
@@ -30,14 +30,14 @@ REST = 121  # start of the part that depends on the kind
 ANCHORED_KIND, ADDITIVE_KIND = KINDS.index(ANCHORED), KINDS.index(ADDITIVE)
 
 # offsets into an anchored model
-SCALES = REST  # (3,) [mm]
-OFFSET = REST + 3  # (3,) [rad]
-LINEAR = REST + 6  # (3 inputs, 3 outputs) [rad]
-PATH = REST + 15  # scale, low, high [mm], then 5 coefficients of gx and 5 of gz
-ARCH = REST + 28  # (7,)
-DROP = REST + 35  # (4,)
-SOFTNESS = REST + 39  # [mm]
-FADE = REST + 40  # [mm]
+SCALES = REST  # lengths dividing the sheared displacement (3,) [mm]
+OFFSET = REST + 3  # value of the spline at u = 0 (3,) [rad]
+LINEAR = REST + 6  # linear terms of the spline (3 inputs, 3 outputs) [rad]
+PATH = REST + 15  # habitual path: scale, low, high [mm], then 5 coefficients of gx and 5 of gz
+ARCH = REST + 28  # coefficients of rho (7,)
+DROP = REST + 35  # coefficients of drop (4,)
+SOFTNESS = REST + 39  # radius of the softened absolute value and ramp [mm]
+FADE = REST + 40  # opening over which the glide surface fades out [mm]
 SPLINE = REST + 41  # centres, column-major (3, m), then kernel weights (m, 3), then the table of the glide surface
 # layout of the table: numbers of knots n2 and n3, both 0 without a table; knots of d2 (n2,), starts (n2 + 1,), likewise
 # for d3, coefficients (n2 + 1, n3 + 1, 4, 4)
@@ -49,8 +49,8 @@ GRID = REST + 4  # d (n, 3) and incisal displacements (n, 3) of the starting poi
 # layout of a curve: number of knots n, knots (n,), starts (n + 1,), coefficients (n + 1, 4, k)
 
 # offsets into the bound
-ROUNDING = 0  # [mm]
-MARGIN = 1  # [mm]
+ROUNDING = 0  # `SliceHull.softness_mm`
+MARGIN = 1  # `SliceHull.offset_mm`
 SIDES = 2  # number k of half-planes
 HULL = 3  # normals of the half-planes, column-major (2, k), then the curve of the supports
 

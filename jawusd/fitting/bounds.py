@@ -73,7 +73,7 @@ def alpha_shape(points: Array, alpha: float) -> tuple[Array, Array]:
     try:
         corners = normalised[Delaunay(normalised).simplices]
         shape = union_all(polygons(corners[_circumradius(corners) <= alpha]))
-    except QhullError:  # all points on one line
+    except QhullError:  # all points are collinear
         shape = Polygon()
     if shape.is_empty:
         shape = MultiPoint(normalised).convex_hull.buffer(_THIN, join_style="mitre", cap_style="square")

@@ -279,7 +279,7 @@ def screened(selection: Selection) -> Selection:
 
 
 def gross_outliers(data: TrainingData) -> Mask:
-    """Return which poses lie centimetres off the majority's quadratic map, shape (N,); none below 60 poses."""
+    """Return which poses lie centimetres off the majority's quadratic map, shape (N,); none of under 60 poses."""
     count = len(data)
     if count < _FEWEST:
         return np.zeros(count, dtype=bool)

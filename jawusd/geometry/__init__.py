@@ -4,7 +4,7 @@ Conventions of the whole package:
 
 * ``T_a_b`` maps b-coordinates to a-coordinates, ``p_a = T_a_b @ p_b``; column vectors, float64, shape (..., 4, 4).
 * A twist is ``(omega [rad], v [mm])``, rotation first, and ``T = se3_exp(twist)``.
-* Lengths mm, angles rad, image coordinates px with the centre of the top-left pixel at (0, 0).
+* Lengths are in mm, angles in rad, image coordinates in px with the centre of the top-left pixel at (0, 0).
 
 Imports only `base` and numpy.
 """

@@ -83,7 +83,7 @@ def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Arra
         lower: Lower scan, mandible frame [mm].
 
     Raises:
-        NoContact: A scan is too coarse or inconsistently wound, or there is no closed bite.
+        NoContact: A scan is too coarse or inconsistently wound, or the closed bite is implausible.
     """
     placed = (("upper", upper, T_anatomical_skull, 1.0), ("lower", lower, T_anatomical_skull @ T_rest, -1.0))
     with ThreadPoolExecutor(len(placed)) as pool:  # most of the work releases the GIL
@@ -114,7 +114,7 @@ def wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float
         NoContact: The winding is inconsistent; the message names the mesh.
     """
     found = solid(corners, up, box, step_mm)
-    if found.entering < 0.5:  # inside out
+    if found.entering < 0.5:  # the mesh is inside out
         found = solid(np.ascontiguousarray(corners[:, ::-1]), up, box, step_mm)
     if found.entering < _LEAST_WOUND:
         raise NoContact(f"the triangles of the {name} are not consistently wound")

@@ -122,7 +122,7 @@ def _hull_height(heights: Array) -> Array:
     out = np.full(heights.shape, np.nan)
     try:
         planes = ConvexHull(places).equations
-    except (QhullError, ValueError):  # a flat or tiny piece
+    except (QhullError, ValueError):  # a flat or tiny component has no convex hull
         out[tuple(filled.T)] = places[:, 2].max()
         return out
     # Steep hull facets lead down to palate, folds or base plate beside the teeth; extend the level facets over them.

@@ -266,7 +266,8 @@ def _set_distances(
             to_wall = min(i - walls[0, 0], walls[1, 0] - i, j - walls[0, 1], walls[1, 1] - j)
             for k in range(nz):
                 own = found = nearest[i, j, k]
-                # A surface within the walls is known at a grid point half a diagonal from where it leaves its band.
+                # Lower bound of the distance: the band around a surface within the walls is `_BAND_CELLS` wide, less at
+                # most a cell diagonal.
                 least = step * min(
                     np.sqrt(away[i, j, k]) + _BAND_CELLS - _DIAGONAL_CELLS, to_wall, k - walls[0, 2], walls[1, 2] - k
                 )

@@ -22,7 +22,7 @@ from jawusd.paper.model import COMPONENTS, PaperFit, fit_paper
 from jawusd.paper.synthesis import Bounds, captured_reference, distance_to_nearest
 
 if TYPE_CHECKING:
-    from jawusd.paper.nlpca import Nlpca  # imports torch
+    from jawusd.paper.nlpca import Nlpca  # only for type checkers, since it imports torch
 
 #: Configurations of the compared models, by label.
 MODELS: dict[str, FittingConfig] = {
@@ -153,7 +153,7 @@ def _networks(
     data: TrainingData, config: FittingConfig, paper: FittedForm | None, notify: Callable[[int], None]
 ) -> list[Nlpca]:
     """Return networks of 1 to 5 components; the last is taken from the paper's model if it was fitted."""
-    from jawusd.paper.nlpca import train_nlpca  # imports torch
+    from jawusd.paper.nlpca import train_nlpca  # imported late, since it imports torch
 
     points = se3_log(data.motion) @ data.metric.twist_root()
     nets = []

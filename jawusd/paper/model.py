@@ -33,7 +33,7 @@ from jawusd.fitting.fit import FormFitter
 from jawusd.geometry import se3_exp, se3_log
 
 if TYPE_CHECKING:
-    from jawusd.paper.nlpca import Nlpca  # imports torch
+    from jawusd.paper.nlpca import Nlpca  # only for type checkers, since it imports torch
 
 Groups = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
@@ -124,7 +124,7 @@ def fit_paper(
     Raises:
         FittingError: the data do not exercise a parameter, or no component moves the incisal point in its direction.
     """
-    from jawusd.paper.nlpca import train_nlpca  # imports torch, which takes two seconds
+    from jawusd.paper.nlpca import train_nlpca  # imported late: it imports torch, which takes two seconds
 
     if not shown.all():
         raise FittingError(

@@ -34,8 +34,8 @@ _OVERJET_MM, _OVERBITE_MM = 2.5, 2.0
 
 _WIDTH_PX = 360  # image width at which candidates are aligned
 _FACES = 6000  # number of crown faces per arch, sufficient at this resolution
-_CANDIDATES, _FINALISTS = 20, 4  # each number applies to mirrored and to not mirrored views
-# Gates of the steps [mm] with the given bite and with shifted bites; the first is half a tooth width or more.
+_CANDIDATES, _FINALISTS = 20, 4  # numbers of mirrored and, equally, of not mirrored views
+# Gates of the steps [mm], with the given bite and with shifted bites: from a tooth width down to half a tooth width.
 _WIDE_GATES, _SLID_GATES = (4.0, 4.0, 3.5, 3.5, 3.0, 3.0, 2.5, 2.5), (3.0, 3.0, 2.5, 2.0, 2.0, 2.0)
 # Shifts of the lower arch from a typical bite: all are scored, and the best `_SLIDES` are aligned.
 _ASIDE_MM, _UP_MM, _AHEAD_MM = (-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-4.0, -2.0, 0.0, 2.0, 4.0)
@@ -117,7 +117,7 @@ def searched(
         crowns: upper and lower, decimated for fast rendering.
         usual: typical bite, from which the anatomical axes are taken.
         T_upper_lower: the assumed bite, shape (4, 4).
-        count: number of candidates to return, mirrored and not mirrored each.
+        count: number of candidates to return of each kind, mirrored and not mirrored.
     """
     size = next_fast_len(int(1.3 * _PX_PER_MM * _WIDTHS_MM.max()), real=True)
     drawn = list(_drawn_spectra(drawing, size))
@@ -153,7 +153,7 @@ def _facing(turn: tuple[float, float, float]) -> Array:
 
 
 def _drawn_spectra(drawing: Drawing, size: int) -> Iterator[tuple[float, bool, NDArray[np.complex128], float]]:
-    """Yield field of view at the teeth [mm], whether mirrored, spectra by direction bin, and number of points."""
+    """Yield field of view [mm], whether mirrored, spectra by direction bin, and number of points per candidate."""
     for mirrored in (False, True):
         lines = drawing.mirrored() if mirrored else drawing
         middle = 0.5 * (np.array(drawing.size_px) - 1.0)

@@ -90,7 +90,7 @@ class AnchoredMotion(MotionModule):
     def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rotation, translation [mm] and spatial derivative at u (n, 3) [mm]."""
         gauge, _, scales, *_ = self._anchored_numbers()
-        # the order of `AnchoredNumbers`
+        # in the order of `AnchoredNumbers`
         incisor, _, tail, offset = self.singles[_GAUGE_NUMBERS:].split([3, 3, 9, 3])
         tail = tail.reshape(3, 3)
         sheared, slopes = spline_input(gauge, scales, triple(x.unbind(dim=1)), TENSORS)

@@ -94,7 +94,7 @@ class Hull(Formula):
     def _sides(self, d: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the distance (n,) [mm], weights (n, k), gradients (n, k, 3) of the half-spaces, and d2 reach / d d1^2.
 
-        In the order of `jawusd.evaluator.bounds`: the sides, then both ends.
+        The half-spaces are in the order of `jawusd.evaluator.bounds`: the sides, then both ends.
         """
         first, last, softness, offset = self.singles.unbind()
         (reach,), (reach_1,), (reach_11,) = curve_derivatives("support", d[:, :1], self.tables(), OPERATIONS)
