@@ -49,7 +49,7 @@ TOP = """# jawusd
 | [`jawusd.load`][jawusd.load] | read a rig |
 | [`jawusd.JawRig`][jawusd.evaluator.JawRig] | the rig: pose, encode, margin, validate, ik |
 | [`jawusd.build`][jawusd.pipeline.build.build] | from a capture to a rig in one call |
-| [`jawusd.track`][jawusd.pipeline.track.track] | track both rows of teeth |
+| [`jawusd.track`][jawusd.pipeline.track.track] | track both dental arches |
 | [`jawusd.JawusdError`][jawusd.base.errors.JawusdError] | the base class of all errors |
 | `jawusd.__version__` | the version, as text |
 """

@@ -210,7 +210,7 @@ class Subject:
     inferred: tuple[str, ...] = ()  # quantities derived from the meshes instead of given
 
     def measured_points(self) -> Array | None:
-        """Return the points at which errors are measured [mm], shape (V, 3): of mandible, or lower teeth, or None."""
+        """Return the vertices (V, 3) [mm] at which errors are measured: mandible or, without it, lower teeth."""
         for name in ("mandible", "lower_teeth"):
             if name in self.meshes:
                 return self.meshes[name].vertices
