@@ -37,7 +37,7 @@ def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
     tables = sorted((k for k in data if _CAMERA_TABLE.match(k)), key=lambda k: int(k[4:]))
     if not tables:
         below = data.get("cameras")
-        if isinstance(below, dict):  # Caliscope
+        if isinstance(below, dict):  # written by Caliscope
             data = {f"cam_{port}": table for port, table in below.items()}
         tables = [key for key, table in data.items() if isinstance(table, dict) and "matrix" in table]
     if not tables:

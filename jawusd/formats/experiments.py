@@ -65,7 +65,7 @@ class Coverage:
     slices: Array
     # points (d1, d2) and (d1, d3) [mm] inside the slice hull but far from all captured poses, each (G, 2)
     gaps: tuple[Array, Array]
-    sentences: tuple[str, ...]  # which movements to record next
+    sentences: tuple[str, ...]  # movements to record next
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class Experiments:
     # centres of the left and right condyle in all captured poses, anatomical frame [mm], shape (2, N, 3)
     captured_condyles: Array
     skull: Array  # outline of the skull beside the left condyle: segments (z, y) [mm], shape (S, 2, 2)
-    condyle_paths: tuple[CondylePath, ...]  # one per model
+    condyle_paths: tuple[CondylePath, ...]  # opening movements, one per model
     distances: tuple[Distances, ...]  # everything measured, in the order of the table
     coverage: Coverage  # captured part of the envelope
     # remarks: numbers of frames excluded by each model, models that could not be fitted, experiments not requested

@@ -23,7 +23,7 @@ COPY_AGAIN = "Copy the file again from its source, or export it again."
 class MeshData(NamedTuple):
     """A mesh as read from a file."""
 
-    vertices: Array  # shape (V, 3)
+    vertices: Array  # positions, shape (V, 3)
     faces: Indices  # triangles, shape (F, 3); indices may lie outside the vertices
     colors: NDArray[np.uint8] | None = None  # red, green, blue per vertex, shape (V, 3)
     uv: Array | None = None  # texture coordinates of the corners, shape (F, 3, 2)

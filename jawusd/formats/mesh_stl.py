@@ -67,7 +67,7 @@ def _are_triangles(corners: Array) -> np.typing.NDArray[np.bool_]:
 def _text(path: Path, data: bytes) -> Array:
     data = (b"\n" + data.removeprefix(b"\xef\xbb\xbf")).lower().replace(b"\r", b"\n")
     ends = [bool(word) for word in _SOLID.findall(data)]
-    body = _SOLID.sub(b"", data)  # names may contain keywords
+    body = _SOLID.sub(b"", data)  # names of solids may contain keywords
     whole = body.count(b"endfacet")
     facets = body.count(b"facet") - whole
     check_count(path, facets, "triangles")

@@ -31,7 +31,7 @@ class JawModel:
     frames: NDArray[np.int64]  # captured frame numbers, shape (F,)
     d: Array  # parameters of the captured poses [mm], NaN for lost frames, shape (F, 3)
     residual_mm: Array  # rms landmark distance between pose and model [mm], NaN for lost frames, shape (F,)
-    trained: Mask  # frames used in the fit, shape (F,)
+    trained: Mask  # whether a frame was used in the fit, shape (F,)
     # kind, method, actor, error tables, warnings, configuration, versions, hashes
     meta: dict[str, object] = field(default_factory=dict)
 

@@ -56,7 +56,7 @@ class ReplayPart:
 
     name: str  # display name
     kind: str  # "bone", "tooth" or "gum": determines the colour
-    moves: bool  # moves with the mandible
+    moves: bool  # whether it moves with the mandible
     mesh: Mesh  # decimated, anatomical frame, in occlusion [mm]
 
 

@@ -221,7 +221,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         # Lost frames are NaN, so only integer arrays must be finite.
         name: take(arrays, name, shape, path, finite=name in _WHOLE)
         for name, shape in _shapes(count, len(names)).items()
-        if not name.startswith("lost_") or "lost_reason" in arrays  # files of older versions lack all three
+        if not name.startswith("lost_") or "lost_reason" in arrays  # older files lack all three arrays
     }
     if not np.isin(values.get("lost_reason", 0), list(LostReason)).all():
         raise FormatError('"lost_reason" has an unknown reason.', path=path)

@@ -21,7 +21,7 @@ _DRIFT_FRAMES = 0.5
 _RATE_TOLERANCE = 0.005
 _DECODED_PX = 1.5e9  # maximum number of pixels decoded per clip: 700 images of full HD, a few seconds
 _ENDS_S = 4.0  # duration decoded at either end, which `sync` reads first
-_PART = 48  # images per decoded part
+_PART = 48  # number of images per decoded part
 _SPARSE = 4  # subsampling step: every 4th pixel in both directions
 _LISTED = 5
 # Thresholds for repeated images are relative to the usual change: this percentile of the changes within this number of

@@ -163,7 +163,7 @@ def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels,
         where = "" if error.index is None else f"picture {numbers[error.index]}: "
         raise CaptureError(where + error.reason, path=path, hint=error.hint) from error
     if lossy and neutral[0]:
-        colour = "gray"  # the video's luma, at full resolution
+        colour = "gray"  # luma, at full resolution
     return SourceLevels(found), colour
 
 

@@ -29,9 +29,9 @@ _BYTE_BITS = 8
 # interpolate.
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 _AROUND_PX = 8  # margin converted around a region, for chroma interpolation
-_STEP_PX = 32  # alignment of the region's sides
+_STEP_PX = 32  # alignment of the region's sides [px]
 _ANY_TIME = Fraction(1, 1000)  # arbitrary, but filters need a time base
-_FULL_RANGE = 2  # AVCOL_RANGE_JPEG
+_FULL_RANGE = 2  # AVCOL_RANGE_JPEG: full range
 _PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
 _PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
 # Little-endian planar formats of more than 8 bits; p010 and similar store values in the highest bits.

@@ -30,7 +30,7 @@ SETTINGS: dict[RcKeyType, object] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "svg.fonttype": "none",
-    "svg.hashsalt": "jawusd",  # reproducible files
+    "svg.hashsalt": "jawusd",  # for reproducible files
 }
 DPI, _INLINE_DPI = 150, 110
 _PX_PER_PT = 4 / 3
