@@ -27,7 +27,7 @@ _BLUR_RATIO, _BLUR_LIMITS_PX = 1.5, (4.0, 8.0)
 class BoardDetections:
     """Detected board corners."""
 
-    names: tuple[str, ...]  # camera names, C of them
+    names: tuple[str, ...]  # names of the C cameras
     sizes_px: tuple[tuple[int, int], ...]  # image (width, height) per camera
     numbers: NDArray[np.int64]  # image number of each view, shape (V,)
     corners_px: Array  # pixel of each corner, NaN where hidden, shape (C, V, N, 2)

@@ -54,7 +54,7 @@ class CalibrationReport:
     """Accuracy of a calibration, with advice."""
 
     cameras: dict[str, CameraFigures]
-    views: int  # board poses used
+    views: int  # number of board poses used
     board_shape: ShapeError  # error of distances between triangulated corners near the mouth, in the images used
     expected_shape_mm: float  # expected mean error of distances in the mouth, from the scatter of the corners
     mouth_mm: tuple[float, float, float]  # centre of the mouth in the world

@@ -160,7 +160,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
     # (orders, views, 4, 4): T_b_a if b lists the corners in that order.
     candidates = np.stack([T_b @ turn @ se3_inverse(T_a) for turn in turns])
     flat = candidates.reshape(-1, 4, 4)
-    votes = _equal(flat[:, None, None], candidates[None]).any(1)  # (candidates, views)
+    votes = _equal(flat[:, None, None], candidates[None]).any(1)  # agreement, shape (candidates, views)
     support = votes.sum(1)
     best = int(np.argmax(support))
     if support[best] < _LEAST_AGREEMENT * both.sum():

@@ -29,7 +29,7 @@ class ScaleCheck:
 
     ratio: float | None  # measured size / scanned size, None if unknown
     sigma: float | None  # standard error of the ratio
-    reason: str = ""  # why the ratio is unknown, otherwise empty
+    reason: str = ""  # reason why the ratio is unknown, otherwise empty
 
 
 def triangulated_picks(

@@ -45,7 +45,7 @@ class Step:
     """A sudden change of brightness."""
 
     time_frames: float  # time in frames of the camera's video; the exposure of frame k starts at time k
-    rising: bool  # whether the light is switched on
+    rising: bool  # True if the light is switched on, False if off
     slack_frames: float = 0.0  # by how much the step may be earlier, if images before it are missing
 
 
@@ -64,7 +64,7 @@ class Offset:
 class Flashes:
     """Light steps of one video."""
 
-    steps: list[Step]  # in order of time
+    steps: list[Step]  # light steps in temporal order
     reason: str = ""  # reason why there are too few steps for synchronisation; empty if there are enough
 
 

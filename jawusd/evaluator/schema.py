@@ -26,7 +26,7 @@ class ArraySpec(NamedTuple):
     integer: bool = False
 
 
-D_RANGE_ATTRIBUTES = ("jaw:d1:range", "jaw:d2:range", "jaw:d3:range")  # rows of `d_range`, (low, high) [mm]
+D_RANGE_ATTRIBUTES = ("jaw:d1:range", "jaw:d2:range", "jaw:d3:range")  # one per row of `d_range`, (low, high) [mm]
 
 
 def _curve(i: int) -> dict[str, ArraySpec]:

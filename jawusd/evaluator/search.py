@@ -127,7 +127,7 @@ class BoundedSearch:
         best, least = np.full((len(wanted), 3), np.nan), np.full(len(wanted), np.inf)
         rows, starts = self._scan.valleys(features, wanted)
         found, cost = search(rows, starts)
-        order = np.lexsort((cost, rows))  # by row, then by cost, NaN last
+        order = np.lexsort((cost, rows))  # sort by row, then by cost, with NaN last
         each, first = np.unique(rows[order], return_index=True)
         best[each], least[each] = found[order[first]], cost[order[first]]
         return best, least

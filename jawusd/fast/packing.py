@@ -22,8 +22,8 @@ COUNT = 1  # number of spline centres; 0 for an additive model
 INCISOR = 2  # incisal point at rest (3,) [mm]
 FROM_ANATOMICAL = 5  # (4, 4), row-major: L in pose = L M Q
 CLOSED = 21  # (4, 4): Q in pose = L M Q
-TO_ANATOMICAL = 37  # (4, 4): L^-1
-FROM_CLOSED = 53  # (4, 4): Q^-1
+TO_ANATOMICAL = 37  # (4, 4): inverse of L
+FROM_CLOSED = 53  # (4, 4): inverse of Q
 ADJOINT = 69  # (6, 6): twists from the anatomical to the skull frame
 VECTORS = 105  # (4, 4): vectors that represent the landmarks, see `evaluator.encoding`
 REST = 121  # start of the part that depends on the kind
@@ -43,7 +43,7 @@ SPLINE = REST + 41  # centres, column-major (3, m), then kernel weights (m, 3), 
 # for d3, coefficients (n2 + 1, n3 + 1, 4, 4)
 
 # offsets into an additive model
-CURVES = REST  # offsets of the three curves
+CURVES = REST  # offsets at which the three curves start
 STARTS = REST + 3  # number n of starting points for searches
 GRID = REST + 4  # d (n, 3) and incisal displacements (n, 3) of the starting points [mm], then the curves
 # layout of a curve: number of knots n, knots (n,), starts (n + 1,), coefficients (n + 1, 4, k)

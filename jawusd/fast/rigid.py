@@ -75,7 +75,7 @@ def _glide(table: Array, d2: float, d3: float) -> Vector:
     s, t = d2 - side[count2 + i], d3 - front[count3 + j]
     c = table[4 + 2 * count2 + 2 * count3 + 16 * (i * (count3 + 1) + j) :]
     down = down_2 = down_3 = 0.0
-    for k in range(3, -1, -1):  # powers of d3
+    for k in range(3, -1, -1):  # from the highest power of d3 to the lowest
         a = ((c[12 + k] * s + c[8 + k]) * s + c[4 + k]) * s + c[k]
         b = (3.0 * c[12 + k] * s + 2.0 * c[8 + k]) * s + c[4 + k]
         down_3 = down_3 * t + down

@@ -63,7 +63,7 @@ class CondylarGuidance:
     incisor: Array  # lower incisal point at rest [mm], shape (3,)
     centres: Array  # kinematic centres at rest [mm], shape (2, 3)
     slopes: Array  # polynomial coefficients of the height as a function of the slide, shape (2, 4) [mm]
-    slide_range: Array  # captured slides [mm], shape (2, 2)
+    slide_range: Array  # range of the captured slides [mm], per condyle, shape (2, 2)
     shift: Array  # coefficients of the sideways movement of the condyles' midpoint [mm], shape (5,)
     misfit_mm: float  # rms residual of the three equations over the captured poses
 

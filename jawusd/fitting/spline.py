@@ -39,7 +39,7 @@ def farthest_points(points: Array, count: int) -> Array:
 class SplineBasis:
     """Regression basis on normalised points whose bending energy is a quadratic form."""
 
-    centres: Array  # shape (m, 3)
+    centres: Array  # spline centres, shape (m, 3)
     null_space: Array  # maps free coefficients to kernel weights that meet the side conditions, shape (m, k)
     energy: Array  # bending energy of the free coefficients, zero rows for the linear tail, shape (k + 3, k + 3)
     at_zero: Array  # kernel values at q = 0, shape (m,)

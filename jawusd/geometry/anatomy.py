@@ -181,7 +181,7 @@ def find_landmarks(
         near = lower[(lower[:, 0] * side > 0) & (np.abs(lower[:, 2] - z) < 3.0)]
         if len(near):
             out[row] = near[near[:, 1] >= np.percentile(near[:, 1], 70)].mean(0)
-        else:  # no tooth in this region
+        else:  # the scan has no tooth in this region
             out[row] = [side * _MOLAR_ASIDE_MM, out[0, 1], z]
     if mandible_vertices is None:
         for row, side in ((3, 1.0), (4, -1.0)):

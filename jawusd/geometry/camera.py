@@ -22,7 +22,7 @@ _ALLOWED_COEFFICIENTS = (0, 4, 5, 8)
 class Camera:
     """A calibrated camera: pose, intrinsics and distortion."""
 
-    name: str  # name in the capture
+    name: str  # name of the camera in the capture
     size_px: tuple[int, int]  # image width and height [px]
     K: Array  # intrinsic matrix [px], shape (3, 3)
     distortion: Array  # OpenCV coefficients, shape (0,), (4,), (5,) or (8,)

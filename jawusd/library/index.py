@@ -61,8 +61,8 @@ class Entry:
 class Library:
     """A scanned folder."""
 
-    folder: Path  # the folder, resolved
-    entries: tuple[Entry, ...]  # its rigs, sorted by path
+    folder: Path  # resolved path of the folder
+    entries: tuple[Entry, ...]  # rigs in the folder, sorted by path
     skipped: dict[str, str]  # reasons why files could not be read, by path
     reread: int  # number of new or changed rigs
 

@@ -119,7 +119,7 @@ class Learned:
     # landmark distance at which a weight falls to exp(-1/2), inf for equal weights; None if only the closest subject is
     # used
     bandwidth_mm: float | None
-    expected: Expected | None  # None if the library has a single subject
+    expected: Expected | None  # leave-one-out result; None if the library has a single subject
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,7 +67,7 @@ class PersonAnatomy:
     lower: DentalArch
     mandible: Mesh  # mandible bone without teeth
     skull: Mesh  # sockets of the joint, cheekbones, upper jaw bone
-    occlusion: Occlusion  # contact of the two arches
+    occlusion: Occlusion  # contact between the two arches
 
 
 def build_anatomy(person: Person) -> PersonAnatomy:

@@ -44,8 +44,8 @@ class Joint:
     slide_limit_mm: float  # maximum forward slide of a condyle
     slide_early: float  # fraction of the slide that follows the rotation from the start
     slide_onset: float  # opening (0..1) over which that early fraction ramps up
-    protrusion_max_mm: float  # forward slide in full protrusion, closed
-    retrusion_max_mm: float  # backward slide in full retrusion, closed
+    protrusion_max_mm: float  # forward slide in full protrusion at zero opening
+    retrusion_max_mm: float  # backward slide in full retrusion at zero opening
     hinge_share: float  # fraction of the opening slide reversed by retrusion below half opening
     deviation_mm: Array  # lateral deviation of the opening path: S-shaped and one-sided part, shape (2,)
     protrusive_guidance: Array  # tooth guidance: initial slope, later slope, transition length [mm], (3,)

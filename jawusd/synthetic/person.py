@@ -259,7 +259,7 @@ def _mandible_points(joint: Joint) -> Array:
         from_condyle = np.array(
             [
                 [9, 0, 0], [-9, 0, 0], [0, 4, 0], [0, 0, -4], [0, 0, 5], [0, -18, -3],  # head and neck of the condyle
-                [-3, 4, 26], [-2, -12, 20],  # coronoid and notch
+                [-3, 4, 26], [-2, -12, 20],  # points on coronoid process and notch
                 [-4, -45, 0], [-2, -58, 10], [-6, -30, 14], [-14, -62, 35], [-22, -66, 60],  # ramus and lower border
             ]
         )  # fmt: skip

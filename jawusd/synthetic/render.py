@@ -217,7 +217,7 @@ class Renderer:
         radius = np.sqrt(sum(f**2 for f in np.meshgrid(frequency, frequency, frequency, indexing="ij")))
         spectrum = np.fft.fftn(rng.normal(size=(n, n, n))) * np.exp(-((radius / 14.0) ** 2))
         value = np.fft.ifftn(spectrum).real
-        fields = np.stack([value, *np.gradient(value)[::-1]], -1)  # memory order z, y, x
+        fields = np.stack([value, *np.gradient(value)[::-1]], -1)  # axes in memory order z, y, x
         fields = 0.5 + 0.16 * fields / fields.std((0, 1, 2))
         texels = (255 * np.clip(fields, 0.0, 1.0)).astype(np.uint8)
         texture = self._gl.texture3d((n, n, n), 4, texels.tobytes())

@@ -61,7 +61,7 @@ class Surface:
     """A coloured surface for rendering."""
 
     vertices: Array  # positions [mm], shape (V, 3)
-    faces: Faces  # shape (F, 3)
+    faces: Faces  # vertex indices, shape (F, 3)
     colors: Array  # linear diffuse reflectance, shape (V, 3), 0..1
     gloss: Array  # strength of the highlight, shape (V,), 0..1
     skin: Array  # strength of the skin texture, shape (V,), 0..1

@@ -114,9 +114,9 @@ class Take:
     dark: NDArray[np.int64]  # dark intervals [first, last) in reference frames, shape (2, 2)
     controls: Array  # opening, lateral, protrusion, shape (I, 3)
     phase: NDArray[np.str_]  # name of the exercise, shape (I,)
-    T_skull_mandible: Array  # shape (I, 4, 4)
-    T_world_skull: Array  # shape (I, 4, 4)
-    lips: list[LipState]  # one per frame
+    T_skull_mandible: Array  # jaw poses [mm], shape (I, 4, 4)
+    T_world_skull: Array  # head poses [mm], shape (I, 4, 4)
+    lips: list[LipState]  # shape of the lips in each frame
     tongue_mm: Array  # displacement of the tongue forward, up and left, shape (I, 3)
     light: Array  # brightness factor, shape (I,)
 
