@@ -85,8 +85,8 @@ def test_each_fault_is_named_by_line_and_column(tmp_path, row, words):
     [
         ("", "empty"),
         (HEADER, "no rows"),
-        (HEADER.replace("JawOpen", "MouthOpen"), '"jawopen" 0 times'),
-        (HEADER + ",jawopen", '"jawopen" 2 times'),
+        (HEADER.replace("JawOpen", "MouthOpen"), 'has 0 columns named "jawopen"'),
+        (HEADER + ",jawopen", 'has 2 columns named "jawopen"'),
     ],
 )
 def test_tables_that_are_none(tmp_path, text, words):
