@@ -28,7 +28,7 @@ Rate = Annotated[
 RetargetFrom = Annotated[
     Path | None,
     typer.Option(
-        help="Rig that the source was made for; the source may then also be an animation layer.",
+        help="Rig for which the source was made; the source may then also be an animation layer.",
         callback=rig_of_folder,
         show_default=False,
     ),
@@ -124,7 +124,7 @@ def animate(
     mapping: Annotated[
         Path | None,
         typer.Option(
-            help="The actor's mapping of --arkit, from arkit-fit. Default: shares of the ranges.", show_default=False
+            help="The actor's mapping of --arkit, from arkit-fit. Default: fractions of the ranges.", show_default=False
         ),
     ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer, or .glb for the web.")] = Path("anim.usdc"),
@@ -182,7 +182,8 @@ def arkit_fit(
         float | None, typer.Option(min=0.001, help="Frames per second of the face. Default: from its time codes.")
     ] = None,
     jaw_fps: Annotated[
-        float | None, typer.Option(min=0.001, help="Frames per second of the jaw. Default: of the tracks, or the rig.")
+        float | None,
+        typer.Option(min=0.001, help="Frames per second of the jaw. Default: of the tracks or the rig."),
     ] = None,
     offset: Annotated[
         float | None,
@@ -220,7 +221,7 @@ def arkit_fit(
         as_json,
         lambda: [
             f"{out}: from {found.frames} frames, the face starts {found.offset_s:.3f} s after the jaw's frame 0",
-            f"held-out error at the incisal point {found.error_mm:.2f} mm, by shares {found.shares_error_mm:.2f} mm",
+            f"held-out error at the incisal point {found.error_mm:.2f} mm, by fractions {found.shares_error_mm:.2f} mm",
         ],
     )
 
@@ -230,7 +231,7 @@ def arkit_table(
     out: Annotated[Path, typer.Option("-o", "--out", help="The table (CSV).")] = Path("joint.csv"),
     mapping: Annotated[
         Path | None,
-        typer.Option(help="The actor's mapping, from arkit-fit. Default: shares of the ranges.", show_default=False),
+        typer.Option(help="The actor's mapping, from arkit-fit. Default: fractions of the ranges.", show_default=False),
     ] = None,
     force: Force = False,
     prim: Prim = None,
@@ -320,8 +321,8 @@ def _own_mapping(rig: JawRig, path: Path) -> ArkitMapping:
     own, actor = load_mapping(path), str(rig.meta.get("actor", ""))
     if own.actor != actor:
         raise FormatError(
-            f'is the mapping of "{own.actor}", but the rig is of "{actor}"; parameters differ between persons.',
+            f'is the mapping of "{own.actor}", but the rig is of "{actor}"; parameters differ between subjects.',
             path=path,
-            hint="Omit --mapping, or animate that person's rig and use `jawusd retarget`.",
+            hint="Omit --mapping, or animate that subject's rig and use `jawusd retarget`.",
         )
     return own

@@ -50,7 +50,7 @@ class Backend(StrEnum):
     gl = "gl"
 
 
-SolverOption = Annotated[Solver, typer.Option(help="Tracker; paper is slower and less accurate, for comparison.")]
+SolverOption = Annotated[Solver, typer.Option(help="Tracker; paper, for comparison, is slower and less accurate.")]
 BackendOption = Annotated[Backend, typer.Option(help="Renderer of --solver paper; gl needs OpenGL 4.3 (EGL).")]
 
 
@@ -113,7 +113,7 @@ def track(
     backend: BackendOption = Backend.cpu,
     prior: Annotated[
         Path | None,
-        typer.Option(help="model.npz of this person, as a prior of a second pass.", show_default=False),
+        typer.Option(help="model.npz of this subject, as a prior for a second pass.", show_default=False),
     ] = None,
     overlay: Annotated[
         Path | None,
@@ -209,7 +209,7 @@ def bake(
     upper_teeth: UpperOption = None,
     lower_teeth: LowerOption = None,
     mandible: MandibleOption = None,
-    fps: Annotated[float, typer.Option(min=0.001, help="Frames per second, for a person without a capture.")] = 24.0,
+    fps: Annotated[float, typer.Option(min=0.001, help="Frames per second, for a subject without a capture.")] = 24.0,
     table: Annotated[int, typer.Option(help="Knots per axis of the sampled decoder: 17, 33 or 65.")] = 33,
     prim_name: PrimName = None,
     force: Force = False,
@@ -232,7 +232,7 @@ def bake(
 
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the capture.", show_default=False)],
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random person.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random subject.")] = 0,
     frames: Annotated[int, typer.Option(min=24, max=20000, help="Exercise frames.")] = 240,
     force: Force = False,
 ) -> None:

@@ -68,7 +68,7 @@ def sync(
     ] = None,
     curves: Annotated[
         Path | None,
-        typer.Option(help="Also write the brightness of every picture as CSV.", show_default=False),
+        typer.Option(help="Also write the brightness of every image as CSV.", show_default=False),
     ] = None,
     plot: Annotated[
         Path | None,
@@ -189,7 +189,7 @@ def scans(
         typer.Option(
             "-o",
             "--out",
-            help="Folder of labels and picture; name it in [scans] labels of the capture. Default: beside the "
+            help="Folder of labels and image; name it in [scans] labels of the capture. Default: beside the "
             "scans, and the capture's folder.",
             show_default=False,
         ),
@@ -238,7 +238,7 @@ def photos(
     outlines: Annotated[
         list[Path],
         typer.Argument(
-            help="A picture per photograph: tooth outlines as bright lines on black, or filled teeth.",
+            help="An image per photograph: tooth outlines as bright lines on black, or filled teeth.",
             show_default=False,
         ),
     ],

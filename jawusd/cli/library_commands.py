@@ -30,11 +30,11 @@ def retarget(
         typer.Argument(help="Motion of --from: an animation layer, keys.json, or a CSV of d or poses."),
     ] = None,
     source: Annotated[
-        Path | None, typer.Option("--from", help="Rig the motion was made for.", callback=rig_of_folder)
+        Path | None, typer.Option("--from", help="Rig for which the motion was made.", callback=rig_of_folder)
     ] = None,
     target: Annotated[Path | None, typer.Option("--to", help="Target rig.", callback=rig_of_folder)] = None,
     landmarks: Annotated[
-        Path | None, typer.Option(help="Landmarks (JSON) of a person without a capture, instead of a motion.")
+        Path | None, typer.Option(help="Landmarks (JSON) of a subject without a capture, instead of a motion.")
     ] = None,
     library_folder: Annotated[
         Path | None, typer.Option("--library", help="With --landmarks: folder of rigs to learn from.")
@@ -45,7 +45,7 @@ def retarget(
     fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second. Default: as in the motion.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Layer of the motion (retargeted.usdc) or model of the person (model.npz)."),
+        typer.Option("-o", "--out", help="Layer of the motion (retargeted.usdc) or model of the subject (model.npz)."),
     ] = None,
     force: Force = False,
     prim: Prim = None,
@@ -116,7 +116,7 @@ def library(
     folder: Annotated[Path, typer.Argument(help="Folder with a subfolder per subject.", show_default=False)],
     search: Annotated[str | None, typer.Option(help="List only names and paths that contain this text.")] = None,
     like: Annotated[Path | None, typer.Option(help="Sort by similarity to these landmarks (JSON).")] = None,
-    compare: Annotated[tuple[str, str] | None, typer.Option(help="Compare two persons side by side.")] = None,
+    compare: Annotated[tuple[str, str] | None, typer.Option(help="Compare two subjects side by side.")] = None,
     add: Annotated[
         Path | None,
         typer.Option(
@@ -124,10 +124,10 @@ def library(
         ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="With --add: name of the person. Default: the name in the rig.")
+        str | None, typer.Option(help="With --add: name of the subject. Default: the name in the rig.")
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Folder for ranges.png and ranges.svg of the persons listed.")
+        Path | None, typer.Option(help="Folder for ranges.png and ranges.svg of the listed subjects.")
     ] = None,
     force: Force = False,
     allow: Allow = None,

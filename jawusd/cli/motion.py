@@ -232,10 +232,10 @@ def carried_over(
     mean, largest = float(carried.moved_mm[known].mean()), float(carried.moved_mm[known].max())
     lines = [f", {valid} of {samples - lost} samples valid", *_lost_line(lost)]
     if clamped:
-        lines.append(f"{clamped} samples lay outside the bound at equal shares of the ranges")
+        lines.append(f"{clamped} samples lay outside the bound at equal fractions of the ranges")
     if largest > 0.005:
         moved = f"{mean:.2f} mm on average, {largest:.2f} mm at most"
-        lines.append(f"moved from equal shares by {moved}, to keep the timing of the source and stay inside")
+        lines.append(f"moved from equal fractions by {moved}, to keep the timing of the source and stay inside")
     figures = {"samples": samples, "lost": lost, "valid": valid, "clamped": clamped}
     sizes = {"mean_move_mm": mean, "largest_move_mm": largest}
     return AuthoredMotion(carried.frames, carried.d, motion.fps), Changes({**figures, **sizes}, lines)

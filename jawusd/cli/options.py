@@ -151,7 +151,7 @@ ColumnsOption = Annotated[
     ),
 ]
 UnitOption = Annotated[LengthUnit, typer.Option(help="Length unit, if the file does not state it.")]
-InvertOption = Annotated[bool, typer.Option("--invert", help="The poses map skull to mandible.")]
+InvertOption = Annotated[bool, typer.Option("--invert", help="Invert the poses, because they map skull to mandible.")]
 RestOption = Annotated[
     int | None,
     typer.Option(help="Frame with the teeth in occlusion; poses are taken relative to it.", show_default=False),

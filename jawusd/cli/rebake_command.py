@@ -53,7 +53,7 @@ def rebake(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Layer to write. Default: <shot>_baked.usdc.")] = None,
     root: Annotated[bool, typer.Option("--root", help="Make the layer a new root that sublayers the shot.")] = False,
     origin: Annotated[
-        Origin | None, typer.Option("--from", help="Which to use if d and mandible disagree.", show_default=False)
+        Origin | None, typer.Option("--from", help="Source to use if d and mandible disagree.", show_default=False)
     ] = None,
     mandible: MandiblePrim = None,
     skull: SkullPrim = None,

@@ -179,7 +179,7 @@ def view(
     if not is_loopback(host):
         may = "write picks into the capture" if capture else "write animations beside the rig"
         say(
-            f"jawusd: warning: listening on {host}: anyone who reaches this address can see this person's jaw without "
+            f"jawusd: warning: listening on {host}: anyone who reaches this address can see this subject's jaw without "
             f"a password, and {may}. `ssh -L 8080:localhost:8080` works without --host.",
             err=True,
         )

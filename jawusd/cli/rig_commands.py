@@ -33,7 +33,7 @@ def info(
         bool,
         typer.Option("--schema", help="Print the path of the USD schema JawRigAPI, and how other programs find it."),
     ] = False,
-    frame: Annotated[int | None, typer.Option(help="Of tracks.npz: describe the tracking of this frame.")] = None,
+    frame: Annotated[int | None, typer.Option(help="For tracks.npz: describe the tracking of this frame.")] = None,
     prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,
@@ -161,11 +161,13 @@ def validate(
         Path | None, typer.Argument(help="CSV or JSON of poses or of d, tracks.npz, or an animated USD stage.")
     ] = None,
     residual_mm: Annotated[
-        float | None, typer.Option(help="Largest distance from the model. Default: of the rig.")
+        float | None, typer.Option(help="Maximum distance from the model. Default: the rig's limit.")
     ] = None,
     tolerance_mm: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Allowed distance outside the bound, 0 for authored poses. Default: of the rig."),
+        typer.Option(
+            min=0.0, help="Allowed distance outside the bound; 0 for authored poses. Default: set by the rig."
+        ),
     ] = None,
     prim: Prim = None,
     allow: Allow = None,

@@ -51,7 +51,7 @@ def solve(
     report: Annotated[
         Path | None,
         typer.Option(
-            help="Page (.html) to write: curves with expected errors, unseen frames, findings, pictures.",
+            help="Page (.html) to write: curves with expected errors, frames with hidden teeth, findings, images.",
             show_default=False,
         ),
     ] = None,
@@ -135,7 +135,7 @@ def live(
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="Stop after this time [s].", show_default=False)
     ] = None,
-    silence: Annotated[float, typer.Option(min=0.1, help="Longest wait for a picture of a source [s].")] = 10.0,
+    silence: Annotated[float, typer.Option(min=0.1, help="Maximum time without an image from a source [s].")] = 10.0,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")] = 2,
     allow_outside: Outside = False,
     prim: Prim = None,

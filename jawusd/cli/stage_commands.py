@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 MandiblePrim = Annotated[
     str | None,
-    typer.Option("--mandible", help="Of a stage: prim above the mandible's meshes, if names do not identify it."),
+    typer.Option("--mandible", help="For a stage: prim above the mandible's meshes, if names do not identify it."),
 ]
 SkullPrim = Annotated[
-    str | None, typer.Option("--skull", help="Of a stage: prim above the meshes of skull or upper teeth.")
+    str | None, typer.Option("--skull", help="For a stage: prim above the meshes of skull or upper teeth.")
 ]
 
 

@@ -88,7 +88,7 @@ def cameras(
     ] = 1.0,
     size: Annotated[
         str | None,
-        typer.Option(help="Picture size, as 1920x1080, if the source does not state it.", show_default=False),
+        typer.Option(help="Image size, as 1920x1080, if the source does not state it.", show_default=False),
     ] = None,
     force: Force = False,
     as_json: Json = False,

@@ -123,7 +123,7 @@ def track_lines(summary: TrackSummary) -> list[str]:
     lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")
     uncovered = summary["coverage_error_percent"]
     if uncovered is not None:
-        lines.append(f"  uncovered share of the masks: {uncovered} %")
+        lines.append(f"  uncovered fraction of the masks: {uncovered} %")
     if "frames_used" in summary:
         used = ", ".join(f"{name} {count}" for name, count in summary["frames_used"].items())
         lines.append(f"  frames used per camera: {used}")

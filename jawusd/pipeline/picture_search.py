@@ -103,7 +103,7 @@ class PictureSearch(Generic[T]):
                 break
         raise TrackingError(
             _describe_failure(tried, best, frames[seen:]),
-            hint="Check that scans, or rig, belong to this person. Show both arches apart and upright for a moment, "
+            hint="Check that scans, or rig, belong to this subject. Show both arches apart and upright for a moment, "
             "pick teeth in two cameras ([bootstrap]), or draw masks.",
         )
 
@@ -163,7 +163,7 @@ def picks_mismatch(frame: int, fit: float, least: float = LEAST_FIT) -> Tracking
         f"the picks do not match the pictures: {fit:.0%} of the visible contour fits the colours, at least "
         f"{least:.0%} is needed",
         frame=frame,
-        hint="Check the picks, and that scans, rig and calibration belong to this person and these cameras.",
+        hint="Check the picks, and that scans, rig and calibration belong to this subject and these cameras.",
     )
 
 

@@ -157,7 +157,7 @@ def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -
         raise FormatError(
             f'{found.GetPath()} is the rig of "{other}", but the given rig is of "{own}"; their d and bounds differ.',
             path=str(path),
-            hint="Give the rig of that person, or transfer the motion with `jawusd retarget`.",
+            hint="Give the rig of that subject, or transfer the motion with `jawusd retarget`.",
         )
     return found
 
