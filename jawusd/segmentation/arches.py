@@ -17,7 +17,7 @@ from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 
 OTHER, UPPER, LOWER = 0, 1, 2
 _TAU = _SIGMA = 0.35  # step sizes of the primal-dual iteration; convergence needs tau sigma 8 < 1
-_NEVER = 30.0  # log-odds of a hard constraint
+_NEVER = 30.0  # magnitude of the log-odds that impose a hard constraint
 _FEWEST_OPEN = 20  # minimum number of undecided pixels between the arches for re-estimating their border
 _ARCH_BLUR_PX = 0.8  # sigma of the blur of the border between the arches, for fractional coverage
 

@@ -19,7 +19,7 @@ from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.base.npz import DAMAGED
 from jawusd.formats.atomic import write_npz_atomic
 
-_BINS = 32  # histogram bins per channel
+_BINS = 32  # number of histogram bins per channel
 _FLOOR = 12.0  # offset of every channel [8-bit steps], which damps the noisy colour ratios of dark pixels
 _RATIO_STEP = 0.03  # bin width of the log ratios [-]; the bins cover red over green from 0.6 to more than 1.6
 _MOST = 6.0  # maximum magnitude of the log-odds from colour alone [-]
@@ -39,21 +39,22 @@ class SegmentationConfig:
     working_px_per_mm: float = 7.2
     # Margin around the projected crowns [mm]: includes lips, gum and tongue, but no background.
     margin_mm: float = 4.0
-    # Distance inside the projected crowns from which pixels train the tooth colours [mm]: larger than the pose error.
+    # Minimum depth inside the projected crowns of pixels that train the tooth colours [mm]: larger than the pose error.
     inner_mm: float = 0.4
-    # Distance outside the projected crowns from which pixels train the colours of the surroundings [mm].
+    # Minimum distance outside the projected crowns of pixels that train the colours of the surroundings [mm].
     outer_mm: float = 1.0
     # Maximum distance of tooth pixels outside the projected crowns [mm], in the first iteration and after alignment.
     reach_mm: tuple[float, ...] = (1.6, 1.0)
     # Time constant of the colour histograms [frames]: light changes slowly, as the head moves.
     memory_frames: float = 24.0
-    # Quantile of the surroundings' log-odds that tooth colours must exceed [-], and the margin required without
-    # evidence from position [-]: the separability of colours differs between subjects.
+    # Quantile of the surroundings' log-odds that tooth colours must exceed [-], since the separability of colours
+    # differs between subjects; and the margin required in addition without evidence from position [-].
     surroundings_share: float = 0.95
     doubt: float = 1.5
-    # Limits of the required log-odds [-].
+    # Minimum and maximum of the required log-odds [-].
     doubt_range: tuple[float, float] = (-1.0, 1.0)
-    # Log-odds of tooth per mm inside the projected outline [1/mm], and their limits outside and inside [-].
+    # Log-odds of tooth per mm inside the projected outline [1/mm], and their lower limit outside and upper limit inside
+    # [-].
     place_per_mm: float = 2.0
     place_most: tuple[float, float] = (1.5, 1.0)
     # Cost of a border per pixel of its length, in log-odds [-], and the fraction of this cost on the strongest edges.
@@ -66,7 +67,8 @@ class SegmentationConfig:
     # [mm].
     border_band_mm: float = 0.4
     border_side_mm: float = 0.8
-    # Blur of the compared colours [px], and the required separation in standard deviations [-].
+    # Sigma of the blur of the compared colours [px], and minimum separation of visible borders in standard deviations
+    # [-].
     border_blur_px: float = 0.7
     border_contrast: float = 2.0
     # Outward shift of the outlines of the upper and lower arch [-], learned from annotated masks; 1 is the width of the

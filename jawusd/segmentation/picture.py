@@ -16,7 +16,7 @@ from jawusd.media.clip import Clip
 from jawusd.media.pixels import ColourPicture
 from jawusd.media.working_view import WorkingView, remap
 
-_NODE_PX = 8  # grid spacing of the undistortion map
+_NODE_PX = 8  # spacing of the grid on which the undistortion map is computed
 _CHUNK = 16  # number of frames buffered when reading backwards: 50 MB per full HD camera
 
 Pictures: TypeAlias = "dict[str, ColourPicture | None]"
@@ -28,7 +28,7 @@ class Window:
     """A part of a working image."""
 
     camera: Camera  # pinhole camera of the part
-    rgb: NDArray[np.uint8]  # pixels, 8 bit, shape (h, w, 3)
+    rgb: NDArray[np.uint8]  # 8-bit RGB pixels, shape (h, w, 3)
     corner: tuple[int, int]  # first column and row in the working image [px]
 
 

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from jawusd.base.arrays import Array, Mask
 
-_WIDTH_PX = 480  # working width
+_WIDTH_PX = 480  # width to which images are resized
 # Teeth are found by thresholding lightness minus redness, CIELAB L* - 2.5 a*: weight of a*, candidate thresholds as
 # percentiles of the image, and the percentile that counts as white.
 _REDNESS, _LEVELS, _BRIGHTEST = 2.5, (40, 55, 65, 72, 78, 83, 87, 90, 92, 94, 96), 99.5
@@ -163,7 +163,7 @@ def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None
     """Split teeth into upper and lower row (2, h, w) at the line with the lowest bridged fraction; also return that."""
     rows, columns = np.nonzero(teeth)
     first, last, top, bottom = columns.min(), columns.max(), rows.min(), rows.max()
-    lines = top + _lines(int(last - first + 1), int(bottom - top + 1))  # (N, width)
+    lines = top + _lines(int(last - first + 1), int(bottom - top + 1))  # row at each column, shape (N, width)
     np.clip(lines, 1, len(teeth) - 2, out=lines)
     across = np.arange(first, last + 1)
     taken = teeth[:, across].any(0)

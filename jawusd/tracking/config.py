@@ -26,7 +26,8 @@ class TrackingConfig:
     working_px_per_mm: float = 7.2
     # Spacing of contour samples [px]: mask noise is correlated over a longer distance.
     sample_step_px: float = 3.0
-    # Residual gate of each iteration [px]. Narrow at the end: wider gates also match lip and gum edges 0.5 mm away.
+    # Residual gate of each iteration [px]: narrow at the end, since wider gates also match lip and gum edges 0.5 mm
+    # away.
     wide_gates_px: tuple[float, ...] = (14.0, 10.0, 8.0, 6.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0)
     # First gate if motion is predictable [px]; wider gates are used for fast motion and as fallback.
     first_gate_px: float = 6.0
@@ -35,7 +36,8 @@ class TrackingConfig:
     # Minimum and maximum of the final gate [px], which adapts to the spread of the residuals: 2 px for good hand-drawn
     # masks.
     final_gate_px: tuple[float, float] = (1.2, 4.0)
-    # Residual beyond which a sample adds nothing to the score [px]; the same for all poses, so scores are comparable.
+    # Residual above which a sample adds nothing to the score [px]; the same for all poses, so that scores are
+    # comparable.
     score_gate_px: float = 2.5
     # Tukey gate in standard deviations: 95 % efficiency for normal noise (Huber & Ronchetti 2009).
     gate_sigmas: float = 4.685
@@ -69,7 +71,7 @@ class TrackingConfig:
     # Outline variance times correlation length assumed by the prediction prior [px^3]: 0.4 px squared times 18 px, as
     # in drawn masks.
     typical_noise_px3: float = 3.0
-    # Correlation length of outline errors along the contour [px], until it is measured on the take.
+    # Assumed correlation length of outline errors along the contour [px], until it is measured on the take.
     correlation_px: float = 18.0
     # Known correlation length of outline errors [px], for residuals that cannot reveal it; None uses the measured
     # value.
@@ -108,7 +110,7 @@ class TrackingConfig:
     # Offsets of the starts of the multi-start search [mm, rad]: prediction errors in fast chewing, and after an
     # occlusion.
     search_rings: tuple[tuple[float, float], ...] = ((2.0, 0.05), (4.0, 0.12))
-    # Gates of the short trial alignment from every start [px], and number of starts that are refined fully.
+    # Residual gates of the short trial alignment from every start [px], and number of starts that are refined fully.
     trial_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4
     # Matched contour length below which an arch is lost [px]: 8 mm of tooth edge.
@@ -169,9 +171,11 @@ class TrackingConfig:
         return tuple(g for g in self.wide_gates_px if g <= max(reach_px, self.first_gate_px))
 
 
-#: For takes of several cameras: scans are rendered half as often. Searches with a single camera need the default.
+#: Settings for takes of several cameras: scans are rendered half as often. Searches with a single camera need the
+#: default.
 FOR_TAKES = TrackingConfig(redraw_px=2.0)
 
-#: For masks made by jawusd. They vary more between frames than hand-drawn ones, and get rougher as lips close, so the
-#: limits for lost arches are wider. Their errors are correlated along whole teeth, hence the larger `tile_factor`.
+#: Settings for masks made by jawusd. These masks vary more between frames than hand-drawn ones, and get rougher as lips
+#: close, so the limits for lost arches are wider. Their errors are correlated along whole teeth, hence the larger
+#: `tile_factor`.
 FOR_AUTO_MASKS = replace(FOR_TAKES, suspect_residual=3.0, suspect_score=0.25, tile_factor=20.0)

@@ -27,7 +27,7 @@ from jawusd.tracking.contour.samples import (
     pixel_of,
 )
 
-_EDGE = 127.5  # mask value at the outline: half of a pixel belongs to the teeth
+_EDGE = 127.5  # mask value at the outline, where half of a pixel belongs to the teeth
 
 
 @numba.njit(nogil=True, cache=True, inline="always")

@@ -28,7 +28,7 @@ class Loss(NamedTuple):
     limit: float
 
 
-#: For an arch that is not lost, or whose loss has no recorded reason.
+#: Entry for an arch that is not lost, or whose loss has no recorded reason.
 NO_LOSS = Loss(LostReason.NONE, np.nan, np.nan)
 
 
@@ -39,8 +39,8 @@ class FrameRecord:
     solution: Solution  # the alignment; poses of lost arches are invalid
     status: NDArray[np.int8]  # status of both arches, as in `Tracks`, shape (2,)
     used: Mask  # masks used, shape (2, C)
-    coverage: Array  # E_SP over mask pixels, shape (2, C); NaN without a mask
-    losses: tuple[Loss, Loss] = (NO_LOSS, NO_LOSS)  # why each arch is lost
+    coverage: Array  # uncovered fraction of every mask, shape (2, C); NaN without a mask
+    losses: tuple[Loss, Loss] = (NO_LOSS, NO_LOSS)  # reasons why arches are lost
 
 
 def whole_frames(records: Mapping[int, FrameRecord]) -> list[int]:

@@ -104,7 +104,7 @@ class Drawing:
             matrix: as for the constructor.
             labels, inverse_depth: receive the label and the inverse depth [1/mm] of every pixel of the window.
         """
-        if (_shifted(matrix, _AROUND_PX) == self._matrix).all():  # the same pose, possibly a smaller window
+        if (_shifted(matrix, _AROUND_PX) == self._matrix).all():  # the pose is unchanged, but the window may be smaller
             window = tuple(slice(_AROUND_PX, _AROUND_PX + side) for side in labels.shape)
             labels[:], inverse_depth[:] = self._labels[window], self._inverse_depth[window]
             return 0.0
@@ -242,7 +242,7 @@ class Rendering:
             views: the views of the frame.
             contours: contours of the upper and lower arch, sampled while drawing.
             drawings: cache shared between frames.
-            redraw_px: motion after which an arch is rendered again.
+            redraw_px: image motion after which an arch is rendered again.
             map: distributes the drawing among threads.
         """
         self._contours, self._drawings, self._redraw_px, self._map = contours, drawings, redraw_px, map
@@ -270,7 +270,7 @@ class Rendering:
         Args:
             contour: contour of the arch; the drawing may be of a scan with fewer faces.
             r, c: arch and view.
-            pose: T_world_arch at the view's instant, shape (4, 4).
+            pose: T_world_arch at the view's exposure, shape (4, 4).
 
         Returns:
             As `contour_samples`; a copy.

@@ -160,7 +160,7 @@ def _silhouette(
         if k in (i, j):
             k = faces[f, 2]
         uk, vk, wk = _pixel(matrix, vertices[k, 0], vertices[k, 1], vertices[k, 2])
-        if nx * (uk - ui) + ny * (vk - vi) > 0:  # the normal points away from the face's third corner
+        if nx * (uk - ui) + ny * (vk - vi) > 0:  # makes the normal point away from the third corner of the face
             nx = -nx
             ny = -ny
         pieces = max(1, int(np.ceil(length / step_px)))
@@ -257,8 +257,8 @@ def _outermost(samples: Array, shape: tuple[int, int]) -> Array:
     the outline; the others would bias it inwards by 0.03 to 0.05 px.
     """
     rows, columns = int(shape[0] / _BESIDE_PX) + 3, int(shape[1] / _BESIDE_PX) + 3
-    last = np.full((rows, columns), -1, np.int32)  # last sample of every cell
-    before = np.empty(len(samples), np.int32)  # previous sample of the same cell
+    last = np.full((rows, columns), -1, np.int32)  # index of the last sample in every cell
+    before = np.empty(len(samples), np.int32)  # index of the previous sample in the same cell
     for s in range(len(samples)):
         j, i = int(samples[s, V] / _BESIDE_PX) + 1, int(samples[s, U] / _BESIDE_PX) + 1
         before[s] = last[j, i]

@@ -40,7 +40,7 @@ class Scan:
 
     name: str  # "upper" or "lower"
     vertices: Array  # welded vertices in scan coordinates [mm], float64, shape (V, 3)
-    vertices_single: NDArray[np.float32]  # the same in float32 for the rasteriser
+    vertices_single: NDArray[np.float32]  # the same vertices in float32, for the rasteriser
     crown_faces: Faces  # faces whose contour is matched, int32, shape (F, 3)
     gum_faces: Faces  # faces that only occlude, int32, shape (G, 3)
     planes: Array  # normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used
@@ -49,7 +49,7 @@ class Scan:
     margin_directions: Array  # unit vectors on the crown across these segments, shape (S, 3)
     probes: Array  # vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
     centre: Array  # centroid of the crown vertices [mm], shape (3,)
-    radius_mm: float  # largest distance of a crown vertex from the centre
+    radius_mm: float  # maximum distance of a crown vertex from the centre
     # whether labels or paint separate crown from gum (back faces of separated crowns are culled); otherwise the whole
     # scan counts as crown
     painted: bool

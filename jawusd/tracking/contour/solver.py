@@ -230,7 +230,7 @@ class ContourSolver:
         d = np.sort(d[d < gate])
         if len(d) < 20:
             return gate
-        median = 0.5 * float(d[(len(d) - 1) // 2] + d[len(d) // 2])  # np.median is several times slower
+        median = 0.5 * float(d[(len(d) - 1) // 2] + d[len(d) // 2])  # faster than np.median by several times
         low, high = self.config.final_gate_px
         return min(max(self.config.gate_sigmas * 1.4826 * median, low), high)
 
@@ -274,7 +274,7 @@ class ParallelMap:
             while left:
                 try:
                     k, item = left.popleft()
-                except IndexError:  # another thread took the last item
+                except IndexError:  # another thread has taken the last item
                     return
                 try:
                     results[k] = function(item)

@@ -47,7 +47,7 @@ class EdgeSearch(Protocol):
 class Drawn:
     """Both arches as rendered in an image."""
 
-    own: NDArray[np.uint8]  # labels of the arch alone: CROWN, GUM or 0, shape (h, w)
+    own: NDArray[np.uint8]  # labels of the searched arch alone: CROWN, GUM or 0, shape (h, w)
     other: NDArray[np.uint8]  # labels of the other arch, shape (h, w)
     other_inverse_depth: NDArray[np.float32]  # inverse depth of the other arch [1/mm], 0 = empty, shape (h, w)
 

@@ -18,7 +18,7 @@ from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
 _BESIDE = 2  # number of surveyed frames on either side of a chosen frame that are redundant
-_WIDTH_PX = 320  # width of the surveyed images: enough for mask centres accurate to a tenth of a millimetre
+_WIDTH_PX = 320  # width of the surveyed images: mask centres are accurate to a tenth of a millimetre
 
 
 @dataclass(frozen=True, eq=False)

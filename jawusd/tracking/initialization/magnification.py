@@ -65,7 +65,7 @@ class Magnification:
         return float(np.median(self.scale))
 
 
-#: One frame: T_world_upper and T_world_lower (2, 4, 4), views, masks used (2, C).
+#: A frame: T_world_upper and T_world_lower (2, 4, 4), its views, and the masks used (2, C).
 Instant = tuple[Array, Sequence[View], Mask]
 
 
@@ -73,11 +73,11 @@ Instant = tuple[Array, Sequence[View], Mask]
 class _Rows:
     """Linearised distances of one arch in one frame: d = J x + C theta with pose x and shared unknowns theta."""
 
-    distance: Array  # shape (n,)
+    distance: Array  # signed distances to the edges [px], shape (n,)
     length: Array  # contour length [px], shape (n,)
     pose: Array  # derivatives with respect to the twist of the arch, shape (n, 6)
-    camera: Array  # camera of each row, shape (n,)
-    shared: Array  # derivatives with respect to the unknowns of its camera, shape (n, _UNKNOWNS)
+    camera: Array  # index of each row's camera, shape (n,)
+    shared: Array  # derivatives with respect to the unknowns of the row's camera, shape (n, _UNKNOWNS)
 
 
 def measure_magnification(

@@ -34,9 +34,9 @@ _GUM_SHARE, _GUM_BELOW_MM = 0.3, 2.0
 class Occlusion:
     """How two arches meet; lengths in mm, NaN if not measurable."""
 
-    gap_mm: float  # smallest distance between the crowns, 0 if they touch
+    gap_mm: float  # minimum distance between the crowns, 0 if they touch
     side_gaps_mm: tuple[float, float]  # gaps left and right of the midline, negative if crowns overlap
-    depth_mm: float  # largest overlap of the crowns
+    depth_mm: float  # maximum overlap of the crowns
     deep_share: float  # fraction of the opposed crown surface that is more than 1 mm inside the other arch
     # fraction of the common area in the bite plane in which lower crowns reach more than 2 mm above the lowest point of
     # the upper ones
@@ -49,8 +49,8 @@ class Occlusion:
     turned_over: tuple[bool | None, bool | None]
     opens_towards: tuple[bool, bool]  # per arch, whether the open side of its crowns faces the other arch
     midlines_mm: float  # lateral distance of the midlines, where both arches have teeth left and right
-    width_ratio: float  # ratio of the widths of upper and lower arch, measured at equal depth
-    widths_mm: tuple[float, float]  # largest width of each arch
+    width_ratio: float  # ratio of the upper to the lower width, measured in the same transverse slabs
+    widths_mm: tuple[float, float]  # maximum extent of each arch in its own plane
     lower_ahead_mm: float  # distance by which the lower front teeth lie in front of the upper ones
 
 
@@ -58,10 +58,10 @@ class Occlusion:
 class CrownSurface:
     """Samples of a crown surface."""
 
-    points: Array  # [mm], shape (N, 3)
+    points: Array  # centres of faces [mm], shape (N, 3)
     normals: Array  # outward unit normals, shape (N, 3)
-    areas: Array  # [mm^2], shape (N,)
-    border: Mask  # next to an opening of the surface, where the inside is undefined, shape (N,)
+    areas: Array  # areas of these faces [mm^2], shape (N,)
+    border: Mask  # whether a sample adjoins an opening of the surface, where the inside is undefined, shape (N,)
 
 
 def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlusion:

@@ -85,7 +85,7 @@ class _Evidence:
     """How well the picks and masks of a setting agree."""
 
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
-    wrong: Mapping[str, list[int]]  # numbers of the rejected picks, by arch
+    wrong: Mapping[str, list[int]]  # numbers (from 1) of the rejected picks, by arch
     miss_mm: float  # rms error of the picks, clipped at the rejection limit
     on: Mapping[str, float]  # fraction of each camera's mask pixels on the scans; cameras without masks are omitted
     unseen: int  # number of cameras without masks in this frame

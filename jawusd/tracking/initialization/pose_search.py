@@ -87,7 +87,7 @@ class ShiftCorrelation:
         some = np.abs(picture) > 1e-3
         y, x = np.flatnonzero(some.any(1)), np.flatnonzero(some.any(0))
         picture = picture[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
-        # Padding by the largest shift prevents circular wrap-around onto the template.
+        # Padding by the maximum shift prevents circular wrap-around onto the template.
         right, down = np.abs(pixels).max(0)
         picture = np.pad(picture, ((down, down), (right, right))).astype(np.float32)
         self._shape = picture.shape
@@ -198,7 +198,7 @@ def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], us
     H, g, sight = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for view in (view for view, used in zip(views, use[arch], strict=True) if used):
         height, width = view.masks.shape[1:]
-        # Three times the image size, since the teeth may be outside the image.
+        # The rendered area is three times the image size, since the teeth may be outside the image.
         bits = scan.silhouette(view.matrix @ view.T_delay[arch] @ pose, (3 * height, 3 * width), -width, -height)
         crowns, mask = unpack_bits(bits, 3 * width), view.masks[arch] > 127
         depth = view.matrix[2] @ centre

@@ -42,7 +42,7 @@ FRAMES_TRIED = 5
 class Start:
     """The first tracked frame and its poses."""
 
-    frame: int  # reference camera frame
+    frame: int  # frame number of the reference camera
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     notes: dict[str, object]  # how the start was found, for the meta data of the tracks
     findings: tuple[Finding, ...] = ()  # findings about scans and picks

@@ -20,8 +20,8 @@ from jawusd.tracking.initialization.start_search import StartSearch
 
 # Maximum ratio of the uncovered mask fraction after undoing a swap to that before, for the swap to be reported.
 _PROOF = 0.5
-# Uncovered fraction of a camera's masks from which swapped masks are suspected: good poses leave 0.01, and swapped
-# masks of similar cameras as little as 0.1.
+# Minimum uncovered fraction of a camera's masks for a swap to be suspected: good poses leave 0.01, and swapped masks of
+# similar cameras as little as 0.1.
 _ODD_SHARE = 0.05
 
 
@@ -125,7 +125,8 @@ def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
     return any(size[_masks(source).upper] != footage.cameras[source.name].size_px for source in sources)
 
 
-#: Clear fit [-]: correct poses exceed it unless lips are nearly closed; wrong poses stay below 0.1 in one arch.
+#: Minimum of a clear fit [-]: correct poses exceed it unless lips are nearly closed; wrong poses stay below 0.1 in one
+#: arch.
 CLEAR_FIT = 0.3
 #: Minimum acceptable fit with a mistake undone [-]: wrong poses do not reach it.
 EXPLAINS = 0.1
@@ -245,8 +246,9 @@ def raise_for_unmatched_arch(fits: Mapping[int, Array]) -> None:
     fit = clear[frame]
     name, other = ARCH_NAMES[1 - good], ARCH_NAMES[good]
     raise TrackingError(
-        f"the {name} scan does not fit its own masks on any frame where the {other} one does: {fit[1 - good]:.2f} of "
-        f"its contour against {fit[good]:.2f}, less what stays uncovered; at least {EXPLAINS:g} is needed",
+        f"the {name} scan does not fit its own masks on any frame on which the {other} scan fits its own: the "
+        f"fit (matched fraction of the contour less a penalty for uncovered mask) is {fit[1 - good]:.2f} against "
+        f"{fit[good]:.2f}; at least {EXPLAINS:g} is needed",
         frame=frame,
         hint=f"Check that the {name} scan is a recent one of this subject, and that its masks show the {name} teeth.",
     )

@@ -27,7 +27,7 @@ _FOCAL_ROUNDS = 6
 #: Ratio of true to computed variance of a frame's unknowns [-]: the equations ignore that outline errors persist over
 #: frames and that the rig deviates from the subject's anatomy.
 WIDER = 1.5**2
-# Standard deviations of smoothed poses in frames where an arch was missed [rad, mm, mm].
+# Standard deviations of the prior for realigning frames in which an arch was missed [rad, mm, mm].
 _NEARBY = np.r_[[0.05] * 3, [3.0] * 3, [3.0] * 3]
 
 
@@ -38,7 +38,7 @@ class Smoothed:
     fits: list[FrameFit]
     covariance: Array
     state: TakeState
-    sigma_log_focal: Array  # shape (C,)
+    sigma_log_focal: Array  # standard deviations of the log focal lengths, shape (C,)
 
 
 class Smoother:
@@ -61,7 +61,7 @@ class Smoother:
         """Configure the refinement.
 
         Args:
-            instants: solver of single instants.
+            instants: solver of single frames.
             views: source of the views; None if the outlines of the fits are to be used as matched, in which case fits
                 with a fixed head share its pose.
             frames: frame numbers in temporal order.

@@ -44,7 +44,7 @@ class TakeState:
     """Current estimate of the unknowns of a take."""
 
     habits: Array  # mask biases of both arches, shape (2, 3): see `View.habits`
-    log_focal: Array  # logarithm of true over calibrated focal length, shape (C,)
+    log_focal: Array  # logarithm of the ratio of true to calibrated focal length, shape (C,)
 
     @classmethod
     def unknown(cls, cameras: int) -> TakeState:
@@ -52,7 +52,7 @@ class TakeState:
         return cls(np.zeros((2, _HABITS)), np.zeros(cameras))
 
     def corrected(self, views: Sequence[View]) -> list[View]:
-        """Return the views of an instant, corrected by the estimate."""
+        """Return the views of a frame, corrected by the estimate."""
         pairs = zip(views, self.log_focal.tolist(), strict=True)
         return [replace(with_focal(view, log_focal), habits=self.habits) for view, log_focal in pairs]
 

@@ -34,7 +34,7 @@ class Picture(NamedTuple):
     """Part of an undistorted image around the teeth."""
 
     camera: Camera  # the pinhole camera of the part
-    rgb: NDArray[np.uint8]  # shape (h, w, 3)
+    rgb: NDArray[np.uint8]  # 8-bit pixels, shape (h, w, 3)
 
 
 #: Returns the images of a frame, one per camera or None, cropped around T_world_upper and T_world_lower, shape (2, 4,
@@ -69,7 +69,7 @@ class LearnedColours:
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
         """
         self._scans, self._cameras, self.axes = tuple(scans), tuple(cameras), axes
-        # Seeded, so that the same scans give the same patches.
+        # The clustering is seeded, so that the same scans give the same patches.
         crowns = [scan.crown_vertices(3000) @ axes.T[:, [0, 2]] for scan in scans]
         self._patches = np.stack([kmeans2(points, PATCHES, seed=1, minit="++")[0] for points in crowns])
         self._colours: list[CameraColours | None] = [None] * len(cameras)

@@ -11,17 +11,17 @@ from scipy.ndimage import gaussian_filter1d
 
 from jawusd.base.arrays import Array, Mask
 
-PATCHES = 8  # per arch
-KINDS = 2  # free edges and gum line
+PATCHES = 8  # number of patches per arch
+KINDS = 2  # number of kinds of borders: free edges and gum line
 TABLES = PATCHES * KINDS  # number of colour tables per arch; table = KINDS * patch + kind
 _BITS = 4  # bits per channel; with more, most bins would stay empty
 BINS = 1 << (3 * _BITS)
 
-_BLUR = 0.7  # standard deviation of the blur of histograms [bins]
+_BLUR = 0.7  # standard deviation of the blur kernel [bins]
 _REACH = 2  # radius of the blur kernel [bins]
 # Matrix that blurs along one axis of the colour cube; values are replicated at its border.
 _SPREAD = gaussian_filter1d(np.eye(1 << _BITS), _BLUR, axis=0, mode="nearest", radius=_REACH)
-_LOCAL = 0.5  # weight of a patch's own histogram
+_LOCAL = 0.5  # weight of a patch's own histogram in its colour model
 _MOST = 3.0  # maximum magnitude of the log ratios, as no colour is conclusive
 _LIPS = 0.2  # weight of skin and lips in the background model
 _EMPTY = 2e-5  # probability assigned to unseen colours
@@ -100,7 +100,7 @@ class CameraColours:
     def _ratio(self) -> NDArray[np.float32]:
         """Return the log ratio of tooth to background by arch, table and bin, shape (2, TABLES, BINS)."""
         out = np.empty((2 * TABLES, BINS), np.float32)
-        beside = np.stack([self._outside, 0.5 * (self._gum + self._outside)])  # by kind
+        beside = np.stack([self._outside, 0.5 * (self._gum + self._outside)])  # by kind of border
         inside, outside = self._local_tooth.reshape(-1, BINS), self._local_outside.reshape(-1, BINS)
         _write_ratios(inside, outside, self._tooth, beside, self._lips, out)
         return out.reshape(2, TABLES, BINS)

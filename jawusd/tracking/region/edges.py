@@ -246,8 +246,8 @@ def sharpen(
                 outer[c] += beyond[c] / 3
         if ((inner - outer) ** 2).sum() < contrast * contrast:
             continue
-        # A moving edge is a ramp in linear light, not in gamma-encoded values. Its middle is the steepest point after a
-        # second blur of the same width.
+        # A moving edge is a ramp in linear light, not in gamma-encoded values. The middle of the ramp is its steepest
+        # point after a second blur of the same width.
         power = _GAMMA if blur_px[s] > _LEAST_BLUR_PX else 1.0
         norm = 0.0
         for c in range(3):

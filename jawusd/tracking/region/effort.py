@@ -44,7 +44,7 @@ class Effort:
     learn_every: int
 
 
-#: For recorded images.
+#: Effort for recorded images.
 THOROUGH = Effort(
     gates_px=(6.0, 4.0, 3.0, 2.5, 2.0),
     next_px=(6.0, 4.0, 3.0, 2.5, 2.0),
@@ -61,7 +61,7 @@ THOROUGH = Effort(
     in_turn=False,
     learn_every=1,
 )
-#: For live images. Frames are dropped during a search, so searches are less frequent.
+#: Effort for live images. Frames are dropped during a search, so searches are less frequent.
 FAST = Effort(
     gates_px=(8.0, 3.0, 2.0),
     next_px=(16.0, 6.0, 2.5, 2.0),

@@ -19,7 +19,8 @@ from jawusd.tracking.contour.quality import landmark_sigmas
 
 _UNIT_MM = (5.0, 20.0, 5.0)  # scale of the incisal point's motion to the left, up and forwards
 # Mean motion of the left condyle to the left, up and forwards [mm] as coefficients of 1, x, y, z, xx, xy, xz, yy, yz,
-# zz, over 60 joints of `jawusd.synthetic.person`, whose ranges come from the literature. The right condyle mirrors it.
+# zz, over 60 joints of `jawusd.synthetic.person`, whose ranges come from the literature. The motion of the right
+# condyle is the mirror image.
 _USUAL_MM = np.array(
     [
         [0.0, 1.1, 0.0, 0.0, 0.0, 0.2, -0.4, 0.0, 0.0, 0.0],
@@ -68,7 +69,7 @@ class CondyleMotion:
         first[:, 0] = 1.0 / _CONSTANT_MM**2
         first[:, 4:] /= _PRODUCTS**2
         self._precision = first[:, :, None] * np.eye(mean.shape[1])  # precision of the coefficients, shape (6, K, K)
-        self._sums = first * mean  # precision times mean, shape (6, K)
+        self._sums = first * mean  # precision times mean of the coefficients, shape (6, K)
 
     def learn(self, relative: Array, covariance: Array) -> None:
         """Learn from T_upper_lower (4, 4), and the covariance (6, 6) of its left twist about the skull origin."""

@@ -75,7 +75,7 @@ class LiveTake:
             ValueError: `begin` was not called.
         """
         if self._tracker is None:
-            raise ValueError("step before begin")
+            raise ValueError("`step` was called before `begin`")
         return self._tracker.step(cut, frames)
 
     def sigma_d(self, fit: FrameFit) -> Array:
@@ -85,7 +85,7 @@ class LiveTake:
             ValueError: `begin` was not called.
         """
         if self._tracker is None:
-            raise ValueError("sigma before begin")
+            raise ValueError("the standard deviations were requested before `begin` was called")
         precision = np.diag(self._tracker.expected.precision)
         if fit.solution is not None and fit.found.any():
             variance = np.where(fit.found, residual_px(fit.solution) ** 2 * CORRELATION_PX, np.inf)

@@ -60,7 +60,7 @@ def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list
             "camera_rarely_used",
             "warning",
             f"{share[c]:.0%} of the teeth's outlines match its images, compared with {share.max():.0%} for the best "
-            f"camera and at least {_LEAST_SHARE:.0%} of that usually. It contributes little to the tracks.",
+            f"camera; at least {_LEAST_SHARE:.0%} of the latter is usual. It contributes little to the tracks.",
             value=round(float(share[c]), 3),
             limit=round(float(_LEAST_SHARE * share.max()), 3),
             camera=name,
@@ -111,7 +111,7 @@ def footage_doubts(tracks: Tracks) -> list[Finding]:
     Kind: "footage_doubtful" [%].
     """
     sigma_mm = tracks.sigma_mm[:, :3].mean(1)
-    bad = ~(sigma_mm <= _UNKNOWN_MM)  # NaN where an arch is lost
+    bad = ~(sigma_mm <= _UNKNOWN_MM)  # also true for NaN, where an arch is lost
     share = float(bad.mean())
     if share <= _FEW:
         return []

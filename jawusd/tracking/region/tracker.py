@@ -37,11 +37,12 @@ class RegionPose:
     """Poses of both arches in a frame."""
 
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4); predictions for arches not found
-    found: Mask  # shape (2,)
+    found: Mask  # arches found, shape (2,)
     covariance: Array  # covariance of their left twists about the world origin, NaN if not found, shape (2, 6, 6)
     objective_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
     solution: Solution | None = None  # the alignment; None for poses read from a file
-    usual: Array = field(default_factory=lambda: np.ones(2))  # matched fraction relative to the usual one, shape (2,)
+    # matched fraction of the contour relative to the usual one, shape (2,)
+    usual: Array = field(default_factory=lambda: np.ones(2))
     # minimum of `usual` for an arch to count as found, shape (2,)
     least: Array = field(default_factory=lambda: np.zeros(2))
 

@@ -21,13 +21,14 @@ from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
 
 _AHEAD_PX = 2.0  # distance outside a crown's silhouette at which the rendered label is tested for gum
 
-_SHUTTER = 0.5  # assumed exposure as a fraction of the frame time, typical of film
+_SHUTTER = 0.5  # assumed exposure as a fraction of the frame time, as is typical of film
 # Motion during the exposure at which the weight of a border is halved [px]: the variance of an edge grows with the
 # square of its blur. Applied only in the final alignment: in earlier ones, the matched fraction of the contour
 # determines whether teeth are lost.
 _BLURRED_PX = 10.0
 _LEARNED_PX = (2, 7)  # minimum and maximum distance from the contour of pixels whose colours are learned
-# For estimating the gum-line offset: minimum weight of a border [-], largest distance [px], minimum number of samples.
+# For estimating the gum-line offset: minimum weight of a border [-], maximum distance of a border from its sample [px],
+# and number of samples that must be exceeded.
 _SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
 _CLEAR_RATIO = 1.0  # minimum mean log ratio on both sides for full weight of a border [-]
 _SHARPEN_PX = 5.0  # maximum search range for which borders are refined by colour
@@ -90,7 +91,7 @@ class Counts:
     """Statistics collected beside the borders matched in an image."""
 
     tooth: Array  # colours inside borders, shape (2, TABLES, BINS)
-    outside: Array  # colours outside, shape (2, TABLES, BINS)
+    outside: Array  # colours outside borders, shape (2, TABLES, BINS)
     gum_px: Array  # outward offset of observed gum lines from those of the scans [px], NaN if not measured, shape (2,)
 
     @classmethod
@@ -103,7 +104,7 @@ class Counts:
 class RegionView:
     """Part of an undistorted image with the colour model of teeth."""
 
-    rgb: NDArray[np.uint8]  # shape (h, w, 3)
+    rgb: NDArray[np.uint8]  # 8-bit pixels, shape (h, w, 3)
     bins: NDArray[np.uint16]  # colour bins, shape (h, w)
     ratio: NDArray[np.float32]  # log ratios of tooth to background, shape (2, TABLES, BINS)
     patches: Array  # centres of the patches of both arches, left and front [mm], shape (2, PATCHES, 2)

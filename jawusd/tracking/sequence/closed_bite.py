@@ -266,7 +266,7 @@ def registration_unknown(rest: RestFrames) -> Finding:
     where = (
         "the frame named in rest_frame is not tracked" if rest.named else "no frame shows the teeth at rest together"
     )
-    hint = "Record a closed bite with both arches in view, and name its frame as rest_frame in [motion]."
+    hint = "Record closed teeth with both arches in view, and name such a frame as rest_frame in [motion]."
     return Finding("registration_unknown", "note", f"{where}: the bite of the scans was not checked", hint=hint)
 
 

@@ -41,7 +41,7 @@ class MotionPredictor:
             if step is not None:
                 out[r] = step @ self._last[r]
         if self._lost_for[1] and not self._lost_for[0]:
-            out[1] = out[0] @ se3_inverse(self._last[0]) @ self._last[1]  # a lost jaw moves with the head
+            out[1] = out[0] @ se3_inverse(self._last[0]) @ self._last[1]  # a lost jaw is assumed to move with the head
         return orthonormalise(out)
 
     def starts(self) -> list[Array]:
@@ -215,7 +215,7 @@ def _median(values: deque[Array], otherwise: float | Array) -> Array:
     """Return medians that ignore NaN; `np.nanmedian` is ten times slower for so few values."""
     if not values:
         return np.asarray(otherwise, np.float64)
-    stack = np.sort(np.array(values), axis=0)  # NaN sorts last
+    stack = np.sort(np.array(values), axis=0)  # NaN is sorted to the end
     known = np.isfinite(stack).any(0)
     count = (~np.isnan(stack)).sum(0)
     low, high = (np.take_along_axis(stack, at[None], axis=0)[0] for at in (np.maximum(count - 1, 0) // 2, count // 2))

@@ -183,7 +183,7 @@ def _corrected_views(views: Sequence[View], tracks: Tracks, k: int, poses: Array
     """Return the views of frame index k, corrected by the whole-take estimates of the first pass."""
     before, after = poses[max(k - 1, 0)], poses[min(k + 1, len(poses) - 1)]
     span = max(1, min(k + 1, len(poses) - 1) - max(k - 1, 0))
-    velocity = se3_log(after @ se3_inverse(before)) / span  # per frame
+    velocity = se3_log(after @ se3_inverse(before)) / span  # twist per frame
     meta, out = tracks.meta, []
     steady = poses[k] @ np.array(meta.get("steady_error", np.tile(np.eye(4), (2, 1, 1)))) @ se3_inverse(poses[k])
     for name, view in zip(tracks.camera_names, views, strict=True):

@@ -52,7 +52,7 @@ OF_COLOURS = LensLimits(0.03, 0.015, np.inf, np.inf, 1.6, np.inf)
 _MOST_BEND = 0.015
 # Rotation and motion of a camera since its calibration above which a warning is given, although they are corrected.
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
-_KNOCKED_MORE = 1.5  # minimum ratio of the motion of a knocked camera to that of any other
+_KNOCKED_MORE = 1.5  # minimum ratio of a knocked camera's motion to that of any other camera
 _TELLING_CAMERAS = 3  # minimum number of cameras for identifying a wrong one: if two differ, either may be wrong
 # Minimum matched fraction of the visible contour, and maximum residual, both relative to the other scan: a scan that
 # violates both belongs to another subject. Last, minimum number of frames for the decision. False-alarm rate: at most
@@ -247,8 +247,8 @@ def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) 
             "searches_left_out",
             "warning",
             f"{searches.fruitless} searches for lost teeth failed, the limit for a take of this length (at most "
-            f"{searches.most} more failures than successes); on {len(lost)} frames from this one on, the teeth stay "
-            "lost without another search.",
+            f"{searches.most} more failures than successes); in {len(lost)} frames, of which this is the first, lost "
+            "teeth were not searched for.",
             value=len(lost),
             limit=searches.most,
             frame=lost[0],
@@ -288,8 +288,8 @@ def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -
                 Finding(
                     "camera_rarely_used" if with_use else "camera_not_used",
                     "warning",
-                    f"used in {with_use} of {len(frames)} frames: of its {int(seen.sum())} masks "
-                    f"{int((seen & ~taken).sum())} fit neither the scans nor the other cameras' masks.",
+                    f"used in {with_use} of {len(frames)} frames: {int((seen & ~taken).sum())} of its "
+                    f"{int(seen.sum())} masks fit neither the scans nor the other cameras' masks.",
                     value=round(float(taken.sum() / seen.sum()), 3),
                     limit=_HALF,
                     camera=name,

@@ -27,7 +27,7 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
 from jawusd.tracking.sequence.results import outline_variance
 
-SHIFTS = (-1, 0, 1)  # frames
+SHIFTS = (-1, 0, 1)  # time shifts of the compared masks [frames]
 _CHECKED_FRAMES = 18  # number of frames checked per take, which take a tenth of a second each
 _FEWEST = 3  # minimum number of conclusive frames on either side of a step, since two masks in a row may be wrong
 # Minimum margin by which a shift fits better than all others, and maximum to which margins are clipped, as fractions of
@@ -154,7 +154,7 @@ def _fits(record: FrameRecord, around: Sequence[Sequence[View]], solver: Contour
     for c, view in enumerate(views):
         use = present_masks(views)
         use[:, c] = False
-        shown = np.logical_and.reduce([now[c].present for now in around]) & use.any(1)  # (2,)
+        shown = np.logical_and.reduce([now[c].present for now in around]) & use.any(1)  # shape (2,)
         if shown.any():
             apart = solver.solve(poses, views, config.gates_from(0.0), use, rendering=rendering).poses
             masks = [_in_window(view, now[c]) for now in around]
