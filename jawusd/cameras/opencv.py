@@ -117,7 +117,7 @@ def _array(path: Path, key: str, shape: tuple[int, ...], words: list[str]) -> Ar
 
 
 def _values(path: Path) -> Iterator[tuple[str, tuple[int, ...], list[str]]]:
-    """Yield the name, shape and words of each top-level value; the shape of scalars and text is ()."""
+    """Yield the name, shape and tokens of each top-level value; the shape of scalars and text is ()."""
     suffix = path.suffix.lower()
     if suffix == ".xml":
         for node in parsed_xml(path):

@@ -133,7 +133,7 @@ def _equal(a: Array, b: Array) -> Mask:
 
 
 def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array]) -> Array:
-    """Return T_cam_world (C, 4, 4), chained from the first camera over the pairs with most shared views."""
+    """Return T_cam_world (C, 4, 4), chained from the first camera over the pairs with the most shared views."""
     seen = np.isfinite(T_cam_board[..., 0, 0])
     T_cam_world = np.full((len(names), 4, 4), np.nan)
     T_cam_world[0] = np.eye(4)
@@ -187,7 +187,7 @@ class DetectedBoard:
 
 
 def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
-    """Return the board found in most gray images (h, w); None if no two agree."""
+    """Return the board found in the most gray images (h, w); None if no two agree."""
     boards: Counter[tuple[int, int]] = Counter()
     markers: Counter[str] = Counter()
     highest: dict[str, int] = {}

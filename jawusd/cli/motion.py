@@ -110,7 +110,7 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
     """Project a motion into the bound, see `JawRig.keep_inside`; frames without parameters are kept.
 
-    Only the keys of a smooth motion are projected if that suffices, so that they remain connected by curves.
+    For a smooth motion, only the keys are projected if that suffices, so that they remain connected by curves.
     """
     known = np.isfinite(motion.d).all(axis=1)
     lost = int((~known).sum())

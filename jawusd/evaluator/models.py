@@ -346,8 +346,8 @@ class StartGrid:
     @classmethod
     def of(cls, decode: Callable[[Array], tuple[Array, Array]], incisor: Array, d_range: Array) -> StartGrid:
         """Decode a grid over the box d_range (3, 2) [mm]."""
-        # opening is long and curved, the other axes short: with 13 x 9 x 9 nodes, every point lies in the Gauss-Newton
-        # basin of one
+        # the opening axis is long and curved, the others short; with 13 x 9 x 9 nodes, every point lies in the
+        # Gauss-Newton basin of at least one node
         axes = [np.linspace(low, high, n) for (low, high), n in zip(d_range, (13, 9, 9))]
         d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         R, t = decode(d)

@@ -108,7 +108,7 @@ def nearest_in_valley(bound: BoundFormula, wanted: Vector, start: Vector) -> Vec
 def lowest_in_valley(
     bound: BoundFormula, pull: Callable[[Vector], Pull], start: Vector, *, exact: bool = False
 ) -> Vector:
-    """Return the minimum of a cost inside the bound, in the basin of a valid start [mm].
+    """Return the minimiser of a cost inside the bound, in the basin of a valid start [mm].
 
     Args:
         bound: The bound.

@@ -29,7 +29,7 @@ from jawusd.geometry import se3_exp, se3_left_jacobian, se3_log
 Curve = Callable[[Array], tuple[Array, Array]]
 
 KNOTS = 97
-#: Directions of the incisal displacement that opening, laterotrusion and protrusion measure.
+#: Directions along which the incisal displacement is measured as opening, laterotrusion and protrusion.
 MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 # Fraction of the mandible's rms speed below which the incisal point counts as standing still or reversing.

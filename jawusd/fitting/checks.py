@@ -34,8 +34,9 @@ _SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
 _WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # wide open: fraction of the largest opening, minimum number of frames
 _HALF_OPEN = (0.25, 0.65)  # fractions of the largest opening between which the mouth counts as half open
 _HALF_OPEN_SHARE = 0.35  # minimum fraction of the full range that should be reached with the mouth half open
-# Number of directions in (laterotrusion, protrusion), fraction of the range that covers a direction with the mouth half
-# open, and minimum number of directions that should be covered.
+# With the mouth half open: number of directions in the plane of laterotrusion and protrusion, distance from the median,
+# as a fraction of the range, beyond which a frame covers its direction, and minimum number of directions that should be
+# covered.
 _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
 #: A point of the bound lies in a gap if it is farther than this from all captured poses, per parameter [mm].
 FAR_MM = np.array([3.0, 2.0, 2.0])

@@ -1,4 +1,4 @@
-"""Error tables: distances between model and captured poses at the mandible and landmarks, trained and held out."""
+"""Error tables: distances of mandible and landmarks between model and captured poses, on training and held-out data."""
 
 from __future__ import annotations
 

@@ -237,7 +237,7 @@ class _Reader:
         return np.dtype(parts)
 
     def _walk(self, data: bytes, at: int, rows: int) -> tuple[Indices, Indices]:
-        """Return the offsets of rows and the end (n + 1,), and the lengths of their lists, shape (n, lists)."""
+        """Return the offset of each row and the end of the last, shape (n + 1,), and list lengths, shape (n, lists)."""
         steps = [
             (np.dtype(value).itemsize, Struct(length[0] + _LETTERS[length[1:]]) if length else None)
             for value, length in zip(self._values, self._lengths, strict=True)

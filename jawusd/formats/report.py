@@ -79,7 +79,7 @@ class ReportData:
     cameras: tuple[CameraFacts, ...]  # empty if the capture is not available
     inferred: tuple[str, ...]  # values that were derived instead of given
     seconds: Mapping[str, float]  # duration of each stage [s]
-    hashes: Mapping[str, str]  # SHA-256 by file name of the build
+    hashes: Mapping[str, str]  # SHA-256 of each file of the build, by file name
     origin: Origin
     rig: RigFacts
     experiments: Experiments | None  # the paper's experiments, None if they failed

@@ -21,12 +21,12 @@ RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as stored in files
 # 0.39 or more.
 MOST_GRAY = 0.2
 MOST_SOFT = 0.35  # maximum median fraction of intermediate values outside the background, as after a blur of 8 px
-_FAINT = 0.25  # maximum coverage in an image without teeth, whose pixels are noise
+_FAINT = 0.25  # maximum coverage of a pixel in an image without teeth, where coverage is noise
 _DEAD_ZONE = 0.06  # maximum deviation from a level due to lossy coding, as a fraction of the contrast
 _NEAR = 24  # maximum difference of values of one level after blur or lossy coding [of 255]
 _FLAT = 10  # maximum difference between adjacent pixels inside a region [of 255]; edges have larger differences
 _ALIKE = 0.15  # maximum difference of a level between images of one source, as a fraction of the contrast
-_MOST_THIRD = 0.25  # maximum area of a third level / area of the second largest; soft edges have no flat area
+_MOST_THIRD = 0.25  # maximum flat area of a third level, relative to the second largest; soft edges have no flat area
 _SHARP = 0.8  # minimum fraction of a third level's area within 1 of its value; labels exceed it, photographs do not
 
 

@@ -145,13 +145,16 @@ def _stored_window(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> S
 
 
 def _widened(part: slice[int, int, int], limit: int) -> tuple[int, int]:
-    """Return the range of a side with margin, aligned for fast conversion."""
+    """Return a range of pixels along one side of an image, widened by a margin and aligned for fast conversion."""
     start = max(0, part.start - _AROUND_PX) // _STEP_PX * _STEP_PX
     return start, min(limit, start + -(-(part.stop + _AROUND_PX - start) // _STEP_PX) * _STEP_PX)
 
 
 def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices]:
-    """Return a crop of a stored image around a window, and the window in the crop; the whole if not much larger."""
+    """Return a crop of a stored image around a window, with a margin, and the position of the window in the crop.
+
+    If the crop would cover more than half of the image, the image is not cropped.
+    """
     rows, columns = window
     (top, bottom), (left, right) = (_widened(*sides) for sides in zip(window, (frame.height, frame.width)))
     height, width = bottom - top, right - left

@@ -167,7 +167,7 @@ def _teeth_parts(
 
 
 def _part_around(camera: Camera, world: Array, aspect: float) -> Part:
-    """Return the image region around the points (F, n, 3) [mm] of many frames; unknown points are NaN."""
+    """Return the image region that shows points (F, n, 3) [mm], NaN if unknown, in all frames, except outliers."""
     size = np.array(camera.size_px)
     pixels = camera.project(world)
     pixels[camera.depth(world) <= 0] = np.nan

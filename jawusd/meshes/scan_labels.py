@@ -43,7 +43,7 @@ _ON_CROWN = 0.2
 # Minimum difference in redness between the highest points and points far below them, in standard deviations, for which
 # colours are used; it is smaller for stone casts and untextured scans.
 _LEAST_CONTRAST = 4.0
-_FAR_BELOW_MM = 9.0  # depth below the highest point nearby that most crowns do not reach
+_FAR_BELOW_MM = 9.0  # depth below the highest point nearby beyond which few crowns extend
 _FEWEST = 50  # colours need at least this many vertices that are certainly crown, and as many that are certainly gum
 _GRAIN = 0.003  # standard deviation of redness due to 8-bit quantisation
 

@@ -140,7 +140,11 @@ def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[
 
 
 def _above(path: Array, captured: Array) -> Array:
-    """Return the heights of path points (K, 3) above the highest captured ones (N, 3) at equal z [mm], at least 0."""
+    """Return how far path points (K, 3) lie above the highest captured point with nearly the same z [mm].
+
+    The result is 0 for path points that lie lower. Path points with few captured points (N, 3) near their z are left
+    out.
+    """
     beside = np.abs(path[:, None, 2] - captured[None, :, 2]) < _BESIDE_MM
     highest = np.where(beside, captured[None, :, 1], -np.inf).max(1)
     known = beside.sum(1) >= _FEWEST_BESIDE

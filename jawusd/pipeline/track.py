@@ -51,7 +51,7 @@ class TrackSummary(TakeNotes):
     without_a_camera: int
     prior_aided: int
     sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if unknown
-    coverage_error_percent: float | None  # uncovered fraction of the masks used, None without masks
+    coverage_error_percent: float | None  # mean uncovered part of the masks used [%], None without masks
     frames_used: NotRequired[dict[str, int]]  # number of frames in which a camera was used, by camera
 
 

@@ -86,7 +86,8 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
     if best is None:
         return None
     _, inside, outside, group = best
-    level = (inside + outside) / 2  # midway between both, since highlights on lips are brighter than the surroundings
+    # midway between the two, since highlights on lips are brighter than the surroundings
+    level = (inside + outside) / 2
     parts, count = ndimage.label(toothlike > level)
     like = ndimage.median(toothlike, parts, np.arange(count + 1)) > outside + _AS_BRIGHT * (inside - outside)
     own = np.bincount(parts.ravel(), group.ravel(), count + 1) > 0.5 * np.bincount(parts.ravel())

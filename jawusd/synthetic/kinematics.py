@@ -42,8 +42,8 @@ class Joint:
     rotation_bend: float  # curvature of pitch over opening (0: proportional)
     slide_open_mm: float  # forward slide at full opening
     slide_limit_mm: float  # maximum forward slide of a condyle
-    slide_early: float  # fraction of the slide that follows the rotation from the start
-    slide_onset: float  # opening (0..1) over which that early fraction ramps up
+    slide_early: float  # fraction of the opening slide that starts early; the rest lags behind the rotation
+    slide_onset: float  # opening (0..1) around which the early part of the slide becomes proportional to opening
     protrusion_max_mm: float  # forward slide in full protrusion at zero opening
     retrusion_max_mm: float  # backward slide in full retrusion at zero opening
     hinge_share: float  # fraction of the opening slide reversed by retrusion below half opening

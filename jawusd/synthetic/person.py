@@ -134,7 +134,7 @@ def _asymmetric(rng: np.random.Generator, value: float, relative: float) -> Arra
 
 
 def draw_joint(rng: np.random.Generator) -> Joint:
-    """Draw the joint of one subject."""
+    """Sample a random joint for one subject."""
     u = rng.uniform
     half_distance, middle_x = u(47.0, 53.0), u(-0.7, 0.7)
     height, depth = u(41.0, 47.0), u(86.0, 92.0)

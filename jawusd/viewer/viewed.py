@@ -79,7 +79,8 @@ class ViewedCapture:
     # fits T_world_upper and T_world_lower (4, 4) to picks, and returns them with the names of inconsistent picks;
     # raises a JawusdError
     poses_of_picks: Callable[[Bootstrap], tuple[tuple[Array, Array], list[str]]]
-    # writes picks (first argument) to the capture file if it still has the second ones; raises a JawusdError
+    # writes the new picks (first argument) to the capture file if it still has the expected old picks (second
+    # argument); otherwise raises a JawusdError
     save_picks: Callable[[Bootstrap, Bootstrap | None], None]
     # writes the approved labels of an arch and returns the file; raises a JawusdError
     save_labels: Callable[[str, NDArray[np.uint8]], Path]

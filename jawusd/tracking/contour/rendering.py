@@ -182,7 +182,11 @@ class Drawings:
 def _moved(
     samples: Array, silhouettes: int, matrix: Array, cos: float, sin: float, height: int, width: int, out: Array
 ) -> tuple[int, int]:
-    """Write the samples at another pose that lie in the window; return their number, and that of silhouettes."""
+    """Move samples to another pose and write those that lie in the window, silhouettes first.
+
+    Returns:
+        The number of samples written, and how many of them are silhouettes.
+    """
     n, first = 0, 0
     for s in range(len(samples)):
         x, y, z = samples[s, X], samples[s, Y], samples[s, Z]

@@ -186,7 +186,7 @@ def _silhouette(
 
 @numba.njit(nogil=True, cache=True)
 def _border_slope(vertices: Array, i: int, j: int, k: int, sample: Array, matrix: Array, w: float) -> float:
-    """Return the image motion of border ij along its normal per mm away from corner k in its triangle [px/mm]."""
+    """Return how far border ij moves along its image normal per mm away from corner k in its triangle [px/mm]."""
     ex, ey, ez = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
     tx, ty, tz = sample[X] - vertices[k, 0], sample[Y] - vertices[k, 1], sample[Z] - vertices[k, 2]
     along = (tx * ex + ty * ey + tz * ez) / max(ex * ex + ey * ey + ez * ez, 1e-18)

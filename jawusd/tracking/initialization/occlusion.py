@@ -42,7 +42,8 @@ class Occlusion:
     # the upper ones
     through: float
     same: float  # fraction of the lower surface that coincides with the upper one
-    opposite: float  # fraction of the arch with fewer teeth that has crowns of the other arch above or below it
+    # fraction of crown points with crowns of the other arch above or below them, of the arch in which it is larger
+    opposite: float
     aside_mm: float  # distance between the centres of the arches along the bite plane
     turn_rad: float  # angle in the bite plane between the forward directions of both arches
     # per arch, whether its gum lies between its crowns and the other arch; None if unknown
@@ -229,8 +230,8 @@ def _turned_over(scan: Scan, surface: CrownSurface, towards: Array) -> bool | No
 def _opens_towards(surface: CrownSurface, towards: Array) -> bool:
     """Return whether the open side of a surface faces the other arch.
 
-    The directed area of an open surface, the area integral of its normal, points away from the opening, where crowns
-    were cut from the gum.
+    The vector area (the integral of the normal) of an open surface points away from the opening, where crowns were cut
+    from the gum.
     """
     directed = (surface.normals * surface.areas[:, None]).sum(0) / surface.areas.sum()
     return bool(towards @ directed < -_OPEN)

@@ -14,9 +14,9 @@ from jawusd.geometry import anatomical_frame
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusion
 
-# The limits lie outside the range of all valid bites measured (docs/explanation/constants.md). Limits of impossible
-# bites: distance between the arches, fraction of the bite passed through, fraction of coinciding surface, minimum
-# opposed fraction, rotation about the bite normal, maximum and minimum width.
+# The limits lie outside the range of all valid bites measured (docs/explanation/constants.md). Limits beyond which a
+# bite is impossible: distance between the arches, fraction of the bite in which the arches interpenetrate, fraction of
+# coinciding surface, minimum opposed fraction, rotation about the bite normal, maximum and minimum width.
 _APART_MM = 4.0
 _THROUGH_SHARE = 0.5
 _SAME_SHARE = 0.5

@@ -42,7 +42,7 @@ _PX_PER_MM = 2.0
 # initial distance of the teeth along the optical axis, which determines the resolution of the views
 _ANYWHERE_MM = 200.0
 _SURVEYED, _FRAMES_TRIED = 24, 4  # number of frames surveyed for large masks, and maximum number of frames searched
-# Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, in steps of an eighth.
+# Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, each an eighth larger than the last.
 _WIDTHS_MM = 22.0 * 1.125 ** np.arange(10)
 _USUAL_WIDTH_MM = 42.0
 _GRID = Grid(
@@ -197,7 +197,7 @@ class SingleStart:
         return [(head.objective + scores[k], Pose(head.pose, self._jaws[k])) for k in np.argsort(scores)[::-1][:2]]
 
     def _outside_price(self, arch: int, pose: Array, view: View) -> float:
-        """Return the penalty for crowns outside the mask; otherwise, teeth close to the camera would cover any mask."""
+        """Return the penalty for crowns outside the mask; without it, teeth near the camera would cover any mask."""
         bits = self._coarse[arch].silhouette(view.matrix @ pose, view.masks.shape[1:])
         return _OUTSIDE_PRICE * max(int(count_bits(bits)) - int((view.masks[arch] > 127).sum()), 0)
 

@@ -174,7 +174,10 @@ class Smoother:
         return fits
 
     def _covariance(self, system: TakeSystem) -> tuple[Array, Array]:
-        """Return the covariances of the frames, marginalised over the take's unknowns, (F, 9, 9), and of the take."""
+        """Return the covariance of each frame's unknowns, shape (F, 9, 9), and that of the take's unknowns.
+
+        The former include the uncertainty of the take's unknowns.
+        """
         found, unknowns = system.covariance(), self._unknowns
         wide = np.sqrt(unknowns.redundancy)
         shared = found.shared * np.outer(wide, wide)

@@ -67,6 +67,8 @@ class KeptViews:
 class Growth:
     """Sums like those of `OutlineSums`, with a sample's derivative g with respect to log focal length [px].
 
+    The vector h is the derivative of a sample's outline shift with respect to the annotator's habits.
+
     Attributes:
         twist: sum w J g, shape (2, C, 6).
         habit: sum w h g, shape (2, C, 3).

@@ -1,4 +1,6 @@
-"""Fusion of poses with the condylar motion of a whole take; covariances of implausible frames are inflated.
+"""Fusion of each pose with the condylar motion learned from all frames of a take.
+
+The covariances of frames with implausible condylar motion are inflated first.
 
 Masks generated around a wrong pose confirm it, and colours may favour it, but such poses rarely fit the condylar motion
 of this jaw. While a take is tracked, the condylar prior has a low weight, as few frames have trained it. Once all

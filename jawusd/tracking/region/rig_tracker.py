@@ -29,7 +29,7 @@ _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _LAST_GATES_PX = (2.0,)
 _TRIAL_GATES_PX = (8.0, 6.0)  # gates of the short trial alignments of a search
-# Maximum time since the last step for which no frame counts as dropped, and for which only one does [frames].
+# Longest intervals between steps [frames] that count as no dropped frame, and as one dropped frame.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
 _FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some tenths of a millimetre
 # Fractions of the usual matched contour below which a pose is doubtful, a search starts, an arch is lost, and a lost

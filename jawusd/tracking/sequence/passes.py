@@ -47,7 +47,7 @@ class Passes:
         self.searches = SearchBudget(stop - first)
 
     def track_from(self, frame: int, poses: Array) -> None:
-        """Track all frames in both directions from the given one, then back to it, and into the gaps.
+        """Track outwards from the given frame in both directions, then back to it, then fill the gaps.
 
         Args:
             frame: reference frame number.

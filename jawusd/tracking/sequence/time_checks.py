@@ -258,8 +258,8 @@ def delay_steps(
 
 _CLEARLY = 4.0  # minimum significance of a delay or step [standard deviations]
 _LATE_FRAMES = 0.7  # minimum delay for a warning; free-running cameras differ by up to half a frame
-# Minimum step of a camera's delay for a warning, in a take without masks [frames]. Steps are missed where the jaw is
-# fast.
+# Smallest step in a camera's delay that triggers a warning, in a take without masks [frames]. Steps are missed where
+# the jaw is fast.
 _STEP_FRAMES = 0.5
 
 
