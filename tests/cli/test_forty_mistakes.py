@@ -53,7 +53,7 @@ IN_THE_FILE = [
     ("a board clip too few", ', "right.mp4"]', "]", "[boards] videos", "1 clips", "2 are needed", "in the order"),
     ("a way to align that is none", "[boards]", '[sync]\nmethod = "clap"\n[boards]', "method", '"clap"', '"flash"', ""),
     ("a camera that is none", "[boards]", '[sync]\nreference = "mid"\n[boards]', "reference", '"mid"', "left", "Use"),
-    ("an offset too few", "[boards]", "[sync]\noffsets = { left = 0 }\n[boards]", "offsets", "right", "needed", "= 0"),
+    ("an offset too few", "[boards]", "[sync]\noffsets = { left = 0 }\n[boards]", "offsets", "right", "require", "= 0"),
     ("a pick before the take", "[boards]", "[bootstrap]\nframe = -1\n[boards]", "frame", "-1", "0 or more", "For ex"),
     ("a pick of no camera", "[boards]", PICK % "mid", "[[bootstrap.upper]] camera", '"mid"', "left, ", "Use the"),
     ("a newer file", "capture/1", "capture/9", "format", "capture/9", "up to", "Update jawusd"),

@@ -295,7 +295,7 @@ def test_somebody_without_a_capture_gets_a_rig_on_loose_scans(people, tmp_path):
 
 def test_an_empty_library_is_said_to_be_empty(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(FittingError, match="no person"):
+    with pytest.raises(FittingError, match="no subject"):
         run(
             "retarget",
             "--landmarks",

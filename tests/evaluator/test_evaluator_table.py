@@ -70,7 +70,11 @@ def test_parameters_outside_are_clamped_and_nan_gives_nan():
 
 @pytest.mark.parametrize(
     ("knots", "message"),
-    [(([0, 1], [0, 1], [0, 1, 2]), "shape"), (([0, 1], [1, 0], [0, 1]), "rising"), (([0], [0, 1], [0, 1]), "rising")],
+    [
+        (([0, 1], [0, 1], [0, 1, 2]), "shape"),
+        (([0, 1], [1, 0], [0, 1]), "increasing"),
+        (([0], [0, 1], [0, 1]), "increasing"),
+    ],
 )
 def test_tables_that_do_not_fit_are_refused(knots, message):
     counts = (2, 2, 2) if message == "shape" else tuple(len(k) for k in knots)

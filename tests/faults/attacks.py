@@ -41,7 +41,7 @@ class Attack:
         says: text required in the output.
         most_mb: limit of resident memory.
         limit: called in the process before the program starts.
-        act: called with the running process.
+        act: called with the running process and the file of its output.
         env: environment variables.
     """
 
@@ -50,7 +50,7 @@ class Attack:
     says: str = ""
     most_mb: int = 600
     limit: Callable[[], None] | None = None
-    act: Callable[[int], None] | None = None
+    act: Callable[[int, Path], None] | None = None
     env: tuple[tuple[str, str], ...] = ()
 
 
@@ -161,9 +161,11 @@ def viewed(folder: Path) -> list[str]:
     return ["view", str(rig(folder) / "actor.usda"), "--port", "0"]
 
 
-def after(seconds: float, number: int, process: int) -> None:
-    """Send a signal after a time."""
-    time.sleep(seconds)
+def when_serving(number: int, process: int, said: Path) -> None:
+    """Send a signal once the viewer has printed its address."""
+    end = time.monotonic() + MOST_S / 2
+    while "http://" not in said.read_text(errors="replace") and time.monotonic() < end:
+        time.sleep(0.1)
     os.kill(process, number)
 
 
@@ -208,8 +210,8 @@ ATTACKS = {
     "ulimit -v 300 MB": Attack(viewed, ENDED, "ulimit -v", limit=partial(space, 300)),
     "ulimit -v 900 MB": Attack(viewed, ENDED, "ulimit -v", limit=partial(space, 900)),
     "no /proc": Attack(lambda folder: ["info", str(rig(folder) / "actor.usda")], YES, "actor", limit=without_proc),
-    "SIGTERM": Attack(viewed, -signal.SIGTERM, "", 1200, act=partial(after, 20, signal.SIGTERM)),
-    "SIGINT": Attack(viewed, YES, "", 1200, act=partial(after, 20, signal.SIGINT)),
+    "SIGTERM": Attack(viewed, -signal.SIGTERM, "", 1200, act=partial(when_serving, signal.SIGTERM)),
+    "SIGINT": Attack(viewed, YES, "", 1200, act=partial(when_serving, signal.SIGINT)),
 }
 
 
@@ -228,6 +230,12 @@ def largest_mb(pid: int) -> float:
 def run(attack: Attack, folder: Path) -> tuple[bool, str]:
     """Return whether an attack was held off, and the rest of its line."""
     from forked import in_copy
+    from run_jawusd import heed_signals
+
+    def prepare() -> None:
+        heed_signals()
+        if attack.limit is not None:
+            attack.limit()
 
     words = in_copy(partial(attack.words, folder))  # memory of other processes only
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **dict(attack.env)}
@@ -239,10 +247,10 @@ def run(attack: Attack, folder: Path) -> tuple[bool, str]:
             stdout=said,
             stderr=said,
             env=environment,
-            preexec_fn=attack.limit,
+            preexec_fn=prepare,
         )
         if attack.act is not None:
-            attack.act(process.pid)
+            attack.act(process.pid, folder / "said")
         peak_mb = 0.0
         while (code := process.poll()) is None and time.monotonic() - begun < MOST_S:
             peak_mb = max(peak_mb, largest_mb(process.pid))

@@ -103,5 +103,5 @@ def test_one_person_gives_a_motion_but_no_expected_error(donor):
     learned = leave_one_out([donor])
     assert learned.expected is None
     assert personal_motion([donor], donor.landmarks, learned).weights == {"one": 1.0}
-    with pytest.raises(FittingError, match="no person"):
+    with pytest.raises(FittingError, match="no subject"):
         leave_one_out([])

@@ -149,7 +149,7 @@ def test_numbers_that_cannot_be(tmp_path: Path) -> None:
 )
 def test_wrong_units_are_named(tmp_path: Path, scale: float, unit: str) -> None:
     arch(scale).export(tmp_path / "a.stl")
-    with pytest.raises(CaptureError, match=rf"is 20 to 150 mm\. It looks like {unit}\..*must be in mm"):
+    with pytest.raises(CaptureError, match=rf"must measure 20 to 150 mm\. It looks like {unit}\..*must be in mm"):
         meshio.load_mesh(tmp_path / "a.stl")
 
 

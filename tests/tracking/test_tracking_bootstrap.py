@@ -94,7 +94,7 @@ def test_picks_on_a_line_are_refused():
 def test_pick_outside_of_the_picture_is_refused():
     picks = _picks(4)
     picks[2] = _moved(picks[2], 5000.0)
-    with pytest.raises(TrackingError, match="pick 3 on the upper teeth lies at .* outside its 640 x 400 picture"):
+    with pytest.raises(TrackingError, match="pick 3 on the upper teeth lies at .* outside its 640 x 400 image"):
         pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
 
 
