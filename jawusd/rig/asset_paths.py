@@ -49,17 +49,16 @@ def target_of(layer: Sdf.Layer, asset: str) -> str | None:
     return Sdf.Layer.CreateIdentifier(found or path, arguments)
 
 
-def evaluated(layer: Sdf.Layer, variables: Mapping[str, object]) -> Sdf.Layer:
-    """Return a copy of a layer with its variable expressions evaluated; without variables the layer itself.
+def with_variables(layer: Sdf.Layer, variables: Mapping[str, object]) -> Sdf.Layer:
+    """Return a copy of a layer with these variables, in which `asset_paths` evaluates expressions.
 
-    The variables of referring layers are stronger than the layer's own.
+    The variables of referring layers are stronger than the layer's own. Without variables, return the layer itself.
     """
     if not variables:
         return layer
     copy = Sdf.Layer.CreateAnonymous(".usda")
     copy.TransferContent(layer)
     copy.expressionVariables = dict(variables)
-    asset_paths(copy)
     return copy
 
 

@@ -16,13 +16,13 @@ from jawusd.rig.asset_paths import (
     asset_paths,
     check_checksum,
     clip_templates,
-    evaluated,
     file_of,
     file_of_layer,
     files_of_template,
     is_layer,
     recorded_checksums,
     target_of,
+    with_variables,
 )
 from jawusd.rig.layout import SCHEMA_NAME
 
@@ -190,7 +190,7 @@ def _referenced_layers(layer: Sdf.Layer, rig_folder: Path | None, variables: Map
         variables: Expression variables of the layer.
     """
     folder = rig_folder or file_of_layer(layer).resolve().parent
-    read = evaluated(layer, variables)
+    read = with_variables(layer, variables)
     found: list[_LayerRef] = []
     for template in clip_templates(read):  # before asset_paths, in which OpenUSD lists the folders of clips
         pattern = _checked_file(layer, template, folder)

@@ -9,7 +9,7 @@ from pxr import Sdf, Usd
 
 from jawusd.base.errors import RigError
 from jawusd.base.inputs import SETTING
-from jawusd.rig import describe, untrusted
+from jawusd.rig import asset_paths, describe, untrusted
 from jawusd.rig.asset_paths import file_of
 from jawusd.rig.publish import write_package
 from jawusd.rig.read import open_stage
@@ -306,3 +306,13 @@ def test_a_syntax_error_is_named_with_its_line(name, tmp_path):
     with pytest.raises(RigError, match=r"read: line 3") as found:
         open_stage(tmp_path / "shot.usda")
     assert str(found.value.path).endswith(name)
+
+
+def test_templates_are_checked_before_openusd_lists_their_folders(anchored_folder, elsewhere, monkeypatch):
+    """It lists them whenever it is asked for the asset paths of a layer."""
+    asked = []
+    monkeypatch.setattr(asset_paths.UsdUtils, "ModifyAssetPaths", lambda *_: asked.append(1))
+    (anchored_folder / "shot.usda").write_text(attack_by_a_template(anchored_folder, elsewhere))
+    with pytest.raises(RigError, match="outside its own folder"):
+        open_stage(anchored_folder / "shot.usda")
+    assert asked == []
