@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from jawusd.cli.text_capture import calibration_lines
 from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM
 from jawusd.formats.finding import Finding
+from jawusd.formats.notes import registration_sizes
 
 if TYPE_CHECKING:
     from jawusd.pipeline.build import BuildSummary, PlannedStage
@@ -146,8 +146,7 @@ def _take_lines(summary: TrackSummary) -> list[str]:
         )
     if "registration" in summary:
         bite = summary["registration"]
-        shift, turn = math.hypot(*bite["shift_mm"]), math.hypot(*bite["turn_deg"])
-        sigmas = math.hypot(*bite["shift_sigma_mm"]), math.hypot(*bite["turn_sigma_deg"])
+        shift, turn, *sigmas = registration_sizes(bite)
         what = "lower scan moved to the closed bite by" if bite["applied"] else "lower scan off the closed bite by"
         lines.append(f"  {what} {shift:.2f} +- {sigmas[0]:.2f} mm, {turn:.2f} +- {sigmas[1]:.2f} degrees")
     return lines

@@ -74,14 +74,14 @@ def sync_lines(result: SyncResult) -> list[str]:
 
 def segment_lines(summary: SegmentSummary) -> list[str]:
     """Return the summary of a segmentation as text."""
-    doubtful = summary["look_at"]
+    uncertain = summary["look_at"]
     lines = [f"{summary['frames']} frames segmented in {len(summary['masks'])} cameras"]
     if learned := summary.get("learned"):
         before, after = (f"{100 * value:.1f} %" for value in learned["disagreement"])
         lines.append(f"learned from {learned['pictures']} drawn masks: disagreement {before} before, {after} after")
-    if doubtful:
-        lines.append(f"{len(doubtful)} masks to inspect, worst first (thumbnails in {summary['sheet']}):")
-    for row in doubtful[:_LISTED_MASKS]:
+    if uncertain:
+        lines.append(f"{len(uncertain)} masks to inspect, worst first (thumbnails in {summary['sheet']}):")
+    for row in uncertain[:_LISTED_MASKS]:
         where = f"  {row['camera']} frame {row['own_frame']:>5}  {row['row']:<5}"
         lines.append(f"{where}  confidence {row['confidence']:.2f}  {row['reason']}")
     return lines

@@ -5,9 +5,10 @@ Every value is optional: other programs and older versions omit some or add thei
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
-from typing import Required
+from typing import NamedTuple, Required
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict
@@ -46,6 +47,24 @@ class Registration(TypedDict, total=False):
     shift_sigma_mm: list[float]
     turn_sigma_deg: list[float]
     T: Required[list[list[float]]]
+
+
+class RegistrationSizes(NamedTuple):
+    """Lengths of the vectors of a `Registration`: shift [mm], turn [deg], and standard deviations, NaN if unknown."""
+
+    shift_mm: float
+    turn_deg: float
+    shift_sigma_mm: float
+    turn_sigma_deg: float
+
+
+def registration_sizes(found: Registration) -> RegistrationSizes:
+    """Return how far and how much a registration moves the lower scan."""
+    shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
+    unknown = [math.nan]
+    sigma_mm = math.hypot(*found.get("shift_sigma_mm", unknown))
+    sigma_deg = math.hypot(*found.get("turn_sigma_deg", unknown))
+    return RegistrationSizes(shift, turn, sigma_mm, sigma_deg)
 
 
 class TakeNotes(TypedDict, total=False):

@@ -30,7 +30,7 @@ _LOWEST = 0.12
 # Maximum rate at which walks leave a crown top for the gum, per mm of the top's outline [1/mm]; the limit is divided by
 # a factor that grows with the depth of the top below the hull of the arch. Rates on 40 scans of one surface: 0.003
 # (median) to 0.030 at crowns, 0.026 to 0.074 at ridges without teeth, which are mostly below the hull.
-_LEAVING, _DOUBT_PER_MM, _MOST_DOUBT_MM = 0.06, 3.0, 0.6
+_LEAVING, _STRICTER_PER_MM, _STRICTEST_MM = 0.06, 3.0, 0.6
 # Maximum fraction of a component's crown-gum border without a crease, median over an arch, for which the components
 # are taken to contain gum. Observed: 0.02 to 0.162 for crowns with a collar of gum (58 scans of synthetic subjects with
 # 5,000 faces and more), 0.8 to 1.0 for plain synthetic crowns, 0.24 to 0.34 for plain real ones, and 0.167 in one scan
@@ -98,8 +98,8 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
     low = seen.gum | ~bearing[piece]
     surely = np.bincount(piece, seen.gum, len(extent)) > 0
     low |= (bearing & ~(surely & ~small))[piece] & (_height_share(surface, up) < _LOWEST)
-    doubt = 1.0 + _DOUBT_PER_MM * np.clip(seen.top_depth, 0.0, _MOST_DOUBT_MM)
-    crown = walk.crowns(high & ~low, low, np.where(small[piece], np.inf, _LEAVING / doubt))
+    strictness = 1.0 + _STRICTER_PER_MM * np.clip(seen.top_depth, 0.0, _STRICTEST_MM)
+    crown = walk.crowns(high & ~low, low, np.where(small[piece], np.inf, _LEAVING / strictness))
     across, weak = walk.weak(crown)
     owner = piece[across[:, 0]]
     count = np.bincount(owner, minlength=len(extent))

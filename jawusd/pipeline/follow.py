@@ -15,7 +15,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, relative_pose, transform_points
 from jawusd.pipeline.cameras import open_footage
-from jawusd.pipeline.picture_search import PictureSearch, Start, picks_mismatch, picks_outside
+from jawusd.pipeline.picture_search import PictureSearch, Start, picked_start
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_capture
 
@@ -220,7 +220,7 @@ def track_videos(
     from jawusd.segmentation.picture import ColourFootage
     from jawusd.tracking.contour.scan import prepare_scan
     from jawusd.tracking.region.picture_start import ArchStart
-    from jawusd.tracking.region.take import TakeFacts, footage_doubts, tracks_of
+    from jawusd.tracking.region.take import TakeFacts, footage_findings, tracks_of
 
     cameras, videos = open_footage(capture)
     if len(videos) < FEWEST_VIDEOS:
@@ -254,7 +254,7 @@ def track_videos(
     )
     tracks = tracks_of(followed, facts, follower.sampled_views)
     tracks.meta["start"] = {"by": begin.by, "frame": begin.frame, "fit": begin.fit}
-    findings = [finding.as_json() for finding in (*rows.findings, *footage_doubts(tracks))]
+    findings = [finding.as_json() for finding in (*rows.findings, *footage_findings(tracks))]
     tracks.meta["findings"] = [*tracks.meta.get("findings", []), *findings]
     return tracks
 
@@ -265,12 +265,12 @@ def _picked_start(rows: ArchStart, follower: Follower, picks: Bootstrap, frames:
     Raises:
         TrackingError: the picks are inconsistent, or do not fit the images.
     """
-    if picks.frame not in frames:
-        raise picks_outside(picks.frame, frames)
-    found, fit = follower.start_at(picks.frame, rows.picked(picks, follower.cameras))
-    if fit < _LEAST_PICKED_FIT:
-        raise picks_mismatch(picks.frame, fit, _LEAST_PICKED_FIT)
-    return Start(picks.frame, found.poses, fit, "picks")
+
+    def begin() -> tuple[Array, float]:
+        found, fit = follower.start_at(picks.frame, rows.picked(picks, follower.cameras))
+        return found.poses, fit
+
+    return picked_start(picks.frame, frames, begin, _LEAST_PICKED_FIT)
 
 
 def searched_start(

@@ -157,14 +157,29 @@ def masked_cameras(
     return [camera for camera in with_masks(capture, folder).cameras if camera.name in rows]
 
 
-def picks_mismatch(frame: int, fit: float, least: float = LEAST_FIT) -> TrackingError:
-    """Return the error for picks on a frame if the fraction of the visible contour that fits, 0 .. 1, is too small."""
-    return TrackingError(
-        f"the picks do not match the pictures: {fit:.0%} of the visible contour fits the colours, at least "
-        f"{least:.0%} is needed",
-        frame=frame,
-        hint="Check the picks, and that scans, rig and calibration belong to this subject and these cameras.",
-    )
+def picked_start(picked_frame: int, frames: range, begin: Callable[[], tuple[T, float]], least_fit: float) -> Start[T]:
+    """Return a start from picks.
+
+    Args:
+        picked_frame: frame of the picks.
+        frames: range to be tracked.
+        begin: returns the pose there, and the fraction of the visible contour that fits it, 0 .. 1.
+        least_fit: smallest fraction that is accepted.
+
+    Raises:
+        TrackingError: the frame is not to be tracked, or the picks do not match the images.
+    """
+    if picked_frame not in frames:
+        raise picks_outside(picked_frame, frames)
+    pose, fit = begin()
+    if fit < least_fit:
+        raise TrackingError(
+            f"the picks do not match the pictures: {fit:.0%} of the visible contour fits the colours, at least "
+            f"{least_fit:.0%} is needed",
+            frame=picked_frame,
+            hint="Check the picks, and that scans, rig and calibration belong to this subject and these cameras.",
+        )
+    return Start(picked_frame, pose, fit, "picks")
 
 
 def picks_outside(frame: int, frames: range) -> TrackingError:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Maximum distance [mm] between the jaw poses from masks and from colours, above which one of them must be wrong;
 # correct poses of three takes differed by at most 0.9 mm. Fractions of wrong or lost frames above which a take is
-# reported as doubtful (`_FEW`) or as not usable (`_MANY`).
+# reported as partly unreliable (`_FEW`) or as not usable (`_MANY`).
 _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 

@@ -28,7 +28,7 @@ RECORD, SUMMARY, SHEET, LEARNED = "segment.jsonl", "segment.json", "look_at_thes
 FORMAT = "jawusd-segment/1"
 _MAX_LEARNED_BYTES = 1 << 20
 # Masks below this confidence need inspection.
-_DOUBTFUL = 0.5
+_LOW_CONFIDENCE = 0.5
 # Symptoms of a bad mask: 1 if larger values are worse, -1 if smaller values are. Each is compared with its median over
 # the take.
 _SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
@@ -268,7 +268,7 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
         OutputError: a file cannot be written.
     """
     rows = summarise(entries)
-    doubtful = sorted((row for row in rows if row["confidence"] < _DOUBTFUL), key=lambda row: row["confidence"])
+    uncertain = sorted((row for row in rows if row["confidence"] < _LOW_CONFIDENCE), key=lambda row: row["confidence"])
     videos = {camera.name: camera.clip for camera in capture.cameras if camera.clip is not None}
     summary: SegmentSummary = {
         "format": FORMAT,
@@ -276,15 +276,15 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
         "masks": {name: {arch: f"{name}/{arch}/%06d.png" for arch in ("upper", "lower")} for name in videos},
         "frames": len(entries),
         "learned": _learned(folder / LEARNED),
-        "look_at": doubtful,
-        "sheet": SHEET if doubtful else None,
+        "look_at": uncertain,
+        "sheet": SHEET if uncertain else None,
         "confidence": rows,
     }
     write_text_atomic(folder / SUMMARY, json.dumps(summary, indent=1) + "\n")
-    if doubtful:
+    if uncertain:
         from jawusd.segmentation.files import write_sheet
 
-        worst = [(row["camera"], row["own_frame"], row["reason"]) for row in doubtful[:_SHEET_FRAMES]]
+        worst = [(row["camera"], row["own_frame"], row["reason"]) for row in uncertain[:_SHEET_FRAMES]]
         write_sheet(folder / SHEET, worst, videos, folder)
     return summary
 

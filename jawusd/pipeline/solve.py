@@ -26,7 +26,7 @@ from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras, open_videos
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.follow import Cutter
-from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch, Start, picks_mismatch, picks_outside
+from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch, Start, picked_start
 from jawusd.pipeline.pictures import VIDEO, write_overlay
 from jawusd.pipeline.segment_guide import combine_guide
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
@@ -136,12 +136,12 @@ class VideoShot:
 
     def _picked(self, bootstrap: Bootstrap) -> Start[Pose]:
         """Return a start from the picks."""
-        if bootstrap.frame not in self._frames:
-            raise picks_outside(bootstrap.frame, self._frames)
-        pose, fit = self.take.begun(bootstrap.frame, self._teeth.search.picked(bootstrap, self.cameras))
-        if fit < LEAST_FIT:
-            raise picks_mismatch(bootstrap.frame, fit)
-        return Start(bootstrap.frame, pose, fit, "picks")
+        frame = bootstrap.frame
+
+        def begin() -> tuple[Pose, float]:
+            return self.take.begun(frame, self._teeth.search.picked(bootstrap, self.cameras))
+
+        return picked_start(frame, self._frames, begin, LEAST_FIT)
 
 
 def solve_videos(

@@ -163,10 +163,10 @@ def first_pass(
             tracks = track_capture(
                 capture, cameras, offsets, upper, lower, landmarks, config, threads=jobs, progress=report
             )
-            tracks, doubts = combine_guide(capture, tracks, landmarks)
+            tracks, disagreements = combine_guide(capture, tracks, landmarks)
             if auto_masks_folder(capture) is not None:
                 tracks = widen_strained(tracks, landmarks, subject.T_anatomical_skull[:3, :3])
-            findings = [*findings, *doubts]
+            findings = [*findings, *disagreements]
     tracks.meta["findings"] = [*tracks.meta.get("findings", []), *(finding.as_json() for finding in findings)]
     rescaled = rescaled_cameras(capture)
     tracks.meta["calibration_rescaled_px"] = {name: [list(was), list(now)] for name, (was, now) in rescaled.items()}

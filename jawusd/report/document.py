@@ -19,7 +19,7 @@ from jawusd.base.errors import shown
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import DEEP, TOUCHING
-from jawusd.formats.notes import TracksMeta
+from jawusd.formats.notes import TracksMeta, registration_sizes
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.figures import human_ranges, model_figure, tracking_figure
@@ -231,8 +231,7 @@ def _bite(data: ReportData) -> str:
         )
     if "registration" in meta:
         found = meta["registration"]
-        shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
-        sigma_mm, sigma_deg = math.hypot(*found["shift_sigma_mm"]), math.hypot(*found["turn_sigma_deg"])
+        shift, turn, sigma_mm, sigma_deg = registration_sizes(found)
         off = f"{shift:.2f} \u00b1 {sigma_mm:.2f} mm and {turn:.2f} \u00b1 {sigma_deg:.2f} degrees"
         frames = f"frames {found['frames'][0]} to {found['frames'][-1]}"
         what = "was moved to the closed bite by" if found["applied"] else "deviates from the closed bite by"

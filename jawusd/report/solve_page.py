@@ -224,7 +224,7 @@ def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
     return [(name, int(has.sum()), f"{100 * has.sum() / total:.1f} %", words) for name, has, words in rows]
 
 
-def _sentence(solved: SolvedJaw, doubts: bool) -> str:
+def _sentence(solved: SolvedJaw, has_findings: bool) -> str:
     """Return a sentence on what to inspect, based on existing verdicts only."""
     said = []
     if (solved.state == SolveState.LOST).any():
@@ -235,7 +235,7 @@ def _sentence(solved: SolvedJaw, doubts: bool) -> str:
         said.append(
             "some poses lie outside the rig's bound: the masks are wrong, or the person exceeded the captured range"
         )
-    if doubts:
+    if has_findings:
         said.append("there are findings")
     if not said:
         return "Both arches were found in every frame, and every pose is valid for the rig."

@@ -3,7 +3,7 @@
     python tests/benchmarks/spoilt_footage.py CAPTURE... [--kinds KIND...] [--out DIR]
 
 Captures without masks, each with truth/truth.npz. A take whose incisal point is a millimetre off in the median frame
-must be refused, or be called doubtful, or claim no more than it holds. Kinds:
+must be rejected, be reported as unreliable, or carry honest sigmas. Kinds:
 
     clean        nothing changed
     dark         a fifth of the light

@@ -17,7 +17,8 @@ from jawusd.rig.bake import bake_rig
 BLENDERS = ["blender45", "blender50"]
 FRAMES, D = example_motion()
 RIG = example_rig()
-JAW = ("--mandible", "/root/Actor/geo/Mandible", "--skull", "/root/Actor/geo/Skull")
+EXPORTED = "/root"  # Blender's default prim above all that it exports
+JAW = ("--mandible", f"{EXPORTED}/Actor/geo/Mandible", "--skull", f"{EXPORTED}/Actor/geo/Skull")
 SPLINES = ["splines", "alone", "edited", "over"]
 SHOWN_MM = 0.02
 EXPORTED_MM = 0.01

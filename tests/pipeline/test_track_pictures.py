@@ -17,7 +17,7 @@ from jawusd.pipeline.follow import track_videos
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_meshes
 from jawusd.pipeline.track import first_pass, track_summary
-from jawusd.tracking.region.take import footage_doubts
+from jawusd.tracking.region.take import footage_findings
 
 EXAMPLE = ROOT / "examples" / "capture"
 
@@ -149,7 +149,7 @@ def test_frames_that_tell_little_make_footage_doubtful(tracked, lost, unsure, wo
     sigma = np.full((12, 5), 0.3)
     sigma[:unsure] = 1.2
     sigma[11 : 11 - lost : -1] = np.nan
-    found = footage_doubts(replace(tracked[1], sigma_mm=sigma))
+    found = footage_findings(replace(tracked[1], sigma_mm=sigma))
     if words is None:
         assert found == []
         return
@@ -161,4 +161,4 @@ def test_frames_that_tell_little_make_footage_doubtful(tracked, lost, unsure, wo
 def test_footage_doubtful_all_over_has_no_part_to_keep(tracked):
     sigma = np.full((12, 5), 0.3)
     sigma[6] = np.nan
-    assert "frames =" not in footage_doubts(replace(tracked[1], sigma_mm=sigma))[0].hint
+    assert "frames =" not in footage_findings(replace(tracked[1], sigma_mm=sigma))[0].hint

@@ -1,12 +1,15 @@
 """One surface of known quads, and files of it as scanners and editors write them, byte by byte."""
 
+import re
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jawusd.meshes.meshio import winding
+from jawusd.base.errors import CaptureError
+from jawusd.meshes.meshio import load_mesh, winding
 
 AROUND, ACROSS = 16, 6
 
@@ -86,3 +89,10 @@ def obj(faces=QUADS, *, corner="{v}", colour: float | None = None) -> str:
     rows += ["vt 0.5 0.5", "vn 0 0 1"]
     rows += ["f " + " ".join(corner.format(v=v + 1) for v in face) for face in faces]
     return "\n".join(["# by hand", "o arch", *rows, ""])
+
+
+def assert_refused(path: Path, data: bytes, words: str) -> None:
+    """Write a file and check that it is rejected by name, with these words."""
+    path.write_bytes(data)
+    with pytest.raises(CaptureError, match=rf"{re.escape(path.name)}: .*{words}"):
+        load_mesh(path)

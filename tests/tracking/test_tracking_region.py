@@ -226,8 +226,8 @@ class Covered(ColourFootage):
                 yield frame, skin if instead is None else pictures
 
 
-def fit_of(by, found, px, doubtful=False):
-    return SimpleNamespace(by=by, found=np.array([True, found]), solution=np.array([px]), doubtful=doubtful)
+def fit_of(by, found, px, uncertain=False):
+    return SimpleNamespace(by=by, found=np.array([True, found]), solution=np.array([px]), uncertain=uncertain)
 
 
 @pytest.mark.parametrize("step", [1, -1])
@@ -250,7 +250,7 @@ def test_teeth_are_followed_back_from_where_they_were_found(monkeypatch, step):
 
 
 def test_a_wrong_pose_is_replaced_up_to_where_the_right_one_fits_hardly_better(monkeypatch):
-    """Wrong from frame 2, but doubtful only in 3, where it fits better anyway, and in 5; correct from frame 6."""
+    """Wrong from frame 2, but uncertain only in 3, where it fits better anyway, and in 5; correct from frame 6."""
     monkeypatch.setattr(performance, "score_px", np.asarray)
     fits = {k: fit_of("first", True, 7.0 if k == 3 else 5.0, k in (3, 5)) for k in range(8)}
     follow_back(fits, range(8), lambda frame, before: (fit_of("back", True, 6.0 if at > 1 else 5.2) for at in before))

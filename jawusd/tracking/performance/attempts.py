@@ -37,7 +37,7 @@ class FrameFit:
         present: available masks, shape (2, C).
         uncovered: fraction of every mask not covered by the scan, NaN without a mask, shape (2, C).
         growth: derivatives of the outlines with respect to unknown focal lengths.
-        doubtful: whether less of the contour fits than usual, so that the pose may be wrong.
+        uncertain: whether less of the contour fits than usual, so that the pose may be wrong.
     """
 
     pose: Pose
@@ -46,7 +46,7 @@ class FrameFit:
     present: Mask
     uncovered: Array
     growth: Growth | None = None
-    doubtful: bool = False
+    uncertain: bool = False
 
     @property
     def found(self) -> Mask:

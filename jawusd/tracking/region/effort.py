@@ -16,8 +16,8 @@ class Effort:
         next_px: gates after one dropped frame.
         far_px: gates after several dropped frames.
         wide_px: gates from other starts and at the end of a search; None to use those from the prediction.
-        doubted, searched: fractions of the usual matched contour below which other starts are tried, and below which a
-            search starts, provided that hardly any frames were dropped.
+        uncertain, searched: fractions of the usual matched contour below which other starts are tried, and below which
+            a search starts, provided that hardly any frames were dropped.
         jaws, finalists, heads: numbers of jaw poses tried by a search, of jaw poses aligned fully, and of head poses
             tried.
         search_every: number of failed frames from one search to the next.
@@ -32,7 +32,7 @@ class Effort:
     next_px: _Gates
     far_px: _Gates
     wide_px: _Gates | None
-    doubted: float
+    uncertain: float
     searched: float
     jaws: int
     finalists: int
@@ -50,7 +50,7 @@ THOROUGH = Effort(
     next_px=(6.0, 4.0, 3.0, 2.5, 2.0),
     far_px=(6.0, 4.0, 3.0, 2.5, 2.0),
     wide_px=(12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0),
-    doubted=0.8,
+    uncertain=0.8,
     searched=0.6,
     jaws=16,
     finalists=3,
@@ -67,7 +67,7 @@ FAST = Effort(
     next_px=(16.0, 6.0, 2.5, 2.0),
     far_px=(24.0, 14.0, 8.0, 4.0, 2.0),
     wide_px=None,
-    doubted=0.6,
+    uncertain=0.6,
     searched=0.4,
     jaws=4,
     finalists=1,

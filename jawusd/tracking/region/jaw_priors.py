@@ -38,12 +38,12 @@ _NEWS = 0.1  # weight of a frame in the regression: below 1, as neighbouring fra
 # backward motion of the incisal point per mm of opening and per mm^2 of its square: mean over the joints of `_USUAL_MM`
 _BACK = 0.25, 0.005
 # squared Mahalanobis distance per coordinate at which the weight of a frame is halved, as its pose may be wrong [-]
-_DOUBT = 4.0
+_HALVING = 4.0
 
 # Standard deviation of the height of lower teeth above their position in the occlusion of the scans [mm], due to errors
 # of the bite registration; and the squared height in standard deviations [-] at which the penalty's weight is halved,
 # as the bite of the scans may be wrong instead of the pose.
-_ABOVE_MM, _BITE_DOUBT = 0.2, 4.0
+_ABOVE_MM, _BITE_HALVING = 0.2, 4.0
 
 
 class CondyleMotion:
@@ -78,7 +78,7 @@ class CondyleMotion:
         known = self._off + np.repeat(landmark_sigmas(relative, covariance, self._points[1:]) ** 2, 3)
         if not np.isfinite(known).all():
             return
-        trust = _DOUBT / (_DOUBT + self.strain(relative) / len(known))
+        trust = _HALVING / (_HALVING + self.strain(relative) / len(known))
         weight = _NEWS * trust / known
         self._precision += weight[:, None, None] * np.outer(features, features)
         self._sums += (weight * condyles)[:, None] * features
@@ -177,6 +177,6 @@ class BiteTerm:
             # The point moves with the lower arch, and its upper limit with the upper arch.
             moves = [up @ np.hstack([-hat(here - centre), np.eye(3)]) for centre in state.centres]
             slope = np.concatenate([-moves[0], moves[1]])
-            trust = _BITE_DOUBT / (_BITE_DOUBT + (height / _ABOVE_MM) ** 2)
+            trust = _BITE_HALVING / (_BITE_HALVING + (height / _ABOVE_MM) ** 2)
             weight = trust * self.noise_px3 * float(equations.outline_weight.mean()) / _ABOVE_MM**2
             equations.add_joint(weight * np.outer(slope, slope), -weight * height * slope)

@@ -207,7 +207,7 @@ class PictureTake:
 
 
 def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, range], Iterator[FrameFit]]) -> None:
-    """Track backwards into frames in which the teeth were not found or the fit is doubtful; keep the better fits.
+    """Track backwards into frames in which the teeth were not found or the fit is uncertain; keep the better fits.
 
     Teeth may be visible for some frames before a search finds them, and a wrong pose is often corrected only some
     frames later.
@@ -230,8 +230,8 @@ def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, rang
 
 
 def _trust(fit: FrameFit) -> int:
-    """Return the trust in a fit: 0 if the teeth were not found, 1 if it is doubtful, 2 otherwise."""
-    return int(fit.found.all()) * (1 if fit.doubtful else 2)
+    """Return the trust in a fit: 0 if the teeth were not found, 1 if it is uncertain, 2 otherwise."""
+    return int(fit.found.all()) * (1 if fit.uncertain else 2)
 
 
 def _fitting_px(fit: FrameFit) -> float:

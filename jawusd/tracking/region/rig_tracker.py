@@ -32,9 +32,8 @@ _TRIAL_GATES_PX = (8.0, 6.0)  # gates of the short trial alignments of a search
 # Longest intervals between steps [frames] that count as no dropped frame, and as one dropped frame.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
 _FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some tenths of a millimetre
-# Fractions of the usual matched contour below which a pose is doubtful, a search starts, an arch is lost, and a lost
-# arch stays lost. `Effort` overrides the first two unless several frames were dropped.
-_DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
+# Fractions of the usual matched contour below which an arch is lost, and below which a lost arch stays lost.
+_LOST, _AGAIN = 0.33, 0.5
 # number of frames since the last step above which an arch must fit as well as a lost one to be accepted
 _UNSURE_FRAMES = 3.0
 _USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
@@ -126,12 +125,12 @@ class RigTracker:
             self._remember(share)
         self._motion.take(found.pose, trusted)
         fit = look.fit(found, trusted, self._free_focal)
-        return replace(fit, doubtful=bool((share < _DOUBTED * usual).any()))
+        return replace(fit, uncertain=bool((share < THOROUGH.uncertain * usual).any()))
 
     def _remember(self, share: Array) -> None:
-        """Add the matched fractions (2,) to the statistics, except doubtful ones."""
+        """Add the matched fractions (2,) to the statistics, except uncertain ones."""
         usual = self._usual_share()
-        self._usual.append(np.where(share >= _SEARCHED * usual, share, usual))
+        self._usual.append(np.where(share >= THOROUGH.searched * usual, share, usual))
 
     def _usual_share(self) -> Array:
         return np.maximum(np.median(self._usual, axis=0), _LEAST_USUAL * self._first)
@@ -156,14 +155,14 @@ class RigTracker:
         in_turn, far = effort.in_turn and self._failed > effort.searches, frames > _STEADY_FRAMES
         gates = effort.gates_px if in_turn or frames <= _NEXT_FRAMES else effort.far_px if far else effort.next_px
         # After dropped frames, partial fits are not trusted, as the motion prior is weak.
-        doubted, searched = (_DOUBTED, _SEARCHED) if far else (effort.doubted, effort.searched)
+        limits = THOROUGH if far else effort
         found = look.align(expected.pose, expected, gates)
-        if not (fitting_share(found.solution) < doubted * usual).any():
+        if not (fitting_share(found.solution) < limits.uncertain * usual).any():
             return found, look
         if not in_turn:
             for start in (self._motion.last,) if effort.wide_px is None else (expected.pose, self._motion.last):
                 found = _better(found, look.align(start, expected, effort.wide_px or gates))
-        if not (fitting_share(found.solution) < searched * usual).any():
+        if not (fitting_share(found.solution) < limits.searched * usual).any():
             return found, look
         self._failed += 1
         if in_turn:
@@ -172,7 +171,7 @@ class RigTracker:
             return found, look
         look = self._wide_look(found, cut)
         found = look.align(found.pose, expected, gates)
-        if self._head == 1.0 and fitting_share(found.solution)[0] < _SEARCHED * usual[0]:
+        if self._head == 1.0 and fitting_share(found.solution)[0] < THOROUGH.searched * usual[0]:
             found = self._with_head_searched(found, expected, look)
         far_away = self._searched(found, expected, look)
         return far_away if (fitting_share(far_away.solution) >= least).all() else found, look

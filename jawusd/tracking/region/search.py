@@ -50,7 +50,7 @@ _NEAR_GATES_PX, _FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0,
 _TRIAL_GATES_PX, _LAST_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
 _FACES = 6_000  # number of crown faces of the scans before the final step
 # Border variance times correlation length that sets the weight of the condylar prior [px^3]: for a clearly visible jaw,
-# and in doubtful frames, where a lower weight would let a hidden jaw drift.
+# and in uncertain frames, where a lower weight would let a hidden jaw drift.
 _LOOSE_PX3, _FIRM_PX3 = 3.0, 15.0
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX  # border variance times correlation length, as estimated from residuals
 # Penalty per unit of the condyles' squared Mahalanobis distance, as length of matched contour [px]: Tukey's loss of a
@@ -140,7 +140,7 @@ class PoseSearch:
         """Align from a start accurate to some tenths of a millimetre, T_world_upper and T_world_lower (2, 4, 4).
 
         Args:
-            firm: whether to use a high weight of the condylar prior, for doubtful frames.
+            firm: whether to use a high weight of the condylar prior, for uncertain frames.
         """
         return self._align(start, look, _FAR_GATES_PX, firm)
 

@@ -32,7 +32,7 @@ from jawusd.tracking.sequence.time_checks import time_findings
 
 _LEAST_SHARE = 0.3  # matched fraction of a camera's contour, relative to the best camera, below which it is reported
 # Standard deviation of the lower teeth above which a frame is uninformative [mm], and the fractions of such frames
-# above which a take is doubtful, and above which it is unusable.
+# above which a take is partly unreliable, and above which it is unusable.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 _MOST = 0.6  # minimum length of a run of good frames, as a fraction of the take, for suggesting to trim the take's ends
 
@@ -105,7 +105,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
     return first, last
 
 
-def footage_doubts(tracks: Tracks) -> list[Finding]:
+def footage_findings(tracks: Tracks) -> list[Finding]:
     """Return a warning if the jaw is lost, or uncertain by more than a millimetre, in too many frames.
 
     Kind: "footage_doubtful" [%].

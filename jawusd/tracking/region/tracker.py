@@ -17,6 +17,7 @@ from jawusd.tracking.contour.quality import matched_px, relative_covariance, res
 from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
+from jawusd.tracking.region.effort import THOROUGH
 from jawusd.tracking.region.search import InstantViews, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 
@@ -24,9 +25,9 @@ _FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some
 # Fractions of the usual matched contour below which wider gates are tried, the jaw is searched for, a lost arch stays
 # lost, and an arch is lost. The usual matched contour is the median over the last frames, but at least `_LEAST_USUAL`
 # times that of the first frame, so that slowly closing lips do not redefine it.
-_DOUBTED, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = 0.8, 0.6, 0.5, 0.25, 0.7
+_UNCERTAIN, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = THOROUGH.uncertain, THOROUGH.searched, 0.5, 0.25, 0.7
 _USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
-_EAGER, _OFTEN = 6, 4
+_EAGER, _OFTEN = 6, 4  # a lost arch is searched in the first frames, then in every n-th one; see `_is_due`
 # number of frames in which wide gates are not tried again after they have failed, since lips stay closed for a while
 _RESTING = 4
 _WIDE_MM = 40.0  # maximum expected opening of a jaw that was not visible
@@ -157,7 +158,7 @@ class _DirectionTracker:
         solution = search.best(starts, look, self._poses)
         share = fitting_share(solution)
         self._rest = max(self._rest - 1, 0)
-        if (share < _DOUBTED * usual).any() and not self._rest:
+        if (share < _UNCERTAIN * usual).any() and not self._rest:
             near, solution = solution, search.from_farther(solution, starts[0], self._poses, look)
             share, self._rest = fitting_share(solution), _RESTING if solution is near else 0
         if share[1] < _SUSPECT * usual[1]:

@@ -9,7 +9,6 @@ by reweighting (Lange, Little & Taylor 1989).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.formats.finding import Finding, Severity
-from jawusd.formats.notes import Registration
+from jawusd.formats.notes import Registration, registration_sizes
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.contour.equations import translation
@@ -245,9 +244,8 @@ _OFF_MM, _OFF_DEG, _OFF_SIGMAS = 0.2, 0.5, 3.0
 
 def registration_findings(found: Registration) -> list[Finding]:
     """Return a warning if the registration of the scans contradicts the rest frames, a note if it was corrected."""
-    shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
-    shifted = shift > max(_OFF_MM, _OFF_SIGMAS * math.hypot(*found["shift_sigma_mm"]))
-    turned = turn > max(_OFF_DEG, _OFF_SIGMAS * math.hypot(*found["turn_sigma_deg"]))
+    shift, turn, sigma_mm, sigma_deg = registration_sizes(found)
+    shifted, turned = shift > max(_OFF_MM, _OFF_SIGMAS * sigma_mm), turn > max(_OFF_DEG, _OFF_SIGMAS * sigma_deg)
     if not shifted and not turned:
         return []
     frames = f"{found['frames'][0]} to {found['frames'][-1]}"
@@ -280,7 +278,7 @@ def check_registration(found: Registration) -> None:
     Raises:
         TrackingError: the lower scan is too far off the bite of the take.
     """
-    shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
+    shift, turn, *_ = registration_sizes(found)
     if found["applied"] and (shift > _MOST_MM or turn > _MOST_DEG):
         raise TrackingError(
             f"the teeth are {shift:.1f} mm and {turn:.1f} degrees off the bite of the scans; at most {_MOST_MM:g} mm "
