@@ -4,7 +4,7 @@ import html
 
 import typer
 
-from jawusd.cli.commands import EXIT_CODES, SUMMARIES
+from jawusd.cli.commands import EXIT_CODES, GROUPS, SUMMARIES, help_row
 from jawusd.cli.main import app
 
 INTRODUCTION = """# Commands
@@ -21,8 +21,13 @@ without `--force` (or `--resume` and `--fresh`, for commands that continue earli
 def page():
     """Return the page as Markdown."""
     program = typer.main.get_command(app)
-    parts = [INTRODUCTION, "| command | what it does |\n|---|---|\n"]
-    parts += [f"| [`{name}`](#jawusd-{name}) | {escaped(SUMMARIES[name])} |\n" for name in SUMMARIES]
+    parts = [INTRODUCTION, "| group | command | what it does |\n|---|---|---|\n"]
+    for group, names in GROUPS.items():
+        heads = [group] + [""] * (len(names) - 1)
+        parts += [
+            f"| {head} | [`{name}`](#jawusd-{name}) | {escaped(names[name])} |\n"
+            for head, name in zip(heads, names, strict=True)
+        ]
     parts.append(f"\n{escaped(EXIT_CODES)} [Errors and exit codes](errors.md) lists them.\n\n")
     parts.append(section("jawusd", program, "jawusd"))
     parts += [section(f"jawusd {name}", program.commands[name], f"jawusd-{name}") for name in SUMMARIES]
@@ -37,10 +42,12 @@ def section(title, command, anchor):
     if command.help:
         lines.append(escaped(command.help.replace("\f", "")) + "\n\n")
     for parameter in command.get_params(context):
-        record = parameter.get_help_record(context)
+        record = help_row(parameter, context)
         if record is not None:
             names, meaning = record
             lines.append(f"`{names}`\n:   {escaped(meaning) or 'See its name.'}\n\n")
+    if title != "jawusd":
+        lines.append(f"```sh\n{command.epilog}\n```\n\n")
     return "".join(lines)
 
 

@@ -16,42 +16,55 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from jawusd.base.errors import JawusdError
+from jawusd.cli.examples import EXAMPLES
 from jawusd.cli.output import RunLog, say
 
-SUMMARIES = {
-    "init": "Draft a capture.toml from a folder of footage and scans.",
-    "doctor": "Check the installation.",
-    "cameras": "Convert calibrated cameras between programs.",
-    "build": "Build a rig from a capture.",
-    "track": "Track the teeth of both jaws.",
-    "fit": "Fit a jaw model to tracks or other poses.",
-    "bake": "Write the OpenUSD rig of a model.",
-    "demo": "Render a synthetic capture with ground truth.",
-    "build-many": "Build many captures, one process each.",
-    "check": "Check a capture in seconds.",
-    "calibrate": "Calibrate the cameras from clips of a board.",
-    "sync": "Estimate the frame offsets between cameras.",
-    "segment": "Make masks of the teeth from the videos.",
-    "scans": "Label crown and gum of the scans.",
-    "photos": "Register two scans in occlusion from photographs.",
-    "info": "Describe a rig file or tracks.",
-    "pose": "Print the jaw pose of parameters d.",
-    "encode": "Convert poses to the nearest parameters d.",
-    "validate": "Check a rig, or poses against a rig.",
-    "ik": "Find the d that move a point to a target.",
-    "animate": "Write an animation of a rig from keys, poses or ARKit.",
-    "arkit-fit": "Fit the mapping from a subject's ARKit jaw weights to d.",
-    "arkit-table": "Write the jaw joint's offset per ARKit shape.",
-    "rebake": "Make d and mandible of an edited stage agree.",
-    "publish": "Copy a rig under unique names, or pack a shot.",
-    "solve": "Track a performance of a subject with a rig.",
-    "live": "Track the jaw in live video.",
-    "retarget": "Retarget a motion to another subject's rig.",
-    "library": "Manage many actors and compare their ranges.",
-    "plates": "Write undistorted footage.",
-    "report": "Write the report of a build or a solve again.",
-    "view": "View a rig or a capture in the browser.",
+#: Groups of `jawusd --help`, with the summary of each command.
+GROUPS = {
+    "Start": {
+        "doctor": "Check the installation.",
+        "demo": "Render a synthetic capture with ground truth.",
+    },
+    "Capture": {
+        "init": "Draft a capture.toml from a folder of footage and scans.",
+        "check": "Check a capture in seconds.",
+        "calibrate": "Calibrate the cameras from clips of a board.",
+        "cameras": "Convert calibrated cameras between programs.",
+        "sync": "Estimate the frame offsets between cameras.",
+        "segment": "Make masks of the teeth from the videos.",
+        "scans": "Label crown and gum of the scans.",
+        "photos": "Register two scans in occlusion from photographs.",
+        "plates": "Write undistorted footage.",
+    },
+    "Rig": {
+        "build": "Build a rig from a capture.",
+        "build-many": "Build many captures, one process each.",
+        "track": "Track the teeth of both jaws.",
+        "fit": "Fit a jaw model to tracks or other poses.",
+        "bake": "Write the OpenUSD rig of a model.",
+        "publish": "Copy a rig under unique names, or pack a shot.",
+        "library": "Manage many actors and compare their ranges.",
+    },
+    "Animate": {
+        "animate": "Write an animation of a rig from keys, poses or ARKit.",
+        "retarget": "Retarget a motion to another subject's rig.",
+        "solve": "Track a performance of a subject with a rig.",
+        "live": "Track the jaw in live video.",
+        "rebake": "Make d and mandible of an edited stage agree.",
+        "arkit-fit": "Fit the mapping from a subject's ARKit jaw weights to d.",
+        "arkit-table": "Write the jaw joint's offset per ARKit shape.",
+    },
+    "Inspect": {
+        "view": "View a rig or a capture in the browser.",
+        "info": "Describe a rig file or tracks.",
+        "report": "Write the report of a build or a solve again.",
+        "validate": "Check a rig, or poses against a rig.",
+        "pose": "Print the jaw pose of parameters d.",
+        "encode": "Convert poses to the nearest parameters d.",
+        "ik": "Find the d that move a point to a target.",
+    },
 }
+SUMMARIES = {name: words for group in GROUPS.values() for name, words in group.items()}
 
 EXIT_CODES = (
     "Exit codes: 0 done, 1 a negative result (invalid poses, something missing, a failed build of many), "
@@ -81,10 +94,57 @@ _KEPT = {
 _ELSE = "no incomplete file was written"
 
 
+class _Parameter(Protocol):
+    """An argument or option of typer."""
+
+    param_type_name: str
+
+    def get_help_record(self, ctx: typer.Context) -> tuple[str, str] | None: ...
+
+
+class _Formatter(Protocol):
+    """The formatter of typer's help."""
+
+    def section(self, name: str) -> AbstractContextManager[None]: ...
+    def write(self, text: str) -> None: ...
+    def write_dl(self, rows: Sequence[tuple[str, str]]) -> None: ...
+
+
+# Words for typer's names of types. Options with several values state their own.
+_KINDS = {"path": "PATH", "str": "TEXT", "int": "N", "int range": "N", "float": "NUMBER", "float range": "NUMBER"}
+
+
+def help_row(parameter: _Parameter, ctx: typer.Context) -> tuple[str, str] | None:
+    """Return the names and the meaning of an argument or option for help; None if it is hidden."""
+    row = parameter.get_help_record(ctx)
+    if row is None:
+        return None
+    names, meaning = row
+    if parameter.param_type_name == "argument":
+        return re.sub(r" <[^<>]*>$", "", names), meaning
+    return re.sub(r"<([^<>]*)>", lambda found: _KINDS.get(found[1], found[1]), names), meaning
+
+
 class Command(TyperCommand):
     """A command of jawusd."""
 
-    # typer passes its public Context to both methods; the base class declares that of its private copy of click.
+    # typer passes its public Context to all methods; the base class declares that of its private copy of click.
+
+    def format_options(self, ctx: typer.Context, formatter: _Formatter) -> None:  # type: ignore[override]  # as above
+        """Write arguments and options, without the names of Python's types."""
+        for title, kind in (("Arguments", "argument"), ("Options", "option")):
+            shown = [help_row(one, ctx) for one in self.get_params(ctx) if one.param_type_name == kind]
+            rows = [row for row in shown if row is not None]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+    def format_epilog(self, ctx: typer.Context, formatter: _Formatter) -> None:  # type: ignore[override]  # as above
+        """Write the examples, one per line."""
+        lines = (self.epilog or "").splitlines()
+        with formatter.section("Examples" if len(lines) > 1 else "Example"):
+            for line in lines:
+                formatter.write(f"  {line}\n")
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]  # click has its own Context
         """Accept vectors such as `--d 20,2,1`, and store the arguments for `command_line`."""
@@ -171,13 +231,6 @@ _NAMES = {
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 
-class _Formatter(Protocol):
-    """The formatter of typer's help."""
-
-    def section(self, name: str) -> AbstractContextManager[None]: ...
-    def write_dl(self, rows: Sequence[tuple[str, str]]) -> None: ...
-
-
 class Commands(TyperGroup):
     """The group of all commands; listing them does not load their modules."""
 
@@ -192,9 +245,11 @@ class Commands(TyperGroup):
         return list(SUMMARIES)
 
     def format_commands(self, ctx: object, formatter: _Formatter) -> None:
-        """Write the list of commands with their summaries."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, SUMMARIES[name]) for name in SUMMARIES])
+        """Write the commands with their summaries, by group."""
+        wide = max(map(len, SUMMARIES))
+        for title, group in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name.ljust(wide), words) for name, words in group.items()])
 
 
 class _Loaded(Mapping[str, TyperCommand]):
@@ -218,5 +273,6 @@ class _Loaded(Mapping[str, TyperCommand]):
 def _load(name: str, module: str) -> TyperCommand:
     function = getattr(importlib.import_module(f"jawusd.cli.{module}"), name.replace("-", "_"))
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-    alone.command(name, cls=Command, context_settings=CONTEXT, short_help=SUMMARIES[name])(function)
+    examples = "\n".join(EXAMPLES[name])
+    alone.command(name, cls=Command, context_settings=CONTEXT, short_help=SUMMARIES[name], epilog=examples)(function)
     return cast(TyperCommand, typer.main.get_command(alone))

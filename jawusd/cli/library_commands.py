@@ -116,7 +116,9 @@ def library(
     folder: Annotated[Path, typer.Argument(help="Folder with a subfolder per subject.", show_default=False)],
     search: Annotated[str | None, typer.Option(help="List only names and paths that contain this text.")] = None,
     like: Annotated[Path | None, typer.Option(help="Sort by similarity to these landmarks (JSON).")] = None,
-    compare: Annotated[tuple[str, str] | None, typer.Option(help="Compare two subjects side by side.")] = None,
+    compare: Annotated[
+        tuple[str, str] | None, typer.Option(metavar="NAME NAME", help="Compare two subjects side by side.")
+    ] = None,
     add: Annotated[
         Path | None,
         typer.Option(

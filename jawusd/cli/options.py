@@ -51,6 +51,7 @@ Allow = Annotated[
     list[Path] | None,
     typer.Option(
         "--allow",
+        metavar="FOLDER",
         callback=_allow,
         help="Folder from which a rig or shot may load files, such as a library; repeatable. Also: JAWUSD_ALLOW.",
         show_default=False,

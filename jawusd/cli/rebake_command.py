@@ -59,7 +59,9 @@ def rebake(
     skull: SkullPrim = None,
     prim: Annotated[
         list[str] | None,
-        typer.Option("--prim", help="Prim paths of the rigs to bake. Default: all.", show_default=False),
+        typer.Option(
+            "--prim", metavar="PRIM", help="Prim paths of the rigs to bake. Default: all.", show_default=False
+        ),
     ] = None,
     allow: Allow = None,
     force: Force = False,

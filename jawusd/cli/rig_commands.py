@@ -111,7 +111,10 @@ def _info_lines(found: Description) -> list[str]:
 
 def pose(
     rig: RigArg,
-    d: Annotated[Triple, typer.Option("--d", help="Opening, laterotrusion (+ left), protrusion (+ forward) [mm].")],
+    d: Annotated[
+        Triple,
+        typer.Option("--d", metavar="D1 D2 D3", help="Opening, laterotrusion (+ left), protrusion (+ forward) [mm]."),
+    ],
     prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,
@@ -273,9 +276,9 @@ def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
 
 def ik(
     rig: RigArg,
-    point: Annotated[Triple, typer.Option(help="Point on the mandible at rest [mm].")],
-    target: Annotated[Triple, typer.Option(help="Target of the point, skull frame [mm].")],
-    start: Annotated[Triple | None, typer.Option(help="Initial parameters [mm].")] = None,
+    point: Annotated[Triple, typer.Option(metavar="X Y Z", help="Point on the mandible at rest [mm].")],
+    target: Annotated[Triple, typer.Option(metavar="X Y Z", help="Target of the point, skull frame [mm].")],
+    start: Annotated[Triple | None, typer.Option(metavar="D1 D2 D3", help="Initial parameters [mm].")] = None,
     prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,

@@ -121,14 +121,13 @@ def live(
     source: Annotated[
         list[str] | None,
         typer.Option(
+            metavar="NAME=SOURCE",
             help="Source of a camera: NAME=/dev/video0, NAME=rtsp://..., NAME=FILE. Cameras without a source are not "
             "used; without any source, the shot's videos are played in real time.",
             show_default=False,
         ),
     ] = None,
-    osc: Annotated[
-        str | None, typer.Option(help="HOST:PORT for OSC messages: /jaw/d, /jaw/sigma, ...", show_default=False)
-    ] = None,
+    osc: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="OSC messages: /jaw/d, /jaw/sigma, ...")] = None,
     view: Annotated[bool, typer.Option("--view", help="Also show the jaw in a page on this machine.")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; the next free one if taken.")] = 8080,
     head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = Head.free,

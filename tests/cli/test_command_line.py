@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -16,7 +17,8 @@ from typer.testing import CliRunner
 
 from jawusd import __version__
 from jawusd.base import errors
-from jawusd.cli.commands import EXIT_CODES, SUMMARIES, with_vectors_split
+from jawusd.cli.commands import EXIT_CODES, GROUPS, SUMMARIES, help_row, with_vectors_split
+from jawusd.cli.examples import EXAMPLES
 from jawusd.cli.main import app
 from jawusd.cli.text_build import _verdict_lines, rounded_duration
 
@@ -31,10 +33,55 @@ def run(*words):
 def test_help_fits_80_columns_and_every_summary_is_whole():
     for flag in ("-h", "--help"):
         printed = run(flag).stdout
-        assert max(map(len, printed.splitlines())) <= 80 and "..." not in printed.split("Commands:")[1]
+        assert max(map(len, printed.splitlines())) <= 80 and "..." not in printed.split("Start:")[1]
         for name, command in COMMANDS.items():
             assert f"{name} " in printed and SUMMARIES[name] in printed and command.short_help == SUMMARIES[name]
     assert set(COMMANDS) == set(SUMMARIES)
+
+
+def test_every_command_is_in_one_group_of_the_help():
+    printed = run("--help").stdout
+    assert sum(map(len, GROUPS.values())) == len(SUMMARIES) == len(COMMANDS)
+    for group, names in GROUPS.items():
+        part = printed.split(f"\n{group}:\n")[1].split("\n\n")[0]
+        assert [line.split()[0] for line in part.splitlines()] == list(names)
+
+
+def parsed(line):
+    """Parse a command line as the program does, but without reading the files that it names."""
+    _, name, *words = shlex.split(line)
+    command = COMMANDS[name]
+    callbacks = {one: one.callback for one in command.params}
+    try:
+        for one in command.params:
+            one.callback = None
+        return command.make_context(name, words)
+    finally:
+        for one, callback in callbacks.items():
+            one.callback = callback
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_command_ends_with_examples_that_the_program_accepts(name):
+    assert 1 <= len(EXAMPLES[name]) <= 2
+    ending = run(name, "--help").stdout.partition("\nExample")[2].splitlines()[1:]
+    assert [line.strip() for line in ending] == list(EXAMPLES[name])
+    assert all(parsed(line).info_name == name for line in EXAMPLES[name])
+
+
+@pytest.mark.parametrize(
+    "line", ["jawusd pose out", "jawusd pose out --d 20 2", "jawusd check a --nope", "jawusd fit a --length-unit ft"]
+)
+def test_an_example_that_the_program_rejects_is_found(line):
+    with pytest.raises(Exception, match=r"(?i)missing|requires 3|no such option|not one of"):
+        parsed(line)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_help_has_no_types_of_python(name):
+    context = typer.Context(COMMANDS[name], info_name=name, help_option_names=["-h", "--help"])
+    rows = [help_row(one, context) for one in COMMANDS[name].get_params(context)]
+    assert rows and not [names for names, _ in rows if re.search(r"[<>\[\]]|\b(str|int|float|path)\b", names)]
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
