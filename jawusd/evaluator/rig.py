@@ -5,35 +5,31 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.base.arrays import Array, Indices, Mask
+from jawusd.base.arrays import Array, Indices
 from jawusd.base.errors import EvaluatorError, FormatError
 from jawusd.base.npz import read_npz, upgraded_model
 from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import PolygonBound, SliceHull
-from jawusd.evaluator.contact import ContactField, RigClearance
+from jawusd.evaluator.contact import ContactField
 from jawusd.evaluator.encoding import Encoder, Encoding, handle_vectors, point_velocities, vector_images, whitening_of
+from jawusd.evaluator.judging import SINGLE_LIMIT_MM, RigJudging
 from jawusd.evaluator.kernels import NumpyKernels, RigParts
 from jawusd.evaluator.models import FORMS
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.search import BoundedSearch, IkResult
 from jawusd.evaluator.speeds import Speeds
-from jawusd.evaluator.verdicts import Limits, Verdicts, is_inside, too_fast
+from jawusd.evaluator.verdicts import Limits
 from jawusd.geometry.se3 import transform_points
 
 FAMILY, VERSION = "jawusd-model", 2
-BoundName = Literal["slices", "polygons"]
-
-_scalar = cast("Callable[[float], Array]", np.float64)  # numpy's stubs do not treat scalars as arrays
-_SINGLE_LIMIT_MM = 1e4  # maximum |d|; beyond it, float functions may raise where array functions give infinities
 
 
-class JawRig(RigClearance, RigAuthoring):
+class JawRig(RigJudging, RigAuthoring):
     """One subject's jaw: pure functions from d = (opening, laterotrusion, protrusion) [mm] to poses and back.
 
     ``pose(d) = A^-1 M(d) A rest`` with A = T_anatomical_skull and rest = T_skull_mandible of the closed bite;
@@ -92,7 +88,7 @@ class JawRig(RigClearance, RigAuthoring):
         d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
-            if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # comparison is false for NaN
+            if abs(d1) + abs(d2) + abs(d3) < SINGLE_LIMIT_MM:  # comparison is false for NaN
                 return self.kernels.pose(d1, d2, d3)
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.poses(rows).reshape(*batch, 4, 4)
@@ -181,40 +177,6 @@ class JawRig(RigClearance, RigAuthoring):
         d, residual_mm = pairs_in_chunks(encode, np.arange(len(rows)))
         return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
 
-    def margin(self, d: ArrayLike, *, bound: BoundName = "slices") -> Array:
-        """Return the signed distance of d to the bound [mm]: positive inside, finite and smooth outside.
-
-        Args:
-            d: Jaw parameters [mm], shape (..., 3).
-            bound: "slices", the joint bound of all three parameters, or "polygons", the paper's two outlines in
-                (d1, d2) and (d1, d3), whose margin is continuous but not smooth.
-
-        Returns:
-            Margins [mm], shape (...).
-        """
-        if bound != "slices":
-            rows, batch = as_rows(d, (3,), "d")
-            return -in_chunks(self._polygons(bound).signed_distance, rows).reshape(batch)
-        d = as_floats(d, "d")
-        if d.shape == (3,):
-            d1, d2, d3 = d.tolist()
-            if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # comparison is false for NaN
-                return _scalar(self.kernels.margin(d1, d2, d3))
-        rows, batch = rows_of(d, (3,), "d")
-        return self.kernels.margins(rows).reshape(batch)
-
-    def is_inside(self, d: ArrayLike, *, bound: BoundName = "slices") -> Mask:
-        """Return whether jaw parameters d (..., 3) [mm] lie inside the bound: a margin of 0 or more.
-
-        The bound itself counts as inside, up to rounding of 1e-6 mm. The tolerance of measured poses does not apply.
-        """
-        return is_inside(self.margin(d, bound=bound))
-
-    def _polygons(self, bound: BoundName) -> PolygonBound:
-        if bound != "polygons":
-            raise ValueError(f'bound must be "slices" or "polygons", got {bound!r}')
-        return self.polygons
-
     def margin_gradient(self, d: ArrayLike) -> Array:
         """Return the derivative of `margin` (slice bound) with respect to d [mm/mm], shape (..., 3), for d (..., 3)."""
         rows, batch = rows_of(d, (3,), "d")
@@ -234,77 +196,6 @@ class JawRig(RigClearance, RigAuthoring):
         """
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(self._search.nearest, rows).reshape(*batch, 3)
-
-    def validate(
-        self,
-        T_skull_mandible: ArrayLike,
-        *,
-        residual_limit_mm: float | None = None,
-        tolerance_mm: float | None = None,
-        bound: BoundName = "slices",
-        times_s: ArrayLike | None = None,
-        speed_limit_mm_s: float | None = None,
-    ) -> Verdicts:
-        """Judge measured poses: finite, rigid, on the model, inside the bound or tolerance, no collision, not too fast.
-
-        Args:
-            T_skull_mandible: Poses, shape (..., 4, 4).
-            residual_limit_mm: Largest landmark distance to the model; default: the rig's own limit.
-            tolerance_mm: How far outside the bound a measured pose may lie; default: the rig's own tolerance. With 0
-                the poses are judged as authored: teeth may then penetrate less deeply than in measured poses.
-            bound: Which bound, see `margin`.
-            times_s: Times of the poses along the last batch axis, shape (F,); required with a speed limit.
-            speed_limit_mm_s: Largest speed of a landmark between consecutive poses; None disables the check.
-
-        Returns:
-            Verdicts of the batch shape.
-
-        Raises:
-            ValueError: wrong shapes, a negative tolerance, or a speed limit without increasing times.
-        """
-        rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
-        limits = self.limits.replaced(residual_limit_mm, tolerance_mm, speed_limit_mm_s)
-        verdicts = self.kernels.judge_poses(rows, limits)
-        if bound != "slices":
-            verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
-        verdicts = self._without_collisions(verdicts, measured=tolerance_mm != 0)
-        return self._with_speed(verdicts, rows, batch, times_s, limits)
-
-    def validate_parameters(
-        self,
-        d: ArrayLike,
-        *,
-        tolerance_mm: float | None = 0.0,
-        bound: BoundName = "slices",
-        times_s: ArrayLike | None = None,
-        speed_limit_mm_s: float | None = None,
-    ) -> Verdicts:
-        """Judge jaw parameters d (..., 3) [mm] as `validate` judges poses; the residual is 0.
-
-        By default they count as authored, with tolerance 0. With another tolerance, or None for the rig's own, they are
-        judged as measured.
-
-        Raises:
-            ValueError: wrong shapes, a negative tolerance, or a speed limit without increasing times.
-        """
-        rows, batch = rows_of(d, (3,), "d")
-        limits = self.limits.replaced(None, tolerance_mm, speed_limit_mm_s)
-        verdicts = self.kernels.judge_parameters(rows, limits)
-        if bound != "slices":
-            verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
-        verdicts = self._without_collisions(verdicts, measured=tolerance_mm != 0)
-        poses = rows if speed_limit_mm_s is None else self.kernels.poses(rows)
-        return self._with_speed(verdicts, poses, batch, times_s, limits)
-
-    def _with_speed(
-        self, verdicts: Verdicts, poses: Array, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits
-    ) -> Verdicts:
-        """Return the verdicts in batch shape, with frames that exceed the speed limit marked."""
-        if limits.speed_mm_s is None:
-            return verdicts.finished(batch, limits.tolerance_mm)
-        measured = np.where(verdicts.measured()[:, None, None], poses, np.nan)
-        positions = transform_points(measured, self.landmarks[None]).reshape(*batch, -1, 3)
-        return verdicts.finished(batch, limits.tolerance_mm, too_fast(positions, times_s, limits.speed_mm_s))
 
     def ik(
         self,

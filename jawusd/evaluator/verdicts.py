@@ -136,7 +136,7 @@ class Limits:
         residual_mm: Largest landmark distance to the model.
         tolerance_mm: How far outside the bound a pose may lie: 0 for authored poses, the rig's tolerance for measured
             ones.
-        speed_mm_s: Largest speed of any landmark between consecutive poses; None disables the check.
+        speed_mm_s: Largest speed of any landmark since the last valid pose; None disables the check.
     """
 
     residual_mm: float
@@ -181,17 +181,27 @@ def _outside(margin_mm: Array, limits: Limits) -> Mask:
     return ~(margin_mm >= limits.margin_mm - ON_BOUND_MM)
 
 
-def too_fast(positions: Array, times_s: ArrayLike | None, limit_mm_s: float) -> Mask:
-    """Return which frames were reached too fast.
+def exceeds(moved_mm: Array, elapsed_s: ArrayLike, limit_mm_s: float) -> Mask:
+    """Return whether landmarks that moved by (..., L, 3) [mm] in a time (...) [s] exceeded a speed; False for NaN."""
+    travelled = np.sqrt((moved_mm**2).sum(axis=-1).max(axis=-1, initial=0.0))
+    return np.asarray(travelled > limit_mm_s * np.asarray(elapsed_s))
+
+
+def too_fast(positions: Array, valid: Mask, times_s: ArrayLike | None, limit_mm_s: float) -> Mask:
+    """Return which frames were reached too fast from the last good one.
+
+    A frame is good if it is valid and was not reached too fast. Measuring from the last good frame, not from the frame
+    before, keeps one wrong frame from making the next one invalid. After a lasting jump, frames are too fast until the
+    time since the last good frame suffices for the jump.
 
     Args:
         positions: Landmark positions [mm], shape (..., F, L, 3); NaN where there is no pose.
+        valid: Which frames are valid apart from their speed, shape (..., F).
         times_s: Increasing times, shape (F,).
         limit_mm_s: Largest speed [mm/s].
 
     Returns:
-        Shape (..., F). A frame is compared with the one just before it; the first frame, and frames next to a NaN,
-        are never too fast.
+        Shape (..., F). Frames before the first good one, and that one itself, are never too fast.
 
     Raises:
         ValueError: there is no frame axis, or the times do not match it or do not increase.
@@ -203,6 +213,21 @@ def too_fast(positions: Array, times_s: ArrayLike | None, limit_mm_s: float) -> 
             f"{positions.shape[:-2]} and {times.shape}"
         )
     flags = np.zeros(positions.shape[:-2], dtype=bool)
-    travelled = np.linalg.norm(np.diff(positions, axis=-3), axis=-1).max(axis=-1, initial=0.0)
-    flags[..., 1:] = travelled > limit_mm_s * np.diff(times)
+    for track in np.ndindex(flags.shape[:-1]):
+        flags[track] = _too_fast(positions[track], valid[track].tolist(), times, limit_mm_s)
+    return flags
+
+
+def _too_fast(positions: Array, valid: list[bool], times: Array, limit_mm_s: float) -> list[bool]:
+    """Return which frames of one track were reached too fast, for positions (F, L, 3)."""
+    steps = [False, *exceeds(np.diff(positions, axis=0), np.diff(times), limit_mm_s).tolist()]
+    flags, last = [False] * len(valid), None
+    for frame, good in enumerate(valid):
+        if last == frame - 1:
+            flags[frame] = steps[frame]
+        elif last is not None:
+            elapsed_s = times[frame] - times[last]
+            flags[frame] = bool(exceeds(positions[frame] - positions[last], elapsed_s, limit_mm_s))
+        if good and not flags[frame]:
+            last = frame
     return flags

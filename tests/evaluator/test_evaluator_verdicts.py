@@ -92,11 +92,72 @@ def test_as_many_poses_as_landmarks_are_no_pairs():
         assert [bool(r & Reason.TOO_FAST) for r in reasons(verdicts)] == [False] * 4 + [True]
 
 
-def test_speed_across_a_lost_frame_is_not_judged():
+def test_speed_is_measured_from_the_last_good_frame():
+    """Across a lost frame, and not from a frame that was itself invalid."""
     d = np.zeros((3, 3))
     d[:, 0] = [0.0, np.nan, 30.0]
     verdicts = RIG.validate_parameters(d, times_s=[0.0, 0.1, 0.2], speed_limit_mm_s=10.0)
-    assert reasons(verdicts) == [Reason.VALID, Reason.NOT_FINITE, Reason.VALID]
+    assert reasons(verdicts) == [Reason.VALID, Reason.NOT_FINITE, Reason.TOO_FAST]
+    assert RIG.validate_parameters(d, times_s=[0.0, 0.1, 9.0], speed_limit_mm_s=10.0).valid[2]
+    glitch = np.zeros((2, 5, 3))
+    glitch[0, 2] = [15.0, 14.0, 1.0]  # outside the bound
+    glitch[1, 2] = [15.0, 0.0, 0.0]  # possible, but too far
+    verdicts = RIG.validate_parameters(glitch, times_s=np.arange(5.0), speed_limit_mm_s=5.0)
+    np.testing.assert_array_equal(verdicts.valid, [[True, True, False, True, True]] * 2)
+    assert reasons(verdicts)[2] == Reason.OUTSIDE_BOUNDS | Reason.TOO_FAST and reasons(verdicts)[7] == Reason.TOO_FAST
+
+
+def test_a_lasting_jump_is_accepted_once_there_was_time_for_it():
+    d = np.zeros((6, 3))
+    d[1:, 0] = 10.0
+    verdicts = RIG.validate_parameters(d, times_s=np.arange(6.0), speed_limit_mm_s=3.0)
+    assert verdicts.valid.tolist() == [True, False, False, False, True, True]
+
+
+def take(seed):
+    """Return poses of a take with steps of a few mm, glitches of every kind, and their times."""
+    rng = np.random.default_rng(seed)
+    d = RIG.project(np.cumsum(rng.normal(size=(120, 3)), axis=0) * [1.0, 0.3, 0.3] + [15.0, 0.0, 0.0])
+    d[::17, 0] += 12.0
+    d[5::19, 1] += 14.0
+    T = RIG.pose(d)
+    T[10:14] = np.nan
+    T[::23, :3, :3] *= 1.02
+    T[::29] = se3_exp([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]) @ T[::29]
+    return T, np.cumsum(rng.uniform(0.02, 0.06, 120))
+
+
+@pytest.mark.parametrize(
+    "given", [{}, {"speed_limit_mm_s": 80.0}, {"speed_limit_mm_s": 150.0, "tolerance_mm": 0.0, "bound": "polygons"}]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_stream_is_judged_as_its_poses_together(given, seed):
+    T, times = take(seed)
+    batch = RIG.validate(T, times_s=times, **given)
+    stream = RIG.verdicts(**given)
+    found = [stream(pose, time) for pose, time in zip(T, times)]
+    assert [int(each.reason) for each in found] == batch.reason.tolist()
+    assert [bool(each.valid) for each in found] == batch.valid.tolist()
+    assert [each.words()[0] for each in found] == batch.words()
+    for name in ("residual_mm", "margin_mm", "d"):
+        np.testing.assert_allclose([getattr(each, name) for each in found], getattr(batch, name), rtol=0, atol=1e-9)
+    last = np.flatnonzero(batch.valid)[-1]
+    assert stream.last_good.time_s == times[last]
+    np.testing.assert_array_equal(stream.last_good.T_skull_mandible, T[last])
+    if "speed_limit_mm_s" in given:
+        assert any(Reason.TOO_FAST in reason for reason in reasons(batch))
+
+
+def test_a_stream_rejects_what_is_no_next_pose():
+    stream = RIG.verdicts(speed_limit_mm_s=100.0)
+    assert stream(RIG.pose([5.0, 0.0, 0.0]), 1.0).valid
+    for time_s in (1.0, 0.5, np.nan, np.inf):
+        with pytest.raises(ValueError, match="time_s"):
+            stream(RIG.pose([5.0, 0.0, 0.0]), time_s)
+    with pytest.raises(ValueError, match="shape"):
+        stream(RIG.pose(np.zeros((1, 3))), 2.0)
+    with pytest.raises(ValueError, match="bound"):
+        RIG.verdicts(bound="box")
 
 
 @pytest.mark.parametrize("times", [None, [0.0, 1.0], [0.0, 1.0, 1.0]])
