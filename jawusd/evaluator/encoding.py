@@ -27,6 +27,10 @@ from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_i
 # x (k, 3) -> rotations (k, 3, 3), translations (k, 3), spatial derivatives (k, 6, 3)
 Derivative = Callable[[Array], tuple[Array, Array, Array]]
 
+# Weight of a distance along the sight relative to one across it. It matters only at the bound: elsewhere, two equations
+# across the sight and one along it determine d.
+_DEPTH_WEIGHT = 0.1
+
 
 def landmark_vectors(landmarks: Array) -> Array:
     """Return the four homogeneous vectors (4, 4), one per column, that represent the landmarks (n, 3) [mm]."""
@@ -39,16 +43,64 @@ def landmark_vectors(landmarks: Array) -> Array:
     return vectors
 
 
-def handle_vectors(points: Array, weights: ArrayLike | None) -> Array:
-    """Return points (H, 3) [mm] as homogeneous vectors (4, H), scaled so that sums of squares are weighted means.
+class Handles(NamedTuple):
+    """Points that inverse kinematics moves.
 
-    Raises:
-        ValueError: weights of a wrong shape, negative, not finite or all zero.
+    Attributes:
+        vectors: Homogeneous points of the mandible at rest, anatomical frame [mm], scaled by their weights, shape
+            (4, m).
+        sight: Unit vectors along which their distances do not count, anatomical frame, shape (3, m), 0 for points whose
+            whole distance counts; None if all do.
     """
-    share = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
-    if share.shape != (len(points),) or not np.isfinite(share).all() or (share < 0).any() or share.sum() == 0:
-        raise ValueError(f"weights must be {len(points)} numbers >= 0, not all zero, got {share.tolist()}")
-    return np.column_stack([points, np.ones(len(points))]).T * np.sqrt(share / share.sum())
+
+    vectors: Array
+    sight: Array | None = None
+
+    @classmethod
+    def of(cls, points: Array, weights: ArrayLike | None, sight: Array) -> Handles:
+        """Return handles at points (H, 3) [mm], scaled so that sums of squares are weighted means.
+
+        Args:
+            points: Points of the mandible at rest, anatomical frame [mm], shape (H, 3).
+            weights: Weights, shape (H,); None for equal ones.
+            sight: Directions along which distances do not count, anatomical frame, shape (H, 3), of any length or 0.
+
+        Raises:
+            ValueError: weights of a wrong shape, negative, not finite or all zero.
+        """
+        share = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
+        if share.shape != (len(points),) or not np.isfinite(share).all() or (share < 0).any() or share.sum() == 0:
+            raise ValueError(f"weights must be {len(points)} numbers >= 0, not all zero, got {share.tolist()}")
+        vectors = np.column_stack([points, np.ones(len(points))]).T * np.sqrt(share / share.sum())
+        if not sight.any():
+            return cls(vectors)
+        length = np.linalg.norm(sight, axis=1, keepdims=True)
+        return cls(vectors, (sight / np.where(length > 0, length, 1.0)).T)
+
+    @property
+    def depths(self) -> Array:
+        """Return rows (m, 3) that map d to weighted offsets from the habitual path along the sight of each handle."""
+        if self.sight is None:
+            return np.zeros((0, 3))
+        # d2 and d3 displace the incisal point from the path along the anatomical x and z
+        along = np.stack([np.zeros(self.sight.shape[1]), self.sight[0], self.sight[2]], axis=1)
+        return _DEPTH_WEIGHT * self.vectors[3][:, None] * along
+
+    def across(self, values: Array) -> Array:
+        """Return vectors (n, 3, m) or their derivatives (n, 3, m, 3) without their components along the sight."""
+        if self.sight is None:
+            return values
+        along = np.einsum("am,nam...->nm...", self.sight, values)
+        return values - np.einsum("am,nm...->nam...", self.sight, along)
+
+    def features(self, images: Array, d: Array) -> Array:
+        """Return what is compared: images (n, 3, m) across the sight [mm], then the depths of d (n, 3) [mm].
+
+        Returns:
+            Features [mm], shape (n, 3 m), or (n, 4 m) with a sight.
+        """
+        seen = self.across(images).reshape(len(images), 3 * self.vectors.shape[1])
+        return seen if self.sight is None else np.concatenate([seen, d @ self.depths.T], axis=1)
 
 
 def vector_images(R: Array, t: Array, vectors: Array) -> Array:
@@ -69,9 +121,9 @@ def point_velocities(R: Array, t: Array, S: Array, points: Array) -> Array:
     return np.cross(S[:, None, :3], image[..., None], axis=2) + S[:, None, 3:]
 
 
-def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> Residual:
-    """Return the residual function that `minimise` needs, for vectors (4, m) and their targets (n, 3, m)."""
-    count = vectors.shape[1]
+def distance_residual(derivative: Derivative, handles: Handles, target: Array) -> Residual:
+    """Return the residual function that `minimise` needs, for handles and their scaled targets (n, 3, m) [mm]."""
+    vectors, count = handles.vectors, handles.vectors.shape[1]
 
     def residual(x: Array, rows: Indices) -> tuple[Array, Array]:
         R, t, S = derivative(x)
@@ -83,8 +135,11 @@ def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> 
         by_velocity[:, 2, :, 0], by_velocity[:, 0, :, 2] = image[:, 1], -image[:, 1]
         for axis in range(3):
             by_velocity[:, axis, :, 3 + axis] = vectors[3]
-        r = (image - target[rows]).reshape(len(x), 3 * count)
-        return r, by_velocity.reshape(len(x), 3 * count, 6) @ S
+        r, J = handles.features(image - target[rows], x), by_velocity.reshape(len(x), 3 * count, 6) @ S
+        if handles.sight is None:
+            return r, J
+        seen = handles.across(J.reshape(len(x), 3, count, 3)).reshape(J.shape)
+        return r, np.concatenate([seen, np.broadcast_to(handles.depths, (len(x), count, 3))], axis=1)
 
     return residual
 
@@ -151,7 +206,7 @@ class Encoder:
 
 def nearest_in_chart(model: JawModelForm, R: Array, t: Array, vectors: Array) -> Array:
     """Return the chart coordinates (n, 3) whose motions are nearest to motions R (n, 3, 3), t (n, 3) [mm]."""
-    residual = distance_residual(model.chart_derivative, vectors, vector_images(R, t, vectors))
+    residual = distance_residual(model.chart_derivative, Handles(vectors), vector_images(R, t, vectors))
     return minimise(residual, model.chart_start(R, t))
 
 

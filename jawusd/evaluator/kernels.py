@@ -12,7 +12,7 @@ import numpy as np
 from jawusd.base.arrays import Array, Indices
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks, usable_rows
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.encoding import Encoder, distance_residual, landmark_vectors
+from jawusd.evaluator.encoding import Encoder, Handles, distance_residual, landmark_vectors
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.nearest import Pull, Vector, lowest_in_valley, nearest_in_valley
@@ -131,19 +131,19 @@ class NumpyKernels:
 
         return self._bottom(residual, start)
 
-    def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
-        """Search inside the bound for the motions that move homogeneous vectors nearest to their targets.
+    def solve_ik(self, handles: Handles, targets: Array, start: Array) -> tuple[Array, Array]:
+        """Search inside the bound for the motions that move handles nearest to their targets.
 
         Args:
-            vectors: Points of the mandible at rest, anatomical frame [mm], scaled by their weights, shape (4, m).
-            targets: Their target positions, scaled likewise, shape (n, 3, m).
+            handles: Points of the mandible, m of them.
+            targets: Their target positions, anatomical frame [mm], scaled likewise, shape (n, 3, m).
             start: Initial d [mm] inside the bound, shape (n, 3).
 
         Returns:
             The local minima (n, 3) [mm] around the starts, and the remaining squared distances (n,).
         """
         if len(start) == 1:
-            residual = distance_residual(self._model.decode_derivative, vectors, targets)
+            residual = distance_residual(self._model.decode_derivative, handles, targets)
 
             def pull(x: Vector) -> Pull:
                 r, J = residual(np.array([x]), np.zeros(1, dtype=np.intp))
@@ -154,7 +154,7 @@ class NumpyKernels:
             found = np.array([lowest_in_valley(self._bound.formula, pull, triple(start[0].tolist()))])
             r, _ = residual(found, np.arange(1))
             return found, np.einsum("nm,nm->n", r, r)
-        return self._bottom(distance_residual(self._model.decode_derivative, vectors, targets), start)
+        return self._bottom(distance_residual(self._model.decode_derivative, handles, targets), start)
 
     def _bottom(self, residual: Residual, start: Array) -> tuple[Array, Array]:
         found = minimise(residual, start, self._bound)

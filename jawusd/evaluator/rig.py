@@ -16,7 +16,7 @@ from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import PolygonBound, SliceHull
 from jawusd.evaluator.contact import ContactField
-from jawusd.evaluator.encoding import Encoder, Encoding, handle_vectors, point_velocities, vector_images, whitening_of
+from jawusd.evaluator.encoding import Encoder, Encoding, Handles, point_velocities, vector_images, whitening_of
 from jawusd.evaluator.judging import SINGLE_LIMIT_MM, RigJudging
 from jawusd.evaluator.kernels import NumpyKernels, RigParts
 from jawusd.evaluator.models import FORMS
@@ -158,7 +158,7 @@ class JawRig(RigJudging, RigAuthoring):
             return Encoding(d[0], residual_mm[0])
         if inside and (out := np.flatnonzero(self.kernels.margins(d) < 0)).size:
             targets = self._encoder.targets(rows[out])
-            d[out] = in_chunks(lambda target: self._search.solve_ik_multistart(self._vectors, target), targets)
+            d[out] = in_chunks(lambda target: self._search.solve_ik_multistart(Handles(self._vectors), target), targets)
             residual_mm[out] = in_chunks(lambda i: self._encoder.residual_mm(d[i], rows[i]), out)
         return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
 
@@ -204,6 +204,7 @@ class JawRig(RigJudging, RigAuthoring):
         start: ArrayLike | None = None,
         *,
         weights: ArrayLike | None = None,
+        sight: ArrayLike | None = None,
     ) -> IkResult:
         """Return the valid jaw parameters that bring points of the mandible nearest to targets (Yang et al. eq. 10).
 
@@ -213,30 +214,37 @@ class JawRig(RigJudging, RigAuthoring):
             start: Initial d [mm], shape (..., 3). While dragging, pass the last result, so that the jaw moves without
                 jumps. A start outside the bound is first projected. Default: the best of a scan of the valid volume.
             weights: Weights of the handles, shape (H,), >= 0 and not all zero; default: equal.
+            sight: Directions along which distances do not count, skull frame, of the shape of p_mandible; 0 for handles
+                whose whole distance counts. Along the sight the jaw follows the habitual path: in a frontal view d3
+                becomes 0, in a lateral view d2. From above or below, the sight leaves the opening undetermined.
 
         Returns:
-            d, always inside the bound, and the weighted rms distance between handles and targets.
+            d, always inside the bound, and the weighted rms distance between handles and targets, across the sight.
 
         Raises:
-            ValueError: wrong shapes or weights.
+            ValueError: wrong shapes or weights, or a sight that is not finite.
             EvaluatorError: the bound of the rig is empty.
         """
         handles = as_points(p_mandible, "p_mandible")
         at_rest = transform_points(self._frames.T_anatomical_mandible_rest, handles.reshape(-1, 3))
-        vectors = handle_vectors(at_rest, weights)
+        look = np.zeros_like(handles) if sight is None else as_points(sight, "sight")
+        if look.shape != handles.shape:
+            raise ValueError(f"sight must have the shape of p_mandible, {handles.shape}, got {look.shape}")
+        held = Handles.of(at_rest, weights, look.reshape(-1, 3) @ self._frames.T_anatomical_skull[:3, :3].T)
+        vectors = held.vectors
         targets, batch = as_rows(p_skull, handles.shape, "p_skull")
         targets = targets.reshape(len(targets), vectors.shape[1], 3)
         scaled = np.swapaxes(transform_points(self._frames.T_anatomical_skull, targets), 1, 2) * vectors[3]
         if start is None:
-            d = in_chunks(lambda target: self._search.solve_ik_multistart(vectors, target), scaled)
+            d = in_chunks(lambda target: self._search.solve_ik_multistart(held, target), scaled)
         else:
             given, _ = as_rows(np.broadcast_to(as_floats(start, "start"), (*batch, 3)), (3,), "start")
             first = in_chunks(self._search.nearest, given)
-            find = partial(self._search.solve_ik, vectors)
+            find = partial(self._search.solve_ik, held)
             chunked = len(scaled) > CHUNK_ROWS
             each = np.arange(len(scaled))
             d = in_chunks(lambda i: find(scaled[i], first[i]), each) if chunked else find(scaled, first)
-        left = vector_images(*self.model.decode(d), vectors) - scaled
+        left = held.across(vector_images(*self.model.decode(d), vectors) - scaled)
         distance_mm = np.sqrt(np.einsum("nij,nij->n", left, left))
         return IkResult(d.reshape(*batch, 3), distance_mm.reshape(batch))
 

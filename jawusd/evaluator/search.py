@@ -12,6 +12,7 @@ from jawusd.base.arrays import Array, Indices
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.encoding import Handles
 from jawusd.evaluator.kernels import NumpyKernels
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.solver import pulled_inside
@@ -67,42 +68,42 @@ class BoundedSearch:
         )
         return valid
 
-    def solve_ik_multistart(self, vectors: Array, target: Array) -> Array:
-        """Return the valid d (n, 3) [mm] that move the vectors (4, m) nearest to the targets (n, 3, m).
+    def solve_ik_multistart(self, handles: Handles, target: Array) -> Array:
+        """Return the valid d (n, 3) [mm] that move the handles nearest to the targets (n, 3, m).
 
         Args:
-            vectors: Homogeneous points of the mandible at rest, anatomical frame [mm], scaled by their weights.
-            target: Their target positions, scaled likewise.
+            handles: Points of the mandible, m of them.
+            target: Their target positions, anatomical frame [mm], scaled likewise.
 
         Raises:
             EvaluatorError: the valid volume is empty.
         """
-        return self._multistart(vectors, target)[0]
+        return self._multistart(handles, target)[0]
 
-    def solve_ik(self, vectors: Array, target: Array, start: Array) -> Array:
+    def solve_ik(self, handles: Handles, target: Array, start: Array) -> Array:
         """Return the local minimum in whose basin start (n, 3) [mm] lies.
 
         Short steps keep the search in that basin, which makes dragging continuous. A result far from its start is not
         part of a drag; the result of `solve_ik_multistart` replaces it if that is better.
         """
-        found, left = self._kernels.solve_ik(vectors, target, start)
+        found, left = self._kernels.solve_ik(handles, target, start)
         far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _MAX_DRAG_MM)
         if far.size:
-            best, least = self._multistart(vectors, target[far])
+            best, least = self._multistart(handles, target[far])
             better = least < left[far]
             found[far[better]] = best[better]
         return found
 
-    def _multistart(self, vectors: Array, target: Array) -> tuple[Array, Array]:
+    def _multistart(self, handles: Handles, target: Array) -> tuple[Array, Array]:
         """Return the lowest minima (n, 3) [mm], and the remaining squared distances (n,)."""
-        images = self._scan.images(vectors)
-        wanted = target.reshape(len(target), images.shape[1])
+        images = handles.features(self._scan.images(handles.vectors), self._scan.points)
+        wanted = handles.features(target, np.zeros((len(target), 3)))
         best, least = self._best(
-            lambda rows, first: self._kernels.solve_ik(vectors, target[rows], first), images, wanted
+            lambda rows, first: self._kernels.solve_ik(handles, target[rows], first), images, wanted
         )
         first, inside = pulled_inside(self._bound, (best[:, None] + self._ripples).reshape(-1, 3))
         first[~inside] = np.nan
-        found, left = self._kernels.solve_ik(vectors, np.repeat(target, len(self._ripples), axis=0), first)
+        found, left = self._kernels.solve_ik(handles, np.repeat(target, len(self._ripples), axis=0), first)
         left = np.where(np.isnan(left), np.inf, left).reshape(len(best), len(self._ripples))
         choice = left.argmin(axis=1)
         each = np.arange(len(best))
@@ -147,8 +148,8 @@ class _Scan:
         self._first = np.flatnonzero(np.diff(points[:, 0], prepend=-np.inf) > 0)
 
     def images(self, vectors: Array) -> Array:
-        """Return the images of homogeneous vectors (4, m) [mm] under the motions, flattened, shape (p, 3 m)."""
-        return (self._motions @ vectors).reshape(len(self.points), -1)
+        """Return the images (p, 3, m) of homogeneous vectors (4, m) [mm] under the motions."""
+        return (self._motions @ vectors).reshape(len(self.points), 3, vectors.shape[1])
 
     def valleys(self, features: Array, wanted: Array) -> tuple[Indices, Array]:
         """Return starting points: row indices (m,), with repeats, and d (m, 3) [mm]; rows with NaN have none.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import viser
 
@@ -16,6 +18,8 @@ from jawusd.viewer.session import Session
 from jawusd.viewer.viewed import ViewedActor
 from jawusd.viewer.widgets import begin_panel, guarded, small_text
 
+#: Key that keeps the depth of a dragged point instead of the habitual path.
+FREE_DEPTH: Literal["shift"] = "shift"
 _PANEL_PX, _PLOTS_PX = 350, 310
 _PLACEHOLDER = small_text(
     "<b>The mandible is a placeholder:</b> the rig was built without a mandible mesh. It shows the motion of teeth and "
@@ -95,7 +99,8 @@ class Page:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_PX)
         for grip in self.scene.grips:
-            grip.on_drag(guarded(client, self._drag))
+            for modifier in (None, FREE_DEPTH):
+                grip.on_drag("left", modifier=modifier)(guarded(client, self._drag))
         self.refresh()
 
     def _add_contacts(self, actor: ViewedActor) -> ContactPanel | None:
@@ -112,8 +117,8 @@ class Page:
             session.grab(scene.skull_from_page(event.start_position))
         if not session.dragging:
             return
-        pointer = scene.skull_from_page(event.end_position)
-        session.drag_to(pointer)
+        sight = None if event.modifier == FREE_DEPTH else scene.sight_to(event.end_position)
+        pointer = session.drag_to(scene.skull_from_page(event.end_position), sight)
         held = session.grabbed_point()
         if event.phase == "end":
             session.release()

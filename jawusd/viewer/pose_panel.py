@@ -29,7 +29,9 @@ _HINTS = (
     "Protrusion d3 [mm] relative to this person's opening path, which itself leads backwards: + in front, - behind.",
 )
 _DRAG_HELP = small_text(
-    "You can also drag the jaw: the grabbed point follows the pointer as far as this person can move.", "opacity:.7"
+    "You can also drag the jaw: the grabbed point follows the pointer as far as this person can move. In depth it "
+    "follows this person's opening path; with Shift it keeps its depth.",
+    "opacity:.7",
 )
 _KEYS_HELP = small_text("Undo: Ctrl+Z, redo: Ctrl+Shift+Z (Mac: Cmd)", "opacity:.7")
 _MARGIN_HELP = "Distance of the pose from this person's bound, in d; negative outside."

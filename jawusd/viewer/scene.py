@@ -168,6 +168,10 @@ class JawScene:
         """Transform a position from the page's world to the skull frame [mm], shape (3,)."""
         return transform_point(se3_inverse(self._T_world_skull), np.array(position))
 
+    def sight_to(self, position: tuple[float, float, float]) -> Array:
+        """Return the direction from the camera to a position in the page's world, skull frame, shape (3,)."""
+        return self._T_world_skull[:3, :3].T @ (np.array(position) - self._client.camera.position)
+
     def look(self, preset: str) -> None:
         """Move the camera to a preset; close-ups of a condyle make the mandible translucent."""
         camera = self._client.camera

@@ -22,6 +22,8 @@ Interpolation = Literal["linear", "smooth"]
 # Weight of a pinned landmark's squared distance relative to that of the dragged point: dragging by 5 mm moves the
 # pinned landmark by a fraction of a millimetre.
 _PIN_WEIGHT = 100.0
+# Cosine of the angle to the vertical below which a view counts as one from above or below.
+_STEEP = 0.8
 _MOST_UNDO = 200
 _SHARES = np.linspace(1.0, 0.0, 65)
 
@@ -148,11 +150,17 @@ class Session:
         self._handle = transform_point(se3_inverse(self.pose()), np.asarray(p_skull, dtype=np.float64))
         self._gesture = None
 
-    def drag_to(self, p_skull: ArrayLike) -> float:
-        """Move the grabbed point towards p_skull [mm] (3,), skull frame, by inverse kinematics that respects the pins.
+    def drag_to(self, p_skull: ArrayLike, sight: ArrayLike | None = None) -> Array:
+        """Move the grabbed point to where the pointer is, by inverse kinematics that respects the pins.
+
+        Args:
+            p_skull: A point under the pointer [mm], skull frame, shape (3,).
+            sight: Direction in which the pointer is seen, skull frame, shape (3,): the point moves to the line through
+                p_skull, and its depth follows the subject's habitual path. None moves it to p_skull itself. So does a
+                view from above or below, whose depth is the opening.
 
         Returns:
-            Remaining distance between the grabbed point and p_skull [mm].
+            The target that the grabbed point was moved towards [mm], skull frame, shape (3,).
 
         Raises:
             RuntimeError: nothing is grabbed.
@@ -160,12 +168,17 @@ class Session:
         if self._handle is None:
             raise RuntimeError("drag_to was called before grab")
         target = np.asarray(p_skull, dtype=np.float64)
+        look = np.zeros(3) if sight is None else np.asarray(sight, dtype=np.float64)
+        if abs(self.rig.T_anatomical_skull[1, :3] @ look) > _STEEP * np.linalg.norm(look):
+            look = np.zeros(3)
         handles = np.array([self._handle, *(pin.p_mandible for pin in self.work.pins)])
         targets = np.array([target, *(pin.p_skull for pin in self.work.pins)])
         weights = [1.0] + [_PIN_WEIGHT] * len(self.work.pins)
-        d, _ = self.rig.ik(handles, targets, start=self.d, weights=weights)
+        free = np.vstack([look, np.zeros((len(self.work.pins), 3))])
+        d, _ = self.rig.ik(handles, targets, start=self.d, weights=weights, sight=free)
         self._change("drag", replace(self.work, d=triple(d)))
-        return float(np.linalg.norm(transform_point(self.rig.pose(d), self._handle) - target))
+        held = transform_point(self.rig.pose(d), self._handle)
+        return target + look * (float(look @ (held - target)) / max(float(look @ look), 1e-300))
 
     def release(self) -> None:
         """Release the grabbed point."""

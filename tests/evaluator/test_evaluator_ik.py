@@ -116,6 +116,46 @@ def test_targets_and_starts_with_nan_give_nan(rig):
     assert np.isnan(rig.ik(chin, targets[0], start=[np.nan, 0.0, 0.0])[0]).all()
 
 
+@pytest.mark.parametrize("handles", [1, 3])
+def test_a_sight_frees_the_depth_of_a_handle(rig, handles):
+    """Never worse across the sight than any of a fine scan, which does not know the path; and on the path in depth."""
+    A, points = rig.T_anatomical_skull[:3, :3], rig.landmarks[:handles]
+    scan = valid_d(rig, 4000, 5)
+    seen = where(rig, scan, points)
+    rng = np.random.default_rng(6)
+    for row in range(8):
+        start = rig.project([12.0 + row, rng.uniform(-2, 2), 0.5])
+        look = np.array([rng.normal(), 0.2 * rng.normal(), -1.0])
+        sight = np.zeros((handles, 3))
+        sight[0] = 300.0 * look @ A
+        targets = where(rig, start, points) + rng.normal(size=(1, 3)) * 2.0
+        found, distance_mm = rig.ik(points, targets, start=start, sight=sight)
+        unit = np.zeros((handles, 3))
+        unit[0] = sight[0] / np.linalg.norm(sight[0])
+
+        def apart(places, targets=targets, unit=unit):
+            left = places - targets
+            left = left - unit * (unit * left).sum(-1, keepdims=True)
+            return np.sqrt((left**2).sum(-1).mean(-1))
+
+        np.testing.assert_allclose(distance_mm, apart(where(rig, found, points)), atol=1e-12)
+        assert rig.margin(found) >= -1e-12 and distance_mm <= apart(seen).min() + 0.02
+        if handles == 1 and distance_mm < 1e-6:
+            assert abs(look[0] * found[1] + look[2] * found[2]) < 1e-5
+    for offset in ([0.0, -4.0, 0.0], [2.0, -3.0, 0.0]):  # from the front: no protrusion, whatever the depth asked for
+        target = where(rig, [12.0, 0.0, 0.0], points[:1])[0] + (np.array(offset) + [0.0, 0.0, 3.0]) @ A
+        found, _ = rig.ik(points[0], target, start=[12.0, 0.0, 0.0], sight=[0.0, 0.0, -1.0] @ A)
+        assert abs(found[2]) < 1e-5
+        scanned, _ = rig.ik(points[0], target, sight=[0.0, 0.0, -1.0] @ A)
+        np.testing.assert_allclose(scanned, found, atol=1e-4)
+
+
+@pytest.mark.parametrize("sight", [[0.0, 0.0], [[0.0, 0.0, 1.0]], [0.0, np.nan, 1.0]])
+def test_a_wrong_sight_is_refused(rig, sight):
+    with pytest.raises(ValueError, match="sight"):
+        rig.ik(rig.landmarks[0], np.zeros(3), sight=sight)
+
+
 @pytest.mark.parametrize(
     ("points", "weights", "message"),
     [([1.0, 2.0], None, "p_mandible"), ([[0.0] * 3] * 2, [1.0], "weights"), ([[0.0] * 3] * 2, [0.0, 0.0], "weights")],

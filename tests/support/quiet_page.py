@@ -73,15 +73,16 @@ class QuietPage:
 
         asyncio.run_coroutine_threadsafe(run(), self.loop).result(60)
 
-    def drag(self, grip, phase, start, end):
-        """Do what a visitor's pointer does to a mesh: places in the page's world [mm]."""
+    def drag(self, grip, phase, start, end, modifier=None):
+        """Do what a visitor's pointer does to a mesh: places in the page's world [mm], and the key that is held."""
         event = viser.SceneNodeDragEvent(
             self.client, self.client.client_id, grip, phase, None, tuple(start), (0.5, 0.5), tuple(end), (0.5, 0.5),
-            "left", None,
+            "left", modifier,
         )  # fmt: skip
 
         async def run():
             for entry in grip._impl.drag_cb:
-                await entry.callback(event)
+                if entry.modifier == modifier:
+                    await entry.callback(event)
 
         asyncio.run_coroutine_threadsafe(run(), self.loop).result(60)

@@ -88,7 +88,9 @@ def test_sliders_pose_the_jaw_and_their_ends_follow(tab):
     until(lambda: tuple(tab.page.scene.grips[0].color) != _OUTSIDE)
 
 
-def test_dragging_the_incisor_is_inverse_kinematics(tab):
+@pytest.mark.parametrize("key", [None, "Shift"])
+def test_dragging_the_incisor_is_inverse_kinematics(tab, key):
+    """The depth follows the opening path, or stays as it is while a key is held."""
     tab.type_slider(0, 15)
     until(lambda: close_to(tab.session, [15, 0, 0]))
     time.sleep(0.5)  # the page draws the pose
@@ -97,7 +99,9 @@ def test_dragging_the_incisor_is_inverse_kinematics(tab):
     here, there = tab.pixel(incisor), tab.pixel(incisor + [5.0, 0.0, 0.0])
     held = []
     drag_to = tab.session.drag_to
-    tab.session.drag_to = lambda p: held.append((tab.session._handle, p)) or drag_to(p)
+    tab.session.drag_to = lambda p, sight: held.append((tab.session._handle, p, sight)) or drag_to(p, sight)
+    if key is not None:
+        tab.web.keyboard.down(key)
     tab.web.mouse.move(*here)
     tab.web.mouse.down()
     for share in np.linspace(0.1, 1.0, 10):
@@ -108,14 +112,20 @@ def test_dragging_the_incisor_is_inverse_kinematics(tab):
     tab.picture("drag")
     tab.web.mouse.up()
     until(lambda: not tab.session.dragging)
-    handle, pointer = held[-1]
-    T = rig.pose(start)
-    asked = rig.T_anatomical_skull[:3, :3] @ (pointer - T[:3, :3] @ handle - T[:3, 3])
+    if key is not None:
+        tab.web.keyboard.up(key)
+    handle, pointer, sight = held[-1]
+    T, R = rig.pose(start), rig.T_anatomical_skull[:3, :3]
+    asked = R @ (pointer - T[:3, :3] @ handle - T[:3, 3])
     np.testing.assert_allclose(asked, [5.0, 0.0, 0.0], atol=0.6)  # the surface is closer to the camera than the incisor
-    found, _ = rig.ik(handle, pointer, start=start)
+    assert (sight is None) == (key is not None)
+    if sight is not None:
+        place = R @ pointer + rig.T_anatomical_skull[:3, 3]
+        np.testing.assert_allclose(R @ sight, place - tab.page.client.camera.position, atol=1e-9)
+    found, _ = rig.ik(handle, pointer, start=start, sight=sight)
     moved = [T[:3, :3] @ handle + T[:3, 3] for T in rig.pose(np.stack([found, tab.session.d]))]
     assert np.linalg.norm(moved[0] - moved[1]) < 0.1
-    assert tab.session.d[1] > 2.0
+    assert tab.session.d[1] > 2.0 and (abs(tab.session.d[2]) > 0.5) == (key is not None)
 
 
 def pull(tab, landmark, offset):

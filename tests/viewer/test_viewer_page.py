@@ -10,6 +10,7 @@ from viser import UploadedFile
 from jawusd.formats.keys import load_keys
 from jawusd.formats.poses import read_parameters
 from jawusd.rig.motion_read import read_poses_of_stage
+from jawusd.viewer.page import FREE_DEPTH
 from jawusd.viewer.readouts import CONDYLES, INCISOR, landmark_places, rest_places
 from jawusd.viewer.scene import PRESETS, preset_view
 
@@ -100,24 +101,29 @@ def test_the_mandible_on_the_page_stands_where_the_rig_says(quiet):
     np.testing.assert_allclose(jaw.position, expected[:3, 3], atol=1e-9)
 
 
-def test_a_drag_of_the_mesh_is_inverse_kinematics_and_pins_are_shown(quiet):
+@pytest.mark.parametrize("key", [None, FREE_DEPTH])
+def test_a_drag_of_the_mesh_is_inverse_kinematics_and_pins_are_shown(quiet, key):
+    """With the key, the pointer's place counts; without, the line of sight through it, from the camera in front."""
     page, rig = quiet.page, quiet.page.session.rig
     quiet.enter(page.pose.sliders[0], 15.0)
     start = page.session.d
     incisor = landmark_places(rig, start)[0]
     grip = page.scene.grips[-1]
     for phase, share in (("start", 0.1), ("update", 0.5), ("update", 1.0)):
-        quiet.drag(grip, phase, incisor, incisor + share * np.array([5.0, 0, 0]))
+        quiet.drag(grip, phase, incisor, incisor + share * np.array([5.0, 0, 0]), key)
     assert page.scene._held.visible and page.session.dragging
-    quiet.drag(grip, "end", incisor, incisor + [5.0, 0, 0])
+    quiet.drag(grip, "end", incisor, incisor + [5.0, 0, 0], key)
     assert not page.scene._held.visible and not page.session.dragging
     A = rig.T_anatomical_skull
-    found, _ = rig.ik(rig.landmarks[0], np.linalg.solve(A, [*(incisor + [5.0, 0, 0]), 1])[:3], start=start)
+    sight = None if key else A[:3, :3].T @ (incisor + [5.0, 0, 0] - page.client.camera.position)
+    target = np.linalg.solve(A, [*(incisor + [5.0, 0, 0]), 1])[:3]
+    found, _ = rig.ik(rig.landmarks[0], target, start=start, sight=sight)
     moved = landmark_places(rig, np.stack([found, page.session.d]))[:, 0]
     assert np.linalg.norm(moved[0] - moved[1]) < 0.1 and page.session.d[1] > 2
+    assert (abs(page.session.d[2]) > 0.5) == (key == FREE_DEPTH)
     quiet.enter(page.pose.pins["condyle_left"], True)
     assert page.scene._pins["condyle_left"].visible and not page.scene._pins["condyle_right"].visible
-    quiet.drag(grip, "update", incisor, incisor)  # no effect without a grabbed point
+    quiet.drag(grip, "update", incisor, incisor, key)  # no effect without a grabbed point
     assert quiet.notices == []
 
 

@@ -86,9 +86,10 @@ def test_a_drag_follows_the_pointer_as_inverse_kinematics_does(session):
     session.grab(chin)
     target = chin + RIG.T_anatomical_skull[:3, :3].T @ [5.0, 0.0, 0.0]
     for share in np.linspace(0.1, 1.0, 10):
-        left = session.drag_to(chin + share * (target - chin))
+        aim = session.drag_to(chin + share * (target - chin))
     found, distance = RIG.ik(RIG.landmarks[0], target, start=start)
     assert np.linalg.norm(place(session.d, 0) - place(found, 0)) < 0.1
+    left = np.linalg.norm(session.grabbed_point() - aim)
     assert left == pytest.approx(float(distance), abs=0.01) and session.readout().inside
     np.testing.assert_allclose(session.grabbed_point(), place(session.d, 0), atol=1e-9)
     session.release()
