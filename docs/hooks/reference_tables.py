@@ -94,7 +94,7 @@ def attribute_entry(attribute, array):
 
 def array_names():
     """Return the name of the array in model.npz by USD attribute."""
-    groups = (arrays.ARRAYS, arrays.GLIDE_ARRAYS, arrays.CONTACT_ARRAYS, arrays.JOINT_ARRAYS, arrays.SPEED_ARRAYS)
+    groups = (arrays.ARRAYS, *arrays.OPTIONAL.values())
     named = {spec.attribute: name for group in groups for name, spec in group.items() if spec.attribute}
     return named | dict.fromkeys(arrays.D_RANGE_ATTRIBUTES, "d_range")
 

@@ -80,6 +80,7 @@ def _print_schema(as_json: bool) -> None:
 
 def _info_lines(found: Description) -> list[str]:
     from jawusd.cli.text_build import contact_words, joint_words
+    from jawusd.evaluator.arrays import HeldOut
 
     lines = [
         f"actor {found['actor']}, format {found['format_version']}, prim {found['prim']}",
@@ -92,6 +93,8 @@ def _info_lines(found: Description) -> list[str]:
         f"measured poses: at most {limits['residual']:.2f} mm from the model, "
         f"tolerance {limits['tolerance']:.2f} mm outside the bound"
     )
+    if found["held_out"]:
+        lines.append(f"  {HeldOut(**found['held_out']).words}")
     lines.append(f"table: {table['format']} {table['shape']}, worst error {table['max_error_mm']:.4f} mm")
     lines.append(f"teeth: {contact_words(found['contact'])}")
     lines.append(f"condyles: {joint_words(found['joints'])}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +21,26 @@ _RIGID_TOLERANCE = 1e-6
 _POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
 _LARGEST = 1e9  # [mm, rad] far beyond any jaw, but small enough that sums of squares do not overflow
 _RISING = ("slice_d1", "path_limits", "glide_d2", "glide_d3", "curve1_knots", "curve2_knots", "curve3_knots")
+
+
+class HeldOut(NamedTuple):
+    """How far frames of the take lie outside a bound that was built without them.
+
+    Attributes:
+        share: Fraction of these frames within the tolerance.
+        p95_mm: Distance outside the bound that 95 % of these frames do not exceed; 0 if they lie inside.
+        tolerance_mm: The tolerance of the rig.
+    """
+
+    share: float
+    p95_mm: float
+    tolerance_mm: float
+
+    @property
+    def words(self) -> str:
+        """The share and the distance in words."""
+        within = f"{100 * self.share:.0f} % of held-out frames lie within the tolerance of {self.tolerance_mm:.1f} mm"
+        return within if self.p95_mm <= self.tolerance_mm else f"{within}; 95 % within {self.p95_mm:.1f} mm"
 
 
 class RigArrays:
@@ -94,6 +115,14 @@ class RigArrays:
     def tolerance_mm(self) -> float:
         """How far outside the bound a measured pose may lie and still be valid [mm]; authored poses must lie inside."""
         return float(self.arrays["tolerance_mm"]) + 0.0  # older files store the negated limit: avoid -0.0
+
+    @property
+    def held_out(self) -> HeldOut | None:
+        """How far held-out frames of the take lie outside the bound; None if unknown."""
+        if "held_out_share" not in self.arrays:
+            return None
+        share, p95_mm = (float(self.arrays[name]) for name in ("held_out_share", "held_out_p95_mm"))
+        return HeldOut(share, p95_mm, self.tolerance_mm)
 
     @property
     def model_hash(self) -> str:
@@ -190,6 +219,8 @@ def _check_values(arrays: dict[str, Array]) -> None:
         raise EvaluatorError(f'"d_range" is {arrays["d_range"].tolist()} mm; rows must be (low, high), opening > 0.')
     if arrays["tolerance_mm"] < 0 or arrays["residual_limit_mm"] <= 0:
         raise EvaluatorError('"residual_limit_mm" must be positive and "tolerance_mm" not negative.')
+    if "held_out_share" in arrays and not (0 <= arrays["held_out_share"] <= 1 and arrays["held_out_p95_mm"] >= 0):
+        raise EvaluatorError('"held_out_share" must be from 0 to 1 and "held_out_p95_mm" not negative.')
 
 
 def _check_sections(arrays: dict[str, Array]) -> None:

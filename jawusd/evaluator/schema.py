@@ -109,6 +109,12 @@ SPEED_ARRAYS: dict[str, ArraySpec] = {
     "acceleration_covariance": ArraySpec("jaw:motion:accelerationCovariance", (3, 3)),
 }
 
+#: How far frames lie outside a bound built without them, both or none; see `jawusd.evaluator.arrays.HeldOut`.
+HELD_OUT_ARRAYS: dict[str, ArraySpec] = {
+    "held_out_share": ArraySpec("jaw:thresholds:heldOutShare"),
+    "held_out_p95_mm": ArraySpec("jaw:thresholds:heldOutP95"),
+}
+
 
 #: Optional groups of arrays, each keyed by the name of one of its arrays.
 OPTIONAL = {
@@ -116,6 +122,7 @@ OPTIONAL = {
     "contact_values": CONTACT_ARRAYS,
     "joint_values": JOINT_ARRAYS,
     "velocity_covariance": SPEED_ARRAYS,
+    "held_out_share": HELD_OUT_ARRAYS,
 }
 
 

@@ -90,22 +90,30 @@ def _circumradius(corners: Array) -> Array:
     return np.where(doubled_area > _SLIVER, sides.prod(1) / np.maximum(2 * doubled_area, _SLIVER), np.inf)
 
 
-def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, Array], float]:
+def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, Array], dict[str, Array]]:
     """Build the slice hull of captured parameters (N, 3) [mm] in temporal order.
 
     Args:
         closed_mm: d1 of closed teeth, where the hull ends; default: the smallest captured d1, apart from noise.
 
     Returns:
-        The `slice_*` arrays of a model; and the tolerance for measured poses [mm]: the 95 % quantile of the distance of
-        held-out frames outside the hull, since other exercises reach slightly farther than those captured.
+        The `slice_*` arrays of a model; and its `tolerance_mm` and `held_out_*` arrays. The tolerance for measured
+        poses is the 95 % quantile of the distance of held-out frames outside the hull, since other exercises reach
+        slightly farther than those captured, but at most 1 mm: a larger one would accept poses that no frame shows.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
     excess = [
         SliceHull.from_arrays(_hull(d[blocks != k], closed_mm)).signed_distance(d[blocks == k]) for k in range(_FOLDS)
     ]
-    tolerance = np.quantile(np.concatenate(excess), _TOLERANCE_QUANTILE)
-    return _hull(d, closed_mm), float(np.clip(tolerance, 0.0, _LARGEST_TOLERANCE_MM))
+    excess_mm = np.maximum(np.concatenate(excess), 0.0)
+    p95_mm = np.quantile(excess_mm, _TOLERANCE_QUANTILE)
+    tolerance_mm = np.minimum(p95_mm, _LARGEST_TOLERANCE_MM)
+    share = np.mean(excess_mm <= tolerance_mm)
+    return _hull(d, closed_mm), {
+        "tolerance_mm": np.array(tolerance_mm),
+        "held_out_share": np.array(share),
+        "held_out_p95_mm": np.array(p95_mm),
+    }
 
 
 def valid_box(arrays: Mapping[str, Array]) -> Array:

@@ -154,7 +154,7 @@ def fit_model(
         raise FittingError("some training poses cannot be encoded.", hint="Check the units of the poses.")
     captured_d = d[:: -(-len(d) // _MOST_CAPTURED)]
     warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(captured_d, shown)]
-    hull, tolerance_mm = fit_slice_hull(d)
+    hull, tolerances = fit_slice_hull(d)
     arrays = {
         **form.model.arrays(),
         **hull,
@@ -165,7 +165,7 @@ def fit_model(
         "landmarks": anatomy.landmarks,
         "d_range": valid_box(hull),
         "codes": captured_d,
-        "tolerance_mm": np.array(tolerance_mm),
+        **tolerances,
     }
     meta: dict[str, object] = {
         "actor": actor,

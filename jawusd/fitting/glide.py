@@ -66,7 +66,7 @@ def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
 def _regauged(model: JawModel, old: Gauge, gauge: Gauge, d: Array) -> JawModel:
     """Return the model with a new gauge, its parameters d (F, 3), and bounds that end at closed teeth."""
     trained = d[model.trained]
-    hull, tolerance_mm = fit_slice_hull(trained, closed_mm=0.0)
+    hull, tolerances = fit_slice_hull(trained, closed_mm=0.0)
     config = model.meta["config"]
     alpha = float(config["alpha"]) if isinstance(config, dict) else 1.0
     arrays = {
@@ -76,7 +76,7 @@ def _regauged(model: JawModel, old: Gauge, gauge: Gauge, d: Array) -> JawModel:
         **alpha_shapes(trained, alpha),
         "d_range": valid_box(hull),
         "codes": _carried(old, gauge, model.arrays["codes"]),
-        "tolerance_mm": np.array(tolerance_mm),
+        **{name: value for name, value in tolerances.items() if name in model.arrays},
     }
     ends = zip(trained.min(axis=0).tolist(), trained.max(axis=0).tolist())
     meta = {**model.meta, "ranges_mm": {name: [low, high] for name, (low, high) in zip(PARAMETERS, ends)}}

@@ -16,6 +16,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError, FormatError, OutputError, explain_missing_packages
 from jawusd.evaluator import JawRig, load
 from jawusd.evaluator.bounds import SMALLEST_REACH_MM
+from jawusd.evaluator.schema import HELD_OUT_ARRAYS
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.model import JawModel, load_model, save_model
 from jawusd.library.index import MODEL_FILE, Entry, Library, load_donors, scan_library
@@ -176,9 +177,11 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
     if expected is not None:
         limit = np.maximum(model.arrays["residual_limit_mm"], expected.pooled().mean())
         model.arrays["residual_limit_mm"] = limit
-    # Transferred poses are not a take of this subject, so the file gets no captured motion.
+    # Transferred poses are not a take of this subject, so the file gets no captured motion and no held-out frames.
+    arrays = {name: value for name, value in model.arrays.items() if name not in HELD_OUT_ARRAYS}
     none = np.zeros(0)
-    return replace(model, frames=none.astype(np.int64), d=np.zeros((0, 3)), residual_mm=none, trained=none.astype(bool))
+    d, trained = np.zeros((0, 3)), none.astype(bool)
+    return replace(model, arrays=arrays, frames=none.astype(np.int64), d=d, residual_mm=none, trained=trained)
 
 
 def _caution(motion: PersonalMotion) -> str:

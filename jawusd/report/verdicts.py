@@ -229,6 +229,8 @@ def _bounds(data: ReportData) -> Verdict:
     counted = f" ({100 * inside:.1f} %)" if used.any() else ""
     name = f"captured poses inside the bound{counted} or within its tolerance of {rig.tolerance_mm:.2f} mm"
     checks = [_share(name, valid, 0.97, 0.9)]
+    if rig.held_out is not None:
+        checks.append(Check("frames outside bounds built without them", rig.held_out.words, "-", OPEN))
     synthesis = data.experiments.of("synthesis") if data.experiments else []
     known = next((one for one in synthesis if one.model.startswith("captured")), None)
     drawn = next((one for one in synthesis if one.model == meta.get("method") and "slice" in one.quantity), None)

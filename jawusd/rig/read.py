@@ -191,6 +191,7 @@ class Description(TypedDict):
     ranges_mm: dict[str, list[float]]
     landmarks_mm: dict[str, list[float]]
     thresholds_mm: dict[str, float]
+    held_out: dict[str, float] | None
     table: TableDescription
     onnx: list[str]
     fps: float
@@ -229,6 +230,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
             "residual": rig.limits.residual_mm,
             "tolerance": rig.tolerance_mm,
         },
+        "held_out": rig.held_out and rig.held_out._asdict(),
         "table": {
             "format": table.format,
             "shape": [len(axis) for axis in table.axes],

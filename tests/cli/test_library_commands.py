@@ -264,6 +264,7 @@ def test_landmarks_and_a_library_make_a_rig(people, tmp_path):
     ]
     assert widest[1] - 1 < widest[2] < widest[0] + 1
     assert rig.meta["personal"]["expected_error_mm"] == said["expected_error_mm"]
+    assert rig.held_out is None  # the transferred poses are no take of this subject
     T = person("Anna").pose([15.0, 1, 0.5])
     assert rig.encode(T)[1] < 1.5
     closest = tmp_path / "closest.npz"

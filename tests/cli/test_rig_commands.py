@@ -14,9 +14,11 @@ from pxr import Usd
 from run_jawusd import face_csv, run
 
 import jawusd
+from jawusd.cli.rig_commands import _info_lines
 from jawusd.formats.poses import read_parameters, write_parameters, write_poses
 from jawusd.formats.tracks import LostReason, TrackStatus, save_tracks
 from jawusd.geometry import se3_exp, se3_log
+from jawusd.rig import describe
 
 
 def test_pose_prints_what_the_evaluator_says(actor):
@@ -65,6 +67,14 @@ def test_info_names_actor_ranges_and_meshes(actor):
     assert found["actor"] == "someone" and found["model"]["kind"] == "anchored"
     text = run("info", actor.parent / "anim_capture.usdc")
     assert "someone" in text and "animation: 40 samples" in text
+
+
+def test_info_states_how_many_held_out_frames_the_tolerance_covers(actor):
+    found = describe(actor)
+    assert not any("held-out" in line for line in _info_lines(found))
+    found["held_out"] = {"share": 0.76, "p95_mm": 4.2, "tolerance_mm": 1.0}
+    words = "  76 % of held-out frames lie within the tolerance of 1.0 mm; 95 % within 4.2 mm"
+    assert words in _info_lines(found)
 
 
 @pytest.mark.slow

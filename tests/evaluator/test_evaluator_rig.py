@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import reference_jaw as reference
-from example_model import example_arrays, example_meta
+from example_model import example_arrays, example_meta, held_out_arrays
 from scipy.spatial.transform import Rotation
 
 from jawusd.base.errors import EvaluatorError
@@ -276,3 +276,15 @@ COMPLEX = np.array([10.0, 1.0, 0.5]) + 1e-3j
 def test_complex_numbers_are_refused(call):
     with pytest.raises(ValueError, match="must be real numbers"):
         call(JawRig(example_arrays(), example_meta()))
+
+
+def test_held_out_frames_are_stated_and_checked():
+    arrays = {**example_arrays(), "tolerance_mm": np.array(1.0), **held_out_arrays()}
+    rig = JawRig(arrays, example_meta())
+    words = "76 % of held-out frames lie within the tolerance of 1.0 mm"
+    assert rig.held_out.words == f"{words}; 95 % within 4.2 mm"
+    assert JawRig({**arrays, "held_out_p95_mm": np.array(0.8)}, example_meta()).held_out.words == words
+    assert JawRig(example_arrays(), example_meta()).held_out is None
+    for name, wrong in (("held_out_share", 1.1), ("held_out_share", -0.1), ("held_out_p95_mm", -1.0)):
+        with pytest.raises(EvaluatorError, match="held_out"):
+            JawRig({**arrays, name: np.array(wrong)}, example_meta())

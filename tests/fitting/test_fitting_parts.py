@@ -281,10 +281,23 @@ def test_tolerance_grows_with_what_a_left_out_exercise_adds():
     rng = np.random.default_rng(21)
     alike = envelope(rng, 1000)
     farther = alike.copy()
-    block = np.arange(1000) // 50 % 5 == 4  # frames held out together
-    farther[block, 1:] = [0.0, 2.0] + 1.3 * (alike[block, 1:] - [0.0, 2.0])
+    blocks = np.arange(1000) // 50 % 5  # of frames held out together
+    farther[blocks == 4, 1:] = [0.0, 2.0] + 1.3 * (alike[blocks == 4, 1:] - [0.0, 2.0])
     (_, small), (_, large) = fit_slice_hull(alike), fit_slice_hull(farther)
-    assert 0.0 <= small < large <= 1.0
+    assert 0.0 <= small["tolerance_mm"] < large["tolerance_mm"] <= 1.0
+    assert small["held_out_p95_mm"] == small["tolerance_mm"] and small["held_out_share"] >= 0.95
+
+
+def test_share_of_held_out_frames_states_what_the_largest_tolerance_leaves_out():
+    rng = np.random.default_rng(21)
+    d = envelope(rng, 1000)
+    blocks = np.arange(1000) // 50 % 5
+    d[blocks == 4, 1:] *= 2.5
+    _, found = fit_slice_hull(d)
+    hulls = [SliceHull.from_arrays(fit_slice_hull(d[blocks != k])[0]) for k in range(5)]
+    beyond_mm = np.concatenate([hull.signed_distance(d[blocks == k]) for k, hull in enumerate(hulls)])
+    assert found["tolerance_mm"] == 1.0 and found["held_out_share"] == (beyond_mm <= 1.0).mean() < 0.9
+    assert found["held_out_p95_mm"] == pytest.approx(np.quantile(beyond_mm, 0.95)) and found["held_out_p95_mm"] > 1.0
 
 
 def test_flat_section_still_contains_its_frames():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from example_model import held_out_arrays
 from report_data import experiments, report_data
 
 from jawusd.formats.finding import Finding
@@ -21,6 +22,13 @@ def test_a_good_build_is_good():
     verdicts = judge(report_data())
     assert [verdict.stage for verdict in verdicts] == ["sync", "track", "fit", "bounds", "rig"]
     assert overall(verdicts) == GOOD, [c for v in verdicts for c in v.checks if c.grade != GOOD]
+
+
+def test_bounds_state_how_many_held_out_frames_the_tolerance_covers():
+    data = report_data()
+    data.model.arrays.update(held_out_arrays())
+    bounds = next(verdict for verdict in judge(data) if verdict.stage == "bounds")
+    assert "76 % of held-out frames" in " ".join(check.found for check in bounds.checks) and bounds.grade == GOOD
 
 
 def late_camera(data):

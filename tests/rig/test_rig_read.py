@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from example_model import example_arrays, example_meta, joint_arrays, moving_arrays, touching_arrays
+from example_model import example_arrays, example_meta, held_out_arrays, joint_arrays, moving_arrays, touching_arrays
 from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig, forget_checksums, moved
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
@@ -50,7 +50,7 @@ def test_what_is_baked_is_read_back_exactly(folder, kind, tmp_path_factory):
 
 
 def test_what_not_every_rig_has_is_read_back_exactly(kind, tmp_path):
-    arrays = {**example_arrays(kind), **touching_arrays(kind), **joint_arrays(), **moving_arrays()}
+    arrays = {**example_arrays(kind), **touching_arrays(kind), **joint_arrays(), **moving_arrays(), **held_out_arrays()}
     rig = JawRig(arrays, example_meta(kind))
     bake_rig(tmp_path, rig, example_meshes(), name="example", fps=FPS, table_size=17)
     found = load_rig(tmp_path / "actor.usda")
@@ -60,6 +60,7 @@ def test_what_not_every_rig_has_is_read_back_exactly(kind, tmp_path):
     assert found.model_hash == rig.model_hash
     speeds = describe(tmp_path / "actor.usda")["speeds"]
     assert speeds == {"rms_mm_s": rig.speeds.rms_mm_s.tolist(), "rms_mm_s2": rig.speeds.rms_mm_s2.tolist()}
+    assert describe(tmp_path / "actor.usda")["held_out"] == {"share": 0.76, "p95_mm": 4.2, "tolerance_mm": 0.0}
     assert_valid_usd(tmp_path / "actor.usda")
 
 
