@@ -296,7 +296,7 @@ def searched_start(
         found, fit = follower.start_at(frame, poses)
         return found.poses, fit
 
-    search = PictureSearch(capture, footage, len(follower.cameras), near, judged)
+    search = PictureSearch(capture, footage, follower.cameras, near, judged)
     begin = search.run(frames, progress)
     follower.start_at(begin.frame, begin.pose)  # repeated, because the search may have tried other frames since
     return begin

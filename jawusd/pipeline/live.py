@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 import jawusd
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError, OutputError, explain_missing_packages, naming_file
@@ -24,7 +22,7 @@ from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.follow import Cutter
-from jawusd.pipeline.picture_search import LEAST_FIT, MOST_BRIDGED, masked_cameras
+from jawusd.pipeline.picture_search import LEAST_FIT, arches_apart, masked_cameras, orientations
 from jawusd.pipeline.solve import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
@@ -261,18 +259,18 @@ class _Follower:
 
     def _begin_in_pictures(self, pictures: Pictures) -> None:
         """Search for the teeth in images, if the arches are apart in them."""
-        from jawusd.segmentation.rows import tooth_rows
-
-        rows = {name: tooth_rows(np.asarray(image)) for name, image in pictures.items() if image is not None}
-        apart = {name: row for name, row in rows.items() if row is not None and row.bridged <= MOST_BRIDGED}
-        if len(apart) < min(2, len(self._cameras)):
-            return
         none = dict.fromkeys(self._cameras, 0)
-        with tempfile.TemporaryDirectory() as folder:
-            masked = masked_cameras(self._capture, apart, none, Path(folder))
-            near = self._teeth.search.at(masked, self._cameras, none, 0)
-        if near is not None:
-            self._learn(pictures, near)
+        for turns in orientations(self._cameras):
+            apart = arches_apart(pictures, turns)
+            if len(apart) < min(2, len(self._cameras)):
+                continue
+            with tempfile.TemporaryDirectory() as folder:
+                masked = masked_cameras(self._capture, apart, none, Path(folder))
+                near = self._teeth.search.at(masked, self._cameras, none, 0)
+            if near is not None:
+                self._learn(pictures, near)
+            if self._cutter is not None:
+                return
 
     def _next(self, last: float, silence_s: float) -> float | None:
         """Wait for the next frame of which all sources have an image; return its time, or None at the end."""

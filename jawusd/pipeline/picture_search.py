@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -12,22 +12,27 @@ import numpy as np
 
 from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import CameraSource, Capture
+from jawusd.geometry import Camera
 from jawusd.pipeline.segment_record import with_masks
 from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:
-    from jawusd.segmentation.picture import ColourFootage
+    from jawusd.segmentation.picture import ColourFootage, Pictures
     from jawusd.segmentation.rows import Rows
 
-# Frame stride of the search, frames per part of the take, and starts tried per part.
-_EVERY, _PART, _TRIED = 8, 240, 4
+# Frame stride of the search, and frames per part of the take.
+_EVERY, _PART = 8, 240
+# Starts tried per part for each of the four orientations of the cameras, the most likely orientation first.
+_TRIED = (4, 2, 2, 2)
 # Maximum number of starts tried, at about ten seconds of CPU time each. If six parts yield no start that fits, scans,
 # cameras or the detection are wrong, and more tries would not help. The limit is a number instead of a time, so that
 # results do not depend on the machine.
 _MOST_TRIED = 24
-#: Maximum fraction of the line between the arches that may be bridged if the arches are to count as apart. Of 64 images
-#: of eight mouths, all below it were separated correctly.
-MOST_BRIDGED = 0.1
+# Maximum fraction of the line between the arches that may be bridged if the arches are to count as apart. Of 64 images
+# of eight mouths, all below it were separated correctly.
+_MOST_BRIDGED = 0.1
+# Minimum length of the vertical, of length 1, in the image plane of a camera whose orientation is known from it.
+_SHORTEST_UP = 0.5
 #: Limits of the fraction of the visible contour that matches the colours. Starts below `LEAST_FIT` are rejected; the 20
 #: starts found in one take, all but one within 0.5 mm, had 0.19 to 0.48. A start above `_CLEAR_FIT` (several cameras)
 #: or `_CLEAR_FIT_SINGLE` (one camera, where depth may be wrong) ends the search.
@@ -65,7 +70,7 @@ class PictureSearch(Generic[T]):
 
     Attributes:
         capture, footage: the capture, and the images of its cameras with a video.
-        cameras: number of these cameras.
+        cameras: these cameras, by name.
         near: function that estimates a pose on a frame from cameras with rough masks; returns None if that fails.
         judged: function that refines a pose on a frame, and returns the fraction of the visible contour that fits, 0 ..
             1.
@@ -73,7 +78,7 @@ class PictureSearch(Generic[T]):
 
     capture: Capture
     footage: ColourFootage
-    cameras: int
+    cameras: Mapping[str, Camera]
     near: Callable[[Sequence[CameraSource], int], T | None]
     judged: Callable[[int, T], tuple[T, float]]
 
@@ -89,13 +94,12 @@ class PictureSearch(Generic[T]):
         seen = 0
         for part in (frames[k : k + _PART] for k in range(0, len(frames), _PART)):
             seen += len(part)
-            candidates = sorted(self._candidates(part, progress), key=lambda candidate: candidate.bridged)
-            for candidate in candidates[:_TRIED]:
+            for candidate in self._promising(part, progress):
                 tried.append(candidate.frame)
                 found = self._at(candidate)
                 if found is not None and (best is None or found.fit > best.fit):
                     best = found
-                if best is not None and best.fit >= (_CLEAR_FIT if self.cameras > 1 else _CLEAR_FIT_SINGLE):
+                if best is not None and best.fit >= (_CLEAR_FIT if len(self.cameras) > 1 else _CLEAR_FIT_SINGLE):
                     return best
             if best is not None and best.fit >= LEAST_FIT:
                 return best
@@ -107,15 +111,18 @@ class PictureSearch(Generic[T]):
             "pick teeth in two cameras ([bootstrap]), or draw masks.",
         )
 
-    def _candidates(self, part: range, progress: Progress) -> list[_Candidate]:
-        """Return the frames of a part of the take on which the arches are apart in enough cameras."""
-        from jawusd.segmentation.rows import tooth_rows
+    def _promising(self, part: range, progress: Progress) -> Iterator[_Candidate]:
+        """Yield candidates of a part of the take, those of the most likely camera orientation first."""
+        for turns, count in zip(orientations(self.cameras), _TRIED, strict=True):
+            candidates = self._candidates(part, turns, progress)
+            yield from sorted(candidates, key=lambda candidate: candidate.bridged)[:count]
 
+    def _candidates(self, part: range, turns: Mapping[str, int], progress: Progress) -> list[_Candidate]:
+        """Return the frames of a part of the take on which the arches are apart in enough cameras."""
         out, chosen = [], part[::_EVERY]
         for done, (frame, pictures) in enumerate(self.footage.walk(chosen), start=1):
-            rows = {name: tooth_rows(np.asarray(image)) for name, image in pictures.items() if image is not None}
-            apart = {name: row for name, row in rows.items() if row is not None and row.bridged <= MOST_BRIDGED}
-            if len(apart) >= min(2, self.cameras):
+            apart = arches_apart(pictures, turns)
+            if len(apart) >= min(2, len(self.cameras)):
                 out.append(_Candidate(frame, apart))
             progress("start", done, len(chosen))
         return out
@@ -129,11 +136,50 @@ class PictureSearch(Generic[T]):
         return None if near is None else Start(candidate.frame, *self.judged(candidate.frame, near), "search")
 
 
+def orientations(cameras: Mapping[str, Camera]) -> list[dict[str, int]]:
+    """Return four hypotheses of how the cameras are turned about their optical axes, the most likely first.
+
+    A camera may lie on its side or hang upside down. The calibration gives the orientation of the cameras relative to
+    one another, so that one unknown remains: how the first camera is turned. Most likely most cameras are upright.
+
+    Returns:
+        for every hypothesis, the number of counter-clockwise quarter turns that make each camera's image upright.
+        Cameras that look along the vertical are left out.
+    """
+    first = next(iter(cameras.values()))
+    out = []
+    for turn in (0, 1, 3, 2):
+        up_first = np.array([np.sin(turn * np.pi / 2), -np.cos(turn * np.pi / 2), 0.0])
+        up_world = first.T_cam_world[:3, :3].T @ up_first
+        turns = {}
+        for name, camera in cameras.items():
+            x, y, _ = camera.T_cam_world[:3, :3] @ up_world
+            if np.hypot(x, y) > _SHORTEST_UP:
+                turns[name] = round(np.arctan2(x, -y) / (np.pi / 2)) % 4
+        out.append(turns)
+    return sorted(out, key=lambda turns: -sum(turn == 0 for turn in turns.values()))
+
+
+def arches_apart(pictures: Pictures, turns: Mapping[str, int]) -> dict[str, Rows]:
+    """Return the arches in the images in which they are visibly apart, by camera name.
+
+    Args:
+        pictures: image per camera, or None.
+        turns: counter-clockwise quarter turns that make the images upright, by camera name.
+    """
+    from jawusd.segmentation.rows import tooth_rows
+
+    images = {name: image for name, image in pictures.items() if image is not None and name in turns}
+    rows = {name: tooth_rows(np.asarray(image), turns[name]) for name, image in images.items()}
+    return {name: row for name, row in rows.items() if row is not None and row.bridged <= _MOST_BRIDGED}
+
+
 def _describe_failure(tried: Sequence[int], best: Start[T] | None, left: range) -> str:
     """Describe a failed search: the frames tried, the best fit, and the frames not searched."""
-    found = f"the teeth were not found on {len(tried)} frames that show both arches apart"
-    if tried:
-        found += f" ({', '.join(map(str, sorted(tried)))})"
+    frames = sorted(set(tried))
+    found = f"the teeth were not found on {len(frames)} frames that show both arches apart"
+    if frames:
+        found += f" ({', '.join(map(str, frames))})"
     if best is not None:
         found += f"; at best {best.fit:.0%} of the visible contour fits, {LEAST_FIT:.0%} is needed"
     if left:

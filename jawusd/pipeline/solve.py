@@ -131,7 +131,7 @@ class VideoShot:
         def near(sources: Sequence[CameraSource], frame: int) -> Pose | None:
             return self._teeth.search.at(sources, self.cameras, self._offsets, frame)
 
-        search = PictureSearch(self._capture, self.footage, len(self.cameras), near, self.take.begun)
+        search = PictureSearch(self._capture, self.footage, self.cameras, near, self.take.begun)
         return search.run(self._frames, progress)
 
     def _picked(self, bootstrap: Bootstrap) -> Start[Pose]:

@@ -47,8 +47,14 @@ class Rows:
     bridged: float
 
 
-def tooth_rows(rgb: NDArray[np.uint8]) -> Rows | None:
-    """Return the rows of teeth in an upright RGB image (H, W, 3); None if no teeth are found."""
+def tooth_rows(rgb: NDArray[np.uint8], turns: int = 0) -> Rows | None:
+    """Return the rows of teeth in an RGB image (H, W, 3) of a roughly upright head; None if no teeth are found.
+
+    `turns` is the number of counter-clockwise quarter turns that make the image upright. Masks are as the image given.
+    """
+    if turns % 4:
+        found = tooth_rows(np.ascontiguousarray(np.rot90(rgb, turns)))
+        return found and Rows(np.ascontiguousarray(np.rot90(found.masks, -turns, axes=(1, 2))), found.bridged)
     height, width = rgb.shape[:2]
     small = cv2.resize(rgb, (_WIDTH_PX, max(8, round(height * _WIDTH_PX / width))), interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(small, (0, 0), 1.0).astype(np.float32)

@@ -1,9 +1,11 @@
 """Track a capture many times with inputs changed by nothing that matters, and compare the runs with the truth.
 
-    python tests/benchmarks/luck.py CAPTURE [--runs 10] [--seed 0] [--footage]
+    python tests/benchmarks/luck.py CAPTURE [--runs 10] [--seed 0] [--footage] [--without-picks]
+        [--cameras cam0,cam2] [--turn cam0=1,cam2=2]
 
-CAPTURE has truth/truth.npz; with --footage its masks are ignored. Every run is a process of its own. The first is the
-capture as it is; the others change one thing each, in turn:
+CAPTURE has truth/truth.npz; with --footage its masks are ignored, with --without-picks its picks. --cameras leaves out
+all others; --turn turns images by counter-clockwise quarter turns, as if these cameras had been mounted so. Every run
+is a process of its own. The first is the capture as it is; the others change one thing each, in turn:
 
     1e-9, 1e-3, 0.1, 0.3 px   picks moved by normal noise of that size
     grey                      a grey level of noise, -1, 0 or 1, in the videos (masks stay)
@@ -25,16 +27,20 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 
+from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.capture import Bootstrap, Capture, load_capture
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.geometry import transform_point
+from jawusd.geometry import Camera, transform_point
 from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.track import track
 
@@ -55,8 +61,10 @@ def moved_picks(picks: Bootstrap, sigma_px: float, rng: np.random.Generator) -> 
     return picks.model_copy(update={"upper": row(picks.upper), "lower": row(picks.lower)})
 
 
-def rewritten(source: Path, target: Path, reverse: bool, rng: np.random.Generator | None) -> int:
-    """Write a video without loss, backwards or with a grey level of noise; return its number of frames."""
+def rewritten(
+    source: Path, target: Path, reverse: bool = False, rng: np.random.Generator | None = None, turns: int = 0
+) -> int:
+    """Write a video without loss, backwards, with a grey level of noise, or turned; return its number of frames."""
     with av.open(str(source)) as opened:
         stream = opened.streams.video[0]
         pictures = list(opened.decode(stream))
@@ -64,18 +72,60 @@ def rewritten(source: Path, target: Path, reverse: bool, rng: np.random.Generato
     layout = "gray" if pictures[0].format.name.startswith("gray") else "yuv420p"
     with av.open(str(target), "w") as made:
         out = made.add_stream("ffv1", rate=rate)
-        out.width, out.height, out.pix_fmt = pictures[0].width, pictures[0].height, layout
+        size = (pictures[0].width, pictures[0].height)[:: -1 if turns % 2 else 1]
+        out.width, out.height, out.pix_fmt = *size, layout
         for picture in reversed(pictures) if reverse else pictures:
             values = picture.to_ndarray(format=layout)
             if rng is not None:
                 luma = values[: picture.height].astype(np.int16)
                 luma += rng.integers(-1, 2, luma.shape, dtype=np.int16)
                 values[: picture.height] = np.clip(luma, 0, 255)
-            frame = av.VideoFrame.from_ndarray(values, layout)
+            if turns:
+                values = np.ascontiguousarray(np.rot90(picture.to_ndarray(format="rgb24"), turns))
+                frame = av.VideoFrame.from_ndarray(values, "rgb24").reformat(format=layout)
+            else:
+                frame = av.VideoFrame.from_ndarray(values, layout)
             frame.colorspace, frame.color_range = picture.colorspace, picture.color_range
             made.mux(out.encode(frame))
         made.mux(out.encode(None))
     return len(pictures)
+
+
+def turned(camera: Camera) -> Camera:
+    """Return a camera whose image is turned counter-clockwise by a quarter: (x, y) becomes (y, width - 1 - x)."""
+    turn = np.eye(4)
+    turn[:2, :2] = [[0.0, 1.0], [-1.0, 0.0]]
+    (fx, _, cx), (_, fy, cy), _ = camera.K
+    K = np.array([[fy, 0.0, cy], [0.0, fx, camera.size_px[0] - 1 - cx], [0.0, 0.0, 1.0]])
+    lens = np.array(camera.distortion)
+    if len(lens):
+        lens[2:4] = -lens[3], lens[2]
+    return replace(camera, size_px=camera.size_px[::-1], K=K, distortion=lens, T_cam_world=turn @ camera.T_cam_world)
+
+
+def mounted(capture: Capture, names: Sequence[str], turns: Mapping[str, int], folder: Path) -> Capture:
+    """Return a capture with only some cameras, some of them turned by quarter turns; masks and picks are dropped."""
+    reference = capture.sync.reference or capture.cameras[0].name
+    offsets = sync_cameras(capture, lambda *_: None)["offsets"]
+    cameras, placed = [], []
+    known = {camera.name: camera for camera in load_cameras(capture)}
+    for camera in capture.cameras:
+        if camera.name in names or camera.name == reference:
+            video, calibrated = camera.video, known[camera.name]
+            if turns.get(camera.name):
+                video = folder / f"{camera.name}_turned.mkv"
+                rewritten(camera.video, video, turns=turns[camera.name])
+                for _ in range(turns[camera.name]):
+                    calibrated = turned(calibrated)
+            elif camera.name not in names:
+                video = None
+            cameras.append(camera.model_copy(update={"video": video, "masks": None}))
+            placed.append(calibrated)
+    path = folder / "turned.toml"
+    save_calibration(path, placed)
+    sync = capture.sync.model_copy(update={"method": "offsets", "offsets": offsets, "reference": reference})
+    changed = {"cameras": tuple(cameras), "sync": sync, "calibration": path, "bootstrap": None}
+    return capture.model_copy(update=changed)
 
 
 def backwards(capture: Capture, folder: Path) -> Capture:
@@ -138,18 +188,27 @@ def scores(capture: Capture, tracks: Tracks, frames: np.ndarray) -> dict[str, ob
         "mean_mm": float(off_mm.mean()),
         "worst_mm": float(off_mm.max()),
         "silent": int(((off_mm > WRONG_MM) & sure).sum()),
+        "start": tracks.meta.get("start", {}),
         "findings": sorted({str(found["kind"]) for found in tracks.meta.get("findings", [])}),
     }
 
 
-def one_run(path: Path, kind: str, seed: int, footage: bool) -> dict[str, object]:
+def one_run(options: argparse.Namespace) -> dict[str, object]:
     """Track a capture with one thing changed."""
-    capture = load_capture(path)
-    if footage:
+    capture, kind = load_capture(options.capture, allow_outside=True), options.one
+    if options.footage:
         bare = tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras)
         capture = capture.model_copy(update={"cameras": bare})
+    if options.without_picks:
+        capture = capture.model_copy(update={"bootstrap": None})
     with tempfile.TemporaryDirectory() as folder:
-        given = changed(capture, kind, Path(folder), np.random.default_rng(seed))
+        if options.cameras or options.turn:
+            names = options.cameras.split(",") if options.cameras else [camera.name for camera in capture.cameras]
+            turns = {
+                name: int(count) for name, count in (each.split("=") for each in filter(None, options.turn.split(",")))
+            }
+            capture = mounted(capture, names, turns, Path(folder))
+        given = changed(capture, kind, Path(folder), np.random.default_rng(options.seed))
         tracks = track(given, jobs=1 if kind == "thread" else 3)
     frames = tracks.frames
     if kind == "reversed":
@@ -166,16 +225,23 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--footage", action="store_true", help="ignore masks")
+    parser.add_argument("--without-picks", action="store_true", help="ignore picks")
+    parser.add_argument(
+        "--cameras", default="", help="names of the cameras used, by default all; ignores masks and picks"
+    )
+    parser.add_argument("--turn", default="", help="name=quarter turns, ...; ignores masks and picks")
     parser.add_argument("--one", help=argparse.SUPPRESS)  # of the processes that this starts
     options = parser.parse_args()
     if options.one is not None:
-        print(json.dumps(one_run(options.capture, options.one, options.seed, options.footage)))
+        print(json.dumps(one_run(options)))
         return
     print(f"{'run':<10}{'lost':>6}{'mean':>9}{'worst':>9}{'silent':>8}  findings")
     found = []
     for run in range(options.runs):
         kind = "as it is" if run == 0 else KINDS[(run - 1) % len(KINDS)]
         line = [sys.executable, __file__, str(options.capture), "--one", kind, "--seed", str(options.seed + run)]
+        line += ["--cameras", options.cameras, "--turn", options.turn]
+        line += ["--without-picks"] if options.without_picks else []
         generic = {"NUMBA_CPU_NAME": "generic"} if kind == "generic" else {}
         line += ["--footage"] if options.footage else []
         done = subprocess.run(line, capture_output=True, text=True, check=False, env={**os.environ, **generic})
