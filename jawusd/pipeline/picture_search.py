@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -23,18 +23,19 @@ if TYPE_CHECKING:
 # Frame stride of the search, and frames per part of the take.
 _EVERY, _PART = 8, 240
 # Starts tried per part for each of the four orientations of the cameras, the most likely orientation first.
-_TRIED = (4, 2, 2, 2)
+_TRIED = (4, 1, 1, 1)
 # Maximum number of starts tried, at about ten seconds of CPU time each. If six parts yield no start that fits, scans,
 # cameras or the detection are wrong, and more tries would not help. The limit is a number instead of a time, so that
 # results do not depend on the machine.
-_MOST_TRIED = 24
+_MOST_TRIED = 42
 # Maximum fraction of the line between the arches that may be bridged if the arches are to count as apart. Of 64 images
 # of eight mouths, all below it were separated correctly.
 _MOST_BRIDGED = 0.1
 # Minimum length of the vertical, of length 1, in the image plane of a camera whose orientation is known from it.
 _SHORTEST_UP = 0.5
 #: Limits of the fraction of the visible contour that matches the colours. Starts below `LEAST_FIT` are rejected; the 20
-#: starts found in one take, all but one within 0.5 mm, had 0.19 to 0.48. A start above `_CLEAR_FIT` (several cameras)
+#: starts found in one take, all but one within 0.5 mm, had 0.19 to 0.48, and starts from images turned the wrong way at
+#: most 0.07. A start above `_CLEAR_FIT` (several cameras)
 #: or `_CLEAR_FIT_SINGLE` (one camera, where depth may be wrong) ends the search.
 LEAST_FIT, _CLEAR_FIT, _CLEAR_FIT_SINGLE = 0.15, 0.25, 0.4
 
@@ -83,39 +84,36 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress) -> Start[T]:
-        """Return the first start with a clear fit; after each part of the take, accept the best start if it fits.
+        """Return the first start with a clear fit, or else the best one of a part of the take and an orientation.
 
         Raises:
             TrackingError: no start fits.
             CaptureError: an image cannot be decoded.
         """
+        clear = _CLEAR_FIT if len(self.cameras) > 1 else _CLEAR_FIT_SINGLE
         best: Start[T] | None = None
         tried: list[int] = []
         seen = 0
         for part in (frames[k : k + _PART] for k in range(0, len(frames), _PART)):
             seen += len(part)
-            for candidate in self._promising(part, progress):
-                tried.append(candidate.frame)
-                found = self._at(candidate)
-                if found is not None and (best is None or found.fit > best.fit):
-                    best = found
-                if best is not None and best.fit >= (_CLEAR_FIT if len(self.cameras) > 1 else _CLEAR_FIT_SINGLE):
+            for turns, count in zip(orientations(self.cameras), _TRIED, strict=True):
+                candidates = self._candidates(part, turns, progress)
+                for candidate in sorted(candidates, key=lambda candidate: candidate.bridged)[:count]:
+                    tried.append(candidate.frame)
+                    found = self._at(candidate)
+                    if found is not None and (best is None or found.fit > best.fit):
+                        best = found
+                    if best is not None and best.fit >= clear:
+                        return best
+                if best is not None and best.fit >= LEAST_FIT:
                     return best
-            if best is not None and best.fit >= LEAST_FIT:
-                return best
             if len(tried) >= _MOST_TRIED:
                 break
         raise TrackingError(
             _describe_failure(tried, best, frames[seen:]),
-            hint="Check that scans, or rig, belong to this subject. Show both arches apart and upright for a moment, "
+            hint="Check that scans, or rig, belong to this subject. Show both arches apart for a moment, "
             "pick teeth in two cameras ([bootstrap]), or draw masks.",
         )
-
-    def _promising(self, part: range, progress: Progress) -> Iterator[_Candidate]:
-        """Yield candidates of a part of the take, those of the most likely camera orientation first."""
-        for turns, count in zip(orientations(self.cameras), _TRIED, strict=True):
-            candidates = self._candidates(part, turns, progress)
-            yield from sorted(candidates, key=lambda candidate: candidate.bridged)[:count]
 
     def _candidates(self, part: range, turns: Mapping[str, int], progress: Progress) -> list[_Candidate]:
         """Return the frames of a part of the take on which the arches are apart in enough cameras."""
