@@ -159,7 +159,7 @@ def viewer(out: Path, folder: Path) -> Path:
         raise NotInstalledError("playwright: pip install playwright") from None
     if program is None:
         raise NotInstalledError("Chromium: install it, or name it in CHROMIUM")
-    served = open_viewer(out, "127.0.0.1", 0)
+    served = open_viewer(out, "127.0.0.1", 0, play=False)
     arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with contextlib.ExitStack() as stack:
         stack.callback(served.stop)

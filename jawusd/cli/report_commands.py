@@ -159,6 +159,9 @@ def view(
     ),
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; the next free one if it is taken.")] = 8080,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
+    play: Annotated[
+        bool, typer.Option("--play/--no-play", help="Begin by playing the captured take of a rig, if it has one.")
+    ] = True,
     allow_outside: Outside = False,
     prim: Prim = None,
     allow: Allow = None,
@@ -169,20 +172,13 @@ def view(
     from jawusd.pipeline.state import changed_files
     from jawusd.pipeline.view import open_viewer
     from jawusd.pipeline.view_capture import is_capture, open_capture_viewer
-    from jawusd.viewer.server import is_loopback
 
     capture = is_capture(rig)
     if tracks is not None and not capture:
         raise typer.BadParameter("--tracks needs a capture, not a rig.")
     if prim is not None and capture:
         raise typer.BadParameter("--prim needs a rig, not a capture.")
-    if not is_loopback(host):
-        may = "write picks into the capture" if capture else "write animations beside the rig"
-        say(
-            f"jawusd: warning: listening on {host}: anyone who reaches this address can see this subject's jaw without "
-            f"a password, and {may}. `ssh -L 8080:localhost:8080` works without --host.",
-            err=True,
-        )
+    _warn_of_host(host, capture)
     for folder in (rig, tracks):
         for found in changed_files(folder) if folder is not None and folder.is_dir() else ():
             say(found.line(), err=True)
@@ -191,7 +187,7 @@ def view(
         with progress() as report:
             viewer = open_capture_viewer(rig, tracks, host, port, report, allow_outside=allow_outside)
     else:
-        viewer = open_viewer(rig, host, port, prim)
+        viewer = open_viewer(rig, host, port, prim, play=play)
     try:
         say(f"{viewer.url}  (Ctrl+C stops)")
         if browser:
@@ -199,6 +195,19 @@ def view(
         viewer.wait()
     except KeyboardInterrupt:
         viewer.stop()
+
+
+def _warn_of_host(host: str, capture: bool) -> None:
+    """Warn that an address can be reached from other machines."""
+    from jawusd.viewer.server import is_loopback
+
+    if not is_loopback(host):
+        may = "write picks into the capture" if capture else "write animations beside the rig"
+        say(
+            f"jawusd: warning: listening on {host}: anyone who reaches this address can see this subject's jaw without "
+            f"a password, and {may}. `ssh -L 8080:localhost:8080` works without --host.",
+            err=True,
+        )
 
 
 def experiment_lines(found: Experiments) -> list[str]:

@@ -150,7 +150,7 @@ def live(
 
     sources = dict(_named(entry) for entry in source or [])
     sender = None if osc is None else OscSender(osc)
-    viewer = open_viewer(rig, "127.0.0.1", port, prim) if view else None
+    viewer = open_viewer(rig, "127.0.0.1", port, prim, play=False) if view else None
     if viewer is not None:
         say(f"{viewer.url}  (Ctrl+C stops)", err=True)
     try:

@@ -29,14 +29,19 @@ if TYPE_CHECKING:
 #: Name of the captured motion among the motions of an actor.
 CAPTURED = "captured take"
 
-_TRACKS = "tracks.npz"
+_TRACKS, _BAKED = "tracks.npz", "anim_capture.usdc"
 _ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
 _MOST_FACES = 8_000  # maximum number of faces of a mesh; renders smoothly in a browser without a GPU
 
 
 @explain_missing_packages()
-def open_viewer(path: str | os.PathLike[str], host: str, port: int, prim: str | None = None) -> Viewer:
+def open_viewer(
+    path: str | os.PathLike[str], host: str, port: int, prim: str | None = None, *, play: bool = True
+) -> Viewer:
     """Serve the rig at a path to browsers; see `viewed_actor` for what it raises.
+
+    Args:
+        play: Whether pages begin by playing the captured take, if there is one.
 
     Raises:
         MissingDependencyError: the viewer is not installed.
@@ -44,7 +49,7 @@ def open_viewer(path: str | os.PathLike[str], host: str, port: int, prim: str | 
     """
     from jawusd.viewer.server import Viewer
 
-    return Viewer(viewed_actor(path, prim), host, port)
+    return Viewer(viewed_actor(path, prim), host, port, play=play)
 
 
 def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> ViewedActor:
@@ -74,6 +79,7 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
         fps=fps,
         folder=path.parent,
         clip_names=partial(motion_names, path.parent),
+        take=next((name for name in (CAPTURED, _BAKED) if name in motion_names(path.parent)), None),
         load_clip=partial(load_motion, path.parent, rig, fps, prim=prim),
         save_layer=partial(save_motion, path, rig, prim=prim),
         contacts=None if rig.contact is None else ContactView(path, rig, place).draw,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import html
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,32 +19,56 @@ from jawusd.viewer.motion import Clip, KeyTrack, Player, with_key, without_key
 from jawusd.viewer.plots import Plot, curve_plot, plot_seek, with_playhead
 from jawusd.viewer.session import Interpolation, Session
 from jawusd.viewer.viewed import ViewedActor
-from jawusd.viewer.widgets import Choice, assign, guarded, limit_uploads, notify, upload_name
+from jawusd.viewer.widgets import Choice, assign, errors_shown, guarded, limit_uploads, notify, small_text, upload_name
 
 KEYS = "keys"
 _LENGTH = 100
 _MOST_THUMBS = 40  # maximum number of keys for which there is a multi-slider
 
 
+class Playback:
+    """The line that names the motion and its frame, and the button that plays and pauses it."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        """Add both to the current container."""
+        self._line = client.gui.add_html("")
+        self.button = client.gui.add_button("play", icon=viser.Icon.PLAYER_PLAY)
+
+    def show(self, motion: str, frame: float, span: tuple[float, float] | None) -> None:
+        """Name the motion, its frame, and its first and last frame; without a span, the motion has no frames."""
+        where = "nothing to play" if span is None else f"frame {frame:.0f} of {span[0]:.0f} to {span[1]:.0f}"
+        self._line.content = small_text(f"{html.escape(motion)}, {where}", "padding-top:6px")
+
+    def show_playing(self, playing: bool) -> None:
+        """Label the button by what it does."""
+        self.button.label = "pause" if playing else "play"
+        self.button.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
+
+
 class MotionPanel:
     """Timeline of one page and its current frame."""
 
     def __init__(
-        self, client: viser.ClientHandle, session: Session, actor: ViewedActor, changed: Callable[[], None]
+        self,
+        client: viser.ClientHandle,
+        session: Session,
+        actor: ViewedActor,
+        playback: Playback,
+        changed: Callable[[], None],
     ) -> None:
         """Add the widgets to the current container; call `changed` after every change of pose or keys."""
         self._client, self._session, self._actor, self._changed = client, session, actor, changed
         self._loaded: dict[str, Clip] = {}
         self._copied: tuple[float, float, float] | None = None
         self._drawn: tuple[str, Clip | None, KeyTrack, Interpolation, float] | None = None
-        self.player = Player(self.show, self._stopped)
+        self.player = Player(self.show, lambda: playback.show_playing(False))
+        self._playback, self.play = playback, playback.button
+        self.play.on_click(guarded(client, self._toggle))
         gui = client.gui
         self.source = gui.add_dropdown("motion", (KEYS, *actor.clip_names()))
         self.source.on_update(guarded(client, self._choose))
         self.frame_slider = gui.add_slider("frame", 0.0, float(_LENGTH), 1.0, 0.0)
         self.frame_slider.on_update(guarded(client, self._scrub))
-        self.play = gui.add_button("play", icon=viser.Icon.PLAYER_PLAY)
-        self.play.on_click(guarded(client, self._toggle))
         self.loop = gui.add_checkbox("loop", True)
         gui.add_button_group("keys", ("set", "delete", "copy", "paste")).on_click(guarded(client, self._edit))
         gui.add_button_group("go to", ("previous", "next")).on_click(guarded(client, self._jump))
@@ -99,6 +124,8 @@ class MotionPanel:
         svg = with_playhead(plot, self.frame)
         self._playhead.content = plot_seek(svg, ends, plot.across, self.frame_slider._impl.uuid)
         assign(self.frame_slider, float(round(self.frame)))
+        clip = self.clip()
+        self._playback.show(chosen, self.frame, None if clip is None else clip.span)
 
     def _set_ends(self, clip: Clip | None) -> tuple[float, float]:
         """Set the range of the timeline to a motion; return its first and last frame."""
@@ -117,6 +144,18 @@ class MotionPanel:
             self.thumbs.min, self.thumbs.max = int(self.frame_slider.min), int(self.frame_slider.max)
             assign(self.thumbs, tuple(int(frame) for frame in frames))
         self.thumbs.visible = visible
+
+    async def play_take(self) -> None:
+        """Play the captured take, if there is one, unless the visitor has done something while it was read."""
+        take, source, work = self._actor.take, self.source.value, self._session.work
+        if take is None:
+            return
+        with errors_shown(self._client):
+            clip = self._loaded[take] = await asyncio.to_thread(self._actor.load_clip, take)
+            if self.source.value == source and self._session.work is work:
+                assign(self.source, take)
+                self._begin(clip)
+                self._start(clip)
 
     async def _choose(self, _: object) -> None:
         self.player.stop()
@@ -148,12 +187,12 @@ class MotionPanel:
         clip = self.clip()
         if clip is None:
             raise FormatError("there is nothing to play.", hint="Set keys, or select another motion.")
-        self.play.label, self.play.icon = "stop", viser.Icon.PLAYER_STOP
+        self._start(clip)
+
+    def _start(self, clip: Clip) -> None:
+        self._playback.show_playing(True)
         fps = self._session.work.fps if self.source.value == KEYS else clip.fps
         self.player.start(self.frame, fps, clip.span, lambda: bool(self.loop.value))
-
-    def _stopped(self) -> None:
-        self.play.label, self.play.icon = "play", viser.Icon.PLAYER_PLAY
 
     async def _edit(self, event: Choice) -> None:
         session, frame = self._session, float(round(self.frame))

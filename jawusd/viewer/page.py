@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Literal
 
 import numpy as np
@@ -9,7 +10,7 @@ import viser
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import transform_point
-from jawusd.viewer.motion_panel import FilePanel, MotionPanel
+from jawusd.viewer.motion_panel import FilePanel, MotionPanel, Playback
 from jawusd.viewer.plots import VERMILION, bound_plot, posselt_plot, posselt_point
 from jawusd.viewer.pose_panel import ContactPanel, PosePanel, verdict_html
 from jawusd.viewer.readouts import landmark_places, rest_places
@@ -85,14 +86,15 @@ class Page:
         self.session = Session(actor.rig, actor.fps)
         gui = client.gui
         self.verdict = gui.add_html("")
+        self.playback = Playback(client)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Pose"):
             if "mandible" in actor.placeholders:
                 gui.add_html(_PLACEHOLDER)
-            self.pose = PosePanel(client, self.session, self.scene, self.refresh)
+            self.pose = PosePanel(client, self.session, self.scene, self._posed)
             self.contacts = self._add_contacts(actor)
         with tabs.add_tab("Animate"):
-            self.motion = MotionPanel(client, self.session, actor, self.refresh)
+            self.motion = MotionPanel(client, self.session, actor, self.playback, self.refresh)
         with tabs.add_tab("Files"):
             self.files = FilePanel(client, self.session, actor, self.motion, self.refresh)
         self.plots = PlotPanel(client, actor.rig, static)
@@ -101,7 +103,12 @@ class Page:
         for grip in self.scene.grips:
             for modifier in (None, FREE_DEPTH):
                 grip.on_drag("left", modifier=modifier)(guarded(client, self._drag))
+        self._opening: asyncio.Task[None] | None = None
         self.refresh()
+
+    def play_take(self) -> None:
+        """Start to read the captured take, if there is one, and then to play it."""
+        self._opening = asyncio.get_running_loop().create_task(self.motion.play_take())
 
     def _add_contacts(self, actor: ViewedActor) -> ContactPanel | None:
         with self.client.gui.add_folder("Contacts of the teeth"):
@@ -109,6 +116,11 @@ class Page:
                 self.client.gui.add_html(_NO_CONTACTS)
                 return None
             return ContactPanel(self.client, actor.rig, actor.contacts, self.refresh)
+
+    def _posed(self) -> None:
+        """Pause the motion, which would move the jaw on, and update everything."""
+        self.motion.player.stop()
+        self.refresh()
 
     async def _drag(self, event: viser.SceneNodeDragEvent[viser.MeshHandle]) -> None:
         session, scene = self.session, self.scene
@@ -144,4 +156,6 @@ class Page:
 
     def close(self) -> None:
         """Stop playback."""
+        if self._opening is not None:
+            self._opening.cancel()
         self.motion.player.stop()

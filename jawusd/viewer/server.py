@@ -137,9 +137,9 @@ class PageServer(ABC):
 class Viewer(PageServer):
     """Server of a rig."""
 
-    def __init__(self, actor: ViewedActor, host: str, port: int) -> None:
-        """Start serving an actor; see `PageServer`."""
-        self._actor = actor
+    def __init__(self, actor: ViewedActor, host: str, port: int, *, play: bool = True) -> None:
+        """Start serving an actor, whose captured take pages `play` first; see `PageServer`."""
+        self._actor, self._play = actor, play
         self._static = StaticPlots(actor.rig)
         self._shown_s = -math.inf
         super().__init__(actor.name, host, port)
@@ -159,7 +159,10 @@ class Viewer(PageServer):
     async def _page(self, client: viser.ClientHandle) -> Page:
         scene = begin_page(client, self._actor)
         await asyncio.sleep(_HEAD_START_S)
-        return Page(client, scene, self._actor, self._static)
+        page = Page(client, scene, self._actor, self._static)
+        if self._play:
+            page.play_take()
+        return page
 
 
 class CaptureViewer(PageServer):

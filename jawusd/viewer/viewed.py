@@ -40,6 +40,7 @@ class ViewedActor:
     folder: Path  # folder of the rig, to which animations are written
     # returns the available motions: the captured take and the animation layers beside the rig
     clip_names: Callable[[], tuple[str, ...]]
+    take: str | None  # name of the captured motion, which pages play first; None without one
     load_clip: Callable[[str], Clip]  # reads a motion by name; raises a JawusdError
     # writes an animation layer (file name, clip, overwrite) beside the rig and returns its path; raises a JawusdError
     save_layer: Callable[[str, Clip, bool], Path]

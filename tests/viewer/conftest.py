@@ -26,7 +26,15 @@ def folder(_baked, tmp_path):
 
 @pytest.fixture
 def viewer(folder):
-    """Serve the rig on a free port of this machine."""
+    """Serve the rig, its jaw at rest, on a free port of this machine."""
+    running = open_viewer(folder, "127.0.0.1", 0, play=False)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def playing(folder):
+    """Serve the rig as the command does: pages begin by playing the captured take."""
     running = open_viewer(folder, "127.0.0.1", 0)
     yield running
     running.stop()

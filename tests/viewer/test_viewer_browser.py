@@ -198,7 +198,7 @@ def test_a_placeholder_of_the_mandible_is_shown_as_one(chromium, tmp_path):
     meshes = {name: mesh for name, mesh in example_meshes().items() if name != "mandible"}
     frames, d = example_motion()
     bake_rig(tmp_path, example_rig(), meshes, name="toothless", fps=FPS, frames=frames, d=d, table_size=17)
-    viewer = open_viewer(tmp_path, "127.0.0.1", 0)
+    viewer = open_viewer(tmp_path, "127.0.0.1", 0, play=False)
     tab = Tab(chromium, viewer)
     tab.said("The mandible is a placeholder")
     mandible = tab.page.scene.grips[0]
@@ -283,7 +283,7 @@ def test_the_baked_motion_plays_goes_round_and_stops(tab):
     motion.player._show = lambda frame: shown.append(frame) or show(frame)
     tab.press("play")
     until(lambda: any(after < before for before, after in zip(shown, shown[1:], strict=False)))
-    tab.press("stop")
+    tab.press("pause")
     until(lambda: not motion.player.playing)
     first, last = clip.span
     tab.web.get_by_label("loop").click()
@@ -303,6 +303,25 @@ def test_the_baked_motion_plays_goes_round_and_stops(tab):
     tab.picture("play")
     assert first <= min(shown) and max(shown) <= last
     np.testing.assert_allclose(tab.session.d, clip.at(motion.frame), atol=1e-9)
+
+
+def test_the_page_opens_with_the_take_playing_and_names_the_frame(chromium, playing):
+    tab = Tab(chromium, playing)
+    motion = tab.page.motion
+    until(lambda: motion.player.playing)
+    first, last = motion.clip().span
+    line = tab.web.locator(f"text=/^anim_capture.usdc, frame [0-9]+ of {first:.0f} to {last:.0f}$/")
+    before = line.inner_text()
+    until(lambda: line.inner_text() != before)
+    tab.press("pause")
+    until(lambda: not motion.player.playing)
+    tab.said(f"frame {motion.frame:.0f} of")
+    tab.press("play")
+    until(lambda: motion.player.playing)
+    tab.type_slider(0, 11)
+    until(lambda: np.isclose(tab.session.d[0], 11) and not motion.player.playing)
+    tab.web.close()
+    assert tab.complaints == [] and tab.elsewhere == []
 
 
 def test_a_bad_file_is_a_message_and_the_page_lives_on(tab, tmp_path):

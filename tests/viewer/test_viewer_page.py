@@ -1,5 +1,8 @@
 """Widgets and session, driven by events without a browser."""
 
+import dataclasses
+import re
+import threading
 import time
 
 import numpy as np
@@ -52,10 +55,11 @@ def test_sliders_take_their_ends_from_the_rig(quiet):
     assert quiet.notices == []
 
 
-def test_the_verdict_stands_above_the_tabs_and_sliders_name_their_unit(quiet):
+def test_verdict_and_playback_stand_above_the_tabs_and_sliders_name_their_unit(quiet):
     page = quiet.page
-    inside = {one._impl.parent_container_id for one in (page.pose.sliders[0], page.motion.play, page.files.load)}
-    assert page.verdict._impl.parent_container_id == "root" and len(inside - {"root"}) == 3
+    inside = {one._impl.parent_container_id for one in (page.pose.sliders[0], page.motion.loop, page.files.load)}
+    assert len(inside - {"root"}) == 3
+    assert {one._impl.parent_container_id for one in (page.verdict, page.motion.play)} == {"root"}
     assert all(slider.label.endswith(" [mm]") for slider in page.pose.sliders)
     assert not any("forward" in slider.label for slider in page.pose.sliders)  # only the readout has it
 
@@ -173,7 +177,7 @@ def test_a_baked_motion_is_chosen_played_round_and_stopped(quiet):
     shown = []
     motion.player._show = lambda frame: shown.append(frame) or motion.show(frame)
     quiet.enter(motion.play, True)
-    assert motion.play.label == "stop"
+    assert motion.play.label == "pause"
     until(lambda: any(after < before for before, after in zip(shown, shown[1:], strict=False)))
     quiet.enter(motion.play, True)
     assert motion.play.label == "play" and not motion.player.playing
@@ -181,6 +185,56 @@ def test_a_baked_motion_is_chosen_played_round_and_stopped(quiet):
     quiet.enter(motion.frame_slider, clip.span[0] + 4)
     np.testing.assert_allclose(session.d, clip.at(clip.span[0] + 4), atol=1e-9)
     assert quiet.notices == []
+
+
+def frame_said(quiet):
+    """Return the motion and the frame that a page names."""
+    return re.search(r">([^>]+), (?:frame (\d+) of \d+ to \d+|nothing to play)<", quiet.page.playback._line.content)
+
+
+def test_the_captured_take_plays_as_the_page_opens_until_it_is_paused(quiet):
+    motion, session = quiet.page.motion, quiet.page.session
+    assert frame_said(quiet)[1] == "keys" and frame_said(quiet)[2] is None
+    quiet.call(quiet.page.play_take)
+    until(lambda: motion.player.playing)
+    clip = motion.clip()
+    assert motion.source.value == "anim_capture.usdc" and motion.play.label == "pause" and motion.loop.value
+    until(lambda: motion.frame > clip.span[0] + 3)
+    quiet.enter(motion.play, True)
+    paused = motion.frame
+    assert frame_said(quiet)[1] == "anim_capture.usdc" and frame_said(quiet)[2] == f"{paused:.0f}"
+    np.testing.assert_allclose(session.d, clip.at(paused), atol=1e-9)
+    time.sleep(0.2)
+    assert motion.frame == paused and motion.play.label == "play"
+    quiet.enter(motion.play, True)  # goes on from there
+    assert motion.player.playing and motion.frame >= paused
+    quiet.enter(quiet.page.pose.sliders[0], 11.0)  # posing pauses
+    assert not motion.player.playing and session.d[0] == 11.0 and quiet.notices == []
+
+
+@pytest.mark.parametrize("done", ["posed", "closed"])
+def test_a_take_that_is_read_late_does_not_disturb(quiet, done):
+    page, motion, read = quiet.page, quiet.page.motion, threading.Event()
+    load = motion._actor.load_clip
+    slow = dataclasses.replace(motion._actor, load_clip=lambda name: read.wait(60) and load(name))
+    motion._actor = slow
+    quiet.call(page.play_take)
+    if done == "posed":
+        quiet.enter(page.pose.sliders[0], 11.0)
+    else:
+        quiet.call(page.close)
+    read.set()
+    until(page._opening.done)
+    assert not motion.player.playing and motion.source.value == "keys"
+    assert page.session.d[0] == pytest.approx(11.0 if done == "posed" else 0.0, abs=0.01)
+
+
+def test_a_take_that_cannot_be_read_is_a_message(quiet, folder):
+    (folder / "anim_capture.usdc").write_bytes(b"PXR-USDC")
+    quiet.call(quiet.page.play_take)
+    until(quiet.page._opening.done)
+    assert quiet.notices[-1][0] == "Failed" and quiet.page.motion.source.value == "keys"
+    assert not quiet.page.motion.player.playing
 
 
 @pytest.mark.parametrize(
