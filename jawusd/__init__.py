@@ -49,8 +49,8 @@ def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = Fal
 
     Args:
         path: Folder of a rig, its `actor.usda` (or any layer or package that carries the rig), a `model.npz`, or its
-            `actor.onnx`: then onnxruntime computes poses and judges them, in single precision.
-        prim: Path of the rig's prim, where a stage holds several.
+            `actor.onnx`, alone: then onnxruntime computes poses and judges them, in single precision.
+        prim: Path of the rig's prim, where a stage holds several; a `.onnx` holds one rig.
         fast: Compile the most used functions with numba: the same results to 1e-10, several times faster. Needs
             `pip install 'jawusd[fast]'`; the first use after an installation compiles for about a minute.
         untrusted: Read the file in a second Python with limits of memory and time, some 0.5 s: a file that crashes

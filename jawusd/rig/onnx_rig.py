@@ -20,7 +20,7 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.batching import usable_rows
 from jawusd.evaluator.kernels import NumpyKernels, RigParts
 from jawusd.evaluator.rig import load
-from jawusd.rig.onnx_sidecar import Run, load_sidecar, runner
+from jawusd.rig.onnx_sidecar import Run, check_made_from, load_sidecar, read_sidecar, rig_in, runner
 from jawusd.rig.read import load_rig
 
 # Absolute margin [mm] below which margins are recomputed in double precision, because their sign is uncertain in single
@@ -29,26 +29,20 @@ _NEAR_MM = 1e-3
 
 
 def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
-    """Load the rig in the folder of an ONNX file; the file evaluates it.
+    """Load the rig of an ONNX file; the file evaluates it.
 
-    `X.onnx` decodes; `X_encode.onnx`, if it exists, encodes. The rig, `X.usda` or `model.npz` in the same folder,
-    provides what the graphs lack: limits, landmarks and projection into the bound.
+    `X.onnx` decodes and contains the rig; `X_encode.onnx` in the same folder, if it exists, encodes. Files of older
+    versions contain no rig: `X.usda` or `model.npz` in the same folder then provides it, `prim` as for `load_rig`.
 
     Raises:
-        FormatError: No rig in the folder, not a decoder of jawusd, or made from another model.
+        FormatError: Not a decoder of jawusd, no rig in it or in the folder, or made from another model.
     """
     path = Path(path)
-    actor, model = path.with_suffix(".usda"), path.with_name("model.npz")
-    if not actor.is_file() and not model.is_file():
-        raise FormatError(
-            f"has neither {actor.name} nor {model.name} next to it, which define the limits of the rig.",
-            path=path,
-            hint="Load it from the folder of its rig. To run only the .onnx, use onnxruntime directly.",
-        )
-    rig = load_rig(actor, prim) if actor.is_file() else load(model)
-    decode = load_sidecar(path, rig)
+    decode = read_sidecar(path)
     if [entry.name for entry in decode.graph.input] != ["d"]:
         raise FormatError('is an encoder; give the decoder, whose input is "d".', path=path)
+    rig = rig_in(decode, path) or _rig_beside(path, prim)
+    check_made_from(decode, rig, path)
     encoder = path.with_name(f"{path.stem}_encode.onnx")
     encode = load_sidecar(encoder, rig).SerializeToString() if encoder.is_file() else None
     found = JawRig(rig.arrays, rig.meta, kernels=partial(OnnxKernels, decode.SerializeToString(), encode))
@@ -57,6 +51,18 @@ def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
     except Exception as error:  # damaged graphs raise errors of any type, depending on the operator
         raise FormatError(f"cannot be run ({type(error).__name__}).", path=path) from error
     return found
+
+
+def _rig_beside(path: Path, prim: str | None) -> JawRig:
+    """Return the rig in the folder of an ONNX file that contains none."""
+    actor, model = path.with_suffix(".usda"), path.with_name("model.npz")
+    if not actor.is_file() and not model.is_file():
+        raise FormatError(
+            f"contains no rig, and neither {actor.name} nor {model.name} is next to it.",
+            path=path,
+            hint="Load it from the folder of its rig, or bake the rig again: newer ONNX files contain it.",
+        )
+    return load_rig(actor, prim) if actor.is_file() else load(model)
 
 
 class OnnxKernels(NumpyKernels):

@@ -3,6 +3,9 @@
 Decoder and encoder are separate files: the decoder needs only arithmetic, which every runtime supports, but the encoder
 needs a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is installed, otherwise by the reference
 evaluator of the package onnx, which is slower.
+
+The metadata of the decoder contain the whole rig as JSON, so that poses can be judged from this file alone: `arrays`,
+by the names in `jawusd.evaluator.schema` (landmarks, limits, contact field, ...), and `header`.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import onnx
@@ -21,10 +25,11 @@ from onnx.external_data_helper import convert_model_from_external_data
 from onnx.reference import ReferenceEvaluator
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, JawusdError, RigError
+from jawusd.base.errors import EvaluatorError, FormatError, JawusdError, RigError
 from jawusd.base.inputs import check_input
 from jawusd.base.version import __version__
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.schema import ARRAYS, OPTIONAL
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.rig.onnx_graph import FloatType, Graph, Value, float_type
 from jawusd.rig.onnx_model import add_encoder, add_margin, add_twist, decode_motion, images
@@ -74,7 +79,7 @@ def decode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
     g.op("Reshape", flat, g.constant([-1, 4, 4], np.int64), name="pose")
     g.op("Squeeze", add_margin(g, rig, d), g.constant([1], np.int64), name="margin")
     outputs: Shapes = {"pose": ["N", 4, 4], "twist": ["N", 6], "margin": ["N"]}
-    return _model(g, rig, "jaw_decode", decode_model.__doc__, {"d": ["N", 3]}, outputs)
+    return _model(g, rig, "jaw_decode", decode_model.__doc__, {"d": ["N", 3]}, outputs, _whole_rig(rig))
 
 
 def encode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
@@ -94,8 +99,16 @@ def encode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
     return _model(g, rig, "jaw_encode", encode_model.__doc__, {"pose": ["N", 4, 4]}, outputs)
 
 
-def _model(g: Graph, rig: JawRig, name: str, doc: str | None, inputs: Shapes, outputs: Shapes) -> onnx.ModelProto:
-    """Make a checked model with metadata from a graph."""
+def _model(
+    g: Graph,
+    rig: JawRig,
+    name: str,
+    doc: str | None,
+    inputs: Shapes,
+    outputs: Shapes,
+    more: Mapping[str, str] = MappingProxyType({}),
+) -> onnx.ModelProto:
+    """Make a checked model from a graph, with metadata and more of them."""
 
     def declared(shapes: Shapes) -> list[onnx.ValueInfoProto]:
         return [helper.make_tensor_value_info(key, g.elem_type, shape) for key, shape in shapes.items()]
@@ -108,7 +121,7 @@ def _model(g: Graph, rig: JawRig, name: str, doc: str | None, inputs: Shapes, ou
         ir_version=_IR_VERSION,
         opset_imports=[helper.make_opsetid("", OPSET)],
     )
-    helper.set_model_props(model, _metadata(rig))
+    helper.set_model_props(model, {**_metadata(rig), **more})
     onnx.checker.check_model(model, full_check=True)
     return model
 
@@ -124,6 +137,35 @@ def _metadata(rig: JawRig) -> dict[str, str]:
         "rig_hash": rig.model_hash,
         "d_range_mm": json.dumps(rig.d_range.tolist()),
     }
+
+
+def _whole_rig(rig: JawRig) -> dict[str, str]:
+    """Return the arrays and the header of a rig as JSON, read by `rig_in`."""
+    integer = {name for group in (ARRAYS, *OPTIONAL.values()) for name, spec in group.items() if spec.integer}
+    arrays = {name: (a.astype(int) if name in integer else a).tolist() for name, a in rig.arrays.items()}
+    return {"arrays": json.dumps(arrays), "header": json.dumps(rig.meta, sort_keys=True)}
+
+
+def rig_in(model: onnx.ModelProto, path: str | os.PathLike[str]) -> JawRig | None:
+    """Return the rig in the metadata of a graph; None in files of older versions, which have none.
+
+    Raises:
+        FormatError: The metadata are damaged.
+    """
+    properties = _properties(model)
+    if "arrays" not in properties:
+        return None
+    try:
+        arrays, header = (json.loads(properties.get(name, "")) for name in ("arrays", "header"))
+        if isinstance(arrays, dict) and isinstance(header, dict):
+            return JawRig(arrays, header)
+    except (ValueError, RecursionError, EvaluatorError) as error:
+        raise FormatError(f"has no usable rig in its metadata ({error}).", path=path) from error
+    raise FormatError("has no usable rig in its metadata: these must be JSON objects.", path=path)
+
+
+def _properties(model: onnx.ModelProto) -> dict[str, str]:
+    return {entry.key: entry.value for entry in model.metadata_props}
 
 
 def runner(graph: bytes) -> Run:
@@ -203,6 +245,27 @@ def load_sidecar(path: str | os.PathLike[str], rig: JawRig, recorded: str | None
     Raises:
         FormatError: see `onnx_error_mm`.
     """
+    model = read_sidecar(path, recorded)
+    check_made_from(model, rig, path)
+    return model
+
+
+def check_made_from(model: onnx.ModelProto, rig: JawRig, path: str | os.PathLike[str]) -> None:
+    """Check that a graph was made from the model of a rig.
+
+    Raises:
+        FormatError: It was made from another one.
+    """
+    if _properties(model).get("rig_hash") != rig.model_hash:
+        raise FormatError("was made from another model (rig_hash differs); bake the rig again.", path=path)
+
+
+def read_sidecar(path: str | os.PathLike[str], recorded: str | None = None) -> onnx.ModelProto:
+    """Read a graph.
+
+    Raises:
+        FormatError: Not the recorded file, or not an ONNX file of jawusd.
+    """
     check_input(path)
     try:
         content = Path(path).read_bytes()
@@ -218,9 +281,7 @@ def load_sidecar(path: str | os.PathLike[str], rig: JawRig, recorded: str | None
         raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error
     if model.functions or model.graph.sparse_initializer:  # the check above does not look for other files in these
         raise FormatError("has functions or sparse weights, which graphs written by jawusd do not have.", path=path)
-    properties = {entry.key: entry.value for entry in model.metadata_props}
-    if properties.get("format") != FORMAT:
-        raise FormatError(f"has the format {properties.get('format')!r}, expected {FORMAT!r}.", path=path)
-    if properties.get("rig_hash") != rig.model_hash:
-        raise FormatError("was made from another model (rig_hash differs); bake the rig again.", path=path)
+    found = _properties(model).get("format")
+    if found != FORMAT:
+        raise FormatError(f"has the format {found!r}, expected {FORMAT!r}.", path=path)
     return model

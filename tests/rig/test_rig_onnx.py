@@ -1,5 +1,6 @@
 """The ONNX sidecars, run by onnxruntime, against the evaluator."""
 
+import json
 import pickle
 import shutil
 import subprocess
@@ -16,7 +17,7 @@ from onnx.reference import ReferenceEvaluator
 
 import jawusd
 from jawusd.base.errors import FormatError, RigError
-from jawusd.evaluator import JawRig
+from jawusd.evaluator import JawRig, Reason
 from jawusd.geometry import se3_exp
 from jawusd.rig import onnx_sidecar
 from jawusd.rig.bake import bake_rig
@@ -146,7 +147,10 @@ def test_file_says_what_it_is(kind, tmp_path):
     assert (properties["twist_order"], properties["kind"]) == ("omega v", kind)
     assert model.opset_import[0].version == OPSET
     assert [entry.name for entry in model.graph.output] == ["pose", "twist", "margin"]
-    assert path.stat().st_size < 60_000
+    assert path.stat().st_size < 100_000
+    arrays = json.loads(properties["arrays"])
+    assert arrays["landmarks"] == rig.landmarks.tolist() and arrays["tolerance_mm"] == rig.tolerance_mm
+    assert arrays["residual_limit_mm"] == rig.limits.residual_mm
 
 
 def test_check_measures_the_distance_and_refuses_other_files(kind, tmp_path):
@@ -238,9 +242,55 @@ def test_a_rig_of_its_onnx_file_poses_and_judges(folder):
     np.testing.assert_array_equal(again.pose(d), rig.pose(d))
 
 
-def test_a_model_beside_the_onnx_file_will_do_and_encoding_falls_back(folder, tmp_path):
-    shutil.copy(folder / "actor.onnx", tmp_path / "actor.onnx")
-    with pytest.raises(FormatError, match=r"has neither actor.usda nor model.npz"):
+def old(model):
+    """Return a graph as older versions wrote it, without the rig in its metadata."""
+    kept = {entry.key: entry.value for entry in model.metadata_props if entry.key not in ("arrays", "header")}
+    onnx.helper.set_model_props(model, kept)
+    return model
+
+
+@pytest.mark.parametrize("name", ["anchored, touching", "additive, touching"])
+def test_the_onnx_file_alone_judges_as_its_rig(name, tmp_path):
+    touching = RIGS[name]()
+    deeper = {"contact_values": touching.arrays["contact_values"] - 100.0}  # by 1 mm, so that teeth collide
+    exact = JawRig({**touching.arrays, **deeper}, touching.meta)
+    write_onnx(tmp_path / "actor.onnx", decode_model(exact))
+    rig = jawusd.load(tmp_path / "actor.onnx")
+    assert rig.model_hash == exact.model_hash and rig.meta == exact.meta
+    rng = np.random.default_rng(3)
+    d = rng.uniform(*(exact.d_range + [-5.0, 5.0]).T, (20_000, 3))
+    collide = exact.clearance(d).clearance_mm < exact.contact.limit_mm - 0.05
+    d = np.concatenate([d[:300], d[collide & (exact.margin(d) > 0.2)][:100]])
+    T = se3_exp(rng.normal(size=(len(d), 6)) * [0.003, 0.003, 0.003, 0.2, 0.2, 0.2]) @ exact.pose(d)
+    pairs = ((rig.validate(T), exact.validate(T)), (rig.validate_parameters(d), exact.validate_parameters(d)))
+    for found, wanted in pairs:
+        np.testing.assert_array_equal(found.reason, wanted.reason)
+        assert {int(flag) for flag in Reason if flag and (wanted.reason & flag).any()} >= {8, 32}
+    np.testing.assert_allclose(rig.pose(d), exact.pose(d), atol=1e-2)
+    np.testing.assert_array_equal(rig.clearance(d).clearance_mm, exact.clearance(d).clearance_mm)
+
+
+def test_a_damaged_rig_in_the_metadata_is_rejected(tmp_path):
+    model = decode_model(example_rig())
+    kept = {entry.key: entry.value for entry in model.metadata_props}
+    other = json.dumps({**json.loads(kept["arrays"]), "tolerance_mm": 0.5})
+    path = tmp_path / "actor.onnx"
+    for arrays, message in (
+        ("[" * 100_000, "no usable rig"),
+        ("[]", "no usable rig"),
+        ("{}", "no usable rig"),
+        ('{"landmarks": [[1], "a"]}', "no usable rig"),
+        (other, "another model"),
+    ):
+        onnx.helper.set_model_props(model, {**kept, "arrays": arrays})
+        write_onnx(path, model)
+        with pytest.raises(FormatError, match=message):
+            jawusd.load(path)
+
+
+def test_a_model_beside_an_older_onnx_file_will_do_and_encoding_falls_back(tmp_path):
+    write_onnx(tmp_path / "actor.onnx", old(decode_model(example_rig())))
+    with pytest.raises(FormatError, match=r"neither actor.usda nor model.npz"):
         jawusd.load(tmp_path / "actor.onnx")
     save(example_rig(), tmp_path / "model.npz")
     rig = jawusd.load(tmp_path / "actor.onnx")
@@ -253,7 +303,7 @@ def test_onnx_files_that_cannot_pose_are_refused(folder, tmp_path):
     save(example_rig(), copied / "model.npz")
     for name, make, message in (
         ("encode.onnx", lambda: (folder / "actor_encode.onnx").read_bytes(), "is an encoder"),
-        ("other.onnx", lambda: decode_model(example_rig("additive")).SerializeToString(), "another model"),
+        ("other.onnx", lambda: old(decode_model(example_rig("additive"))).SerializeToString(), "another model"),
         ("cut.onnx", lambda: (folder / "actor.onnx").read_bytes()[:5000], "not a valid ONNX file"),
     ):
         (copied / name).write_bytes(make())
