@@ -18,15 +18,30 @@ if TYPE_CHECKING:
 
     from jawusd.base.errors import JawusdError
     from jawusd.evaluator import JawRig
+    from jawusd.evaluator.skin import load_skin
+    from jawusd.fitting.skin import fit_skin, save_skin
     from jawusd.pipeline.build import build
     from jawusd.pipeline.track import track
 
-__all__ = ["JawRig", "JawusdError", "__version__", "build", "load", "track"]
+__all__ = [
+    "JawRig",
+    "JawusdError",
+    "__version__",
+    "build",
+    "fit_skin",
+    "load",
+    "load_skin",
+    "save_skin",
+    "track",
+]
 
 _MODULES = {
     "JawRig": "jawusd.evaluator",
     "JawusdError": "jawusd.base.errors",
     "build": "jawusd.pipeline.build",
+    "fit_skin": "jawusd.fitting.skin",
+    "load_skin": "jawusd.evaluator.skin",
+    "save_skin": "jawusd.fitting.skin",
     "track": "jawusd.pipeline.track",
 }
 

@@ -29,6 +29,7 @@ FILES = {
         "Tracks: tracks.npz": "jawusd.formats.tracks",
         "Model: model.npz": "jawusd.formats.model",
         "Solved performance: CSV, and arrays in tracks.npz": "jawusd.formats.performance",
+        "Jaw from skin: skin.npz": "jawusd.evaluator.skin",
         "Photographs: photos.json": "jawusd.formats.photographs",
         "glTF for the web: .glb": "jawusd.formats.gltf",
         "Library: library.json": "jawusd.library.index",

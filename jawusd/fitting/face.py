@@ -64,8 +64,8 @@ def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s
     for part in np.array_split(np.arange(len(d)), _BLOCKS):
         others = np.setdiff1d(np.arange(len(d)), part)
         predicted[part] = _learned(rig, weights[others], d[others]).d(weights[part])
-    error = _incisal_error(rig, predicted, d)
-    shares_error = _incisal_error(rig, rig.denormalized(shares_of(weights)), d)
+    error = incisal_error(rig, predicted, d)
+    shares_error = incisal_error(rig, rig.denormalized(shares_of(weights)), d)
     if error >= shares_error:
         raise FittingError(
             f"the mapping learned from this take has an error of {error:.2f} mm on held-out parts, fixed "
@@ -181,7 +181,8 @@ def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
         raise FittingError(f"the weight of {_DIRECTIONS[int(np.argmax(still))]} never changes.")
 
 
-def _incisal_error(rig: JawRig, found: Array, d: Array) -> float:
+def incisal_error(rig: JawRig, found: Array, d: Array) -> float:
+    """Return the mean distance [mm] of the incisal point between two sets of d (N, 3) [mm], inside the bound."""
     incisor = rig.landmarks[:1]
     positions = [transform_points(rig.pose(x), incisor) for x in (rig.project(found), d)]
     return float(np.linalg.norm(positions[0] - positions[1], axis=-1).mean())

@@ -1,0 +1,278 @@
+"""Learn one subject's jaw from facial skin, on frames in which the teeth were seen.
+
+As in Zoss et al. 2019 ("Accurate Markerless Jaw Tracking for Facial Performance Capture"), the skin is regressed on
+frames of known jaw; here to the three parameters of the subject's rig, by a Gaussian process, which also gives
+covariances.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
+
+from jawusd.base.arrays import Array, Indices, Mask
+from jawusd.base.errors import FittingError
+from jawusd.base.npz import TWIST_ORDER, UNITS
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.skin import FAMILY, VERSION, Skin, components, skin_kernel
+from jawusd.fitting.face import incisal_error
+from jawusd.formats.atomic import write_npz_atomic
+from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_points
+
+#: Standard deviation of the error of head stabilisation, beyond that in the training frames [mm, rad].
+HEAD_ERROR = (0.3, 0.0026)
+_LEAST_FRAMES, _FRAMES = 60, 300  # least number of seen frames, and number of training frames chosen from them
+_BLOCKS = 6  # contiguous blocks of held-out frames
+_COMPONENTS, _SMOOTH, _INSIDE = 120, 14, 30  # components of all, of the smooth part, and of a familiar face
+_LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames
+_START = (2.0, 3.0, 0.3, 0.001)  # length, smooth, linear, noise: the usual result
+_LOW, _HIGH = np.log([0.2, 0.01, 0.001, 1e-5]), np.log([20.0, 100.0, 100.0, 3.0])
+_STEPS, _MOST_TRIALS = np.log([3.0, 1.7]), 80
+_FALSE_ALARMS = 0.01  # fraction of held-out frames that are flagged as unfamiliar
+_CHIN_POINTS = 3
+# Largest error relative to each guess. 12 subjects have 0.40 at most; columns of another take have 0.95 and more.
+_MOST_SHARE = 0.65
+_NAMES = ("opening", "laterotrusion", "protrusion")
+
+
+def fit_skin(
+    rig: JawRig,
+    X: ArrayLike,
+    d: ArrayLike,
+    seen: ArrayLike,
+    sigma_d: ArrayLike = 0.15,
+    *,
+    head_error: tuple[float, float] = HEAD_ERROR,
+    names: Sequence[str] = (),
+) -> Skin:
+    """Learn d from facial skin.
+
+    The take must contain exercises and speech with the teeth visible, every expression that occurs later, and some
+    seconds of closed lips with the teeth in occlusion, where d is 0.
+
+    Args:
+        rig: The subject's rig.
+        X: Columns in one unit, such as blendshape weights, shape (F, K); or points on the skin [mm], shape (F, N, 3),
+            in any frame fixed to the head. Frames with a NaN are left out.
+        d: Jaw parameters [mm], shape (F, 3).
+        seen: Frames in which d was measured, shape (F,).
+        sigma_d: Standard deviation of d [mm], shape (), (3,) or (F, 3).
+        head_error: For points, the standard deviation of the error of head stabilisation that frames to come have
+            beyond that of the training frames: shift [mm] and rotation about the points' centre [rad]. The covariances
+            include it.
+        names: Names of the columns or points, stored in the file.
+
+    Returns:
+        The map; its meta has the mean held-out errors at the incisal point, "errors_mm": of "skin", and of the guesses
+        "carried" (the last d before a held-out block), "mean" (of all d), and for points "chin" (inverse kinematics of
+        three points taken as rigid with the bone).
+
+    Raises:
+        ValueError: wrong shapes.
+        FittingError: too few frames, too little motion, or an error above 65 % of that of a guess.
+    """
+    X, d = np.asarray(X, dtype=np.float64), np.asarray(d, dtype=np.float64)
+    points = X.ndim == 3
+    if X.shape[0] != len(d) or d.shape[1:] != (3,) or (X.shape[2:] != (3,) if points else X.ndim != 2):
+        raise ValueError(f"X must have shape (F, K) or (F, N, 3) and d (F, 3), got {X.shape} and {d.shape}")
+    sigma = np.broadcast_to(np.asarray(sigma_d, dtype=np.float64), d.shape)
+    flat = X.reshape(len(X), -1)
+    usable = np.asarray(seen, dtype=bool) & np.isfinite(np.column_stack([flat, d, sigma])).all(axis=1)
+    rows = _chosen(usable)
+    X, flat, d, sigma = X[rows], flat[rows], d[rows], sigma[rows]
+    _check_motion(flat, d, sigma)
+    blocks = np.array_split(np.arange(len(rows)), _BLOCKS)
+    arrays, held_out, variance = _process(flat, d, sigma, blocks)
+    arrays["head_error"] = (
+        _head_motions(X.mean(axis=0), head_error, arrays) if points else np.zeros((0, len(arrays["basis"])))
+    )
+    guesses = {"skin": held_out, "carried": _carried(d, blocks), "mean": np.broadcast_to(d.mean(axis=0), d.shape)}
+    if points and X.shape[1] >= _CHIN_POINTS:
+        guesses["chin"] = _of_chin(rig, X, d, blocks)
+    errors = {name: incisal_error(rig, guess, d) for name, guess in guesses.items()}
+    _check_errors(errors)
+    outside = _outside(flat, blocks)
+    arrays["familiar_limit"] = np.array([np.quantile(each, 1 - _FALSE_ALARMS / 2) for each in (variance, outside)])
+    flagged = (np.column_stack([variance, outside]) > arrays["familiar_limit"]).any(axis=1)
+    meta = {
+        "actor": rig.actor,
+        "names": list(names),
+        "frames": int(usable.sum()),
+        "errors_mm": errors,
+        "false_alarms": float(flagged.mean()),
+    }
+    return Skin(arrays, meta)
+
+
+def save_skin(path: str | os.PathLike[str], skin: Skin) -> None:
+    """Write a map of format jawusd-skin/1 atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    meta = {"units": UNITS, "twist_order": TWIST_ORDER, **skin.meta, "format": f"{FAMILY}/{VERSION}"}
+    write_npz_atomic(path, {**skin.arrays, "meta": np.array(json.dumps(meta, sort_keys=True))})
+
+
+def _chosen(usable: Mask) -> Indices:
+    """Return the training frames, evenly spaced among the usable ones."""
+    rows = np.flatnonzero(usable)
+    if len(rows) < _LEAST_FRAMES:
+        raise FittingError(
+            f"{len(rows)} frames show the teeth and all columns of the face, at least {_LEAST_FRAMES} are needed.",
+            hint="Check that both files show the same performance, and that no point is hidden throughout.",
+        )
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES)).astype(int)]
+
+
+def _check_motion(flat: Array, d: Array, sigma: Array) -> None:
+    moved = d.std(axis=0)
+    least = int(np.argmin(moved))
+    if moved[least] < _LEAST_MOVED_MM:
+        raise FittingError(
+            f"the {_NAMES[least]} varies by {moved[least]:.2f} mm (standard deviation) where the teeth are seen, at "
+            f"least {_LEAST_MOVED_MM:g} mm is needed to learn it.",
+            hint="Record opening, both sides and forward movement with parted lips.",
+        )
+    if not np.ptp(flat, axis=0).any():
+        raise FittingError("no column of the face changes.")
+    if not (sigma > 0).all():
+        raise FittingError(f"sigma of d must be positive, found {sigma.min():g} mm.")
+
+
+def _check_errors(errors: dict[str, float]) -> None:
+    called = {"carried": "holding the last d", "mean": "the mean d", "chin": "a chin rigid with the bone"}
+    for name, words in called.items():
+        if name in errors and errors["skin"] > _MOST_SHARE * errors[name]:
+            raise FittingError(
+                f"the jaw learned from the face has an error of {errors['skin']:.2f} mm at the incisal point on "
+                f"held-out frames, {words} has {errors[name]:.2f} mm: at most {_MOST_SHARE:.0%} of that is accepted.",
+                hint="Check that face and jaw show the same performance on one clock, and that the head is stabilised.",
+            )
+
+
+def _process(flat: Array, d: Array, sigma: Array, blocks: list[Indices]) -> tuple[dict[str, Array], Array, Array]:
+    """Return the arrays of the process, and predictions (M, 3) and variances (M,) of held-out blocks.
+
+    The kernel maximises the likelihood of held-out blocks, by a coordinate search on its logarithms.
+    """
+    mean = flat.mean(axis=0)
+    basis = np.linalg.svd(flat - mean, full_matrices=False)[2][:_COMPONENTS]
+    scale = float(((flat - mean) @ basis[0]).std())
+    f, left_out = components(flat, mean, basis, scale)
+    size = d.std(axis=0)
+    y, measured = (d - d.mean(axis=0)) / size, ((sigma / size) ** 2).mean(axis=1)
+    smooth_count = min(_SMOOTH, len(basis))
+
+    def held_out(log_kernel: Array) -> tuple[float, Array, Array]:
+        kernel = np.exp(log_kernel)
+        K = sum(skin_kernel(f, f, kernel, smooth_count)) + np.diag(kernel[2] * left_out + kernel[3] + measured)
+        precision = np.linalg.inv(K)
+        weights, residual, variance = precision @ y, np.empty_like(y), np.empty(len(y))
+        for b in blocks:  # Rasmussen and Williams 2006, equations 5.10 to 5.12, for blocks
+            block = np.linalg.inv(precision[np.ix_(b, b)])
+            residual[b], variance[b] = block @ weights[b], np.diag(block)
+        spread = (residual**2 / variance[:, None]).mean(axis=0)
+        return float(np.log(spread * variance[:, None]).sum()), residual, variance
+
+    best = np.log(_START)
+    found, trials = held_out(best), 1
+    for step in _STEPS:
+        moved = True
+        while moved and trials < _MOST_TRIALS:
+            moved = False
+            for change in step * np.concatenate([np.eye(4), -np.eye(4)]):
+                tried = np.clip(best + change, _LOW, _HIGH)
+                other, trials = held_out(tried), trials + 1
+                if other[0] < found[0]:
+                    best, found, moved = tried, other, True
+    kernel, (_, residual, variance) = np.exp(best), found
+    whitened = residual * size / np.sqrt(variance)[:, None]
+    arrays = {
+        "mean": mean,
+        "basis": basis,
+        "scale": np.array(scale),
+        "features": f,
+        "d": d,
+        "noise": kernel[2] * left_out + (kernel[3] + measured),
+        "kernel": kernel,
+        "spread": whitened.T @ whitened / len(whitened),
+        "smooth_count": np.array(smooth_count),
+        "familiar_count": np.array(_inside(flat)),
+    }
+    return arrays, d - residual * size, variance - measured
+
+
+def _inside(flat: Array) -> int:
+    """Return the number of components of a familiar face: half of those there are, if there are few."""
+    return max(min(_INSIDE, min(flat.shape) // 2), 1)
+
+
+def _outside(flat: Array, blocks: list[Indices]) -> Array:
+    """Return the squared distance of held-out frames from the components of the others, over scale, shape (M,)."""
+    found, scale = np.empty(len(flat)), float(np.linalg.svd(flat - flat.mean(axis=0))[1][0]) / np.sqrt(len(flat))
+    for b in blocks:
+        others = np.delete(flat, b, axis=0)
+        mean = others.mean(axis=0)
+        basis = np.linalg.svd(others - mean, full_matrices=False)[2][: _inside(flat)]
+        found[b] = components(flat[b], mean, basis, scale)[1]
+    return found
+
+
+def _head_motions(points: Array, head_error: tuple[float, float], arrays: dict[str, Array]) -> Array:
+    """Return the change of the features by one sigma of each shift and rotation of mean points (N, 3), shape (6, C)."""
+    arms = points - points.mean(axis=0)
+    shifts = np.repeat(np.eye(3)[:, None], len(points), axis=1) * head_error[0]
+    turns = np.cross(np.eye(3)[:, None], arms) * head_error[1]
+    moved = np.concatenate([shifts, turns]).reshape(6, -1) / np.sqrt(3)
+    return np.asarray(moved @ arrays["basis"].T / arrays["scale"])
+
+
+def _carried(d: Array, blocks: list[Indices]) -> Array:
+    """Return d of the last frame before each block, of the first one after it for the first block, shape (M, 3)."""
+    held = [d[b[0] - 1] if b[0] else d[b[-1] + 1] for b in blocks]
+    return np.concatenate([np.repeat(each[None], len(b), axis=0) for each, b in zip(held, blocks, strict=True)])
+
+
+def _of_chin(rig: JawRig, X: Array, d: Array, blocks: list[Indices]) -> Array:
+    """Return d (M, 3) of held-out blocks by inverse kinematics of the points that best follow the bone."""
+    poses, found = rig.pose(d), np.empty_like(d)
+    for b in blocks:
+        others = np.delete(np.arange(len(d)), b)
+        T, on_bone, chosen = _on_bone(rig, X[others], poses[others])
+        found[b] = rig.ik(on_bone, transform_points(T, X[b][:, chosen])).d
+    return found
+
+
+def _on_bone(rig: JawRig, X: Array, poses: Array) -> tuple[Array, Array, Indices]:
+    """Fit points (F, N, 3) to the bone as if rigid with it.
+
+    Returns:
+        T_skull_face (4, 4), and for the points with the least residual their positions in the mandible (3, 3) and
+        their indices.
+    """
+    swing = transform_points(poses, rig.landmarks[:1])[:, 0]
+    moved = X.mean(axis=1)
+    # The skin follows the incisal point: the rotation between the two clouds (Kabsch 1976) starts the search.
+    U, _, Vt = np.linalg.svd((swing - swing.mean(axis=0)).T @ (moved - moved.mean(axis=0)))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    start = make_transform(R, rig.landmarks[0] - R @ X.mean(axis=(0, 1)))
+
+    def residual(unknown: Array, chosen: Indices) -> Array:
+        in_skull = transform_points(se3_exp(unknown[:6]) @ start, X[:, chosen])
+        return np.asarray(transform_points(poses, unknown[6:].reshape(-1, 3)) - in_skull)
+
+    def rest(T: Array, chosen: Indices) -> Array:
+        return np.asarray(transform_points(se3_inverse(poses) @ T, X[:, chosen]).mean(axis=0))
+
+    every = np.arange(X.shape[1])
+    first = np.concatenate([np.zeros(6), rest(start, every).ravel()])
+    chosen = np.argsort(np.square(residual(first, every)).sum(axis=(0, 2)))[:_CHIN_POINTS]
+    guess = np.concatenate([np.zeros(6), rest(start, chosen).ravel()])
+    unknown = least_squares(lambda x: residual(x, chosen).ravel(), guess, x_scale="jac").x
+    return se3_exp(unknown[:6]) @ start, unknown[6:].reshape(-1, 3), chosen
