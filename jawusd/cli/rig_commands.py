@@ -59,11 +59,13 @@ def info(
         return
     if frame is not None:
         raise typer.BadParameter("--frame needs tracks.npz.")
+    from jawusd.pipeline.state import recorded_verdict
     from jawusd.rig import describe
 
-    found, changed = describe(rig, prim), changed_in_folder(context)
-    whole = {**found, "changed": [finding.as_json() for finding in changed]}
-    emit(whole, as_json, lambda: [*_info_lines(found), *(finding.line() for finding in changed)])
+    found, changed, verdict = describe(rig, prim), changed_in_folder(context), recorded_verdict(rig.parent)
+    whole = {**found, "verdict": verdict, "changed": [finding.as_json() for finding in changed]}
+    first = [] if verdict is None else [verdict]
+    emit(whole, as_json, lambda: [*first, *_info_lines(found), *(finding.line() for finding in changed)])
 
 
 def _print_schema(as_json: bool) -> None:

@@ -9,6 +9,7 @@ from jawusd.cli.text_capture import calibration_lines
 from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM
 from jawusd.formats.finding import Finding
 from jawusd.formats.notes import registration_sizes
+from jawusd.formats.report import verdict_sentence
 
 if TYPE_CHECKING:
     from jawusd.pipeline.build import BuildSummary, PlannedStage
@@ -51,15 +52,9 @@ def _verdict_lines(report: ReportSummary) -> list[str]:
     """Return the verdict of the report, with its reasons."""
     if "verdict" not in report:
         return ["verdict: none, as there is no report"]
-    grade, because = report["verdict"]["grade"], report["verdict"]["because"]
-    words = {
-        "good": "good",
-        "look": "usable; inspect these points in the report:",
-        "bad": "not usable, because of:",
-        "open": "none, for lack of data",
-    }
+    because = report["verdict"]["because"]
     more = [f"and {len(because) - _MOST_REASONS} more"] if len(because) > _MOST_REASONS else []
-    return [f"verdict: {words.get(grade, grade)}", *(f"  {one}" for one in (*because[:_MOST_REASONS], *more))]
+    return [verdict_sentence(report["verdict"]), *(f"  {one}" for one in (*because[:_MOST_REASONS], *more))]
 
 
 def plan_lines(stages: list[PlannedStage]) -> list[str]:

@@ -43,6 +43,8 @@ FAR_MM = np.array([3.0, 2.0, 2.0])
 _MOST_GAPS = 0.15  # if a larger fraction of the bound lies in gaps, more should be recorded
 # Ranges (1st to 99th percentile) below which a parameter counts as not exercised [mm].
 _SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
+# Movements that exercise each parameter. Sentences on what a take lacks end in ": record" and a movement.
+_MOVEMENTS = ("opening as wide as possible, three times", "full slides to both sides", "a full protrusion")
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,8 @@ def shown_parameters(data: TrainingData) -> tuple[Mask, list[str]]:
     shown = spread >= _SMALLEST_RANGE_MM
     sentences = [
         f"The poses do not show {name}: it varies by {spread[i]:.1f} mm (at least {_SMALLEST_RANGE_MM[i]:g} mm are "
-        f"needed), so its slider only shifts the jaw within that range without learned rotation."
+        f"needed), so its slider only shifts the jaw within that range without learned rotation: "
+        f"record {_MOVEMENTS[i]}."
         for i, name in enumerate(PARAMETERS)
         if not shown[i]
     ]
@@ -190,7 +193,7 @@ def missing_movements(d: Array, shown: Mask) -> list[str]:
             found.append(f"The widest opening is {widest:.0f} mm: record opening as wide as possible, three times.")
         wide = int((d[:, 0] > _WIDE * widest).sum())
         if wide < _FEW_WIDE_FRAMES:
-            found.append(f"Only {wide} frames are near full opening: hold the widest opening for a second.")
+            found.append(f"Only {wide} frames are near full opening: record the widest opening, held for a second.")
     for name, side in (("left", d[:, 1]), ("right", -d[:, 1])):
         if shown[1] and side.max() < _SMALL_LATERAL_MM:
             found.append(f"The jaw moves {max(side.max(), 0.0):.1f} mm to the {name}: record a full slide that way.")
@@ -212,7 +215,7 @@ def bound_not_reached(gaps: tuple[Array, Array], shares: tuple[float, float]) ->
             low, high = places[:, 0].min(), places[:, 0].max()
             found.append(
                 f"{100 * share:.0f} % of the bound of opening and {name} has no captured pose within {FAR_MM[0]:g} and "
-                f"{far:g} mm: record slow circling at {low:.0f} to {high:.0f} mm of opening."
+                f"{far:g} mm: record slow circling between {low:.0f} and {high:.0f} mm of opening."
             )
     return found
 
@@ -228,7 +231,7 @@ def _missing_half_open(d: Array) -> list[str]:
     reached = np.stack([half[:, 0].max(), -half[:, 0].min(), half[:, 1].max()])
     names = ("slide to the left", "slide to the right", "protrusion")
     found = [
-        f"There is no {name} {where}: record it with the mouth half open."
+        f"There is no {name} {where}: record a {name} with the mouth half open."
         for name, here, there in zip(names, reached, reach, strict=True)
         if here < _HALF_OPEN_SHARE * there
     ]

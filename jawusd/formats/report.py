@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NotRequired
+
+from typing_extensions import TypedDict
 
 from jawusd.formats.experiments import Experiments
 from jawusd.formats.finding import Finding
@@ -11,6 +14,27 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.notes import SyncNotes
 from jawusd.formats.tracks import Tracks
+
+
+class BuildVerdict(TypedDict):
+    """Verdict on a build: the worst grade of its stages, what to do, and the checks with that grade."""
+
+    grade: str
+    todo: NotRequired[list[str]]  # sentences, the most important first; absent in earlier builds
+    because: list[str]
+
+
+_USABLE = {
+    "good": "Usable for animation.",
+    "look": "Usable for animation.",
+    "bad": "Not usable.",
+    "open": "Not judged, for lack of data.",
+}
+
+
+def verdict_sentence(verdict: BuildVerdict) -> str:
+    """Return a verdict and the most important thing to do, on one line."""
+    return " ".join([_USABLE.get(verdict["grade"], "Not judged."), *verdict.get("todo", [])[:1]])
 
 
 @dataclass(frozen=True)

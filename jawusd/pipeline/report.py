@@ -18,7 +18,7 @@ from jawusd.formats.experiments import Experiments, save_table
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import JawModel, load_model
 from jawusd.formats.notes import SyncNotes
-from jawusd.formats.report import CameraFacts, Origin, Overlay, ReportData, RigFacts
+from jawusd.formats.report import BuildVerdict, CameraFacts, Origin, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
@@ -39,7 +39,6 @@ from jawusd.pipeline.state import (
     recorded_origin,
 )
 from jawusd.pipeline.subject import Subject, subject_of_build
-from jawusd.report.verdicts import BuildVerdict
 
 T = TypeVar("T")
 

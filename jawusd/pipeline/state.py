@@ -20,13 +20,15 @@ from importlib import metadata
 from pathlib import Path, PurePosixPath
 from typing import Generic, TypeVar
 
+from typing_extensions import TypedDict
+
 from jawusd.base.errors import FormatError, OutputError
 from jawusd.base.inputs import check_input, check_path
 from jawusd.base.npz import check_format
 from jawusd.base.version import __version__
 from jawusd.formats.atomic import ELSEWHERE, clear_unfinished, destination, write_text_atomic
 from jawusd.formats.finding import Finding
-from jawusd.formats.report import Origin
+from jawusd.formats.report import BuildVerdict, Origin, verdict_sentence
 from jawusd.formats.text import parse_json, read_text
 
 FAMILY, VERSION = "jawusd-build", 1
@@ -185,6 +187,24 @@ def _record(found: Mapping[str, object]) -> StageRecord[Mapping[str, object]]:
     if not isinstance(seconds, int | float) or not math.isfinite(float(seconds)):
         raise ValueError("seconds must be a finite number")
     return StageRecord(inputs, outputs, float(seconds), result)
+
+
+class _Reported(TypedDict, total=False):
+    """The verdict in the result of the stage that writes the report."""
+
+    verdict: BuildVerdict
+
+
+def recorded_verdict(folder: Path) -> str | None:
+    """Return the verdict on a build, see `verdict_sentence`.
+
+    None for other folders, for builds without a report, and if build.json is corrupt, which `changed_files` reports.
+    """
+    try:
+        found = BuildState(folder).result("report", _Reported)
+    except FormatError:
+        return None
+    return verdict_sentence(found["verdict"]) if found and "verdict" in found else None
 
 
 def changed_files(folder: Path) -> list[Finding]:

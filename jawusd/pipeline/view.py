@@ -19,6 +19,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
 from jawusd.pipeline.bake import DEFAULT_FPS
 from jawusd.pipeline.contact import teeth_of
+from jawusd.pipeline.state import recorded_verdict
 
 if TYPE_CHECKING:
     from jawusd.meshes.contact import ContactMap
@@ -83,6 +84,7 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
         load_clip=partial(load_motion, path.parent, rig, fps, prim=prim),
         save_layer=partial(save_motion, path, rig, prim=prim),
         contacts=None if rig.contact is None else ContactView(path, rig, place).draw,
+        verdict=recorded_verdict(path.parent) or "",
     )
 
 

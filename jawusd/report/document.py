@@ -20,12 +20,12 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.formats.notes import TracksMeta, registration_sizes
-from jawusd.formats.report import ReportData
+from jawusd.formats.report import BuildVerdict, ReportData, verdict_sentence
 from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.figures import human_ranges, model_figure, tracking_figure
 from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
-from jawusd.report.verdicts import MARKS, WORDS, BuildVerdict, judge, overall, summary
+from jawusd.report.verdicts import MARKS, WORDS, judge, summary
 
 _LISTED = 60  # maximum number of frame ranges listed
 _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
@@ -50,13 +50,15 @@ def write_document(
 def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> str:
     """Return the report as HTML, see `write_document`; text from files is escaped."""
     verdicts = judge(data)
+    verdict = summary(verdicts)
     return (
         page_environment()
         .get_template("report.html.j2")
         .render(
             data=data,
             verdicts=verdicts,
-            overall=overall(verdicts),
+            verdict=verdict,
+            sentence=verdict_sentence(verdict),
             words=WORDS,
             marks=MARKS,
             style=package_file("report.css"),
@@ -144,7 +146,7 @@ def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
     for why, frames in meta.get("excluded_frames", {}).items():
         lists[f"excluded from the fit: {why}"] = np.asarray(frames, dtype=np.int64)
     lists["excluded from the fit as outliers"] = np.asarray(meta.get("trimmed_frames", []), dtype=np.int64)
-    return [(reason, len(frames), _spans(frames)) for reason, frames in lists.items()]
+    return [(reason, len(frames), _spans(frames)) for reason, frames in lists.items() if len(frames)]
 
 
 def _spans(frames: NDArray[np.int64]) -> str:

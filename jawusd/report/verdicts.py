@@ -6,12 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from typing_extensions import TypedDict
 
 from jawusd.base.arrays import Mask
 from jawusd.evaluator import JawRig
 from jawusd.formats.finding import Finding
-from jawusd.formats.report import ReportData
+from jawusd.formats.report import BuildVerdict, ReportData
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks, used_coverage
 
 #: Grades, best first; "open" means that there are no data to judge.
@@ -28,6 +27,11 @@ _UNUSED = {"camera_without_masks", "masks_black", "camera_not_used", "camera_rar
 _WRONG_SCANS = {"scan_misfit", "scans_mirrored"}
 _LACKING = {"take_lacks", "not_shown"}  # fit warnings about movements that are missing or too small
 _MISTAKES = {"scan_units", "pose_units", "front_back_flip", "left_right_flip", "upside_down", "swapped_jaws"}
+_RECORD = "Re-record: "
+_MASKS = "Check masks and calibration in the frames to inspect."
+_OFFSETS = "Give the frame offsets in [sync], or record a flash or a clap with all cameras."
+_VIEWS = "Film closer, or from more directions."
+_WORST = "Check the masks in the frames with the largest error."
 _SENTENCES = {
     "sync": {
         GOOD: "The cameras are synchronised; delays below one frame were estimated and corrected.",
@@ -65,6 +69,7 @@ class Check:
     found: str
     limit: str
     grade: str
+    todo: str = ""  # sentence on what to do, unless the grade is good
 
 
 @dataclass(frozen=True)
@@ -87,41 +92,53 @@ def overall(verdicts: Iterable[Verdict]) -> str:
     return _worst([verdict.grade for verdict in verdicts])
 
 
-class BuildVerdict(TypedDict):
-    """Verdict on a build: the worst grade of its stages, and the checks with that grade."""
-
-    grade: str
-    because: list[str]
-
-
 def summary(verdicts: Iterable[Verdict]) -> BuildVerdict:
-    """Return the worst grade, and the checks with that grade and their limits."""
+    """Return the worst grade, what to do, and the checks with that grade and their limits.
+
+    What to do is ordered by grade, then by stage, as a fault affects the stages after it. All movements to record are
+    one sentence.
+    """
     verdicts = list(verdicts)
     grade = overall(verdicts)
-    checks = [(verdict.stage, check) for verdict in verdicts for check in verdict.checks if check.grade == grade]
-    because = [f"{stage}: {check.name} {check.found} ({check.limit})" for stage, check in checks]
-    return {"grade": grade, "because": because if grade in (LOOK, BAD) else []}
+    checks = [(verdict.stage, check) for verdict in verdicts for check in verdict.checks]
+    because = [
+        f"{stage}: {check.name} {check.found}" + (f" ({check.limit})" if check.limit else "")
+        for stage, check in checks
+        if check.grade == grade and grade in (LOOK, BAD)
+    ]
+    todo = [check.todo for worse in (BAD, LOOK) for _, check in checks if check.grade == worse and check.todo]
+    record = [one.removeprefix(_RECORD).rstrip(".") for one in todo if one.startswith(_RECORD)]
+    joined = f"{_RECORD}{'; '.join(dict.fromkeys(record))}."
+    merged = [joined if one.startswith(_RECORD) else one for one in todo]
+    return {"grade": grade, "todo": list(dict.fromkeys(merged)), "because": because}
 
 
 def _worst(grades: list[str]) -> str:
     return next((grade for grade in (BAD, LOOK, GOOD) if grade in grades), OPEN)
 
 
-def _below(name: str, value: float, good: float, fair: float, unit: str, digits: int = 2) -> Check:
+def _below(name: str, value: float, good: float, fair: float, unit: str, todo: str, digits: int = 2) -> Check:
     """Check a value that should be small."""
     limit = f"good up to {good:g} {unit}, acceptable up to {fair:g} {unit}"
     if not np.isfinite(value):
         return Check(name, _UNKNOWN, limit, OPEN)
     grade = GOOD if value <= good else LOOK if value <= fair else BAD
-    return Check(name, f"{value:.{digits}f} {unit}", limit, grade)
+    return Check(name, f"{value:.{digits}f} {unit}", limit, grade, todo)
 
 
-def _share(name: str, share: float, good: float, fair: float) -> Check:
+def _share(name: str, share: float, good: float, fair: float, todo: str) -> Check:
     """Check a fraction, 0 .. 1, that should be large."""
     limit = f"good from {100 * good:g} %, acceptable from {100 * fair:g} %"
     if not np.isfinite(share):
         return Check(name, _UNKNOWN, limit, OPEN)
-    return Check(name, f"{100 * share:.1f} %", limit, GOOD if share >= good else LOOK if share >= fair else BAD)
+    grade = GOOD if share >= good else LOOK if share >= fair else BAD
+    return Check(name, f"{100 * share:.1f} %", limit, grade, todo)
+
+
+def _movement(sentence: str) -> str:
+    """Return what to record, from a sentence of `fitting.checks` that ends in ": record" and a movement."""
+    _, found, movement = sentence.rpartition(": record ")
+    return _RECORD + (movement if found else sentence)
 
 
 def _mean(has: Mask) -> float:
@@ -139,13 +156,13 @@ def _sync(data: ReportData) -> Verdict:
     rest = max((abs(float(value)) for value in delays.values()), default=np.nan)
     if len(data.tracks.camera_names) == 1:
         return Verdict("sync", "A single camera needs no synchronisation.", (), GOOD)
-    checks = [_below("residual offset estimated by tracking", rest, 0.6, 1.0, "frames")]
+    checks = [_below("residual offset estimated by tracking", rest, 0.6, 1.0, "frames", _OFFSETS)]
     if sync.get("confidence"):
         least = min(float(value) for value in sync["confidence"].values())
-        checks.append(_share("confidence: flashes or sound common to both cameras", least, 0.8, 0.5))
+        checks.append(_share("confidence: flashes or sound common to both cameras", least, 0.8, 0.5, _OFFSETS))
     method = str(sync.get("method", "not known"))
     if method == "taken as simultaneous":
-        checks.append(Check("synchronisation method", method, "flash, sound or given offsets", LOOK))
+        checks.append(Check("synchronisation method", method, "flash, sound or given offsets", LOOK, _OFFSETS))
     return _verdict("sync", checks)
 
 
@@ -158,31 +175,38 @@ def _track(tracks: Tracks) -> Verdict:
     helped = np.any(tracks.status == RECOVERED, axis=1) | tracks.prior_aided
     residual = tracks.residual_px[(tracks.status != LOST) & np.isfinite(tracks.residual_px)]
     checks = [
-        _share("frames tracked", _mean(tracked), 0.98, 0.9),
-        _share("frames tracked without regularisation or a new search", _mean(~helped), 0.6, 0.3),
+        _share("frames tracked", _mean(tracked), 0.98, 0.9, "Correct the masks of the lost frames."),
+        _share("frames tracked without regularisation or a new search", _mean(~helped), 0.6, 0.3, _MASKS),
         _below(
             f"uncovered mask, mean (the paper: {_PAPER_COVERAGE_PERCENT} %)",
             100 * float(np.nanmean(coverage)) if np.isfinite(coverage).any() else np.nan,
             1.0,
             2.0,
             "%",
+            _MASKS,
         ),
-        _below("outline distance, median", float(np.median(residual)) if residual.size else np.nan, 1.0, 2.0, "px"),
-        _below("expected error at the incisor (1 sigma, median)", float(sigma[0]), 0.15, 0.5, "mm", 3),
-        _below("expected error at the worse condyle (1 sigma, median)", float(sigma[3:].max()), 0.5, 1.0, "mm", 3),
+        _below(
+            "outline distance, median", float(np.median(residual)) if residual.size else np.nan, 1.0, 2.0, "px", _MASKS
+        ),
+        _below("expected error at the incisor (1 sigma, median)", float(sigma[0]), 0.15, 0.5, "mm", _VIEWS, 3),
+        _below(
+            "expected error at the worse condyle (1 sigma, median)", float(sigma[3:].max()), 0.5, 1.0, "mm", _VIEWS, 3
+        ),
     ]
     found = [Finding.from_json(one) for one in tracks.meta.get("findings", [])]
-    unused = [f"{one.camera}: {one.message}" for one in found if one.kind in _UNUSED]
-    if unused:
-        checks.append(Check("unused cameras", " ".join(unused), "none", LOOK))
-    wrong = [one.message for one in found if one.kind in _WRONG_SCANS]
-    if wrong:
-        checks.append(Check("scans", " ".join(wrong), "match the masks", BAD))
+    for one in found:
+        if one.kind in _UNUSED:
+            todo = f"Check masks and calibration of camera {one.camera}."
+            checks.append(Check("unused camera", f"{one.camera}: {one.message}", "", LOOK, todo))
+        elif one.kind in _WRONG_SCANS:
+            todo = "Check that the scans are of this person, complete, in mm and not mirrored."
+            checks.append(Check("scans", one.message, "must match the masks", BAD, todo))
     # False positives: 7 of 30 valid subjects (`population.py --persons 30 --seed 9500`), 3 of them with a true
     # underbite.
-    others = [one.line() for one in found if one.severity == "warning" and one.kind not in _UNUSED | _WRONG_SCANS]
-    if others:
-        checks.append(Check("warnings", " ".join(others), "none", LOOK))
+    for one in found:
+        if one.severity == "warning" and one.kind not in _UNUSED | _WRONG_SCANS:
+            told = one.line().removeprefix("warning: ")
+            checks.append(Check("warning", told, "", LOOK, one.hint or f"Check: {one.message}"))
     return _verdict("track", checks)
 
 
@@ -201,6 +225,7 @@ def _fit(data: ReportData) -> Verdict:
             0.6,
             _PAPER_MEAN_MM,
             "mm",
+            _WORST,
         ),
         _below(
             f"error of {kind}, worst frame (the paper, its own poses: {_PAPER_WORST_MM} mm)",
@@ -208,15 +233,32 @@ def _fit(data: ReportData) -> Verdict:
             3.0,
             _PAPER_WORST_MM,
             "mm",
+            _WORST,
         ),
-        _share("frames used for the fit", 1 - out / count if count else np.nan, 0.9, 0.7),
+        _share("frames used for the fit", 1 - out / count if count else np.nan, 0.9, 0.7, _WORST),
     ]
     for warning in meta.get("warnings", []):
         if warning["code"] == "few_poses":
-            checks.append(Check("poses of the take", warning["message"], "about 30 s of all movements", LOOK))
+            checks.append(
+                Check(
+                    "poses of the take",
+                    warning["message"],
+                    "about 30 s of all movements",
+                    LOOK,
+                    f"{_RECORD}about 30 s of all movements.",
+                )
+            )
         elif warning["code"] not in _LACKING:
             grade = BAD if warning["code"] in _MISTAKES else LOOK
-            checks.append(Check("human range", warning["message"], "see the table of human ranges", grade))
+            checks.append(
+                Check(
+                    "human range",
+                    warning["message"],
+                    "see the table of human ranges",
+                    grade,
+                    f"Check: {warning['message']}",
+                )
+            )
     return _verdict("fit", checks)
 
 
@@ -228,7 +270,7 @@ def _bounds(data: ReportData) -> Verdict:
     inside, valid = _mean(verdicts.inside()), _mean(verdicts.valid)
     counted = f" ({100 * inside:.1f} %)" if used.any() else ""
     name = f"captured poses inside the bound{counted} or within its tolerance of {rig.tolerance_mm:.2f} mm"
-    checks = [_share(name, valid, 0.97, 0.9)]
+    checks = [_share(name, valid, 0.97, 0.9, "Check the masks in the frames outside the bound.")]
     if rig.held_out is not None:
         checks.append(Check("frames outside bounds built without them", rig.held_out.words, "-", OPEN))
     synthesis = data.experiments.of("synthesis") if data.experiments else []
@@ -243,12 +285,13 @@ def _bounds(data: ReportData) -> Verdict:
                 3.0,
                 6.0,
                 "times",
+                f"{_RECORD}slow circling at every opening.",
             )
         )
     # Use the values of the experiments, so that the verdict agrees with the plot.
     warned = [w["message"] for w in meta.get("warnings", []) if w["code"] in _LACKING]
     lacks = data.experiments.coverage.sentences if data.experiments else warned
-    checks += [Check("captured movements", sentence, _EXERCISES, LOOK) for sentence in lacks]
+    checks += [Check("captured movements", sentence, _EXERCISES, LOOK, _movement(sentence)) for sentence in lacks]
     if not lacks:
         words, grade = ("nothing missing", GOOD) if used.any() else (_UNKNOWN, OPEN)
         checks.append(Check("captured movements", words, _EXERCISES, grade))
@@ -263,7 +306,20 @@ _TABLE_MM = (0.06, 0.5)
 def _rig(data: ReportData) -> Verdict:
     errors = [finding for finding in data.rig.findings if finding.startswith("error")]
     checks = [
-        Check("validators", f"{len(errors)} errors", "no errors", BAD if errors else GOOD),
-        _below("pose table against the exact model, worst vertex", data.rig.table_error_mm, *_TABLE_MM, "mm", 3),
+        Check(
+            "validators",
+            f"{len(errors)} errors",
+            "no errors",
+            BAD if errors else GOOD,
+            "Correct what `jawusd validate` reports.",
+        ),
+        _below(
+            "pose table against the exact model, worst vertex",
+            data.rig.table_error_mm,
+            *_TABLE_MM,
+            "mm",
+            "Bake again with a finer table: `jawusd bake --table 65`.",
+            3,
+        ),
     ]
     return _verdict("rig", checks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from html import escape
 from typing import Literal
 
 import numpy as np
@@ -85,6 +86,7 @@ class Page:
         self.client, self.scene = client, scene
         self.session = Session(actor.rig, actor.fps)
         gui = client.gui
+        self.built = gui.add_html(small_text(escape(actor.verdict))) if actor.verdict else None
         self.verdict = gui.add_html("")
         self.playback = Playback(client)
         tabs = gui.add_tab_group()

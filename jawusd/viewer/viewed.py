@@ -47,6 +47,7 @@ class ViewedActor:
     # maps d (3,) [mm] to an image of both arches with their contacts, RGB (h, w, 3); raises a JawusdError; None if the
     # rig has no occlusion
     contacts: Callable[[Array], NDArray[np.uint8]] | None = None
+    verdict: str = ""  # sentence on the build of the rig; "" if there is none
 
 
 @dataclass(frozen=True, eq=False)

@@ -197,9 +197,10 @@ def test_a_build_is_told_its_command_line_for_the_report(monkeypatch):
 def test_a_build_ends_with_its_verdict():
     because = [f"track: figure {k} 3 % (good up to 1 %)" for k in range(6)]
     file = {"capture": "x", "file": "report.html"}
-    assert _verdict_lines({**file, "verdict": {"grade": "good", "because": []}}) == ["verdict: good"]
-    assert _verdict_lines({**file, "verdict": {"grade": "bad", "because": because}}) == [
-        "verdict: not usable, because of:",
+    assert _verdict_lines({**file, "verdict": {"grade": "good", "because": []}}) == ["Usable for animation."]
+    verdict = {"grade": "bad", "todo": ["Check the masks.", "Bake again."], "because": because}
+    assert _verdict_lines({**file, "verdict": verdict}) == [
+        "Not usable. Check the masks.",
         *(f"  {one}" for one in because[:4]),
         "  and 2 more",
     ]

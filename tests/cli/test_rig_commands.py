@@ -1,6 +1,7 @@
 """The commands on a finished rig, run as programs: output, JSON and exit codes."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,7 @@ from jawusd.cli.rig_commands import _info_lines
 from jawusd.formats.poses import read_parameters, write_parameters, write_poses
 from jawusd.formats.tracks import LostReason, TrackStatus, save_tracks
 from jawusd.geometry import se3_exp, se3_log
+from jawusd.pipeline.state import BuildState
 from jawusd.rig import describe
 
 
@@ -75,6 +77,17 @@ def test_info_states_how_many_held_out_frames_the_tolerance_covers(actor):
     found["held_out"] = {"share": 0.76, "p95_mm": 4.2, "tolerance_mm": 1.0}
     words = "  76 % of held-out frames lie within the tolerance of 1.0 mm; 95 % within 4.2 mm"
     assert words in _info_lines(found)
+
+
+def test_info_starts_with_the_verdict_on_the_build(actor, tmp_path):
+    folder = shutil.copytree(actor.parent, tmp_path / "out")
+    assert json.loads(run("info", folder, "--json"))["verdict"] is None
+    verdict = {"grade": "look", "todo": ["Re-record: a protrusion.", "Check the masks."], "because": []}
+    BuildState(folder).finish("report", "", [], 0.0, {"file": "report.html", "verdict": verdict})
+    for given in (folder, folder / "actor.usda"):
+        assert run("info", given).splitlines()[0] == "Usable for animation. Re-record: a protrusion."
+    (folder / "build.json").write_text("{}")
+    assert "build.json" in run("info", folder).splitlines()[-1] and run("info", folder).startswith("actor someone")
 
 
 @pytest.mark.slow

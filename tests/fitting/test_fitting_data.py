@@ -287,4 +287,4 @@ def test_a_bound_with_room_for_uncaptured_poses_is_named_with_the_openings_to_re
     assert bound_not_reached((none, none), (0.0, 0.0)) == []
     assert bound_not_reached((places, places), (0.01, 0.15)) == []
     (said,) = bound_not_reached((none, places), (0.0, 0.184))
-    assert said.startswith("18 % of the bound of opening and protrusion") and "12 to 26 mm of opening" in said
+    assert said.startswith("18 % of the bound of opening and protrusion") and "between 12 and 26 mm of opening" in said

@@ -55,7 +55,7 @@ def test_a_report_without_its_capture_says_what_it_lacks(built):
     assert "report DIR --experiments" in text and "replay-data" in text
     record = BuildState(built).valid("report", "as built")  # as --resume tests it
     assert record is not None and list(record.outputs) == ["report.html"]
-    verdict = {"grade": "good", "because": []}
+    verdict = {"grade": "good", "todo": [], "because": []}
     assert record.result == {"capture": "../gone", "file": "report.html", "verdict": verdict}
 
 

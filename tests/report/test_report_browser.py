@@ -79,15 +79,32 @@ def test_no_width_scrolls_the_page_sideways(chromium, tmp_path, scheme, width):
     page = open_page(chromium, width, 844, color_scheme=scheme)
     page.goto((tmp_path / "report.html").as_uri())
     wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+    unfolded = page.evaluate("document.documentElement.scrollWidth")
     cells = page.locator("#verdicts td").evaluate_all("all => all.map(e => e.getBoundingClientRect().right)")
     links = page.locator("nav a").evaluate_all("all => all.map(e => e.getBoundingClientRect().right)")
     letters = page.locator("#tracking svg text").first.evaluate("e => e.getBoundingClientRect().height")
     keep_picture(page, f"report_{width}_{scheme}", full_page=True)
     page.context.close()
     assert wide[0] <= wide[1] == width
-    assert len(links) > 5 and max(links) <= width
+    assert unfolded <= width and len(links) > 5 and max(links) <= width
     assert len(cells) > 20 and max(cells) <= width  # verdicts are read without scrolling
     assert letters > 8  # drawings are legible and scroll separately
+
+
+def test_tables_are_folded_and_a_link_opens_them(chromium, tmp_path):
+    write_document(tmp_path / "report.html", report_data(experiments=experiments(sentences=("Gap: record chewing.",))))
+    page = open_page(chromium, 1440, 900)
+    page.goto((tmp_path / "report.html").as_uri())
+    bottoms = page.locator(".verdict, #todo, #overlay h2, #replay canvas").evaluate_all(
+        "all => all.map(e => e.getBoundingClientRect().bottom)"
+    )
+    assert len(bottoms) == 4 and max(bottoms) < 900 and not page.locator("table").first.is_visible()
+    assert page.locator(".verdict").inner_text().endswith("Usable for animation. Re-record: chewing.")
+    page.click("nav a[href='#model']")
+    page.wait_for_selector("#model table", state="visible")
+    assert not page.locator("#files table").is_visible()
+    page.context.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -72,6 +72,8 @@ def test_reasons_of_losses_are_listed_with_their_frames(words_alone):
     first = data.tracks.frames[20]
     assert listed["lost, lower arch: low score"] == listed["lost by the tracker"] == (2, f"{first}\u2013{first + 1}")
     assert "lost, lower arch: low score" in document(data)
+    assert all(count > 0 for _, count, _ in _frame_lists(data))
+
 
 
 def test_outliers_are_listed_where_no_frame_was_excluded():
@@ -174,7 +176,7 @@ def test_commands_are_set_as_code_and_no_backtick_is_seen():
     text = document(data)
     shown = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
     assert "`" not in shown
-    assert shown.count("<code>jawusd check &lt;it&gt;</code>") == 9  # the verdict contains the finding too
+    assert shown.count("<code>jawusd check &lt;it&gt;</code>") == 10  # also in the verdict and in what to do
     assert worded("one ` alone") == "one ` alone"
 
 

@@ -7,11 +7,12 @@ import pytest
 from example_model import held_out_arrays
 from report_data import experiments, report_data
 
+from jawusd.fitting.checks import bound_not_reached, missing_movements
 from jawusd.formats.finding import Finding
-from jawusd.formats.report import RigFacts
+from jawusd.formats.report import RigFacts, verdict_sentence
 from jawusd.paper.figures import coverage_figure
 from jawusd.report.figures import human_ranges, tracking_figure
-from jawusd.report.verdicts import BAD, GOOD, LOOK, judge, overall
+from jawusd.report.verdicts import BAD, GOOD, LOOK, judge, overall, summary
 
 
 def grades(data):
@@ -92,6 +93,42 @@ def coarse(data):
 def test_each_fault_is_found_where_it_is(fault, stage):
     found = grades(fault(report_data()))
     assert found.pop(stage) == BAD and BAD not in found.values()
+
+
+@pytest.mark.parametrize(
+    "fault", [late_camera, uncovered, blurred, unsure, misfit, swapped, beyond, broken, coarse]
+)  # fmt: skip
+def test_every_fault_says_what_to_do(fault):
+    verdicts = judge(fault(report_data()))
+    assert all(check.todo for verdict in verdicts for check in verdict.checks if check.grade in (BAD, LOOK))
+    sentence = verdict_sentence(summary(verdicts))
+    assert sentence == f"Not usable. {summary(verdicts)['todo'][0]}" and sentence.endswith(".")
+
+
+def test_the_sentence_of_a_build_names_what_to_record():
+    said = ("There is no protrusion: record a protrusion.", "A gap: record slow circling between 4 and 31 mm.")
+    found = summary(judge(report_data(experiments=experiments(sentences=said))))
+    todo = "Re-record: a protrusion; slow circling between 4 and 31 mm."
+    assert found["todo"] == [todo] and verdict_sentence(found) == f"Usable for animation. {todo}"
+    assert verdict_sentence(summary(judge(report_data()))) == "Usable for animation."
+    assert verdict_sentence({"grade": "look", "because": []}) == "Usable for animation."  # of an earlier build
+
+
+def test_every_sentence_on_a_take_ends_in_a_movement_to_record():
+    d = np.stack([np.linspace(0, 28, 60), np.linspace(-1, 1, 60), np.zeros(60)], axis=1)
+    said = missing_movements(d, np.ones(3, dtype=bool))
+    said += missing_movements(d[d[:, 0] < 5], np.ones(3, dtype=bool))
+    said += missing_movements(np.array([[0.0, 9, 9], [40, 0, 0], [20, 9, 0], [20, -9, 9]]), np.ones(3, dtype=bool))
+    said += missing_movements(np.array([[0.0, 9, 9], [40, 0, 0]]), np.ones(3, dtype=bool))
+    said += bound_not_reached((d[:, :2], d[:, ::2]), (0.5, 0.5))
+    assert len({tuple(one.split()[:2]) for one in said}) >= 6
+    assert [one for one in said if ": record " not in one] == []
+
+
+def test_a_warning_is_called_a_warning_once():
+    data = report_data()
+    data.tracks.meta["findings"] = [Finding("odd", "warning", "used twice.", camera="left").as_json()]
+    assert summary(judge(data))["because"] == ["track: warning camera left: used twice."]
 
 
 def test_a_camera_that_is_not_used_asks_for_a_look():

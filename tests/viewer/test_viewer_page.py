@@ -12,6 +12,8 @@ from viser import UploadedFile
 
 from jawusd.formats.keys import load_keys
 from jawusd.formats.poses import read_parameters
+from jawusd.pipeline.state import BuildState
+from jawusd.pipeline.view import open_viewer
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.viewer.page import FREE_DEPTH
 from jawusd.viewer.readouts import CONDYLES, INCISOR, landmark_places, rest_places
@@ -62,6 +64,20 @@ def test_verdict_and_playback_stand_above_the_tabs_and_sliders_name_their_unit(q
     assert {one._impl.parent_container_id for one in (page.verdict, page.motion.play)} == {"root"}
     assert all(slider.label.endswith(" [mm]") for slider in page.pose.sliders)
     assert not any("forward" in slider.label for slider in page.pose.sliders)  # only the readout has it
+
+
+def test_the_page_starts_with_the_verdict_on_the_build(folder, quiet):
+    assert quiet.page.built is None
+    verdict = {"grade": "bad", "todo": ["Check <the> masks."], "because": []}
+    BuildState(folder).finish("report", "", [], 0.0, {"file": "report.html", "verdict": verdict})
+    running = open_viewer(folder, "127.0.0.1", 0)
+    try:
+        page = QuietPage(running).page
+        assert "Not usable. Check &lt;the&gt; masks." in page.built.content
+        first, second = page.built._impl, page.verdict._impl
+        assert first.parent_container_id == "root" and first.props.order < second.props.order
+    finally:
+        running.stop()
 
 
 def test_what_was_undone_is_done_again_by_its_key(quiet):

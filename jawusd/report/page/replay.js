@@ -1,4 +1,18 @@
 "use strict";
+// Folded parts open when a link leads to them, and for printing.
+(() => {
+  const open = () => {
+    const part = location.hash.length > 1 && document.getElementById(location.hash.slice(1));
+    if (part && part.tagName === "DETAILS") {
+      part.open = true;
+      part.scrollIntoView();
+    }
+  };
+  addEventListener("hashchange", open);
+  addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((part) => { part.open = true; }));
+  open();
+})();
+
 // Replay of the captured take in plain WebGL2, without external resources. Coordinates are mm in the anatomical frame.
 (() => {
   const box = document.getElementById("replay");
