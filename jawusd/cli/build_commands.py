@@ -71,6 +71,7 @@ def build(
     ] = False,
     jobs: Jobs = 2,
     prim_name: PrimName = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print the results of all stages.")] = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
@@ -103,7 +104,7 @@ def build(
         return
     with progress() as report:
         summary = stages.build(capture, out, options, report, lambda found: say(found.line(), err=True))
-    emit(summary, as_json, lambda: build_lines(summary))
+    emit(summary, as_json, lambda: build_lines(summary, verbose))
 
 
 def track(

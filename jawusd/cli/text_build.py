@@ -19,42 +19,86 @@ if TYPE_CHECKING:
     from jawusd.pipeline.track import FrameTrackSummary, TrackSummary
 
 
-def build_lines(summary: BuildSummary) -> list[str]:
-    """Return the summary of a build as text."""
+_MOST_TODO = 3  # maximum number of further things to do that a build lists; the report has all
+
+
+def build_lines(summary: BuildSummary, verbose: bool = False) -> list[str]:
+    """Return the summary of a build as text: the verdict, the key figures, and the files; or, verbose, all results."""
+    report, folder = summary["report"], summary["folder"]
+    shown = f"{folder}/{report['file']}" if "file" in report else f"none: {report['missing']}"
+    return [
+        *_verdict_lines(report, verbose),
+        *(_stage_lines(summary) if verbose else _key_lines(summary)),
+        f"rig: {folder}/actor.usda",
+        f"report: {shown}",
+        f"next: jawusd view {folder}",
+    ]
+
+
+def _verdict_lines(report: ReportSummary, verbose: bool) -> list[str]:
+    """Return the verdict of the report, what else to do, and if verbose the reasons."""
+    if "verdict" not in report:
+        return ["No verdict, as there is no report."]
+    verdict = report["verdict"]
+    also = verdict.get("todo", [])[1:]
+    listed = also if verbose else also[:_MOST_TODO]
+    more = [f"  and {len(also) - len(listed)} more in the report"] if len(also) > len(listed) else []
+    reasons = [f"  because {one}" for one in verdict["because"]] if verbose else []
+    return [verdict_sentence(verdict), *(f"  also: {one}" for one in listed), *more, *reasons]
+
+
+def _sync_line(summary: BuildSummary) -> str:
     offsets = ", ".join(f"{name} {offset:+d}" for name, offset in summary["sync"]["offsets"].items())
-    # Findings of the tracks are printed with the tracks.
-    known = [Finding.from_json(found).line() for found in summary["track"].get("findings", [])]
-    lines = [Finding.from_json(found).line() for found in summary.get("findings", [])]
-    lines = [line for line in lines if line not in known]
+    return f"sync ({summary['sync']['method']}): {offsets} frames"
+
+
+def _findings(summary: BuildSummary) -> tuple[list[str], list[str]]:
+    """Return the findings of the check, and those of tracking, as lines; those in both are with tracking."""
+    tracked = [Finding.from_json(found).line() for found in summary["track"].get("findings", [])]
+    checked = [Finding.from_json(found).line() for found in summary.get("findings", [])]
+    return [line for line in checked if line not in tracked], tracked
+
+
+def _key_lines(summary: BuildSummary) -> list[str]:
+    """Return the results of a build that matter most, in a few lines."""
+    track, fit = summary["track"], summary["fit"]
+    sigma_mm = {name: value for name, value in track["sigma_mm"].items() if value is not None}
+    lines = ["the capture names no calibration: made one from its boards"] if summary["calibrate"] else []
+    lines += [_sync_line(summary), f"tracked {track['tracked']} of {track['frames']} frames"]
+    if "incisor" in sigma_mm:
+        lines[-1] += f", expected error at the incisor {sigma_mm['incisor']:.2f} mm"
+    tables = fit.get("errors", {})
+    for table, words in (("holdout", "held-out"), ("train", "fitted")):
+        if "mandible" in tables.get(table, {}):
+            errors = tables[table]["mandible"]
+            lines.append(
+                f"model: {fit.get('method')}, {errors['mean']:.2f} mm from {words} poses on average, "
+                f"{errors['max']:.2f} mm at most"
+            )
+            break
+    told = [*_findings(summary)[0], *_findings(summary)[1]]
+    warned = sum(line.startswith("warning") for line in told) + len(fit.get("warnings", []))
+    if warned:
+        lines.append(f"{warned} warning{'s' if warned > 1 else ''}: see the report, or add -v")
+    ran = [value for name, value in summary["seconds"].items() if name not in summary["reused"]]
+    return [*lines, f"time: {rounded_duration(sum(ran))}" if ran else "time: all stages were kept"]
+
+
+def _stage_lines(summary: BuildSummary) -> list[str]:
+    """Return all results of a build."""
+    lines = _findings(summary)[0]
     if summary["calibrate"]:
         lines += [
             "the capture names no calibration: made one from its boards",
             *calibration_lines(summary["calibrate"]),
         ]
-    lines += [f"sync ({summary['sync']['method']}): {offsets} frames"]
-    lines += [f"  note: {note}" for note in summary["sync"].get("notes", [])]
-    lines += track_lines(summary["track"])
-    lines += fit_lines(summary["fit"])
+    lines += [_sync_line(summary), *(f"  note: {note}" for note in summary["sync"].get("notes", []))]
+    lines += [*track_lines(summary["track"]), *fit_lines(summary["fit"])]
     seconds = ", ".join(
         f"{name} {'kept' if name in summary['reused'] else f'{value:.1f} s'}"
         for name, value in summary["seconds"].items()
     )
-    report = summary["report"]
-    shown = f"{summary['folder']}/{report['file']}" if "file" in report else f"none: {report['missing']}"
-    ends = [f"time: {seconds}", f"rig: {summary['folder']}/actor.usda", f"report: {shown}"]
-    return [*lines, *ends, *_verdict_lines(report)]
-
-
-_MOST_REASONS = 4
-
-
-def _verdict_lines(report: ReportSummary) -> list[str]:
-    """Return the verdict of the report, with its reasons."""
-    if "verdict" not in report:
-        return ["verdict: none, as there is no report"]
-    because = report["verdict"]["because"]
-    more = [f"and {len(because) - _MOST_REASONS} more"] if len(because) > _MOST_REASONS else []
-    return [verdict_sentence(report["verdict"]), *(f"  {one}" for one in (*because[:_MOST_REASONS], *more))]
+    return [*lines, f"time: {seconds}"]
 
 
 def plan_lines(stages: list[PlannedStage]) -> list[str]:

@@ -20,7 +20,7 @@ from jawusd.base import errors
 from jawusd.cli.commands import EXIT_CODES, GROUPS, SUMMARIES, help_row, with_vectors_split
 from jawusd.cli.examples import EXAMPLES
 from jawusd.cli.main import app
-from jawusd.cli.text_build import _verdict_lines, rounded_duration
+from jawusd.cli.text_build import build_lines, rounded_duration
 
 COMMANDS = typer.main.get_command(app).commands
 WIDTH = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
@@ -194,17 +194,57 @@ def test_a_build_is_told_its_command_line_for_the_report(monkeypatch):
     assert asked == ["jawusd build 'some where' -o out --jobs=1"]
 
 
-def test_a_build_ends_with_its_verdict():
-    because = [f"track: figure {k} 3 % (good up to 1 %)" for k in range(6)]
-    file = {"capture": "x", "file": "report.html"}
-    assert _verdict_lines({**file, "verdict": {"grade": "good", "because": []}}) == ["Usable for animation."]
-    verdict = {"grade": "bad", "todo": ["Check the masks.", "Bake again."], "because": because}
-    assert _verdict_lines({**file, "verdict": verdict}) == [
-        "Not usable. Check the masks.",
-        *(f"  {one}" for one in because[:4]),
-        "  and 2 more",
+def built(todo=(), because=(), grade="look", findings=(), warnings=()):
+    """Return the summary of a build."""
+    errors = {"mandible": {"mean": 0.286, "median": 0.25, "p95": 0.6, "max": 1.03, "frames": 200}}
+    return {
+        "folder": "out",
+        "seconds": {"check": 8.0, "track": 120.0, "fit": 9.0},
+        "reused": ["check"],
+        "findings": list(findings),
+        "calibrate": None,
+        "sync": {"method": "sound", "offsets": {"a": 0, "b": -3}, "notes": ["clicks"]},
+        "track": {
+            "tracked": 299, "frames": 300, "lost": [7], "recovered": 0, "without_a_camera": 0, "prior_aided": 0,
+            "calibration_rescaled_px": {}, "sigma_mm": {"incisor": 0.046, "condyle_left": None},
+            "coverage_error_percent": 0.5, "findings": list(findings),
+        },
+        "fit": {"method": "anchored", "errors": {"train": errors, "holdout": errors}, "warnings": list(warnings)},
+        "report": {"file": "report.html", "verdict": {"grade": grade, "todo": list(todo), "because": list(because)}},
+    }  # fmt: skip
+
+
+def test_a_build_starts_with_its_verdict_and_says_the_rest_if_asked():
+    odd = {"kind": "odd", "severity": "warning", "message": "odd."}
+    told = built(["Re-record: chewing.", "Bake again."], ["rig: coarse"], findings=[odd], warnings=[{"message": "x"}])
+    assert build_lines(told) == [
+        "Usable for animation. Re-record: chewing.",
+        "  also: Bake again.",
+        "sync (sound): a +0, b -3 frames",
+        "tracked 299 of 300 frames, expected error at the incisor 0.05 mm",
+        "model: anchored, 0.29 mm from held-out poses on average, 1.03 mm at most",
+        "2 warnings: see the report, or add -v",
+        "time: 2 minutes",
+        "rig: out/actor.usda",
+        "report: out/report.html",
+        "next: jawusd view out",
     ]
-    assert "no report" in _verdict_lines({"capture": "x", "missing": "jinja2"})[0]
+    whole = build_lines(told, verbose=True)
+    for line in ("  because rig: coarse", "  lost: 7", "  note: clicks", "time: check kept, track 120.0 s, fit 9.0 s"):
+        assert line in whole and line not in build_lines(told)
+    assert sum("odd." in line for line in whole) == 1 and len(whole) > 12
+
+
+def test_a_build_with_much_to_do_lists_some_of_it():
+    told = built([f"Do {k}." for k in range(7)], grade="bad")
+    assert build_lines(told)[:5] == ["Not usable. Do 0.", *(f"  also: Do {k}." for k in (1, 2, 3)),
+                                     "  and 3 more in the report"]  # fmt: skip
+    assert "  also: Do 6." in build_lines(told, verbose=True)
+    assert build_lines(built(grade="good"))[0] == "Usable for animation."
+    del told["report"]["verdict"]
+    assert build_lines(told)[0].startswith("No verdict")
+    told["reused"] = list(told["seconds"])
+    assert "time: all stages were kept" in build_lines(told)
 
 
 def test_the_doctor_looks_at_what_a_build_needs():
