@@ -140,13 +140,14 @@ def _report_found(
 
 def view(
     rig: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
-            help="A rig (actor.usda, another layer of it, or its folder) or a capture (capture.toml or its folder).",
+            help="A rig (actor.usda, another layer of it, or its folder) or a capture (capture.toml or its folder). "
+            "Default: the example rig that ships with jawusd.",
             metavar="RIG|CAPTURE",
             show_default=False,
         ),
-    ],
+    ] = None,
     tracks: Annotated[
         Path | None,
         typer.Option(
@@ -172,7 +173,9 @@ def view(
     from jawusd.pipeline.state import changed_files
     from jawusd.pipeline.view import open_viewer
     from jawusd.pipeline.view_capture import is_capture, open_capture_viewer
+    from jawusd.rig.layout import EXAMPLE_RIG
 
+    rig = EXAMPLE_RIG if rig is None else rig
     capture = is_capture(rig)
     if tracks is not None and not capture:
         raise typer.BadParameter("--tracks needs a capture, not a rig.")

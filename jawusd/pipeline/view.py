@@ -183,14 +183,21 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
         name: file name without a folder, anim*.usda or anim*.usdc.
 
     Raises:
-        OutputError: the name is not allowed or taken, or the file cannot be written.
+        OutputError: the name is not allowed or taken, the rig ships with jawusd, or the file cannot be written.
     """
     from jawusd.rig.animation import write_animation
+    from jawusd.rig.layout import EXAMPLE_RIG
     from jawusd.rig.rebake import write_over
 
     if not _ANIMATION.fullmatch(name):
         raise OutputError(f'"{name}" is not a valid name: use anim, then letters, digits, _ or -, then .usdc or .usda.')
     target = actor.parent / name
+    if actor.parent.samefile(EXAMPLE_RIG.parent):
+        raise OutputError(
+            "animations are not written beside the example rig that ships with jawusd.",
+            path=actor.parent,
+            hint="Copy that folder, and view the copy.",
+        )
     refuse_existing(target, overwrite)
     if prim is not None:
         return write_over(target, actor, rig, clip.frames, clip.d, clip.fps, prim)

@@ -30,6 +30,8 @@ ACTOR_FILE, RIG_FILE, GEO_FILE = "actor.usda", "rig.usdc", "geo.usdc"
 ONNX_FILE, ENCODE_FILE = "actor.onnx", "actor_encode.onnx"
 SKEL_FILE, PACKAGE_FILE = "actor_skel.usdc", "actor.usdz"
 PROXY_FILE, CAPTURED_FILE = "proxy.usdc", "anim_capture.usdc"
+#: A finished rig that ships with the package, made by `docs/make_example_rig.py` from `examples/capture`.
+EXAMPLE_RIG = Path(__file__).with_name("example") / ACTOR_FILE
 
 DETAIL, SCAN, PROXY, BOTH = "detail", "scan", "proxy", "both"  # variant set for the level of detail, and its variants
 MOTION, TRANSFORMS, SKELETON = "motion", "transforms", "skeleton"  # variant set for captured motion, and its variants

@@ -13,6 +13,7 @@ from PIL import Image
 
 import jawusd
 from jawusd.formats.mesh import TOUCHING
+from jawusd.rig.layout import EXAMPLE_RIG
 
 FOLDER = ROOT / "docs" / "gallery"
 MOST_BYTES = 2_000_000
@@ -85,6 +86,16 @@ def test_blender_moves_the_jaw(example_build, gallery, tmp_path):
         frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in video.decode(video=0)]
     assert len(frames) == 2
     assert np.abs(frames[0] - frames[1]).max() > 40
+
+
+def test_the_rig_that_ships_is_that_of_the_build(example_build, tmp_path):
+    script = load_script(ROOT / "docs" / "make_example_rig.py")
+    script.make(example_build[0], tmp_path)
+    shipped = {file.name: file.stat().st_size for file in EXAMPLE_RIG.parent.iterdir()}
+    made = {file.name: file.stat().st_size for file in tmp_path.iterdir()}
+    assert set(made) == set(shipped) and sum(made.values()) == pytest.approx(sum(shipped.values()), rel=0.1)
+    rigs = [jawusd.load(actor) for actor in (tmp_path / EXAMPLE_RIG.name, EXAMPLE_RIG)]
+    np.testing.assert_allclose(rigs[0].d_range, rigs[1].d_range, atol=1.0)
 
 
 def test_what_is_missing_is_named(example_build, gallery, tmp_path, monkeypatch, capsys):

@@ -2,12 +2,14 @@
 
 import re
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
 from package_copy import ROOT
 
 import jawusd
+from jawusd.rig.layout import EXAMPLE_RIG
 
 pytest.importorskip("hatchling", reason="hatchling is not installed")
 REPOSITORY = "https://repository.example/jawusd"
@@ -47,6 +49,14 @@ def test_pages_of_other_builds_name_no_addresses(metadata):
     _, core = metadata("")
     assert core.readme == (ROOT / "README.md").read_text()
     assert core.urls == {}
+
+
+def test_a_wheel_brings_the_example_rig():
+    from hatchling.builders.wheel import WheelBuilder
+
+    shipped = {Path(file.distribution_path) for file in WheelBuilder(str(ROOT)).recurse_included_files()}
+    files = {file.relative_to(ROOT) for file in EXAMPLE_RIG.parent.iterdir()}
+    assert EXAMPLE_RIG.relative_to(ROOT) in files <= shipped
 
 
 def test_citation_names_what_the_format_asks_for():

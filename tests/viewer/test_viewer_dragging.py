@@ -8,6 +8,8 @@ from example_rig import FPS, example_rig
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
 from jawusd.geometry import LANDMARKS, make_transform
+from jawusd.rig.layout import EXAMPLE_RIG
+from jawusd.rig.read import load_rig
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 from jawusd.viewer.readouts import INCISOR, landmark_places
@@ -41,6 +43,7 @@ def fitted(seed):
 
 
 RIGS = {
+    "example build": lambda: load_rig(EXAMPLE_RIG),
     "anchored": example_rig,
     "additive": lambda: example_rig("additive"),
     "bent to the side, opening straight down": lambda: with_path([3.0, -0.2]),

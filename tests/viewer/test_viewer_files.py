@@ -12,6 +12,7 @@ from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.formats.tracks import Tracks, save_tracks
 from jawusd.pipeline.view import motion_names, open_viewer, part_of, viewed_actor
 from jawusd.rig.geo import read_geometry, read_gum
+from jawusd.rig.layout import EXAMPLE_RIG
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.viewer.motion import Clip
 
@@ -116,6 +117,18 @@ def test_the_captured_take_is_the_tracks_beside_the_rig(folder):
     clip = actor.load_clip("captured take")
     np.testing.assert_array_equal(clip.frames, np.delete(frames, 4))
     np.testing.assert_allclose(clip.d, np.delete(d, 4, axis=0), atol=1e-5)
+
+
+def test_the_example_rig_plays_and_nothing_is_written_beside_it():
+    before = sorted(EXAMPLE_RIG.parent.iterdir())
+    actor = viewed_actor(EXAMPLE_RIG)
+    clip = actor.load_clip(actor.take)
+    assert actor.take == "anim_capture.usdc" and clip.d[:, 0].max() > 35
+    assert len(actor.meshes) == 6 and not actor.placeholders
+    with pytest.raises(OutputError, match="ships with jawusd"):
+        actor.save_layer("anim_view.usdc", clip, True)
+    assert sorted(EXAMPLE_RIG.parent.iterdir()) == before
+    assert actor.contacts(np.zeros(3)).std() > 10  # the scans are fine enough for contacts
 
 
 def test_without_viser_the_extra_is_named(folder, monkeypatch):

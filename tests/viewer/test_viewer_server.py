@@ -50,8 +50,12 @@ def test_an_address_of_another_machine_is_refused(folder):
 
 
 def run_view(folder, *options):
-    """Run `jawusd view` until it prints its address; return stdout's first line and stderr."""
-    command = [sys.executable, "-m", "jawusd", "view", str(folder), "--no-browser", "--port", "0", *options]
+    """Run `jawusd view`, without a rig if folder is None, until it prints its address.
+
+    Returns stdout's first line and the rest of it, stderr, and the exit code.
+    """
+    named = [] if folder is None else [str(folder)]
+    command = [sys.executable, "-m", "jawusd", "view", *named, "--no-browser", "--port", "0", *options]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_signals
     )
@@ -65,6 +69,12 @@ def run_view(folder, *options):
 
 def test_the_command_says_where_to_look_and_stops_quietly(folder):
     line, rest, errors, code = run_view(folder)
+    assert line.startswith("http://localhost:") and rest == "" and code == 0
+    assert "warning" not in errors and "Traceback" not in errors
+
+
+def test_without_a_rig_the_example_is_shown():
+    line, rest, errors, code = run_view(None)
     assert line.startswith("http://localhost:") and rest == "" and code == 0
     assert "warning" not in errors and "Traceback" not in errors
 
