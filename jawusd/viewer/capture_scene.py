@@ -12,6 +12,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import wxyz_from_matrix
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.picking import ARCHES, FOV_RAD, PickBook, PickingLayout
+from jawusd.viewer.scene import add_lights
 from jawusd.viewer.viewed import ViewedCapture, for_view
 
 ENAMEL, GUM, BASE = (236, 229, 212), (196, 112, 108), (120, 135, 165)
@@ -43,7 +44,7 @@ class CaptureScene:
         """Draw everything that does not depend on the image."""
         self._client, self._scene, self._capture = client, client.scene, capture
         scene = self._scene
-        scene.configure_default_lights(cast_shadow=False)
+        add_lights(scene, UP)
         self.T_page_world = next((camera.T_cam_world for camera in capture.cameras.values()), np.eye(4))
         self._layout = scene.add_frame("/layout", show_axes=False)
         self._picture: viser.ImageHandle | None = None

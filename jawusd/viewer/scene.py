@@ -41,11 +41,22 @@ PRESETS = {
 }
 #: Initial view of a page.
 FIRST_VIEW = "front"
+#: Up direction of the page.
+UP = (0.0, 1.0, 0.0)
 #: Aspect ratio (width over height) below which a screen counts as a phone, whose lower half the panel covers.
 PHONE = 0.6
 _NARROW = 0.75  # aspect ratio below which the camera moves back, so that the jaw fits the width
 _LOWER = 0.25  # fraction of the view's height by which the camera aims below the jaw on a phone
 _FOV_RAD, _NEAR_MM, _FAR_MM = 0.6, 1.0, 5000.0
+
+
+def add_lights(scene: viser.SceneApi, up: tuple[float, float, float]) -> None:
+    """Light a scene from the camera and, more weakly, from everywhere; `up` is (0, 1, 0) or (0, -1, 0)."""
+    scene.configure_default_lights(cast_shadow=False)
+    # Use a hemisphere light: without a GPU, an environment map takes most of the frame time.
+    scene.configure_environment_map(None)
+    turned = (1.0, 0.0, 0.0, 0.0) if up[1] > 0 else (0.0, 1.0, 0.0, 0.0)  # the light comes from its own +y
+    scene.add_light_hemisphere("/light", ground_color=_GROUND, intensity=_AMBIENT, wxyz=turned)
 
 
 class JawScene:
@@ -57,10 +68,7 @@ class JawScene:
         rig = actor.rig
         self._T_world_skull = np.array(rig.T_anatomical_skull)
         self._rest = rest_places(rig)
-        self._scene.configure_default_lights(cast_shadow=False)
-        # Use a hemisphere light: without a GPU, an environment map takes half of the frame time.
-        self._scene.configure_environment_map(None)
-        self._scene.add_light_hemisphere("/light", ground_color=_GROUND, intensity=_AMBIENT)
+        add_lights(self._scene, UP)
         for name in STILL:
             if name in actor.meshes:
                 mesh = actor.meshes[name]
@@ -179,7 +187,7 @@ class JawScene:
         if self._mandible is not None and self._bone != _PLACEHOLDER:
             self._mandible.opacity = _CLEAR if preset.startswith("condyle") else None
         with self._client.atomic():
-            camera.position, camera.look_at, camera.up_direction = tuple(eye), tuple(target), (0.0, 1.0, 0.0)
+            camera.position, camera.look_at, camera.up_direction = tuple(eye), tuple(target), UP
 
 
 def preset_view(rest: Array, preset: str, aspect: float = 1.0) -> tuple[Array, Array]:
@@ -204,5 +212,5 @@ def set_first_view(server: viser.ViserServer, rest: Array, preset: str = FIRST_V
     target, eye = preset_view(rest, preset)
     server.scene.set_up_direction("+y")
     first = server.initial_camera
-    first.position, first.look_at, first.up = tuple(eye), tuple(target), (0.0, 1.0, 0.0)
+    first.position, first.look_at, first.up = tuple(eye), tuple(target), UP
     first.fov, first.near, first.far = _FOV_RAD, _NEAR_MM, _FAR_MM

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import viser
 from browser_tab import until
 from quiet_capture_page import QuietCapturePage
 from viewed_example import FIRST, STOP, copy_example, quiet, truth, write_true_tracks
@@ -17,8 +18,9 @@ from viser._messages import FileTransferStartUpload
 from jawusd.formats.capture import load_capture
 from jawusd.formats.performance import STATE_COLOURS, SolvedJaw, SolveState
 from jawusd.formats.tracks import load_tracks, save_tracks
-from jawusd.geometry import transform_point, transform_points
+from jawusd.geometry import matrix_from_wxyz, transform_point, transform_points
 from jawusd.pipeline.view_capture import viewed_capture
+from jawusd.viewer.capture_scene import UP
 from jawusd.viewer.server import CaptureViewer
 
 
@@ -39,6 +41,21 @@ def page(viewed):
     opened.settle()
     yield opened
     viewer.stop()
+
+
+def test_the_scene_is_lit_without_an_environment_map(viewed, monkeypatch):
+    maps, skies = [], []
+    scene = viser.SceneApi
+    monkeypatch.setattr(scene, "configure_environment_map", lambda self, chosen: maps.append(chosen))
+    add = scene.add_light_hemisphere
+    monkeypatch.setattr(
+        scene, "add_light_hemisphere", lambda *given, **how: skies.append(how["wxyz"]) or add(*given, **how)
+    )
+    viewer = CaptureViewer(viewed, "127.0.0.1", 0)
+    QuietCapturePage(viewer).settle()
+    viewer.stop()
+    assert maps == [None]
+    assert np.allclose(matrix_from_wxyz(np.array(skies)) @ [0.0, 1.0, 0.0], UP)  # light comes from above
 
 
 def test_pages_of_captures_take_no_files(page):
