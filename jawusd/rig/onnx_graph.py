@@ -101,6 +101,13 @@ class Graph:
         self.nodes.append(helper.make_node("Split", [a.name], names, axis=axis))
         return [Value(self, name) for name in names]
 
+    def columns_of(self, a: Value, widths: Sequence[int]) -> list[Value]:
+        """Return groups of the columns of a value, of given widths."""
+        names = [f"{self.prefix}columns{len(self.nodes)}_{i}" for i in range(len(widths))]
+        sizes = self.constant(widths, np.int64)
+        self.nodes.append(helper.make_node("Split", [a.name, sizes.name], names, axis=1))
+        return [Value(self, name) for name in names]
+
     def sum_columns(self, a: Value) -> Value:
         """Return the sum over axis 1, keeping it: (n, k) to (n, 1)."""
         return self.op("ReduceSum", a, self.constant([1], np.int64), keepdims=1)

@@ -1,7 +1,9 @@
 """The exact jaw model and its inverse as ONNX operators.
 
-The encoder is an ONNX loop: damped Gauss-Newton from the nearest of many starts. The distance of two poses is that of
-`jawusd.evaluator.encoding`: four homogeneous vectors represent all landmarks.
+The encoder is an ONNX loop: Newton's method, damped, from the nearest of many starts. The distance of two poses is that
+of `jawusd.evaluator.encoding`: four homogeneous vectors represent all landmarks. The time of a runtime depends on the
+number of operators more than on that of rows. Each iteration therefore evaluates the model once, at a stencil of points
+around each d, whose differences are its first and second derivatives.
 """
 
 from __future__ import annotations
@@ -16,19 +18,27 @@ from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.encoding import landmark_vectors
 from jawusd.evaluator.formula import MODELS, BoundFormula, RigidMotion
 from jawusd.evaluator.operations import Rows, triple
-from jawusd.geometry.rodrigues import Triple, apply_series, cross, dot
+from jawusd.geometry.rodrigues import apply_series, dot
 from jawusd.geometry.se3 import se3_adjoint, se3_inverse
 from jawusd.rig.onnx_graph import Graph, Value
 from jawusd.rig.table import grid_points, valid_box
 
-_ITERATIONS = 30
-_CONVERGED_MM = 1e-7  # step length below which a row has converged; the loop ends when all rows have
+_ITERATIONS = 40
+_FIRST_NEWTON = 5  # iteration from which the full Hessian is used: farther from the minimum it often misleads
+# Step length below which a row has converged. The loop ends when all rows have; their last steps, which double the
+# correct digits, are taken without evaluating the model again.
+_CONVERGED_MM = 1e-5
 _STARTS = (19, 11, 11)  # number of starts along d1, d2, d3
 _START_MARGIN_MM = 3.0  # extension of the grid beyond the bounds, for poses slightly outside
-_STEP_MM = 1e-3  # step of the central differences in d
+_STEP_MM = 1e-3  # step of the differences in d
 _START_DAMPING = 1e-6
 _MIN_DAMPING = 1e-12
-_LOOP_STATE = {"d": 3, "cost": 1, "damping": 1}  # numbers of columns of the values passed between iterations
+# Columns of a point of the search: d, its cost (squared distance), half the gradient of the cost, and half its Hessian,
+# as Gauss-Newton approximates it and in full, see `_PAIRS`.
+_POINT = {"d": 3, "cost": 1, "slope": 3, "gauss_newton": 6, "newton": 6}
+_LOOP_STATE = {"point": sum(_POINT.values()), "trial": 3, "damping": 1}  # numbers of columns passed on by iterations
+_PAIRS = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]  # stored entries of a symmetric matrix
+_PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of the entries of a symmetric matrix in its stored form
 
 
 def decode_motion(g: Graph, rig: JawRig, d: Value) -> RigidMotion[Value]:
@@ -81,17 +91,24 @@ def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> No
     vectors = landmark_vectors(rig.landmarks)
     flat = f.reshape(f.op("Cast", pose, to=TensorProto.DOUBLE), [-1, 16])
     target = f.op("MatMul", flat, f.constant(_images_of_pose(vectors)), name="target")
-    start, cost = _nearest_start(f, rig, vectors, target)
-    state = [f.constant(_ITERATIONS, np.int64), f.constant(True, np.bool_), start, cost, cost * 0.0 + _START_DAMPING]
-    found = ["f_d", "f_cost", "f_damping"]
-    f.nodes.append(helper.make_node("Loop", [value.name for value in state], found, body=_body(rig, vectors)))
-    found_d, found_cost, _ = (Value(f, name) for name in found)
-    # a NaN of the pose propagates to the cost, but not to the start
-    checked_d = found_d + found_cost * 0.0
-    distance = f.op("Squeeze", f.sqrt(found_cost), f.constant([1], np.int64))
+    start = _nearest_start(f, rig, vectors, target)
+    unknown = np.array([[np.inf, *[0.0] * 15]])  # the start is evaluated in the first iteration
+    point = f.concat([start, target @ np.zeros((12, 16)) + f.constant(unknown)])  # NaN of the pose stays NaN
+    damping = start @ np.zeros((3, 1)) + _START_DAMPING
+    some = f.op("Greater", f.op("Size", target), f.constant(0, np.int64))
+    state = [f.constant(_ITERATIONS, np.int64), some, point, start, damping]
+    outputs = ["f_point", "f_trial", "f_damping"]
+    f.nodes.append(helper.make_node("Loop", [value.name for value in state], outputs, body=_body(rig, vectors)))
+    found, cost, slope, *_ = f.columns_of(Value(f, "f_point"), list(_POINT.values()))
+    step = found - Value(f, "f_trial")
+    short = f.op("LessOrEqual", f.op("ReduceMax", f.op("Abs", step), axes=[1], keepdims=1), _CONVERGED_MM)
+    step = f.op("Where", short, step, 0.0)
+    last_cost = f.op("Max", cost - f.sum_columns(slope * step), 0.0)
+    distance = f.op("Squeeze", f.sqrt(last_cost + cost * 0.0), f.constant([1], np.int64))
+    known = found - step + cost * 0.0
     g.nodes += f.nodes
     g.initializers += f.initializers
-    g.op("Cast", checked_d, to=g.elem_type, name=d)
+    g.op("Cast", known, to=g.elem_type, name=d)
     g.op("Cast", distance, to=g.elem_type, name=residual)
 
 
@@ -108,36 +125,43 @@ def _images(g: Graph, rig: JawRig, vectors: Array, d: Value) -> Value:
     return images(g, rig, decode_motion(g, rig, d), vectors)
 
 
-def _nearest_start(g: Graph, rig: JawRig, vectors: Array, target: Value) -> tuple[Value, Value]:
-    """Return the grid point (n, 3) whose vectors are nearest to the target, and the squared distance (n, 1)."""
+def _nearest_start(g: Graph, rig: JawRig, vectors: Array, target: Value) -> Value:
+    """Return the grid point (n, 3) whose vectors are nearest to the target."""
     box = valid_box(rig) + np.array([-_START_MARGIN_MM, _START_MARGIN_MM])
     axes = [np.linspace(low, high, count) for (low, high), count in zip(box, _STARTS, strict=True)]
     grid = grid_points(axes)
     candidates = np.swapaxes((rig.pose(grid) @ vectors)[:, :3], 1, 2).reshape(-1, 12)
     # |a - b|^2 without |a|^2, which is the same for all candidates
     distance = g.constant((candidates**2).sum(axis=1)[None]) - (target @ candidates.T) * 2.0
-    nearest = g.op("ArgMin", distance, axis=1, keepdims=0)
-    start = g.op("Gather", g.constant(grid), nearest, axis=0)
-    return start, _cost(g, _images(g, rig, vectors, start) - target)
+    return g.op("Gather", g.constant(grid), g.op("ArgMin", distance, axis=1, keepdims=0), axis=0)
 
 
 def _body(rig: JawRig, vectors: Array) -> onnx.GraphProto:
-    """Return the loop body: a damped Gauss-Newton step (Levenberg 1944, Marquardt 1963), accepted if it is better."""
+    """Return the loop body: a damped step of Newton's method, accepted if it is better.
+
+    In the first iterations, and where the Hessian is not positive definite, the approximation of Gauss and Newton
+    replaces it (Nocedal and Wright 2006, section 10.3).
+    """
     b = Graph(np.float64, "b_")
-    d, cost, damping = (Value(b, f"b_{name}") for name in _LOOP_STATE)
-    target = Value(b, "target")
-    shifts = _STEP_MM * np.concatenate([np.eye(3), -np.eye(3)])
-    around = b.concat([d + b.constant(shift[None]) for shift in shifts], axis=0)
-    moved = b.parts(_images(b, rig, vectors, around), 6, axis=0)
-    J = [(ahead - behind) * (0.5 / _STEP_MM) for ahead, behind in zip(moved[:3], moved[3:], strict=True)]
-    step = _damped_step(b, J, _images(b, rig, vectors, d) - target, damping)
-    trial = d - step
-    trial_cost = _cost(b, _images(b, rig, vectors, trial) - target)
-    better = b.op("LessOrEqual", trial_cost, cost)
-    b.op("Where", better, trial, d, name="b_d_out")
-    b.op("Where", better, trial_cost, cost, name="b_cost_out")
+    point, trial, damping = (Value(b, f"b_{name}") for name in _LOOP_STATE)
+    tried = b.concat([trial, _measured(b, rig, vectors, trial)])
+    place = b.constant([3], np.int64)
+    cost, cost_tried = (b.op("Gather", x, place, axis=1) for x in (point, tried))
+    better = b.op("LessOrEqual", cost_tried, cost)
+    kept = b.op("Where", better, tried, point, name="b_point_out")
     reduced = b.op("Max", damping * 0.1, _MIN_DAMPING)
-    b.op("Where", better, reduced, damping * 10.0, name="b_damping_out")
+    amount = b.op("Where", better, reduced, damping * 10.0, name="b_damping_out")
+    d, _, slope, gauss_newton, newton = b.columns_of(kept, list(_POINT.values()))
+    minors, determinant = _minors(b, newton)
+    leading = b.concat([newton @ np.eye(6)[:, :1], minors @ np.eye(6)[:, 5:], determinant])
+    definite = b.op("Greater", b.op("ReduceMin", leading, axes=[1], keepdims=1), 0.0)
+    late = b.op("GreaterOrEqual", Value(b, "b_count"), b.constant(_FIRST_NEWTON, np.int64))
+    on_diagonal = np.outer([1, 0, 0, 1, 0, 1], [1, 0, 0, 1, 0, 1]) / 3.0
+    hessian = b.op("Where", b.op("And", definite, late), newton, gauss_newton) + (gauss_newton @ on_diagonal) * amount
+    minors, determinant = _minors(b, hessian)
+    products = (minors @ np.eye(6)[:, _PLACE.ravel()]) * (slope @ np.tile(np.eye(3), 3))
+    step = (products @ np.repeat(np.eye(3), 3, axis=0)) / determinant
+    b.op("Sub", d, step, name="b_trial_out")
     # comparisons with NaN are false, so rows with NaN do not keep the loop running
     long = b.op("Greater", b.op("Abs", step), _CONVERGED_MM)
     moving = b.op("ReduceSum", b.op("Cast", long, to=TensorProto.INT64), keepdims=0)
@@ -155,23 +179,39 @@ def _body(rig: JawRig, vectors: Array) -> onnx.GraphProto:
     return helper.make_graph(b.nodes, "step", inputs, outputs, b.initializers)
 
 
-def _damped_step(g: Graph, J: list[Value], r: Value, damping: Value) -> Value:
-    """Return (J^T J + damping tr/3)^-1 J^T r by Cramer's rule, shape (n, 3), for three columns J (n, 12) each."""
-    products = {(i, j): g.sum_columns(J[i] * J[j]) for i in range(3) for j in range(i, 3)}
-    extra = (products[0, 0] + products[1, 1] + products[2, 2]) * damping * (1.0 / 3.0)
+def _measured(g: Graph, rig: JawRig, vectors: Array, d: Value) -> Value:
+    """Return the columns of `_POINT` after d at points d (n, 3), from central and mixed differences of the images."""
+    unit = np.eye(3)
+    mixed = [unit[i] + unit[j] for i, j in _PAIRS if i != j]
+    shifts = _STEP_MM * np.array([np.zeros(3), *unit, *-unit, *mixed])
+    around = g.reshape(g.reshape(d, [-1, 1, 3]) + g.constant(shifts[None]), [-1, 3])
+    target = g.reshape(Value(g, "target"), [-1, 1, 12])
+    offsets = g.reshape(_images(g, rig, vectors, around), [-1, 10, 12]) - target
+    at = np.eye(10)
+    centre, ahead, behind, both = at[0], at[1:4], at[4:7], iter(at[7:])
+    first = (ahead - behind) / (2.0 * _STEP_MM)
+    second = [
+        (ahead[i] + behind[i] - 2.0 * centre if i == j else next(both) - ahead[i] - ahead[j] + centre) / _STEP_MM**2
+        for i, j in _PAIRS
+    ]
+    differences = np.array([at[0], *first, *second])
+    derivatives, low = (g.op("MatMul", g.constant(rows), offsets) for rows in (differences, differences[:4]))
+    products = g.op("MatMul", derivatives, g.op("Transpose", low, perm=[0, 2, 1]))
+    return g.reshape(products, [-1, 40]) @ _selection()
 
-    def column(j: int) -> Triple[Value]:
-        x, y, z = (
-            products[min(i, j), max(i, j)] + extra if i == j else products[min(i, j), max(i, j)] for i in range(3)
-        )
-        return x, y, z
 
-    columns = [column(j) for j in range(3)]
-    gx, gy, gz = (g.sum_columns(column * r) for column in J)
-    minors = [cross(columns[(j + 1) % 3], columns[(j + 2) % 3]) for j in range(3)]
-    determinant = dot(columns[0], minors[0])
-    return g.concat([dot((gx, gy, gz), minor) for minor in minors]) / determinant
+def _selection() -> Array:
+    """Return the matrix (40, 16) from products of residual and derivatives (10, 4) to the columns of `_POINT`."""
+    place = np.eye(40).reshape(10, 4, 40)
+    gauss_newton = [place[1 + i, 1 + j] for i, j in _PAIRS]
+    newton = [product + place[4 + k, 0] for k, product in enumerate(gauss_newton)]
+    return np.array([place[0, 0], *place[1:4, 0], *gauss_newton, *newton]).T
 
 
-def _cost(g: Graph, r: Value) -> Value:
-    return g.sum_columns(r * r)
+def _minors(g: Graph, matrix: Value) -> tuple[Value, Value]:
+    """Return the adjugates (n, 6) and determinants (n, 1) of symmetric matrices (n, 6)."""
+    xx, xy, xz, yy, yz, zz = range(6)
+    factors = ((yy, xz, xy, xx, xy, xx), (zz, yz, yz, zz, xz, yy), (yz, xy, xz, xz, xx, xy), (yz, zz, yy, xz, yz, xy))
+    a, b, c, e = (matrix @ np.eye(6)[:, columns] for columns in factors)
+    minors = a * b - c * e
+    return minors, (matrix * minors) @ np.array([[1.0], [1.0], [1.0], [0.0], [0.0], [0.0]])

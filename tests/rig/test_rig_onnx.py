@@ -14,6 +14,7 @@ from example_model import example_arrays, example_meta
 from example_people import save
 from example_rig import FPS, example_meshes, example_rig, mandible_vertices, moved, touching_rig
 from onnx.reference import ReferenceEvaluator
+from scipy.optimize import least_squares
 
 import jawusd
 from jawusd.base.errors import FormatError, RigError
@@ -124,6 +125,26 @@ def test_encoder_finds_what_the_evaluator_finds_for_noisy_poses(kind):
     found, residual = search(rig, T, np.float64)
     np.testing.assert_allclose(found, expected, atol=1e-5)
     np.testing.assert_allclose(residual, distance, atol=1e-9)
+
+
+def test_encoder_finds_the_bottom_for_poses_far_from_the_model(kind):
+    """Gauss-Newton alone is slow there; scipy finds no better d around the result."""
+    rig = example_rig(kind)
+    rng = np.random.default_rng(10)
+    noise = se3_exp(rng.normal(size=(40, 6)) * [0.1, 0.1, 0.1, 6.0, 6.0, 6.0])
+    T = noise @ rig.pose(sample_valid(rig, 40, seed=11))
+    found, residual = search(rig, T, np.float64)
+    assert np.median(residual) > 5.0
+    landmarks = np.column_stack([rig.landmarks, np.ones(len(rig.landmarks))])
+    for start, pose, distance in zip(found, T, residual):
+
+        def offsets(d, pose=pose):
+            return ((rig.pose(d) - pose)[:3] @ landmarks.T).ravel() / np.sqrt(len(landmarks))
+
+        best = least_squares(offsets, start, x_scale=5.0, xtol=1e-15, ftol=1e-15, gtol=1e-12)
+        assert np.linalg.norm(offsets(start)) == pytest.approx(distance, abs=1e-6)
+        assert distance - np.linalg.norm(best.fun) < 1e-6
+        np.testing.assert_allclose(start, best.x, atol=5e-3)
 
 
 def test_encoder_keeps_nan_in_its_row_and_takes_empty_batches(kind):
