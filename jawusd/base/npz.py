@@ -84,6 +84,8 @@ def check_format(found: object, family: str, version: int, path: str | os.PathLi
         FormatError: another format, or no label.
         VersionError: a newer version.
     """
+    if found is None:
+        raise FormatError(f'states no format; its format must be "{family}/{version}".', path=path)
     name, _, number = str(found).partition("/")
     if name != family or not (number.isascii() and number.isdigit() and len(number) < 10):
         raise FormatError(f'format is "{found}", expected "{family}/{version}".', path=path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import itertools
 import re
 import shlex
 import signal
@@ -79,7 +80,7 @@ CONTEXT = {"help_option_names": ["-h", "--help"]}
 
 _WORDS = "jawusd.words"  # context key of a command's arguments
 _VECTOR = re.compile(r" *[-+]?[\d.eE+-]+((, *| +)[-+]?[\d.eE+-]+){2} *")
-_VECTORS = ("--d", "--point", "--target", "--start")
+_VECTORS, _VECTOR_LENGTH = ("--d", "--point", "--target", "--start"), 3
 
 # Messages about the results that interrupted commands keep, and about how to resume; commands not listed write complete
 # files at the end.
@@ -149,7 +150,12 @@ class Command(TyperCommand):
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]  # click has its own Context
         """Accept vectors such as `--d 20,2,1`, and store the arguments for `command_line`."""
         ctx.meta[_WORDS] = list(args)
-        return super().parse_args(ctx, with_vectors_split(args))
+        words = with_vectors_split(args)
+        for at, option in enumerate(words):
+            if option in _VECTORS:
+                values = itertools.takewhile(lambda word: not word.startswith("--"), words[at + 1 :])
+                _check_vector(option, list(itertools.islice(values, _VECTOR_LENGTH)))
+        return super().parse_args(ctx, words)
 
     def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]  # as above
         """Run the command; on Ctrl+C, print which results are kept."""
@@ -180,6 +186,17 @@ def with_vectors_split(args: list[str]) -> list[str]:
         else:
             out.append(word)
     return out
+
+
+def _check_vector(option: str, values: Sequence[str]) -> None:
+    """Raise typer.BadParameter unless the words after a vector option are three numbers."""
+    try:
+        count = len([float(word) for word in values])
+    except ValueError:
+        count = 0
+    if count != _VECTOR_LENGTH:
+        said = f'needs three numbers, such as 20,2,1; found "{" ".join(values)}".'
+        raise typer.BadParameter(said, param_hint=option)
 
 
 class _StoppedError(KeyboardInterrupt):

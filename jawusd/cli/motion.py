@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import FormatError, naming_file
 from jawusd.base.inputs import check_input
 from jawusd.cli.options import USD_SUFFIXES
 from jawusd.cli.output import emit
@@ -66,7 +66,17 @@ def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
     Raises:
         FormatError: the file is invalid.
     """
+    with naming_file(source):
+        return _read_motion(rig, source)
+
+
+def _read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
     check_input(source)
+    if source.suffix.lower() == ".npz":
+        raise FormatError(
+            "is an npz file; keys, or a table of d or of poses, are needed.",
+            hint="`jawusd encode` writes the d of tracks as a table.",
+        )
     if source.suffix.lower() == ".json" and source.read_bytes().lstrip()[:1] == b"{":
         keys = load_keys(source)
         key_frames, key_d = keys.arrays()

@@ -31,7 +31,8 @@ class Key(BaseModel):
 
     frame: Finite = Field(description="a number")
     d: tuple[_Parameter, _Parameter, _Parameter] = Field(
-        description=f"three numbers: opening, lateral, protrusion [mm], each within +-{FARTHEST_MM:g}"
+        description="three numbers: d1, d2, d3 (opening, laterotrusion, protrusion) [mm], "
+        f"each within +-{FARTHEST_MM:g}"
     )
 
 

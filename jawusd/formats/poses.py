@@ -38,6 +38,7 @@ _MAX_BYTES = 1 << 30
 # Maximum rigidity defect of a matrix, which accepts matrices written with 5 decimals.
 _RIGID_TOLERANCE = 1e-3
 _ZERO_QUATERNION = 1e-6
+_SHOWN = 60  # maximum length of a line in messages [characters]
 _JOINT_COLUMNS = "shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,qz,clamped_mm"
 
 
@@ -47,9 +48,37 @@ def _read_table(path: Path) -> TextTable:
     else:
         table = _json_table(path)
     named = [name for name in table.header if name]
+    if named and all(map(_is_number, named)):
+        raise FormatError(
+            f"has numbers in its first line: {', '.join(named):.{_SHOWN}}.",
+            path=path,
+            hint="The first line must name the columns, such as frame, d1, d2, d3.",
+        )
     if len(set(named)) != len(named):
         raise FormatError(f"has a duplicate column: {', '.join(named)}.", path=path)
     return table
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _header_hint(table: TextTable) -> str:
+    """Return what to change in a table without the columns of parameters or poses."""
+    lower = {name.lower() for name in table.header}
+    if {"frame", *PARAMETER_COLUMNS} <= lower:
+        return "Write the column names in lower case."
+    if "jawopen" in lower:
+        return "ARKit face captures are read by `jawusd animate RIG --arkit`."
+    if len(table.header) == 1 and len(table.header[0].split()) > 1:
+        return "Separate the columns by commas."
+    if "d" in lower:
+        return 'Write keys as {"fps": 24, "keys": [{"frame": 1, "d": [0, 0, 0]}]}.'
+    return "Name the columns frame, d1, d2, d3: opening, laterotrusion and protrusion in mm."
 
 
 def _json_table(path: Path) -> TextTable:
@@ -125,10 +154,11 @@ def read_poses_or_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.i
         return _parameters_of(table)
     if not any({*names} <= {*table.header} for names in (MATRIX_COLUMNS[:12], QUATERNION_COLUMNS)):
         raise FormatError(
-            f"has neither the columns {', '.join(PARAMETER_COLUMNS)} (opening, lateral, protrusion [mm]) nor "
-            f"{MATRIX_COLUMNS[0]} ... {MATRIX_COLUMNS[11]} nor {', '.join(QUATERNION_COLUMNS)} (poses); "
+            f"has neither the columns {', '.join(PARAMETER_COLUMNS)} nor those of poses, "
+            f"{MATRIX_COLUMNS[0]} ... {MATRIX_COLUMNS[11]} or {', '.join(QUATERNION_COLUMNS)}; "
             f"it has {_listed(table)}.",
             path=table.path,
+            hint=_header_hint(table),
         )
     return _poses_of(table, None)
 

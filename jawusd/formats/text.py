@@ -119,7 +119,7 @@ def _fault(error: ValidationError, model: type[BaseModel]) -> str:
         return str(problem["ctx"]["error"])
     if kind == "extra_forbidden" and above is not None:
         return f'{where}unknown key "{name}"; allowed keys: {", ".join(above.model_fields)}'
-    found = "" if isinstance(given, dict | list) else f", found {json.dumps(given, default=str):.80}"
+    found = "" if isinstance(given, dict) else f", found {json.dumps(given, default=str):.{_SHOWN}}"
     return f"{where}{name} needs {needed}{found}"
 
 

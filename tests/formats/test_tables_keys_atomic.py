@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jawusd.base.errors import FormatError, OutputError
+from jawusd.base.npz import check_format
 from jawusd.formats.atomic import atomic_path, write_bytes_atomic
 from jawusd.formats.keys import Key, Keys, load_keys, save_keys
 from jawusd.formats.poses import read_parameters, read_poses, write_parameters, write_poses
@@ -79,7 +80,8 @@ def test_keys_round_trip_and_faults(tmp_path):
         ('{"fps": 24, "keys": []}', "keys"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 1, "d": [0,0,0]}]}', "must increase"),
         ('{"fps": 0, "keys": [{"frame": 1, "d": [0,0,0]}]}', "fps"),
-        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0]}]}', "keys, entry 1: d needs three numbers: opening, "),
+        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0]}]}', r"keys, entry 1: d needs three numbers: d1, d2, d3 .*, "
+         r"found \[0, 0\]"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [1e300,0,0]}]}', r"entry 1: d needs three.*found 1e\+300"),
         ('{"fps": 24, "keys": [{"frame": 1}]}', "keys, entry 1: d needs three numbers"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 2, "d": [0,"x",0]}]}', 'entry 2: d needs .*"x"'),
@@ -94,6 +96,11 @@ def test_keys_round_trip_and_faults(tmp_path):
         (tmp_path / "k2.json").write_text(text)
         with pytest.raises(FormatError, match=words):
             load_keys(tmp_path / "k2.json")
+
+
+def test_a_file_without_a_format_is_told_which_one_it_needs(tmp_path):
+    with pytest.raises(FormatError, match='states no format; its format must be "jawusd-landmarks/1"'):
+        check_format(None, "jawusd-landmarks", 1, tmp_path)
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_scraps(tmp_path):

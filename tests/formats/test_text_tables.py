@@ -190,9 +190,26 @@ def test_a_table_of_neither_poses_nor_d_is_told_of_both(tmp_path):
     with pytest.raises(FormatError) as error:
         read_poses_or_parameters(tmp_path / "d.csv")
     words = (
-        "d1, d2, d3 (opening, lateral, protrusion [mm])",
+        "Name the columns frame, d1, d2, d3: opening, laterotrusion and protrusion in mm.",
         "m00 ... m23",
         "tx, ty",
         "it has frame, opening, lateral",
     )
     assert all(word in str(error.value) for word in words)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("d.csv", "Frame,D1,D2,D3\n1,0,0,0\n", "it has Frame, D1, D2, D3. Write the column names in lower case."),
+        ("d.csv", "frame d1 d2 d3\n1 0 0 0\n", "Separate the columns by commas."),
+        ("d.csv", "Timecode,JawOpen\n1,0.5\n", "jawusd animate RIG --arkit"),
+        ("d.csv", "1,0,0,0\n2,5,0,0\n", "numbers in its first line: 1, 0, 0, 0. The first line must name the columns"),
+        ("d.json", '[{"frame": 1, "d": [0, 0, 0]}]', 'Write keys as {"fps": 24, "keys": '),
+    ],
+)
+def test_mistakes_of_beginners_in_tables_of_d_are_told_what_to_write(tmp_path, name, text, words):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(FormatError) as error:
+        read_poses_or_parameters(tmp_path / name)
+    assert words in str(error.value)
