@@ -13,7 +13,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -34,14 +36,21 @@ from jawusd.pipeline.pictures import open_wall
 from jawusd.pipeline.report import run_paper_experiments
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import subject_of_build
-from jawusd.pipeline.view import ContactView, open_viewer
+from jawusd.pipeline.view import ContactView, open_viewer, viewed_actor
 from jawusd.report.style import BLUE, VERMILION, figure_bytes
 from jawusd.rig import describe
+from jawusd.viewer.readouts import rest_places
+from jawusd.viewer.scene import preset_view
+from jawusd.viewer.server import Viewer
 
 ROOT = Path(__file__).resolve().parents[1]
 CAPTURE = ROOT / "examples" / "capture"
 FIRST, FRAMES, STEP = 128, 120, 2  # of the clips: opens wide and moves to the side; every second frame, in real time
 TILE_PX = (320, 240)
+JAW_FRAMES = (42, 139)  # of the take, from one closed bite to the next
+JAW_PX, PANELS_PX = (640, 480), (324, 364)  # size of the picture, and of the panels to its left and right
+JAW_FROM_MM, JAW_AIM_MM = np.array([132.0, 0.0, 205.0]), np.array([0.0, -34.0, 0.0])  # camera and aim off the jaw
+DRAWN_MS = 700  # until a pose is drawn without a graphics card
 PATIENCE_MS = 120_000  # for the page of the viewer, drawn without a graphics card
 
 
@@ -149,8 +158,9 @@ def condyles(out: Path, folder: Path) -> Path:
     return save_webp(folder / "condyles.webp", drawn(condyle_figure(found)), 1100)
 
 
-def viewer(out: Path, folder: Path) -> Path:
-    """Photograph the page of `jawusd view` in Chromium, a pose with the teeth apart."""
+@contextlib.contextmanager
+def viewed(out: Path, size_px: tuple[int, int]) -> Iterator[tuple[Viewer, Any]]:
+    """Open the page of `jawusd view` in Chromium, and yield its server and the page."""
     names = ("chromium", "chromium-browser", "google-chrome", "chrome")
     program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
     try:
@@ -165,12 +175,18 @@ def viewer(out: Path, folder: Path) -> Path:
         stack.callback(served.stop)
         playwright = stack.enter_context(sync_playwright())
         page = playwright.chromium.launch(executable_path=program, args=arguments).new_page(
-            viewport={"width": 1440, "height": 900}
+            viewport=dict(zip(("width", "height"), size_px, strict=True))
         )
         page.set_default_timeout(PATIENCE_MS)
         page.goto(served.url)
         page.wait_for_selector("text=nearest captured")
         page.locator(".mantine-Notification-closeButton").first.click()  # "Software WebGL" lies over the jaw
+        yield served, page
+
+
+def viewer(out: Path, folder: Path) -> Path:
+    """Photograph the page of `jawusd view`, a pose with the teeth apart."""
+    with viewed(out, (1440, 900)) as (_, page):
         for index, value in enumerate((18.0, 3.0, 1.0)):
             box = page.locator("input.mantine-NumberInput-input:visible").nth(index)
             box.fill(str(value))
@@ -178,6 +194,29 @@ def viewer(out: Path, folder: Path) -> Path:
         page.wait_for_timeout(4000)  # the last frame is drawn
         picture = page.screenshot()
     return save_webp(folder / "viewer.webp", Image.open(io.BytesIO(picture)), 1200)
+
+
+def jaw(out: Path, folder: Path, step: int = STEP) -> Path:
+    """Photograph a part of the captured take from one closed bite to the next, as a loop."""
+    pictures = []
+    (width, height), left = JAW_PX, PANELS_PX[0]
+    with viewed(out, (width + sum(PANELS_PX), height)) as (served, page):
+        actor = viewed_actor(out)
+        clip = actor.load_clip(actor.take)
+        (shown,) = served.pages.values()
+        shown.scene.show_paths(False)
+        target = preset_view(rest_places(actor.rig), "front")[0] + JAW_AIM_MM
+        camera = shown.client.camera
+        camera.position, camera.look_at = tuple(target + JAW_FROM_MM), tuple(target)
+        for frame in range(*JAW_FRAMES, step):
+            served.show(clip.at(frame))
+            page.wait_for_timeout(DRAWN_MS)
+            picture = page.screenshot(clip={"x": left, "y": 0, "width": width, "height": height})
+            pictures.append(Image.open(io.BytesIO(picture)).convert("RGB"))
+    path = folder / "jaw.webp"
+    pause_ms = round(1000 * step / clip.fps)
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=pause_ms, loop=0, quality=70, method=6)
+    return path
 
 
 def face_solver(out: Path, folder: Path) -> Path:
@@ -207,7 +246,7 @@ def blender(out: Path, folder: Path, frames: int = FRAMES) -> Path:
     return path
 
 
-PICTURES = {made.__name__: made for made in (overlay, envelope, contacts, condyles, viewer, face_solver, blender)}
+PICTURES = {made.__name__: made for made in (overlay, envelope, contacts, condyles, viewer, jaw, face_solver, blender)}
 
 
 def main() -> int:

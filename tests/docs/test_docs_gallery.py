@@ -29,6 +29,12 @@ def pixels(path):
     return np.asarray(Image.open(path).convert("RGB"), dtype=float)
 
 
+def frame_of(picture, frame):
+    """Return a frame of an animation as RGB floats (h, w, 3)."""
+    picture.seek(frame)
+    return np.asarray(picture.convert("RGB"), dtype=float)
+
+
 def near(picture, color, within=24.0):
     """Return the share of pixels of a colour, those that packing has changed a little included."""
     return float((np.abs(picture - np.array(color)).max(axis=-1) < within).mean())
@@ -39,6 +45,15 @@ def test_the_page_shows_every_picture_and_each_has_its_function(gallery):
     stored = sorted(path.stem for path in FOLDER.iterdir())
     assert sorted(shown) == stored == sorted(gallery.PICTURES)
     assert sum(path.stat().st_size for path in FOLDER.iterdir()) < MOST_BYTES
+
+
+def test_the_jaw_on_the_first_page_moves_in_a_loop(gallery):
+    with Image.open(FOLDER / "jaw.webp") as picture:
+        assert picture.n_frames == len(range(*gallery.JAW_FRAMES, gallery.STEP)) and picture.info["loop"] == 0
+        closed, opened = (frame_of(picture, frame) for frame in (0, 9))
+    assert np.abs(closed - opened).mean() > 5
+    for page in ("README.md", "docs/index.md"):
+        assert re.search(r"\]\((docs/)?gallery/jaw\.webp\)", (ROOT / page).read_text())
 
 
 def test_the_border_is_where_the_bound_ends(example_build, gallery):
@@ -73,9 +88,12 @@ def test_condyles_overlay_and_viewer(example_build, gallery, tmp_path):
     assert all(near(frame, (0, 200, 255), 60) > 0.001 for frame in frames)  # outlines of the lower teeth
     try:
         picture = pixels(gallery.viewer(example_build[0], tmp_path))
+        moving = Image.open(gallery.jaw(example_build[0], tmp_path, step=40))
     except gallery.NotInstalledError as needed:
         pytest.skip(str(needed))
     assert near(picture, (236, 229, 212), 40) > 0.005  # enamel
+    assert moving.n_frames == 3 and moving.size == gallery.JAW_PX
+    assert all(near(frame_of(moving, frame), (236, 229, 212), 40) > 0.005 for frame in range(3))
 
 
 @pytest.mark.slow
