@@ -14,6 +14,7 @@ from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.contact import PREFIXES, check_contact
 from jawusd.evaluator.schema import ANCHORED, KINDS, OPTIONAL, arrays_of
 from jawusd.evaluator.speeds import check_speeds
+from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import rigidity_defect
 
 _RIGID_TOLERANCE = 1e-6
@@ -100,6 +101,16 @@ class RigArrays:
     def landmarks(self) -> Array:
         """Landmarks of the mandible [mm], mandible frame, shape (n, 3)."""
         return self.arrays["landmarks"]
+
+    @property
+    def landmark_sigma_mm(self) -> Array:
+        """Root mean square error of the model at its landmarks [mm], from held-out frames, shape (n,); 0 if unknown."""
+        known = self.meta.get("uncertainty")
+        if not isinstance(known, dict) or len(self.landmarks) != len(LANDMARKS):
+            return np.zeros(len(self.landmarks))
+        tables = [known.get(name) for name in LANDMARKS]
+        found = [table.get("base_mm", 0.0) if isinstance(table, dict) else 0.0 for table in tables]
+        return np.array([float(x) if isinstance(x, int | float) and 0 < x < _LARGEST else 0.0 for x in found])
 
     @property
     def incisor(self) -> Array:

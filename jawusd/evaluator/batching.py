@@ -21,10 +21,10 @@ def as_floats(values: ArrayLike, name: str) -> Array:
     """Return values as float64.
 
     Raises:
-        ValueError: complex numbers.
+        ValueError: complex numbers, text, or objects.
     """
     found = np.asarray(values)
-    if found.dtype.kind == "c":
+    if found.dtype.kind not in "biuf":
         raise ValueError(f"{name} must be real numbers, got {found.dtype}")
     return np.asarray(found, dtype=np.float64)
 
@@ -33,7 +33,7 @@ def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
     """Return values as float64 rows (n, *tail) and the batch shape.
 
     Raises:
-        ValueError: the trailing axes are not ``tail``, or complex numbers.
+        ValueError: the trailing axes are not ``tail``, or what `as_floats` rejects.
     """
     values = as_floats(values, name)
     if values.shape == tail:  # fast path for one row

@@ -23,6 +23,7 @@ from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.solver import Residual, minimise
 from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log
+from jawusd.geometry.so3 import hat
 
 # x (k, 3) -> rotations (k, 3, 3), translations (k, 3), spatial derivatives (k, 6, 3)
 Derivative = Callable[[Array], tuple[Array, Array, Array]]
@@ -30,6 +31,7 @@ Derivative = Callable[[Array], tuple[Array, Array, Array]]
 # Weight of a distance along the sight relative to one across it. It matters only at the bound: elsewhere, two equations
 # across the sight and one along it determine d.
 _DEPTH_WEIGHT = 0.1
+_MIN_PRECISION = 1e-12  # addition to precisions of d, relative to their trace
 
 
 def landmark_vectors(landmarks: Array) -> Array:
@@ -151,6 +153,21 @@ class Encoding(NamedTuple):
     residual_mm: Array
 
 
+class WeightedEncoding(NamedTuple):
+    """Result of `JawRig.encode` with a covariance.
+
+    Attributes:
+        d: The most likely jaw parameters [mm], shape (..., 3).
+        residual_mm: RMS landmark distance of their pose, shape (...).
+        covariance: Covariance of d [mm^2], shape (..., 3, 3): that of the noise of the pose, and that of the rig's own
+            error where the rig states it.
+    """
+
+    d: Array
+    residual_mm: Array
+    covariance: Array
+
+
 class Encoder:
     """Encoder of poses for one model, in numpy.
 
@@ -195,19 +212,59 @@ class Encoder:
         whitening = whitening @ self._frames.adjoint
 
         def residual(d: Array, rows: Indices) -> tuple[Array, Array]:
-            R_d, t_d, S = self._model.decode_derivative(d)
-            xi = se3_log(measured[rows] @ se3_inverse(make_transform(R_d, t_d)))
-            W = whitening[rows]
-            # exp(xi(d + e)) = exp(xi) exp(-S e), and the right Jacobian is the left one at -xi
-            return np.einsum("nij,nj->ni", W, xi), -W @ se3_left_jacobian_inverse(-xi) @ S
+            return self._whitened(d, measured[rows], whitening[rows])
 
         return minimise(residual, start, bound)
+
+    def covariance(self, d: Array, T: Array, whitening: Array, own: Array) -> Array:
+        """Return the covariances (n, 3, 3) [mm^2] of the most likely d (n, 3), disregarding the bound.
+
+        With J the derivative of ``W xi``, that of noise is ``(J^T J)^-1``, and a second error of the pose with
+        covariance O adds ``G O G^T`` with the gain ``G = (J^T J)^-1 J^T W`` (Barfoot 2017, section 3.1).
+
+        Args:
+            d, T, whitening: As for `most_likely`.
+            own: Covariance O of the rig's own error, (omega, v), skull frame, shape (n, 6, 6).
+        """
+        known = np.isfinite(d).all(axis=1)
+        found = np.full((len(d), 3, 3), np.nan)
+        measured = make_transform(*self._frames.motions(T[known]))
+        _, J = self._whitened(d[known], measured, whitening[known] @ self._frames.adjoint)
+        precision = np.swapaxes(J, 1, 2) @ J
+        # where a parameter does not move the jaw, its variance is large, not infinite
+        floor = _MIN_PRECISION * np.einsum("nii->n", precision)[:, None, None] * np.eye(3)
+        noise = np.linalg.inv(precision + floor)
+        gain = noise @ np.swapaxes(J, 1, 2) @ whitening[known]
+        found[known] = noise + gain @ own[known] @ np.swapaxes(gain, 1, 2)
+        return found
+
+    def _whitened(self, d: Array, measured: Array, W: Array) -> tuple[Array, Array]:
+        """Return ``W xi`` (n, 6) with ``measured = exp(xi) motion(d)``, and its derivative (n, 6, 3) in d."""
+        R_d, t_d, S = self._model.decode_derivative(d)
+        xi = se3_log(measured @ se3_inverse(make_transform(R_d, t_d)))
+        # exp(xi(d + e)) = exp(xi) exp(-S e), and the right Jacobian is the left one at -xi
+        return np.einsum("nij,nj->ni", W, xi), -W @ se3_left_jacobian_inverse(-xi) @ S
 
 
 def nearest_in_chart(model: JawModelForm, R: Array, t: Array, vectors: Array) -> Array:
     """Return the chart coordinates (n, 3) whose motions are nearest to motions R (n, 3, 3), t (n, 3) [mm]."""
     residual = distance_residual(model.chart_derivative, Handles(vectors), vector_images(R, t, vectors))
     return minimise(residual, model.chart_start(R, t))
+
+
+def covariance_of_points(points: Array, sigma_mm: Array) -> Array:
+    """Return covariances of twists (omega [rad], v [mm]) that reproduce the errors of points, shape (n, 6, 6).
+
+    Args:
+        points: Positions of points of a rigid body [mm], shape (n, p, 3).
+        sigma_mm: Root mean square errors of the points, shape (p,); if one is 0, the result is 0.
+    """
+    if not sigma_mm.all():
+        return np.zeros((len(points), 6, 6))
+    J = np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)
+    precision = np.einsum("npki,npkj,p->nij", J, J, 3.0 / sigma_mm**2)
+    # the points of a rigid body are not independent measurements of its pose
+    return np.asarray(np.linalg.inv(precision) * len(sigma_mm) / 2.0)
 
 
 def whitening_of(covariance: Array) -> Array:

@@ -24,6 +24,11 @@ SINGLE_LIMIT_MM = 1e4  # maximum |d|; beyond it, float functions may raise where
 _scalar = cast("Callable[[float], Array]", np.float64)  # numpy's stubs do not treat scalars as arrays
 
 
+def _scalar_or_array(values: Array) -> Array:
+    """Return values, or the number in a 0-dimensional array."""
+    return values[()]
+
+
 class RigJudging(RigClearance, RigArrays):
     """Margins and verdicts of a rig.
 
@@ -46,18 +51,18 @@ class RigJudging(RigClearance, RigArrays):
                 (d1, d2) and (d1, d3), whose margin is continuous but not smooth.
 
         Returns:
-            Margins [mm], shape (...).
+            Margins [mm], shape (...); a float for one d.
         """
         if bound != "slices":
             rows, batch = as_rows(d, (3,), "d")
-            return -in_chunks(self._polygons(bound).signed_distance, rows).reshape(batch)
+            return _scalar_or_array(-in_chunks(self._polygons(bound).signed_distance, rows).reshape(batch))
         d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
             if abs(d1) + abs(d2) + abs(d3) < SINGLE_LIMIT_MM:  # comparison is false for NaN
                 return _scalar(self.kernels.margin(d1, d2, d3))
         rows, batch = rows_of(d, (3,), "d")
-        return self.kernels.margins(rows).reshape(batch)
+        return _scalar_or_array(self.kernels.margins(rows).reshape(batch))
 
     def is_inside(self, d: ArrayLike, *, bound: BoundName = "slices") -> Mask:
         """Return whether jaw parameters d (..., 3) [mm] lie inside the bound: a margin of 0 or more.

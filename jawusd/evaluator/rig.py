@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +17,16 @@ from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import PolygonBound, SliceHull
 from jawusd.evaluator.contact import ContactField
-from jawusd.evaluator.encoding import Encoder, Encoding, Handles, point_velocities, vector_images, whitening_of
+from jawusd.evaluator.encoding import (
+    Encoder,
+    Encoding,
+    Handles,
+    WeightedEncoding,
+    covariance_of_points,
+    point_velocities,
+    vector_images,
+    whitening_of,
+)
 from jawusd.evaluator.judging import SINGLE_LIMIT_MM, RigJudging
 from jawusd.evaluator.kernels import NumpyKernels, RigParts
 from jawusd.evaluator.models import FORMS
@@ -132,9 +142,40 @@ class JawRig(RigJudging, RigAuthoring):
 
         return in_chunks(derivative, rows).reshape(*batch, *points.shape, 3)
 
+    def pose_covariance(self, T_skull_mandible: ArrayLike) -> Array:
+        """Return the covariance (..., 6, 6) of the rig's own error at poses (..., 4, 4).
+
+        It is that of xi, (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``, and reproduces
+        `landmark_sigma_mm`; 0 where the rig does not state these.
+        """
+        rows, batch = as_rows(T_skull_mandible, (4, 4), "T_skull_mandible")
+        points = transform_points(rows, self.landmarks[None])
+        return covariance_of_points(points, self.landmark_sigma_mm).reshape(*batch, 6, 6)
+
+    def parameter_covariance(self, d: ArrayLike) -> Array:
+        """Return the covariance (..., 3, 3) [mm^2] of d (..., 3) [mm] that follows from the rig's own error.
+
+        It is 0 where the rig does not state its error.
+        """
+        rows, batch = as_rows(d, (3,), "d")
+        if not self.landmark_sigma_mm.all():
+            return np.zeros((*batch, 3, 3))
+        poses = self.kernels.poses(rows)
+        whitening = whitening_of(self.pose_covariance(poses))
+        none = np.zeros((len(rows), 6, 6))
+        return self._encoder.covariance(rows, poses, whitening, none).reshape(*batch, 3, 3)
+
+    @overload
+    def encode(self, T_skull_mandible: ArrayLike, *, inside: bool = False, covariance: None = None) -> Encoding: ...
+
+    @overload
+    def encode(
+        self, T_skull_mandible: ArrayLike, *, inside: bool = False, covariance: ArrayLike
+    ) -> WeightedEncoding: ...
+
     def encode(
         self, T_skull_mandible: ArrayLike, *, inside: bool = False, covariance: ArrayLike | None = None
-    ) -> Encoding:
+    ) -> Encoding | WeightedEncoding:
         """Return the jaw parameters whose pose is nearest to each given one.
 
         The distance is ``residual_mm``, the rms distance of the rig's landmarks between the two poses.
@@ -143,9 +184,9 @@ class JawRig(RigJudging, RigAuthoring):
             T_skull_mandible: Poses, shape (..., 4, 4). If a matrix is slightly non-rigid, the landmark positions it
                 yields are matched; matrices that are not rigid to 1e-3 give NaN.
             inside: Search only inside the bound.
-            covariance: If given, return the most likely instead of the nearest parameters of noisy poses. Covariance
-                of xi, (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``, shape (..., 6, 6) or
-                (6, 6).
+            covariance: If given, return the most likely instead of the nearest parameters of noisy poses, and their
+                covariance, which disregards the bound. Covariance of xi, (omega [rad], v [mm]) in the skull frame,
+                with ``T_true = exp(xi) T``, shape (..., 6, 6) or (6, 6).
 
         Raises:
             ValueError: wrong shapes, or a covariance that is not positive definite.
@@ -162,7 +203,7 @@ class JawRig(RigJudging, RigAuthoring):
             residual_mm[out] = in_chunks(lambda i: self._encoder.residual_mm(d[i], rows[i]), out)
         return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
 
-    def _encode_weighted(self, T_skull_mandible: ArrayLike, covariance: ArrayLike, inside: bool) -> Encoding:
+    def _encode_weighted(self, T_skull_mandible: ArrayLike, covariance: ArrayLike, inside: bool) -> WeightedEncoding:
         rows, batch = as_rows(T_skull_mandible, (4, 4), "T_skull_mandible")
         spread = np.broadcast_to(as_floats(covariance, "covariance"), (*batch, 6, 6))
         whitening = whitening_of(as_rows(spread, (6, 6), "covariance")[0])
@@ -174,8 +215,11 @@ class JawRig(RigJudging, RigAuthoring):
             d = self._encoder.most_likely(rows[i], whitening[i], first, self.bound if inside else None)
             return d, self._encoder.residual_mm(d, rows[i])
 
-        d, residual_mm = pairs_in_chunks(encode, np.arange(len(rows)))
-        return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
+        each = np.arange(len(rows))
+        d, residual_mm = pairs_in_chunks(encode, each)
+        own = self.pose_covariance(rows)
+        of_d = in_chunks(lambda i: self._encoder.covariance(d[i], rows[i], whitening[i], own[i]), each)
+        return WeightedEncoding(d.reshape(*batch, 3), residual_mm.reshape(batch), of_d.reshape(*batch, 3, 3))
 
     def margin_gradient(self, d: ArrayLike) -> Array:
         """Return the derivative of `margin` (slice bound) with respect to d [mm/mm], shape (..., 3), for d (..., 3)."""

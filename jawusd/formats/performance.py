@@ -53,6 +53,7 @@ class Performance:
         d: jaw parameters [mm], shape (F, 3).
         covariance: covariance of a head twist in head axes about `pivot` (omega [rad], v [mm]) and of d [mm], shape
             (F, 9, 9).
+        rig_covariance: covariance of d that follows from the rig's own error [mm^2], shape (F, 3, 3).
         pivot: reference point of the head twist, upper scan frame [mm], shape (3,).
         state: `SolveState`, shape (F,).
         found: arches whose outlines were used, (upper, lower), shape (F, 2).
@@ -70,6 +71,7 @@ class Performance:
     T_world_upper: Array
     d: Array
     covariance: Array
+    rig_covariance: Array
     pivot: Array
     state: NDArray[np.int8]
     found: Mask
@@ -85,8 +87,8 @@ class Performance:
 
     @property
     def sigma_d(self) -> Array:
-        """The standard deviations of d [mm], shape (F, 3)."""
-        return np.sqrt(np.einsum("fii->fi", self.covariance)[:, 6:])
+        """The standard deviations of d [mm], including the rig's own error, shape (F, 3)."""
+        return np.sqrt(np.einsum("fii->fi", self.covariance)[:, 6:] + np.einsum("fii->fi", self.rig_covariance))
 
 
 def write_performance(path: str | os.PathLike[str], performance: Performance, fps: float) -> None:

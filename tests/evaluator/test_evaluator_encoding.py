@@ -8,7 +8,9 @@ from scipy.optimize import minimize as scipy_minimize
 
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.solver import solve_symmetric
-from jawusd.geometry.se3 import se3_exp, se3_log
+from jawusd.geometry.anatomy import LANDMARKS
+from jawusd.geometry.se3 import se3_exp, se3_log, transform_points
+from jawusd.geometry.so3 import hat
 
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
 
@@ -101,7 +103,7 @@ def test_weighted_encode_minimises_the_mahalanobis_distance(rig):
     _, T = noisy_poses(rig, 20, 6)
     root = rng.normal(size=(20, 6, 6)) * 0.1 + np.diag([0.01] * 3 + [0.5] * 3)
     covariance = root @ np.swapaxes(root, 1, 2) + np.diag([1e-6] * 3 + [1e-3] * 3)
-    d, residual_mm = rig.encode(T, covariance=covariance)
+    d, residual_mm, _ = rig.encode(T, covariance=covariance)
     for i in range(20):
         precision = np.linalg.inv(covariance[i])
         oracle = scipy_minimize(
@@ -124,7 +126,7 @@ def test_weighted_encode_trusts_what_was_measured_well(rig):
     covariance = np.diag([1e-4] * 3 + [0.01] * 3)
     covariance[3:, 3:] += 25.0 * np.outer(x_skull, x_skull)
     plain, _ = rig.encode(T)
-    weighted, _ = rig.encode(T, covariance=covariance)
+    weighted, *_ = rig.encode(T, covariance=covariance)
     assert np.linalg.norm(weighted - d) < 0.3 * np.linalg.norm(plain - d)
 
 
@@ -132,16 +134,51 @@ def test_covariance_rows_with_nan_give_nan_and_bad_ones_are_refused(rig):
     d, T = noisy_poses(rig, 3, 7)
     covariance = np.tile(np.eye(6), (3, 1, 1))
     covariance[1] = np.nan
-    found, residual_mm = rig.encode(T, covariance=covariance)
-    assert np.isnan(found[1]).all() and np.isnan(residual_mm[1])
+    found, residual_mm, of_d = rig.encode(T, covariance=covariance)
+    assert np.isnan(found[1]).all() and np.isnan(residual_mm[1]) and np.isnan(of_d[1]).all()
+    assert np.isfinite(of_d[[0, 2]]).all()
     assert np.isfinite(found[[0, 2]]).all()
     with pytest.raises(ValueError, match="positive definite"):
         rig.encode(T, covariance=-np.eye(6))
 
 
+def test_covariance_of_d_is_that_of_its_errors(rig):
+    """Noise of the given covariance, and errors of the rig: squared errors over variances average to 1."""
+    rng = np.random.default_rng(8)
+    table = {name: {"base_mm": size} for name, size in zip(LANDMARKS, (0.3, 0.2, 0.25, 0.5, 0.4))}
+    unsure = JawRig(rig.arrays, {**rig.meta, "uncertainty": table})
+    d = rig.project(rng.uniform(*rig.d_range.T, (2000, 3)) * 0.8)
+    root = rng.normal(size=(6, 6)) * 0.2 * np.array([[0.004]] * 3 + [[0.3]] * 3) + np.diag([0.004] * 3 + [0.3] * 3)
+    covariance, T = root @ root.T, rig.pose(d)
+    noise = se3_exp(rng.normal(size=(2000, 6)) @ root.T)
+    own = se3_exp(np.einsum("nij,nj->ni", np.linalg.cholesky(unsure.pose_covariance(T)), rng.normal(size=(2000, 6))))
+    for judge, poses in ((rig, noise @ T), (unsure, noise @ own @ T)):
+        found, _, of_d = judge.encode(poses, covariance=covariance)
+        lengths = np.einsum("ni,nij,nj->n", found - d, np.linalg.inv(of_d), found - d) / 3.0
+        assert lengths.mean() == pytest.approx(1.0, abs=0.08)
+    assert judge.encode(T[0], covariance=covariance).covariance.shape == (3, 3)
+    assert (np.linalg.eigvalsh(of_d - rig.encode(poses, covariance=covariance).covariance) > -1e-9).all()
+
+
+def test_own_error_of_a_rig_is_that_of_its_landmarks(rig):
+    assert not rig.landmark_sigma_mm.any() and not rig.pose_covariance(rig.T_rest).any()
+    assert not rig.parameter_covariance([10.0, 0.0, 0.0]).any()
+    table = {name: {"base_mm": 0.3} for name in LANDMARKS}
+    unsure = JawRig(rig.arrays, {**rig.meta, "uncertainty": table})
+    d = np.array([10.0, 1.0, 0.5])
+    points = transform_points(unsure.pose(d), unsure.landmarks)
+    J = np.concatenate([-hat(points), np.tile(np.eye(3), (5, 1, 1))], axis=2)
+    spread = np.einsum("pij,jk,pik->p", J, unsure.pose_covariance(unsure.pose(d)), J)
+    assert np.sqrt(spread.mean()) == pytest.approx(0.3, rel=0.35)
+    again = unsure.encode(unsure.pose(d), covariance=unsure.pose_covariance(unsure.pose(d))).covariance
+    np.testing.assert_allclose(unsure.parameter_covariance(d), 0.5 * again, rtol=1e-6)  # noise as large as the error
+    del table["incisor"]
+    assert not JawRig(rig.arrays, {**rig.meta, "uncertainty": table}).pose_covariance(rig.T_rest).any()
+
+
 def test_weighted_encode_with_bounds_stays_inside(rig):
     _, T = noisy_poses(rig, 60, 8)
-    d, _ = rig.encode(T, inside=True, covariance=np.diag([1e-5] * 3 + [0.1] * 3))
+    d, *_ = rig.encode(T, inside=True, covariance=np.diag([1e-5] * 3 + [0.1] * 3))
     assert (rig.margin(d) >= -1e-12).all()
 
 

@@ -84,8 +84,8 @@ def test_encode_takes_any_batch_shape(rig, shape, bounds):
     T = rig.pose(random_d(rig, shape))
     d, residual_mm = rig.encode(T, inside=bounds)
     assert d.shape == (*shape, 3) and residual_mm.shape == shape
-    d, residual_mm = rig.encode(T, inside=bounds, covariance=np.eye(6))
-    assert d.shape == (*shape, 3) and residual_mm.shape == shape
+    d, residual_mm, of_d = rig.encode(T, inside=bounds, covariance=np.eye(6))
+    assert d.shape == (*shape, 3) and residual_mm.shape == shape and of_d.shape == (*shape, 3, 3)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -288,3 +288,19 @@ def test_held_out_frames_are_stated_and_checked():
     for name, wrong in (("held_out_share", 1.1), ("held_out_share", -0.1), ("held_out_p95_mm", -1.0)):
         with pytest.raises(EvaluatorError, match="held_out"):
             JawRig({**arrays, name: np.array(wrong)}, example_meta())
+
+
+@pytest.mark.parametrize("bound", ["slices", "polygons"])
+def test_margin_of_one_d_is_a_float_wherever_it_lies(bound):
+    rig = RIGS["anchored"]
+    for d in ([5.0, 0.0, 0.0], [2e4, 0.0, 0.0], [np.nan, 0.0, 0.0]):
+        assert isinstance(rig.margin(d, bound=bound), float)
+        assert rig.margin([d], bound=bound).shape == (1,)
+
+
+@pytest.mark.parametrize("d", ["10,0,0", ["10", "0", "0"], [None, 0.0, 0.0], [b"1", b"0", b"0"]])
+def test_text_is_no_number(d):
+    rig = RIGS["anchored"]
+    for call in (rig.pose, rig.margin, rig.project, rig.validate_parameters):
+        with pytest.raises(ValueError, match="d must be real numbers"):
+            call(d)

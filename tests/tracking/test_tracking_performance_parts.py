@@ -1,5 +1,7 @@
 """Parts of the performance solver against dense algebra, finite differences and simulated motion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from example_model import LANDMARKS_ANATOMICAL, example_arrays, example_meta
@@ -8,7 +10,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.performance import Performance, SolveState, write_performance
 from jawusd.formats.poses import read_parameters
 from jawusd.formats.tracks import LOST, load_tracks, save_tracks
-from jawusd.geometry import make_transform, relative_pose, se3_exp, se3_inverse, se3_log
+from jawusd.geometry import LANDMARKS, make_transform, relative_pose, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.motion import measured_motion
 from jawusd.tracking.performance.results import tracks_of
@@ -122,6 +124,7 @@ def performance(jaw):
         T_world_upper=se3_exp(rng.normal(size=(COUNT, 6)) * [0.1, 0.1, 0.1, 9, 9, 9]),
         d=d,
         covariance=np.swapaxes(A, 1, 2) @ A,
+        rig_covariance=jaw.parameter_covariance(d),
         pivot=np.array([0.0, 5.0, -9.0]),
         state=np.where(found.all(1), SolveState.SOLVED, SolveState.CARRIED).astype(np.int8),
         found=found,
@@ -155,6 +158,16 @@ def test_covariances_are_those_of_the_moved_poses(jaw, performance):
         np.testing.assert_allclose(
             np.cov(twists.T) / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.06
         )
+
+
+def test_deviations_of_d_include_the_error_of_the_rig(jaw, performance):
+    table = {name: {"base_mm": 0.4} for name in LANDMARKS}
+    unsure = JawRig(jaw.arrays, {**jaw.meta, "uncertainty": table})
+    of_rig = unsure.parameter_covariance(performance.d)
+    found = replace(performance, rig_covariance=of_rig).sigma_d
+    without = replace(performance, rig_covariance=np.zeros_like(of_rig)).sigma_d
+    np.testing.assert_allclose(found**2 - without**2, np.einsum("fii->fi", of_rig), rtol=1e-9)
+    assert (found > without).all() and (0.1 < np.sqrt(np.einsum("fii->fi", of_rig)).max() < 1.0)
 
 
 def test_tracks_hold_the_poses_and_what_was_not_seen(jaw, performance, tmp_path):

@@ -12,7 +12,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.notes import Registration, TracksMeta
 from jawusd.formats.performance import Performance, SolvedJaw, SolveState
 from jawusd.formats.tracks import LOST, TRACKED, Tracks
-from jawusd.geometry import LANDMARKS, hat, make_transform, se3_adjoint, se3_left_jacobian
+from jawusd.geometry import make_transform, se3_adjoint, se3_left_jacobian
 from jawusd.tracking.contour.quality import landmark_sigmas, matched_px, residual_px
 from jawusd.tracking.performance.coordinates import HEAD, JAW
 from jawusd.tracking.performance.smoother import Smoothed
@@ -56,6 +56,7 @@ def performance_of(
         T_world_upper=np.stack([fit.pose.head for fit in fits]),
         d=d,
         covariance=smoothed.covariance,
+        rig_covariance=jaw.parameter_covariance(d),
         pivot=pivot,
         state=state.astype(np.int8),
         found=found,
@@ -115,8 +116,8 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
         masks_used=p.use,
         covariance_upper=_spread(of_upper, p.covariance),
         covariance_lower=_spread(of_lower, p.covariance),
-        covariance_relative=relative_covariance + _of_rig(jaw, relative),
-        sigma_mm=np.hypot(own, rig_sigma_mm(jaw)),
+        covariance_relative=relative_covariance + jaw.pose_covariance(relative),
+        sigma_mm=np.hypot(own, jaw.landmark_sigma_mm),
         residual_px=p.residual_px,
         matched_px=p.matched_px,
         camera_names=p.camera_names,
@@ -125,31 +126,8 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     )
 
 
-def rig_sigma_mm(jaw: JawRig) -> Array:
-    """Return the standard deviation of the rig at each landmark [mm], shape (5,); 0 where it is unknown."""
-    known = jaw.meta.get("uncertainty")
-    table = known if isinstance(known, dict) else {}
-    return np.array([float(table.get(name, {}).get("base_mm", 0.0)) for name in LANDMARKS])
-
-
 def _spread(slope: Array, covariance: Array) -> Array:
     return np.asarray(slope @ covariance @ np.swapaxes(slope, -1, -2), np.float64)
-
-
-def _of_rig(jaw: JawRig, relative: Array) -> Array:
-    """Return the covariance of T_upper_lower that reproduces the rig's landmark uncertainties, shape (F, 6, 6)."""
-    variance = rig_sigma_mm(jaw) ** 2
-    out = np.zeros((len(relative), 6, 6))
-    if not variance.all():
-        return out
-    for k, pose in enumerate(relative):
-        precision = np.zeros((6, 6))
-        for point, spread in zip(jaw.landmarks @ pose[:3, :3].T + pose[:3, 3], variance, strict=True):
-            J = np.hstack([-hat(point), np.eye(3)])
-            precision += J.T @ J * (3.0 / spread)
-        # Five landmarks on a rigid body are not independent measurements of its pose.
-        out[k] = np.linalg.inv(precision) * len(variance) / 2
-    return out
 
 
 def _known_notes(p: Performance) -> TracksMeta:

@@ -79,7 +79,7 @@ class LiveTake:
         return self._tracker.step(cut, frames)
 
     def sigma_d(self, fit: FrameFit) -> Array:
-        """Return the standard deviations of the jaw parameters of the last step [mm], shape (3,).
+        """Return the standard deviations of d of the last step [mm], including the rig's own error, shape (3,).
 
         Raises:
             ValueError: `begin` was not called.
@@ -91,4 +91,6 @@ class LiveTake:
             variance = np.where(fit.found, residual_px(fit.solution) ** 2 * CORRELATION_PX, np.inf)
             for r, slope in zip(ARCHES, self.coordinates.slopes(fit.pose), strict=True):
                 precision += slope.T @ fit.solution.outline.precision[r].sum(0) @ slope / variance[r]
-        return np.asarray(_WIDER * np.sqrt(np.diag(np.linalg.inv(precision))[JAW]), np.float64)
+        variance_mm2 = _WIDER**2 * np.diag(np.linalg.inv(precision))[JAW]
+        of_rig = self.coordinates.jaw.parameter_covariance(fit.pose.d)
+        return np.asarray(np.sqrt(variance_mm2 + np.diag(of_rig)), np.float64)
