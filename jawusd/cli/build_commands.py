@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -237,18 +238,25 @@ def demo(
     frames: Annotated[int, typer.Option(min=24, max=20000, help="Exercise frames.")] = 240,
     force: Force = False,
 ) -> None:
-    """Render a synthetic capture with ground truth: a random subject in front of three cameras."""
+    """Render a synthetic capture with ground truth: a random subject in front of three cameras.
+
+    The default takes about 14 minutes without a GPU.
+    """
     from functools import partial
 
     from jawusd.base.errors import explain_missing_packages
+    from jawusd.cli.text_build import rounded_duration
 
     with explain_missing_packages("demo"):
         from jawusd.synthetic.capture_writer import DemoConfig, write_demo
 
     refuse_existing(out / "capture.toml", force)
+    config = DemoConfig(seed=seed, frames=frames)
+    say(f"renders {config.images} images: about {rounded_duration(config.seconds)} without a GPU", err=True)
     with progress() as report:
-        write_demo(out, DemoConfig(seed=seed, frames=frames), progress=partial(report, "demo"))
+        write_demo(out, config, progress=partial(report, "demo"))
     say(str(out / "capture.toml"))
+    say(f"next: {shlex.join(['jawusd', 'build', str(out), '-o', f'{out}_rig'])}")
 
 
 def build_many(

@@ -73,7 +73,7 @@ def test_every_command_ends_with_examples_that_the_program_accepts(name):
     "line", ["jawusd pose out", "jawusd pose out --d 20 2", "jawusd check a --nope", "jawusd fit a --length-unit ft"]
 )
 def test_an_example_that_the_program_rejects_is_found(line):
-    with pytest.raises(Exception, match=r"(?i)missing|requires 3|no such option|not one of"):
+    with pytest.raises(Exception, match=r"(?i)missing|three numbers|no such option|not one of"):
         parsed(line)
 
 
@@ -245,6 +245,20 @@ def test_a_build_with_much_to_do_lists_some_of_it():
     assert build_lines(told)[0].startswith("No verdict")
     told["reused"] = list(told["seconds"])
     assert "time: all stages were kept" in build_lines(told)
+
+
+def test_the_demo_says_first_how_long_it_takes_and_last_what_comes_next(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr("jawusd.synthetic.capture_writer.write_demo", lambda *given, **_: made.append(given))
+    done = run("demo", "-o", tmp_path / "a b")
+    assert done.stderr.splitlines()[0] == "renders 900 images: about 14 minutes without a GPU" and len(made) == 1
+    rig = tmp_path / "a b_rig"
+    assert done.stdout.splitlines() == [
+        str(tmp_path / "a b" / "capture.toml"),
+        f"next: jawusd build '{tmp_path / 'a b'}' -o '{rig}'",
+    ]
+    assert "about 56 minutes" in run("demo", "-o", tmp_path, "--frames", 1140).stderr
+    assert "about 14 minutes" in run("demo", "--help").stdout
 
 
 def test_the_doctor_looks_at_what_a_build_needs():
