@@ -23,6 +23,7 @@ FILES = {
         "Marker positions: tables and probes": "jawusd.formats.markers",
         "Marker positions: rigid bodies": "jawusd.formats.rigid_bodies",
         "Keys: keys.json": "jawusd.formats.keys",
+        "Faces: CSV of columns or points": "jawusd.formats.face_table",
         "ARKit face captures: CSV, and mappings: JSON": "jawusd.formats.arkit",
     },
     "What comes out": {

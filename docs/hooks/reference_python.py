@@ -3,14 +3,14 @@
 STAGES = (
     "build", "track", "fit", "bake", "check", "calibrate", "segment", "scans", "photographs", "solve", "live", "report",
     "library", "many", "start_capture", "doctor", "cameras",
-    "subject", "capture_inputs",
+    "subject", "capture_inputs", "skin",
 )  # fmt: skip
 
 PAGES = {
     "evaluator": (
         "Needs only numpy: `import jawusd.evaluator` loads no other package. `python -m jawusd.evaluator` "
         "does the same on the command line.",
-        ["jawusd.evaluator", "jawusd.evaluator.skin", "jawusd.fast"],
+        ["jawusd.evaluator", "jawusd.fast"],
     ),
     "solvers": ("The rig in PyTorch, for gradient-based solvers.", ["jawusd.solvers"]),
     "rig": (

@@ -272,10 +272,15 @@ def _jaw_of_take(rig: JawRig, path: Path, source: Path, fps: float | None, prim:
         fps = fps or load_tracks(source).meta.get("fps")
     if d.ndim > 2:
         d, _ = rig.encode(d)
-    return np.asarray(frames, dtype=np.float64) / (fps or _rate_of(path, prim)), d
+    return np.asarray(frames, dtype=np.float64) / (fps or rate_of(path, prim)), d
 
 
-def _rate_of(rig: Path, prim: str | None) -> float:
+def rate_of(rig: Path, prim: str | None) -> float:
+    """Return the frames per second of a rig, for a jaw that does not state its rate.
+
+    Raises:
+        typer.BadParameter: the rig does not state it.
+    """
     from jawusd.cli.options import USD_SUFFIXES
     from jawusd.rig import describe
 

@@ -54,6 +54,7 @@ GROUPS = {
         "rebake": "Make d and mandible of an edited stage agree.",
         "arkit-fit": "Fit the mapping from a subject's ARKit jaw weights to d.",
         "arkit-table": "Write the jaw joint's offset per ARKit shape.",
+        "skin-fit": "Learn the jaw from facial skin, for closed lips.",
     },
     "Inspect": {
         "view": "View a rig or a capture in the browser.",
@@ -241,6 +242,7 @@ _NAMES = {
     "rebake_command": ("rebake",),
     "stage_commands": ("encode", "publish"),
     "animate_commands": ("animate", "arkit-fit", "arkit-table"),
+    "skin_command": ("skin-fit",),
     "solve_commands": ("solve", "live"),
     "library_commands": ("retarget", "library"),
     "report_commands": ("report", "view"),

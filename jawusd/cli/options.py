@@ -186,10 +186,15 @@ def trajectory_options(
     """
     from jawusd.pipeline.fit import TrajectoryOptions
 
-    return TrajectoryOptions(_column_map(columns), length_unit.value, invert, rest_frame, group, _rigid_bodies(rigid))
+    return TrajectoryOptions(_column_map(columns), length_unit.value, invert, rest_frame, group, rigid_bodies(rigid))
 
 
-def _rigid_bodies(given: list[str] | None) -> dict[str, str]:
+def rigid_bodies(given: list[str] | None) -> dict[str, str]:
+    """Return the descriptions of rigid bodies by name.
+
+    Raises:
+        typer.BadParameter: one is not of the form BODY=MARKERS, or given twice.
+    """
     found: dict[str, str] = {}
     for text in given or ():
         name, sign, markers = (piece.strip() for piece in text.partition("="))

@@ -122,6 +122,12 @@ class Skin:
         return SkinJaw(found[:, :3].reshape(*batch, 3), found[:, 3:12].reshape(*batch, 3, 3), familiar.reshape(batch))
 
     @property
+    def errors_mm(self) -> dict[str, float]:
+        """Mean held-out errors at the incisal point [mm] of "skin" and of guesses, see `fitting.skin.fit_skin`."""
+        found = self.meta.get("errors_mm")
+        return {str(k): float(v) for k, v in found.items()} if isinstance(found, Mapping) else {}
+
+    @property
     def actor(self) -> str:
         """The subject's name, empty if unknown."""
         return str(self.meta.get("actor") or "")

@@ -15,7 +15,7 @@ from jawusd.geometry import transform_points
 _REST_SHARE = 0.1  # fraction of the frames that determine the neutral weights: those nearest to the closed bite
 _DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # candidate dead zones of each weight
 _ROUNDS = 2
-_COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offset search: coarse step, fine step, fine steps to each side
+COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offset search: coarse step, fine step, fine steps to each side
 _BLOCKS = 5  # number of contiguous blocks in cross-validation
 _LEAST_SECONDS = 10.0
 _LEAST_REACH = 0.4  # minimum fraction of the subject's range that a take must reach in each direction
@@ -54,8 +54,8 @@ def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s
     face_s = face.frames / face.fps
     if offset_s is None:
         first = _best_offset(face_s, face.weights, times_s, d)
-        offset_s = _refined_offset(first, face_s, face.weights, times_s, d)
-    weights = _weights_at(face_s + offset_s, face.weights, times_s)
+        offset_s = refined_offset(first, face_s, face.weights, times_s, d)
+    weights = columns_at(face_s + offset_s, face.weights, times_s)
     seen = np.isfinite(weights).all(axis=1)
     weights, d, times_s = weights[seen], d[seen], times_s[seen]
     _check_take(rig, weights, d, times_s)
@@ -102,9 +102,23 @@ def _learned(rig: JawRig, weights: Array, d: Array) -> ArkitMapping:
     )
 
 
-def _weights_at(face_s: Array, weights: Array, times_s: Array) -> Array:
-    """Interpolate the weights to times (N,), shape (N, 4); NaN outside the capture and where no face was found."""
+def columns_at(face_s: Array, weights: Array, times_s: Array) -> Array:
+    """Interpolate columns (F, K) to times (N,), shape (N, K); NaN outside the capture and where no face was found."""
     return np.stack([np.interp(times_s, face_s, column, np.nan, np.nan) for column in weights.T], axis=1)
+
+
+def offsets_between(face_s: Array, times_s: Array) -> Array:
+    """Return the offsets [s] to be tried between the clocks of a face and a jaw, with half a take of overlap.
+
+    Raises:
+        FittingError: a take is too short.
+    """
+    shorter = min(face_s[-1] - face_s[0], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
+    if shorter < _LEAST_SECONDS:
+        raise FittingError(
+            f"the takes last {shorter:.1f} s, at least {_LEAST_SECONDS:g} s are needed to learn a mapping."
+        )
+    return np.arange(times_s[0] + shorter / 2 - face_s[-1], times_s[-1] - shorter / 2 - face_s[0], COARSE_S)
 
 
 def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
@@ -112,17 +126,12 @@ def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> flo
 
     The opening alone is ambiguous if the subject opens rhythmically.
     """
-    shorter = min(face_s[-1], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
-    if shorter < _LEAST_SECONDS:
-        raise FittingError(
-            f"the takes last {shorter:.1f} s, at least {_LEAST_SECONDS:g} s are needed to learn a mapping."
-        )
-    tried = np.arange(times_s[0] + shorter / 2 - face_s[-1], times_s[-1] - shorter / 2, _COARSE_S)
-    every = max(int(_COARSE_S / np.median(np.diff(times_s))), 1)
+    tried = offsets_between(face_s, times_s)
+    every = max(int(COARSE_S / np.median(np.diff(times_s))), 1)
     times_s, d = times_s[::every], d[::every]
     following = np.empty((len(tried), 2))
     for row, offset in enumerate(tried):
-        shares = shares_of(_weights_at(face_s + offset, weights, times_s))
+        shares = shares_of(columns_at(face_s + offset, weights, times_s))
         following[row] = [_correlation(shares[:, i], d[:, i]) for i in range(2)]
     best = int(np.argmax(following.sum(axis=1)))
     if following[best, 0] < _LEAST_FOLLOWING:
@@ -134,12 +143,12 @@ def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> flo
     return float(tried[best])
 
 
-def _refined_offset(offset_s: float, face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
-    """Return the offset [s] near an initial one at which all weights together predict d best."""
+def refined_offset(offset_s: float, face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
+    """Return the offset [s] near an initial one at which all columns (F, K) together predict d best."""
     tried = offset_s + _FINE_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1)
     left = []
     for offset in tried:
-        seen = _weights_at(face_s + offset, weights, times_s)
+        seen = columns_at(face_s + offset, weights, times_s)
         rows = np.isfinite(seen).all(axis=1)
         design = np.column_stack([np.ones(rows.sum()), seen[rows]])
         found = np.linalg.lstsq(design, d[rows], rcond=1e-6)[0]

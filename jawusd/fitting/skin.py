@@ -20,7 +20,7 @@ from jawusd.base.errors import FittingError
 from jawusd.base.npz import TWIST_ORDER, UNITS
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import FAMILY, VERSION, Skin, components, skin_kernel
-from jawusd.fitting.face import incisal_error
+from jawusd.fitting.face import COARSE_S, columns_at, incisal_error, offsets_between, refined_offset
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_points
 
@@ -35,8 +35,10 @@ _LOW, _HIGH = np.log([0.2, 0.01, 0.001, 1e-5]), np.log([20.0, 100.0, 100.0, 3.0]
 _STEPS, _MOST_TRIALS = np.log([3.0, 1.7]), 80
 _FALSE_ALARMS = 0.01  # fraction of held-out frames that are flagged as unfamiliar
 _CHIN_POINTS = 3
-# Largest error relative to each guess. 12 subjects have 0.40 at most; columns of another take have 0.95 and more.
+# Largest error relative to each guess. 12 subjects have 0.4 at most; faces of another moment have 1.0 and more.
 _MOST_SHARE = 0.65
+_CLOCK_COMPONENTS = 12  # number of components of the face from which the offset of its clock is estimated
+_LEAST_EXPLAINED = 0.5  # minimum fraction of the variance of opening and laterotrusion that they must explain
 _NAMES = ("opening", "laterotrusion", "protrusion")
 
 
@@ -107,6 +109,49 @@ def fit_skin(
         "false_alarms": float(flagged.mean()),
     }
     return Skin(arrays, meta)
+
+
+def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
+    """Return the offset [s] between a face and a jaw at which the face best explains opening and laterotrusion.
+
+    Args:
+        face_s: times of the face [s], shape (F,).
+        X: columns of the face, NaN where hidden, shape (F, K).
+        times_s: times of the jaw [s], shape (N,).
+        d: jaw parameters [mm], all known, shape (N, 3).
+
+    Returns:
+        What must be added to the face's times.
+
+    Raises:
+        FittingError: the takes are too short, or do not fit at any offset.
+    """
+    known = X[np.isfinite(X).all(axis=1)]
+    if not len(known):
+        raise FittingError("no frame shows all columns of the face.")
+    mean = known.mean(axis=0)
+    f = (X - mean) @ np.linalg.svd(known - mean, full_matrices=False)[2][:_CLOCK_COMPONENTS].T
+    tried = offsets_between(face_s, times_s)
+    every = max(int(COARSE_S / np.median(np.diff(times_s))), 1)
+    explained = [_explained(columns_at(face_s + offset, f, times_s[::every]), d[::every, :2]) for offset in tried]
+    best = int(np.argmax(explained))
+    if explained[best] < _LEAST_EXPLAINED:
+        raise FittingError(
+            f"the face does not follow the jaw at any clock offset: it explains {explained[best]:.0%} of opening and "
+            f"laterotrusion at best, {_LEAST_EXPLAINED:.0%} is required.",
+            hint="Use a face and a jaw of the same performance, or set their offset with --offset.",
+        )
+    return refined_offset(float(tried[best]), face_s, f, times_s, d)
+
+
+def _explained(f: Array, d: Array) -> float:
+    """Return the least fraction of the variances of columns of d (N, n) that is linear in features (N, C)."""
+    rows = np.isfinite(f).all(axis=1)
+    if rows.sum() < _LEAST_FRAMES:
+        return 0.0
+    design, d = np.column_stack([np.ones(rows.sum()), f[rows]]), d[rows]
+    left = d - design @ np.linalg.lstsq(design, d, rcond=1e-6)[0]
+    return float((1 - left.var(axis=0) / d.var(axis=0)).min())
 
 
 def save_skin(path: str | os.PathLike[str], skin: Skin) -> None:

@@ -34,6 +34,7 @@ from jawusd.base.tables import TextTable, check_width, read_table, read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_model
 
+_OTHER = re.compile(r"(head|lefteye|righteye)(yaw|pitch|roll)")  # rotations, which are not blend shapes
 JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
 _TIME, _COUNT = "timecode", "blendshapecount"
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:[.,]\d+)?)")
@@ -51,6 +52,16 @@ _MAX_MAPPING_BYTES = 1 << 20
 _WITHIN = "numbers within +-10000"
 _Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e4, le=1e4)]
 _Weights = tuple[_Number, _Number, _Number, _Number]
+
+
+@dataclass(frozen=True, eq=False)
+class BlendShapes:
+    """All weights of a face capture."""
+
+    frames: Array  # frame numbers from the first row on, increasing, possibly fractional, shape (F,)
+    weights: Array  # one column per shape, nominally 0 .. 1, NaN without a face, shape (F, K)
+    names: tuple[str, ...]  # names of the shapes
+    fps: float  # frames per second
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +94,30 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
             does not fit. The message names line and column.
     """
     path = Path(path)
+    table, columns = _read_columns(path, (_TIME, *JAW_COLUMNS))
+    frames, rate, first = _timed(table, columns.index(_TIME), fps)
+    return FaceCapture(frames, _weights(table, columns, [columns.index(name) for name in JAW_COLUMNS]), rate, first)
+
+
+def read_blend_shapes(path: str | os.PathLike[str], fps: float | None = None) -> BlendShapes:
+    """Read all blend shapes of a face capture of Live Link Face, see `read_arkit`; rotations are left out.
+
+    Raises:
+        FormatError: as for `read_arkit`, or there are no blend shapes.
+    """
+    table, columns = _read_columns(Path(path), (_TIME,))
+    shapes = [k for k, name in enumerate(columns) if name not in (_TIME, _COUNT) and not _OTHER.fullmatch(name)]
+    if not shapes:
+        raise FormatError("has no columns of blend shapes.", path=path)
+    frames, rate, _ = _timed(table, columns.index(_TIME), fps)
+    return BlendShapes(frames, _weights(table, columns, shapes), tuple(table.header[k] for k in shapes), rate)
+
+
+def _read_columns(path: Path, needed: tuple[str, ...]) -> tuple[TextTable, list[str]]:
+    """Return a table with the needed columns, and the names of all its columns in lower case."""
     table = read_table(path, _MAX_BYTES, short_rows=True)
     columns = [name.lower() for name in table.header]
-    for name in (_TIME, *JAW_COLUMNS):
+    for name in needed:
         if columns.count(name) != 1:
             raise FormatError(
                 f'has {columns.count(name)} columns named "{name}", expected one.',
@@ -94,9 +126,13 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
             )
     if not table.rows:
         raise FormatError("has no rows below the header.", path=path)
-    at, *jaw = (columns.index(name) for name in (_TIME, *JAW_COLUMNS))
+    return table, columns
+
+
+def _timed(table: TextTable, at: int, fps: float | None) -> tuple[Array, float, str]:
+    """Return frame numbers (F,), frames per second, and the first time code, of time codes in a column."""
     written = [row[at].strip() if len(row) > at else "" for row in table.rows]
-    codes = np.array([_seconds_and_frame(code, table.named(i, at), path) for i, code in enumerate(written)])
+    codes = np.array([_seconds_and_frame(code, table.named(i, at), table.path) for i, code in enumerate(written)])
     seconds, inside = codes[:, 0].astype(np.int64), _spread(codes)
     # Time codes restart at midnight.
     seconds += _DAY_S * np.concatenate([[0], np.cumsum(np.diff(seconds) < -_DAY_S // 2)])
@@ -106,27 +142,27 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
     if dropped or _is_of_ntsc(rate):
         rate = math.ceil(rate - _NTSC_SLACK) * 1000 / 1001
     frames = _frames(seconds, inside, number, dropped, table, at) * (math.ceil(rate - _NTSC_SLACK) / number)
-    return FaceCapture(np.round(frames, 6), _weights(table, columns, jaw), rate, written[0])
+    return np.round(frames, 6), rate, written[0]
 
 
-def _weights(table: TextTable, columns: list[str], jaw: list[int]) -> Array:
-    """Return the weights (F, 4), NaN without a face."""
+def _weights(table: TextTable, columns: list[str], shapes: list[int]) -> Array:
+    """Return the weights of columns (F, K), NaN without a face."""
     count = columns.index(_COUNT) if _COUNT in columns else None
     seen = [i for i, row in enumerate(table.rows) if count is None or len(row) <= count or row[count].strip() != "0"]
     for i in seen:
         check_width(table, i)
-    found = table.numbers(jaw, seen)
+    found = table.numbers(shapes, seen)
     bad = np.argwhere(~np.isfinite(found))
     if len(bad):
-        i, k = seen[bad[0, 0]], jaw[bad[0, 1]]
+        i, k = seen[bad[0, 0]], shapes[bad[0, 1]]
         raise FormatError(f"{table.named(i, k)} is {table.rows[i][k]}; all weights must be finite.", path=table.path)
-    weights = np.full((len(table.rows), len(jaw)), np.nan)
+    weights = np.full((len(table.rows), len(shapes)), np.nan)
     weights[seen] = found
-    _check_weights(weights, table)
+    _check_weights(weights, shapes, table)
     return weights
 
 
-def _check_weights(weights: Array, table: TextTable) -> None:
+def _check_weights(weights: Array, shapes: list[int], table: TextTable) -> None:
     """Reject weights that are not on ARKit's scale of 0 to 1."""
     away = np.abs(np.nan_to_num(weights, nan=0.5) - 0.5)
     row, column = np.unravel_index(int(np.argmax(away)), away.shape)
@@ -139,7 +175,7 @@ def _check_weights(weights: Array, table: TextTable) -> None:
         else ("Export the weights as recorded, not normalised or scaled.")
     )
     raise FormatError(
-        f'{table.places[row]}, column "{JAW_COLUMNS[column]}" is {worst:g}; ARKit weights range from 0 to 1; values '
+        f"{table.named(int(row), shapes[column])} is {worst:g}; ARKit weights range from 0 to 1; values "
         f"from {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g} are accepted.",
         path=table.path,
         hint=hint,

@@ -14,7 +14,7 @@ from jawusd.base.errors import FormatError, explain_missing_packages
 from jawusd.base.inputs import check_input
 from jawusd.formats.markers import MarkerTable, length_unit, mark_hidden, read_markers
 from jawusd.formats.rigid_bodies import RigidBody, read_body
-from jawusd.geometry import rigid_fits, se3_inverse
+from jawusd.geometry import rigid_fits, se3_inverse, transform_points
 
 BODIES = ("head", "jaw")
 LENGTH_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -61,6 +61,30 @@ def marker_poses(
         for name, body in bodies.items()
     }
     return se3_inverse(moved["head"]) @ moved["jaw"] if "head" in moved else moved["jaw"], table.fps
+
+
+def in_head(
+    points: Array,
+    names: tuple[str, ...],
+    rigid: Mapping[str, str],
+    rest_frame: int | None,
+    unit: str,
+    path: Path,
+) -> Array:
+    """Return points (F, N, 3) [mm] relative to the head, NaN where it is occluded.
+
+    Args:
+        rigid: description of the rigid body "head", see `formats.rigid_bodies.read_body`.
+        rest_frame: frame that defines the shape of the head, if only its markers are named.
+        unit: unit of the rigid body, a key of `LENGTH_UNITS_MM`.
+
+    Raises:
+        FormatError: another rigid body, or one that does not fit the markers.
+    """
+    if set(rigid) != {"head"}:
+        raise FormatError(f"rigid bodies given: {', '.join(rigid)}; only head is used.", path=path)
+    T = _moved("head", read_body(rigid["head"]), points, names, rest_frame, LENGTH_UNITS_MM[unit], path)
+    return transform_points(se3_inverse(T), points)
 
 
 @explain_missing_packages()

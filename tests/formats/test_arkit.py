@@ -98,7 +98,7 @@ def test_tables_that_are_none(tmp_path, text, words):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda w: 100 * w, ("line 5", "jawopen", "is 90", "percent", "divide all weights by 100")),
+        (lambda w: 100 * w, ("line 5", "JawOpen", "is 90", "percent", "divide all weights by 100")),
         (lambda w: (w - w.mean(0)) / w.std(0), ("0 to 1", "normalised")),
         (lambda w: 2 * w - 1, ("0 to 1", "normalised")),
     ],

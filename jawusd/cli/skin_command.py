@@ -1,0 +1,132 @@
+"""The command that learns the jaw from facial skin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jawusd.cli.options import Allow, Force, Json, LengthUnit, Prim, RigArg, UnitOption
+from jawusd.cli.output import emit
+from jawusd.formats.atomic import refuse_existing
+
+if TYPE_CHECKING:
+    from jawusd.evaluator.skin import Skin
+
+_GUESSES = {"chin": "a chin rigid with the bone", "mean": "the mean d", "carried": "the last d"}
+
+
+TakeArg = Annotated[
+    Path,
+    typer.Argument(
+        help="The jaw of a take: tracks.npz, the CSV of solve, or a table of d or poses.", show_default=False
+    ),
+]
+FaceArg = Annotated[
+    Path,
+    typer.Argument(
+        help="The face of the same take: C3D, TRC or another marker table, the CSV of Live Link Face, or a CSV of "
+        "columns or points.",
+        show_default=False,
+    ),
+]
+Out = Annotated[Path, typer.Option("-o", "--out", help="What was learned.")]
+Fps = Annotated[float | None, typer.Option(min=0.001, help="Frames per second of the face. Default: of the file.")]
+JawFps = Annotated[
+    float | None, typer.Option(min=0.001, help="Frames per second of the jaw. Default: of the tracks or the rig.")
+]
+Offset = Annotated[
+    float | None, typer.Option(help="Seconds from the jaw's frame 0 to the face's. Default: estimated from the motion.")
+]
+Bites = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="FIRST-LAST",
+        help="Frames of the jaw with closed lips and the teeth in occlusion, as 1200-1260. Repeatable.",
+        show_default=False,
+    ),
+]
+Rigid = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="head=MARKERS",
+        help="Markers fixed to the head, relative to which points are taken: names, numbers, or a "
+        "marker description. Names and numbers need --rest-frame. Default: the points are stabilised.",
+        show_default=False,
+    ),
+]
+RestFrame = Annotated[
+    int | None, typer.Option(help="Frame of the face that defines the shape of the head, for --rigid.")
+]
+HeadError = Annotated[
+    tuple[float, float],
+    typer.Option(
+        min=0.0,
+        metavar="MM DEGREES",
+        help="Standard deviation of the error of head stabilisation in later takes beyond that of this one.",
+    ),
+]
+
+
+def skin_fit(
+    rig: RigArg,
+    take: TakeArg,
+    face: FaceArg,
+    out: Out = Path("skin.npz"),
+    fps: Fps = None,
+    jaw_fps: JawFps = None,
+    offset: Offset = None,
+    bite: Bites = None,
+    rigid: Rigid = None,
+    rest_frame: RestFrame = None,
+    length_unit: UnitOption = LengthUnit.mm,
+    head_error: HeadError = (0.3, 0.15),
+    force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Learn d from facial skin on frames with visible teeth, to find the jaw where lips are closed.
+
+    Points must be relative to the head: stabilised, or with --rigid head=MARKERS. The take needs exercises, speech with
+    visible teeth, every expression, and some seconds of occlusion (--bite).
+    """
+    import math
+
+    import jawusd
+    from jawusd.cli.animate_commands import rate_of
+    from jawusd.cli.options import rigid_bodies
+    from jawusd.pipeline.skin import learn_skin, read_face, read_jaw
+
+    refuse_existing(out, force)
+    bites = [_frames(text) for text in bite or ()]
+    loaded = jawusd.load(rig, prim=prim)
+    jaw = read_jaw(loaded, take)
+    jaw = jaw.at_rate(jaw_fps or jaw.fps or rate_of(rig, prim))
+    for first, last in bites:
+        jaw = jaw.with_bite(first, last)
+    seen = read_face(face, fps, length_unit.value, rigid_bodies(rigid), rest_frame)
+    if seen.fps is None:
+        raise typer.BadParameter("is needed: the face does not state a rate.", param_hint="--fps")
+    skin, offset_s = learn_skin(loaded, jaw, seen, offset, (head_error[0], math.radians(head_error[1])))
+    jawusd.save_skin(out, skin)
+    emit({"file": str(out), "offset_s": offset_s, **skin.meta}, as_json, lambda: _lines(out, skin, offset_s))
+
+
+def _lines(out: Path, skin: Skin, offset_s: float) -> list[str]:
+    errors = skin.errors_mm
+    what = f"{skin.columns // 3} points" if skin.points else f"{skin.columns} columns"
+    guesses = ", ".join(f"{words} {errors[name]:.2f}" for name, words in _GUESSES.items() if name in errors)
+    return [
+        f"{out}: {what}, {skin.meta['frames']} frames with a known jaw, face {offset_s:.3f} s after the jaw's frame 0",
+        f"held-out error at the incisal point {errors['skin']:.2f} mm; {guesses}",
+        f"{skin.meta['false_alarms']:.1%} of the held-out frames would be flagged as unfamiliar",
+    ]
+
+
+def _frames(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("-")
+    if not (first.isdigit() and last.isdigit() and int(first) <= int(last)):
+        raise typer.BadParameter(f'"{text}" is not of the form FIRST-LAST, such as 1200-1260.', param_hint="--bite")
+    return int(first), int(last)

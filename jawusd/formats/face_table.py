@@ -1,0 +1,103 @@
+"""Tables of a face per frame: any columns, or points, in CSV of any locale (see `jawusd.base.tables`).
+
+    frame,brow_left,jaw_open,...                 any columns in one unit, such as curves of a rig or weights
+    time_s,chin_x,chin_y,chin_z,lip_x,...        points, if all columns come in threes NAME_x, NAME_y, NAME_z
+
+The first row names the columns; one of them is `frame` or `time_s`. A blank or nan is hidden.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
+from jawusd.base.tables import TextTable, read_table, read_text, split_rows
+
+_MAX_BYTES = 1 << 30
+_CLOCKS = ("frame", "time_s")
+_AXIS = re.compile(r"(.+)[_.:]([xyz])", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class FaceTable:
+    """Columns or points of a face.
+
+    Attributes:
+        frames: frame numbers or times of the rows, increasing, shape (F,).
+        X: columns (F, K), or points (F, N, 3) in the table's unit; NaN where hidden.
+        names: names of the columns or points; may be empty.
+        fps: frames per second, 1 if `frames` are times [s], None if unknown.
+        unit: unit of length of points, None if unknown.
+    """
+
+    frames: Array
+    X: Array
+    names: tuple[str, ...]
+    fps: float | None
+    unit: str | None = None
+
+
+def header_of(path: str | os.PathLike[str]) -> list[str]:
+    """Return the cells of the first row of a text table, in lower case.
+
+    Raises:
+        FormatError: not text, or empty.
+    """
+    path = Path(path)
+    rows, _ = split_rows(read_text(path, _MAX_BYTES), path)
+    if not rows:
+        raise FormatError("is empty.", path=path)
+    return [cell.strip().lower() for cell in rows[0][1]]
+
+
+def is_face_table(header: list[str]) -> bool:
+    """Tell whether a first row, in lower case, is that of a face table."""
+    return any(clock in header for clock in _CLOCKS)
+
+
+def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
+    """Read a face table.
+
+    Raises:
+        FormatError: no or two columns `frame` or `time_s`, no other columns, a cell that is not a number, or rows that
+            do not increase.
+    """
+    table = read_table(Path(path), _MAX_BYTES)
+    lower = [name.lower() for name in table.header]
+    clocks = [k for k, name in enumerate(lower) if name in _CLOCKS]
+    others = [k for k in range(len(lower)) if k not in clocks]
+    if len({lower[k] for k in clocks}) != len(clocks) or not clocks or not others or not table.rows:
+        raise FormatError(
+            f"has the columns {', '.join(table.header[:8])} and {len(table.rows)} rows; one column frame or time_s, "
+            "others, and rows are needed.",
+            path=table.path,
+        )
+    clock = lower.index("time_s") if "time_s" in lower else clocks[0]
+    frames = table.numbers([clock])[:, 0]
+    steps = np.diff(frames)
+    if not (np.isfinite(frames).all() and (steps > 0).all()):
+        row = int(np.argmax(~(steps > 0))) + 1
+        raise FormatError(f"{table.named(min(row, len(frames) - 1), clock)} does not increase.", path=table.path)
+    filled = [[cell if cell.strip() else "nan" for cell in row] for row in table.rows]
+    X = TextTable(table.path, table.header, filled, table.places).numbers(others)
+    X[~np.isfinite(X)] = np.nan
+    names = tuple(table.header[k] for k in others)
+    fps = 1.0 if lower[clock] == "time_s" else None
+    points = _points_of(names)
+    if not points:
+        return FaceTable(frames, X, names, fps)
+    return FaceTable(frames, X.reshape(len(X), -1, 3), points, fps)
+
+
+def _points_of(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of points whose x, y, z the columns are, empty if they are not."""
+    found = [_AXIS.fullmatch(name) for name in names]
+    labels = [(match[1], match[2].lower()) for match in found if match]
+    named = tuple(labels[k][0] for k in range(0, len(labels), 3))
+    return named if labels == [(name, axis) for name in named for axis in "xyz"] and len(labels) == len(names) else ()

@@ -1,0 +1,185 @@
+"""Learn the jaw from facial skin: reads a face and a jaw of one performance, and brings them to one clock."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FormatError
+from jawusd.base.tables import read_table
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.skin import Skin
+from jawusd.fitting.face import columns_at
+from jawusd.fitting.skin import HEAD_ERROR, clock_offset, fit_skin
+from jawusd.formats.arkit import read_blend_shapes
+from jawusd.formats.face_table import FaceTable, header_of, is_face_table, read_face_table
+from jawusd.formats.markers import read_markers
+from jawusd.formats.performance import SolveState
+from jawusd.formats.poses import read_poses_or_parameters
+from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.pipeline.markers import LENGTH_UNITS_MM, in_head, read_c3d
+
+SIGMA_MM = 0.15  # of d, where a file does not state it
+_LARGEST_SIGMA_MM = 1.0  # poses with a larger standard deviation at the incisal point do not count as seen
+
+
+@dataclass(frozen=True, eq=False)
+class JawTake:
+    """The jaw of a take, with the frames in which the teeth were seen.
+
+    Attributes:
+        frames: frame numbers, increasing, shape (F,).
+        d: jaw parameters [mm], shape (F, 3).
+        seen: d was measured, not interpolated, shape (F,).
+        sigma_mm: standard deviation of d [mm], shape (F, 3).
+        fps: frames per second, None if unknown.
+    """
+
+    frames: Array
+    d: Array
+    seen: Mask
+    sigma_mm: Array
+    fps: float | None
+
+    def at_rate(self, fps: float) -> JawTake:
+        """Return the take with another frame rate."""
+        return replace(self, fps=fps)
+
+    def with_bite(self, first: int, last: int) -> JawTake:
+        """Return the take with d = 0 in frames first to last, in which the teeth are in occlusion."""
+        bite = np.arange(first, last + 1, dtype=np.float64)
+        kept = (self.frames < first) | (self.frames > last)
+        frames = np.concatenate([self.frames[kept], bite])
+        order = np.argsort(frames)
+        zero = np.zeros((len(bite), 3))
+        return JawTake(
+            frames[order],
+            np.concatenate([self.d[kept], zero])[order],
+            np.concatenate([self.seen[kept], np.ones(len(bite), bool)])[order],
+            np.concatenate([self.sigma_mm[kept], zero + SIGMA_MM])[order],
+            self.fps,
+        )
+
+
+def read_jaw(rig: JawRig, path: str | os.PathLike[str]) -> JawTake:
+    """Read the jaw of a take: tracks.npz, the CSV of a solved performance, or a table of d or poses.
+
+    In tracks, frames count as seen if both arches were tracked without a prior; in a performance, if they are solved;
+    in a table, all frames are.
+
+    Raises:
+        FormatError: the file is none of these.
+    """
+    path = Path(path)
+    if path.suffix == ".npz":
+        return _of_tracks(rig, load_tracks(path))
+    frames, d = read_poses_or_parameters(path)
+    if d.ndim > 2:
+        d = rig.encode(d).d
+    seen = np.asarray(np.isfinite(d).all(axis=1))
+    sigma = np.full(d.shape, SIGMA_MM)
+    if path.suffix.lower() != ".json" and "state" in header_of(path):
+        solved, sigma = _states_of(path)
+        seen &= solved
+    return JawTake(frames.astype(np.float64), d, seen, sigma, None)
+
+
+def _states_of(path: Path) -> tuple[Mask, Array]:
+    """Return which frames of the CSV of a performance are solved (F,), and the sigmas of d [mm] (F, 3)."""
+    table = read_table(path, os.stat(path).st_size)
+    column = table.header.index("state")
+    solved = np.array([row[column].strip() == str(SolveState.SOLVED) for row in table.rows])
+    return solved, table.numbers([table.header.index(f"sigma{i}") for i in (1, 2, 3)])
+
+
+def _of_tracks(rig: JawRig, tracks: Tracks) -> JawTake:
+    frames, fps = tracks.frames.astype(np.float64), tracks.meta.get("fps")
+    if tracks.solved is not None:
+        solved = tracks.solved
+        return JawTake(frames, solved.d, solved.state == SolveState.SOLVED, solved.sigma_mm, fps)
+    d, sigma = np.full((len(frames), 3), np.nan), np.full((len(frames), 3), np.nan)
+    known = tracks.tracked() & np.isfinite(tracks.covariance_relative).all(axis=(1, 2)) & ~tracks.prior_aided
+    d[known] = rig.encode(tracks.T_upper_lower[known]).d
+    J = rig.spatial_jacobian(d[known])
+    information = np.swapaxes(J, 1, 2) @ np.linalg.solve(tracks.covariance_relative[known], J)
+    sigma[known] = np.sqrt(np.einsum("fii->fi", np.linalg.inv(information)))
+    seen = known & (tracks.sigma_mm[:, 0] < _LARGEST_SIGMA_MM)
+    return JawTake(frames, d, seen, sigma, fps)
+
+
+def read_face(
+    path: str | os.PathLike[str],
+    fps: float | None = None,
+    unit: str = "mm",
+    rigid: Mapping[str, str] | None = None,
+    rest_frame: int | None = None,
+) -> FaceTable:
+    """Read a face: C3D, a marker table, a CSV of Live Link Face, or a face table; points in mm.
+
+    Args:
+        path: the file; see `formats.markers`, `formats.arkit` and `formats.face_table`.
+        fps: frames per second, if the file does not state them.
+        unit: unit of points, if the file does not state it.
+        rigid: the rigid body "head" of markers on the head, see `formats.rigid_bodies`; points are then given relative
+            to it. Default: the head is still, or the points are stabilised.
+        rest_frame: frame that defines the shape of the head, if only its markers are named.
+
+    Raises:
+        FormatError: the file is none of these, or the head cannot be found.
+    """
+    path = Path(path)
+    marked = path.suffix.lower() == ".c3d" or not path.is_file() or path.suffix.lower() == ".trc"
+    header = [] if marked else header_of(path)
+    if "timecode" in header:
+        shapes = read_blend_shapes(path, fps)
+        face = FaceTable(shapes.frames, shapes.weights, shapes.names, shapes.fps)
+    elif is_face_table(header):
+        face = read_face_table(path)
+        face = FaceTable(face.frames, face.X, face.names, face.fps or fps)
+    else:
+        table = read_c3d(path) if path.suffix.lower() == ".c3d" else read_markers(path)
+        frames = np.arange(len(table.points), dtype=np.float64)
+        face = FaceTable(frames, table.points, table.names, table.fps or fps, table.unit)
+    if face.X.ndim == 2:
+        if rigid:
+            raise FormatError("has no points, to which --rigid could apply.", path=path)
+        return face
+    points = face.X * LENGTH_UNITS_MM[face.unit or unit]
+    if rigid:
+        points = in_head(points, face.names, rigid, rest_frame, unit, path)
+    return FaceTable(face.frames, points, face.names, face.fps, "mm")
+
+
+def learn_skin(
+    rig: JawRig,
+    jaw: JawTake,
+    face: FaceTable,
+    offset_s: float | None = None,
+    head_error: tuple[float, float] = HEAD_ERROR,
+) -> tuple[Skin, float]:
+    """Learn d from a face and a jaw of the same performance; both need a frame rate.
+
+    Args:
+        offset_s: added to the face's times to obtain the jaw's; default: estimated.
+        head_error: see `fitting.skin.fit_skin`.
+
+    Returns:
+        The map, and the offset [s].
+
+    Raises:
+        FittingError: see `fitting.skin.clock_offset` and `fitting.skin.fit_skin`.
+        ValueError: a frame rate is missing.
+    """
+    if not jaw.fps or not face.fps:
+        raise ValueError("jaw and face need a frame rate")
+    face_s, times_s, flat = face.frames / face.fps, jaw.frames / jaw.fps, face.X.reshape(len(face.X), -1)
+    if offset_s is None:
+        offset_s = clock_offset(face_s, flat, times_s[jaw.seen], jaw.d[jaw.seen])
+    X = columns_at(face_s + offset_s, flat, times_s).reshape(len(times_s), *face.X.shape[1:])
+    skin = fit_skin(rig, X, jaw.d, jaw.seen, jaw.sigma_mm, head_error=head_error, names=face.names)
+    return skin, offset_s
