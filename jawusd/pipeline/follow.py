@@ -1,23 +1,19 @@
-"""Follow the teeth through footage by their colours, and track captures without masks."""
+"""Follow the teeth through footage by their colours, from a start to both ends and again where they were lost."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError
-from jawusd.formats.capture import Bootstrap, CameraSource, Capture
-from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import Tracks
+from jawusd.base.errors import TrackingError
 from jawusd.geometry import Camera, relative_pose, transform_points
-from jawusd.pipeline.cameras import open_footage
-from jawusd.pipeline.picture_search import PictureSearch, Start, picked_start
+from jawusd.pipeline.picture_search import Start
 from jawusd.pipeline.state import Progress
-from jawusd.pipeline.subject import Subject, subject_of_capture
+from jawusd.pipeline.subject import Subject
 
 if TYPE_CHECKING:
     from jawusd.segmentation.picture import ColourFootage, PictureFrame, Pictures
@@ -25,7 +21,6 @@ if TYPE_CHECKING:
     from jawusd.tracking.contour.scan import Scan
     from jawusd.tracking.contour.views import View
     from jawusd.tracking.region.appearance import Cut, Picture
-    from jawusd.tracking.region.picture_start import ArchStart
     from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 
@@ -84,7 +79,12 @@ class Cutter:
 # at 24 fps; a false positive costs the time of one frame.
 _JUMP_MM, _SAME_MM = 0.8, 0.15
 _SAMPLED_VIEWS = 10  # maximum number of frames whose views are kept: a few MB
+_SHORTEST_LOSS = 3  # minimum number of successive lost frames in which the teeth are searched for
 STAGE = "follow"
+
+#: Function that searches for the teeth in some frames, passes what it finds to `Follower.start_at`, and returns it.
+#: Its second argument is the up direction of the head in the world, shape (3,). It raises TrackingError.
+Find: TypeAlias = Callable[[range, Array], Start[Array]]
 
 
 class Follower:
@@ -135,8 +135,10 @@ class Follower:
         self._start: tuple[int, RegionPose, RegionTracker, Cutter] = frame, found, tracker, cutter
         return found, tracker.first_fit
 
-    def run(self, frames: range, progress: Progress) -> dict[int, RegionPose]:
+    def run(self, frames: range, find: Find, progress: Progress) -> dict[int, RegionPose]:
         """Return the poses of all frames, starting from the frame last passed to `start_at`.
+
+        Where the teeth are lost for several frames, `find` searches for them.
 
         Raises:
             CaptureError: an image cannot be decoded.
@@ -146,7 +148,7 @@ class Follower:
         sampled = set(np.linspace(frames.start, frames.stop - 1, _SAMPLED_VIEWS).astype(int).tolist())
         out, points = {frame: begin}, self._subject.landmarks[:3]
         progress(STAGE, 1, len(frames))
-        for way in (range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)):
+        for way in _ways(frame, frames):
             cuts = _Latest(cutter.walk(self._footage, way))
             for at, found in zip(way, tracker.follow(cuts, begin.poses), strict=True):
                 out[at] = found
@@ -155,8 +157,44 @@ class Follower:
                 progress(STAGE, len(out), len(frames))
             for jump in _jumps(way, out, points):
                 back = range(jump - way.step, frame, -way.step)
-                _follow_back(back, tracker.follow(cutter.walk(self._footage, back), out[jump].poses), out, points)
+                _replace(back, tracker.follow(cutter.walk(self._footage, back), out[jump].poses), out, points)
+        self._recover(out, frames, find)
         return out
+
+    def _recover(self, known: dict[int, RegionPose], frames: range, find: Find) -> None:
+        """Search for the teeth where they were lost, and follow them from there both ways, up to equal known poses.
+
+        Poses that contradict the known ones where they meet, and agree with none, are discarded.
+        """
+        vain: set[int] = set()
+        while lost := next((s for s in _lost_stretches(known, frames) if s.start not in vain), None):
+            nearest = min(
+                (f for f in known if known[f].found[0]), key=lambda f: min(abs(f - lost[0]), abs(f - lost[-1]))
+            )
+            up = known[nearest].poses[0, :3, :3] @ self._subject.T_anatomical_skull[1, :3]
+            again = self._followed_from(lost, frames, find, up, known)
+            if again is None:
+                vain.update(lost)
+            else:
+                known.update(again)
+
+    def _followed_from(
+        self, lost: range, frames: range, find: Find, up_world: Array, known: Mapping[int, RegionPose]
+    ) -> dict[int, RegionPose] | None:
+        """Return all poses after a search in lost frames, or None if it fails or contradicts the known poses."""
+        try:
+            begin = find(lost, up_world)
+        except TrackingError:
+            return None
+        frame, pose, tracker, cutter = self._start
+        again = {**known, begin.frame: pose}
+        meetings = [
+            _replace(
+                way, tracker.follow(cutter.walk(self._footage, way), pose.poses), again, self._subject.landmarks[:3]
+            )
+            for way in _ways(frame, frames)
+        ]
+        return None if False in meetings and True not in meetings else again
 
 
 class _Latest(Iterator["Cut"]):
@@ -184,119 +222,36 @@ def _jumps(way: range, known: Mapping[int, RegionPose], points: Array) -> list[i
     return [way[k + 2] for k in np.flatnonzero(bend_mm > _JUMP_MM).tolist()]
 
 
-def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, RegionPose], points: Array) -> None:
-    """Replace poses by those tracked backwards, as long as the two differ and the latter fit more of the contour.
+def _ways(frame: int, frames: range) -> tuple[range, range]:
+    """Return the frames after and before a frame, in the order in which they are followed."""
+    return range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)
 
-    A jump means that the tracker recovered from an error; each wrong pose before the jump is plausible by itself.
+
+def _lost_stretches(known: Mapping[int, RegionPose], frames: range) -> list[range]:
+    """Return the runs of successive frames on which an arch was not found, except very short ones."""
+    found = np.array([known[frame].found.all() for frame in frames])
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], found, [True]]).astype(int))).reshape(-1, 2).tolist()
+    return [frames[first:stop] for first, stop in edges if stop - first >= _SHORTEST_LOSS]
+
+
+def _replace(way: range, again: Iterator[RegionPose], known: dict[int, RegionPose], points: Array) -> bool | None:
+    """Replace poses by others of the same frames, as long as the two differ and the latter fit more of the contour.
+
+    A jump means that the tracker recovered from an error, and a loss that it made one; each wrong pose before is
+    plausible by itself.
+
+    Returns:
+        True if an equal pose ended this, False if a different one that fits at least as well, None if the arches were
+        lost or the take ended.
     """
-    for frame, found in zip(back, again, strict=False):
-        apart_mm = np.linalg.norm(_places(found, points) - _places(known[frame], points), axis=-1).mean()
-        better = found.objective_px > known[frame].objective_px or not known[frame].found.all()
-        if apart_mm < _SAME_MM or not found.found.all() or not better:
-            return
+    for frame, found in zip(way, again, strict=False):
+        if not found.found.all():
+            return None
+        if known[frame].found.all():
+            apart_mm = np.linalg.norm(_places(found, points) - _places(known[frame], points), axis=-1).mean()
+            if apart_mm < _SAME_MM:
+                return True
+            if found.objective_px <= known[frame].objective_px:
+                return False
         known[frame] = found
-
-
-FEWEST_VIDEOS = 2
-# Minimum fraction of the visible contour that matches the colours, below which picks are rejected. Fractions of six
-# path-traced mouths were 0.26 to 0.5; of three dark, noisy or colourless ones 0.13 to 0.27, with errors up to 0.3 mm. A
-# focal length wrong by 15 % gave 0.05, another subject's lower scan 0.08 and 0.12, with errors above 1 mm.
-_LEAST_PICKED_FIT = 0.1
-
-
-def track_videos(
-    capture: Capture, offsets: dict[str, int], meshes: Mapping[str, Mesh], jobs: int, progress: Progress
-) -> Tracks:
-    """Track both arches by the colours of the videos; see `track`.
-
-    Args:
-        offsets: frame offset by camera.
-        meshes: labelled meshes of the capture.
-
-    Raises:
-        CaptureError: fewer than two cameras have a video, or one cannot be decoded.
-        TrackingError: the teeth were not found.
-    """
-    from jawusd.segmentation.picture import ColourFootage
-    from jawusd.tracking.contour.scan import prepare_scan
-    from jawusd.tracking.region.picture_start import ArchStart
-    from jawusd.tracking.region.take import TakeFacts, footage_findings, tracks_of
-
-    cameras, videos = open_footage(capture)
-    if len(videos) < FEWEST_VIDEOS:
-        raise CaptureError(
-            f"{len(videos)} of {len(capture.cameras)} cameras have a video; tracking without masks needs at least "
-            f"{FEWEST_VIDEOS}.",
-            path=capture.folder / "capture.toml",
-        )
-    cameras = {name: camera for name, camera in cameras.items() if name in videos}
-    footage = ColourFootage(videos, offsets)
-    frames = range(*(capture.frames or footage.range()))
-    subject = subject_of_capture(capture, meshes)
-    teeth = meshes["upper_teeth"], meshes["lower_teeth"]
-    scans = prepare_scan(teeth[0], "upper"), prepare_scan(teeth[1], "lower")
-    with ThreadPoolExecutor(jobs) as pool:
-        rows = ArchStart(teeth, scans, capture.anatomy.T_anatomical_skull, pool.map)
-        follower = Follower(footage, cameras, scans, subject, pool)
-        picks = capture.bootstrap
-        if picks is None:
-            begin = searched_start(capture, offsets, footage, rows, follower, frames, progress)
-        else:
-            begin = _picked_start(rows, follower, picks, frames)
-        followed = follower.run(frames, progress)
-    facts = TakeFacts(
-        tuple(cameras.values()),
-        scans,
-        subject.landmarks,
-        subject.T_anatomical_skull[:3, :3],
-        capture.motion.rest_frame,
-        capture.scans.registration == "take",
-    )
-    tracks = tracks_of(followed, facts, follower.sampled_views)
-    tracks.meta["start"] = {"by": begin.by, "frame": begin.frame, "fit": begin.fit}
-    findings = [finding.as_json() for finding in (*rows.findings, *footage_findings(tracks))]
-    tracks.meta["findings"] = [*tracks.meta.get("findings", []), *findings]
-    return tracks
-
-
-def _picked_start(rows: ArchStart, follower: Follower, picks: Bootstrap, frames: range) -> Start[Array]:
-    """Return a start from the picks.
-
-    Raises:
-        TrackingError: the picks are inconsistent, or do not fit the images.
-    """
-
-    def begin() -> tuple[Array, float]:
-        found, fit = follower.start_at(picks.frame, rows.picked(picks, follower.cameras))
-        return found.poses, fit
-
-    return picked_start(picks.frame, frames, begin, _LEAST_PICKED_FIT)
-
-
-def searched_start(
-    capture: Capture,
-    offsets: Mapping[str, int],
-    footage: ColourFootage,
-    rows: ArchStart,
-    follower: Follower,
-    frames: range,
-    progress: Progress,
-) -> Start[Array]:
-    """Search for the teeth and start the follower there; return T_world_upper, T_world_lower (2, 4, 4) as the pose.
-
-    Raises:
-        TrackingError: the teeth were not found.
-        CaptureError: an image cannot be decoded.
-    """
-
-    def near(sources: Sequence[CameraSource], frame: int) -> Array | None:
-        return rows.at(sources, follower.cameras, offsets, frame)
-
-    def judged(frame: int, poses: Array) -> tuple[Array, float]:
-        found, fit = follower.start_at(frame, poses)
-        return found.poses, fit
-
-    search = PictureSearch(capture, footage, follower.cameras, near, judged)
-    begin = search.run(frames, progress)
-    follower.start_at(begin.frame, begin.pose)  # repeated, because the search may have tried other frames since
-    return begin
+    return None

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import CameraSource, Capture
-from jawusd.geometry import Camera
+from jawusd.geometry import Camera, se3_inverse
 from jawusd.pipeline.segment_record import with_masks
 from jawusd.pipeline.state import Progress
 
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
     from jawusd.segmentation.picture import ColourFootage, Pictures
     from jawusd.segmentation.rows import Rows
 
-# Frame stride of the search, and frames per part of the take.
-_EVERY, _PART = 8, 240
+# Frames per part of the take, maximum frame stride of the search, and minimum number of frames searched in long parts.
+_PART, _EVERY, _FEWEST = 240, 8, 8
 # Starts tried per part for each of the four orientations of the cameras, the most likely orientation first.
 _TRIED = (4, 1, 1, 1)
 # Maximum number of starts tried, at about ten seconds of CPU time each. If six parts yield no start that fits, scans,
@@ -83,20 +84,24 @@ class PictureSearch(Generic[T]):
     near: Callable[[Sequence[CameraSource], int], T | None]
     judged: Callable[[int, T], tuple[T, float]]
 
-    def run(self, frames: range, progress: Progress) -> Start[T]:
+    def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
         """Return the first start with a clear fit, or else the best one of a part of the take and an orientation.
+
+        `up_world` is the up direction of the head, shape (3,), if the teeth are known on other frames, with which the
+        start can be compared: the first one that fits is then returned. Otherwise, four orientations are tried.
 
         Raises:
             TrackingError: no start fits.
             CaptureError: an image cannot be decoded.
         """
-        clear = _CLEAR_FIT if len(self.cameras) > 1 else _CLEAR_FIT_SINGLE
+        clear = LEAST_FIT if up_world is not None else _CLEAR_FIT if len(self.cameras) > 1 else _CLEAR_FIT_SINGLE
+        hypotheses = orientations(self.cameras) if up_world is None else [upright_turns(self.cameras, up_world)]
         best: Start[T] | None = None
         tried: list[int] = []
         seen = 0
         for part in (frames[k : k + _PART] for k in range(0, len(frames), _PART)):
             seen += len(part)
-            for turns, count in zip(orientations(self.cameras), _TRIED, strict=True):
+            for turns, count in zip(hypotheses, _TRIED, strict=False):
                 candidates = self._candidates(part, turns, progress)
                 for candidate in sorted(candidates, key=lambda candidate: candidate.bridged)[:count]:
                     tried.append(candidate.frame)
@@ -117,7 +122,7 @@ class PictureSearch(Generic[T]):
 
     def _candidates(self, part: range, turns: Mapping[str, int], progress: Progress) -> list[_Candidate]:
         """Return the frames of a part of the take on which the arches are apart in enough cameras."""
-        out, chosen = [], part[::_EVERY]
+        out, chosen = [], part[:: min(_EVERY, max(1, len(part) // _FEWEST))]
         for done, (frame, pictures) in enumerate(self.footage.walk(chosen), start=1):
             apart = arches_apart(pictures, turns)
             if len(apart) >= min(2, len(self.cameras)):
@@ -134,28 +139,30 @@ class PictureSearch(Generic[T]):
         return None if near is None else Start(candidate.frame, *self.judged(candidate.frame, near), "search")
 
 
+def upright_turns(cameras: Mapping[str, Camera], up_world: Array) -> dict[str, int]:
+    """Return the number of counter-clockwise quarter turns that make each camera's image upright.
+
+    Cameras that look along the up direction of the head in the world, shape (3,), are left out.
+    """
+    turns = {}
+    for name, camera in cameras.items():
+        x, y, _ = camera.T_cam_world[:3, :3] @ up_world
+        if np.hypot(x, y) > _SHORTEST_UP:
+            turns[name] = round(np.arctan2(x, -y) / (np.pi / 2)) % 4
+    return turns
+
+
 def orientations(cameras: Mapping[str, Camera]) -> list[dict[str, int]]:
-    """Return four hypotheses of how the cameras are turned about their optical axes, the most likely first.
+    """Return four hypotheses of how the cameras are turned about their optical axes, as in `upright_turns`.
 
     A camera may lie on its side or hang upside down. The calibration gives the orientation of the cameras relative to
-    one another, so that one unknown remains: how the first camera is turned. Most likely most cameras are upright.
-
-    Returns:
-        for every hypothesis, the number of counter-clockwise quarter turns that make each camera's image upright.
-        Cameras that look along the vertical are left out.
+    one another, so that one unknown remains: how the first camera is turned. The hypothesis with most upright cameras
+    is the first.
     """
-    first = next(iter(cameras.values()))
-    out = []
-    for turn in (0, 1, 3, 2):
-        up_first = np.array([np.sin(turn * np.pi / 2), -np.cos(turn * np.pi / 2), 0.0])
-        up_world = first.T_cam_world[:3, :3].T @ up_first
-        turns = {}
-        for name, camera in cameras.items():
-            x, y, _ = camera.T_cam_world[:3, :3] @ up_world
-            if np.hypot(x, y) > _SHORTEST_UP:
-                turns[name] = round(np.arctan2(x, -y) / (np.pi / 2)) % 4
-        out.append(turns)
-    return sorted(out, key=lambda turns: -sum(turn == 0 for turn in turns.values()))
+    T_world_first = se3_inverse(next(iter(cameras.values())).T_cam_world)
+    ups = [np.array([np.sin(angle), -np.cos(angle), 0.0]) for angle in np.pi / 2 * np.array([0, 1, 3, 2])]
+    found = [upright_turns(cameras, T_world_first[:3, :3] @ up) for up in ups]
+    return sorted(found, key=lambda turns: -sum(turn == 0 for turn in turns.values()))
 
 
 def arches_apart(pictures: Pictures, turns: Mapping[str, int]) -> dict[str, Rows]:

@@ -19,7 +19,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
 from jawusd.pipeline.cameras import open_footage
 from jawusd.pipeline.capture_inputs import input_hashes
-from jawusd.pipeline.follow import Follower, searched_start
+from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.picture_search import picks_outside
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.segment_record import (
@@ -30,6 +30,7 @@ from jawusd.pipeline.segment_record import (
 )
 from jawusd.pipeline.state import Progress, hash_files, hash_value
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
+from jawusd.pipeline.track_videos import ArchSearch
 
 if TYPE_CHECKING:
     from jawusd.segmentation.camera import CameraSegmenter, Segment
@@ -154,7 +155,7 @@ class _Segmentation:
         """Follow the teeth through all frames by their colours, from poses on one of them."""
         follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
         follower.start_at(start, poses)
-        self._guide = follower.run(range(self._first, self._stop), self._progress)
+        self._guide = follower.run(range(self._first, self._stop), self._search(follower).again, self._progress)
         save_guide(self._folder, self._guide_inputs, self._guide)
 
     def _find_start(self) -> tuple[int, Array]:
@@ -163,8 +164,6 @@ class _Segmentation:
         Raises:
             TrackingError: the picks are inconsistent, or the teeth were not found.
         """
-        from jawusd.tracking.region.picture_start import ArchStart
-
         picks = self._capture.bootstrap
         frames = range(self._first, self._stop)
         if picks is not None:
@@ -176,12 +175,17 @@ class _Segmentation:
             self._start = next(iter(self._journal.entries))  # the first recorded frame is the start
             return self._start, self._guide[self._start].poses
         follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
-        upper, lower = self._tracker.scans
-        rows = ArchStart(self._meshes, (upper, lower), self._capture.anatomy.T_anatomical_skull, self._pool.map)
-        capture, footage = self._capture, self._footage
-        begin = searched_start(capture, self._offsets, footage, rows, follower, frames, self._progress)
+        begin = self._search(follower).run(frames, None, self._progress)
         self._start = begin.frame
         return begin.frame, begin.pose
+
+    def _search(self, follower: Follower) -> ArchSearch:
+        """Return a search for the teeth for a follower."""
+        from jawusd.tracking.region.picture_start import ArchStart
+
+        upper, lower = self._tracker.scans
+        rows = ArchStart(self._meshes, (upper, lower), self._capture.anatomy.T_anatomical_skull, self._pool.map)
+        return ArchSearch(self._capture, self._offsets, self._footage, rows, follower)
 
     def _advance(self, stage_name: str, done: int) -> None:
         self._progress(stage_name, done, self._stop - self._first)

@@ -52,9 +52,11 @@ def tooth_rows(rgb: NDArray[np.uint8], turns: int = 0) -> Rows | None:
 
     `turns` is the number of counter-clockwise quarter turns that make the image upright. Masks are as the image given.
     """
-    if turns % 4:
-        found = tooth_rows(np.ascontiguousarray(np.rot90(rgb, turns)))
-        return found and Rows(np.ascontiguousarray(np.rot90(found.masks, -turns, axes=(1, 2))), found.bridged)
+    found = _upright_rows(np.ascontiguousarray(np.rot90(rgb, turns)))
+    return found and Rows(np.ascontiguousarray(np.rot90(found.masks, -turns, axes=(1, 2))), found.bridged)
+
+
+def _upright_rows(rgb: NDArray[np.uint8]) -> Rows | None:
     height, width = rgb.shape[:2]
     small = cv2.resize(rgb, (_WIDTH_PX, max(8, round(height * _WIDTH_PX / width))), interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(small, (0, 0), 1.0).astype(np.float32)

@@ -1,5 +1,7 @@
 """Automatic masks are recognised, and the tracker allows them larger errors than drawn ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from package_copy import ROOT
@@ -8,7 +10,7 @@ from jawusd.base.errors import FormatError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import make_transform
-from jawusd.pipeline.follow import _follow_back, _jumps
+from jawusd.pipeline.follow import _jumps, _lost_stretches, _replace
 from jawusd.pipeline.segment_guide import GUIDE, combine_guide, save_guide
 from jawusd.pipeline.segment_record import SUMMARY, auto_masks_folder, with_masks
 from jawusd.pipeline.track import tracking_config
@@ -145,7 +147,7 @@ def test_a_jaw_found_again_is_followed_back_to_where_it_was_lost():
     assert _jumps(frames, known, LANDMARKS[:3]) == [35, 36, 45, 46]
     back = range(44, 20, -1)
     right = _followed(frames, moved)
-    _follow_back(back, (right[f] for f in back), known, LANDMARKS[:3])
+    assert _replace(back, (right[f] for f in back), known, LANDMARKS[:3]) is True
     assert [known[f].poses[1, 0, 3] for f in frames] == pytest.approx(moved)
 
 
@@ -153,5 +155,16 @@ def test_poses_followed_back_that_fit_less_change_nothing():
     frames = range(20, 30)
     known, worse = _followed(frames, np.zeros(10)), _followed(frames, np.ones(10), 500.0)
     before = dict(known)
-    _follow_back(range(28, 20, -1), (worse[f] for f in range(28, 20, -1)), known, LANDMARKS[:3])
+    assert _replace(range(28, 20, -1), (worse[f] for f in range(28, 20, -1)), known, LANDMARKS[:3]) is False
     assert known == before and _jumps(frames, known, LANDMARKS[:3]) == []
+
+
+def test_poses_lost_again_end_a_replacement():
+    frames = range(20, 30)
+    known, again = _followed(frames, np.zeros(10)), _followed(frames, np.ones(10))
+    lost = replace(again[25], found=np.array([True, False]))
+    known |= {frame: replace(known[frame], found=np.zeros(2, bool)) for frame in range(22, 26)}
+    assert _lost_stretches(known, frames) == [range(22, 26)]
+    assert _replace(range(22, 30), (again[f] if f < 25 else lost for f in range(22, 30)), known, LANDMARKS[:3]) is None
+    assert [known[f].poses[1, 0, 3] for f in frames] == pytest.approx([0, 0, 1, 1, 1, 0, 0, 0, 0, 0])
+    assert _lost_stretches(known, frames) == []  # one frame is left

@@ -11,13 +11,14 @@ from jawusd.cli.text_build import track_lines
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import se3_exp, transform_points
-from jawusd.pipeline import follow
+from jawusd.pipeline import track_videos as videos
 from jawusd.pipeline.cameras import open_footage
-from jawusd.pipeline.follow import track_videos
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_meshes
 from jawusd.pipeline.track import first_pass, track_summary
+from jawusd.pipeline.track_videos import track_videos
 from jawusd.tracking.region.take import footage_findings
+from jawusd.tracking.region.tracker import RegionTracker
 
 EXAMPLE = ROOT / "examples" / "capture"
 
@@ -88,7 +89,7 @@ def test_wrong_cameras_and_scans_are_named(offsets, monkeypatch, spoil, size, ki
         cameras, videos = open_footage(capture)
         return {name: spoil(one) if spoil and name == camera else one for name, one in cameras.items()}, videos
 
-    monkeypatch.setattr(follow, "open_footage", opened)
+    monkeypatch.setattr(videos, "open_footage", opened)
     start = load_capture(EXAMPLE).bootstrap.frame
     capture = unmasked((start - 3, start + 9))
     meshes = {
@@ -162,3 +163,20 @@ def test_footage_doubtful_all_over_has_no_part_to_keep(tracked):
     sigma = np.full((12, 5), 0.3)
     sigma[6] = np.nan
     assert "frames =" not in footage_findings(replace(tracked[1], sigma_mm=sigma))[0].hint
+
+
+@pytest.mark.slow
+def test_teeth_that_stay_lost_are_searched_and_followed_both_ways(offsets, truth, monkeypatch):
+    """The tracker loses the teeth on the second frame, and does not find them again by itself."""
+    original, calls = RegionTracker.follow, []
+
+    def lost(tracker, cuts, poses):
+        calls.append(poses)
+        for found in original(tracker, cuts, poses):
+            yield found if len(calls) > 2 else replace(found, found=np.zeros(2, bool))
+
+    monkeypatch.setattr(RegionTracker, "follow", lost)
+    first = load_capture(EXAMPLE).bootstrap.frame
+    tracks = first_pass(unmasked((first, first + 9)), offsets, 2, no_progress)
+    assert len(calls) == 4 and not (tracks.status == LOST).any()
+    assert off_mm(tracks, truth).max() < 0.3
