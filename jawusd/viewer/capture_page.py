@@ -264,6 +264,6 @@ class CapturePage:
 
     def close(self) -> None:
         """Stop the tasks of this page."""
-        self.footage.player.stop()
+        self.footage.player.close()
         if self._drawing is not None:
             self._drawing.cancel()

@@ -104,7 +104,7 @@ class Player:
     """Playback of a motion in the event loop."""
 
     def __init__(self, show: Callable[[float], None], ended: Callable[[], None]) -> None:
-        """Call `show` with every frame number during playback, and `ended` whenever it stops."""
+        """Call `show` with every frame number during playback, and `ended` whenever it stops, except by `close`."""
         self._show, self._ended = show, ended
         self._task: asyncio.Task[None] | None = None
 
@@ -120,10 +120,15 @@ class Player:
 
     def stop(self) -> None:
         """Stop playback; no effect when stopped."""
+        if self.playing:
+            self.close()
+            self._ended()
+
+    def close(self) -> None:
+        """Stop playback without calling `ended`, for a page that is gone."""
         if self._task is not None:
             self._task.cancel()
             self._task = None
-            self._ended()
 
     async def _run(self, frame: float, fps: float, span: tuple[float, float], loop: Callable[[], bool]) -> None:
         began = time.monotonic()

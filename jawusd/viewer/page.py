@@ -160,4 +160,4 @@ class Page:
         """Stop playback."""
         if self._opening is not None:
             self._opening.cancel()
-        self.motion.player.stop()
+        self.motion.player.close()

@@ -228,6 +228,16 @@ def test_the_captured_take_plays_as_the_page_opens_until_it_is_paused(quiet):
     assert not motion.player.playing and session.d[0] == 11.0 and quiet.notices == []
 
 
+def test_a_page_that_is_closed_while_it_plays_is_sent_nothing_more(quiet):
+    motion = quiet.page.motion
+    quiet.call(quiet.page.play_take)
+    until(lambda: motion.player.playing)
+    quiet.call(quiet.page.close)
+    frame = motion.frame
+    time.sleep(0.2)
+    assert not motion.player.playing and motion.frame == frame and motion.play.label == "pause"
+
+
 @pytest.mark.parametrize("done", ["posed", "closed"])
 def test_a_take_that_is_read_late_does_not_disturb(quiet, done):
     page, motion, read = quiet.page, quiet.page.motion, threading.Event()
