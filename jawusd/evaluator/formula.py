@@ -28,6 +28,7 @@ from typing import Generic, NamedTuple, Protocol, cast
 
 from jawusd.evaluator.curve_formula import curve, curve_tables, flat_ended_slopes
 from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, polynomial, rows, triple
+from jawusd.evaluator.spline_formula import spline, spread_of
 from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 
 # Tolerance of the inside test: parameters on the bound may round to either side of it.
@@ -154,27 +155,6 @@ def spline_input(gauge: GaugeNumbers, scales: Sequence[float], u: Triple[N], ops
     return opening / scales[0], (u[0] - gx) / scales[1], (u[2] - gz) / scales[2]
 
 
-def spline(
-    q: Triple[N], centres: Table, weights: Table, linear: Sequence[Sequence[float]], ops: Operations[N, Table]
-) -> Triple[N]:
-    """Return ``sum_i W_i |q - c_i|^3 + q L``: a polyharmonic spline with a linear tail (Duchon 1977).
-
-    Args:
-        q: The argument, see `spline_input`.
-        centres: The centres c_i, one per row.
-        weights: The kernel weights W_i, one per row.
-        linear: The linear terms, 3 inputs times 3 outputs.
-        ops: Operations of the number type.
-    """
-    kernels = []
-    for x, y, z in zip(*ops.columns(centres)):
-        away = (q[0] - x, q[1] - y, q[2] - z)
-        squared = dot(away, away)
-        kernels.append(squared * ops.sqrt(squared))
-    bent_part = ops.weighted_sum(kernels, weights)
-    return triple([bent_part[k] + q[0] * linear[0][k] + q[1] * linear[1][k] + q[2] * linear[2][k] for k in range(3)])
-
-
 @dataclass(frozen=True)
 class RigidMotion(Generic[N]):
     """A rigid motion.
@@ -243,13 +223,17 @@ class JawFormula(Protocol):
 
 
 class AnchoredNumbers(NamedTuple):
-    """The scalars of an anchored model, see `AnchoredModel`; `linear` has 3 inputs times 3 outputs [rad]."""
+    """The scalars of an anchored model, see `AnchoredModel`; `linear` has 3 inputs times 3 outputs [rad].
+
+    `spread` is as from `spread_of`.
+    """
 
     gauge: GaugeNumbers
     incisor: Triple[float]
     scales: Sequence[float]
     linear: Sequence[Sequence[float]]
     offset: Triple[float]
+    spread: Triple[float] | None
 
 
 class AnchoredFormula:
@@ -277,8 +261,10 @@ class AnchoredFormula:
             for name, d in (("glide2", "d2"), ("glide3", "d3")):
                 knots, factors = arrays[f"glide_{d}"], rows(arrays[f"glide_{d}_factors"], self._glide_width)
                 self.tables.update(curve_tables(name, knots, factors, flat_ended_slopes(knots, factors)))
-        offset = spline((0.0, 0.0, 0.0), self.tables["centres"], weights, linear, FloatOperations())
-        self.numbers = AnchoredNumbers(gauge, triple(arrays["incisor"]), arrays["spline_scales"], linear, offset)
+        spread = spread_of(self.tables["centres"], weights)
+        offset = spline((0.0, 0.0, 0.0), self.tables["centres"], weights, linear, spread, FloatOperations())
+        incisor, scales = triple(arrays["incisor"]), arrays["spline_scales"]
+        self.numbers = AnchoredNumbers(gauge, incisor, scales, linear, offset, spread)
 
     def motion(
         self,
@@ -288,11 +274,11 @@ class AnchoredFormula:
         numbers: Numbers | None = None,
     ) -> RigidMotion[N]:
         """Return the motion away from the closed bite, see `JawFormula`."""
-        gauge, incisor, scales, linear, offset = cast("AnchoredNumbers", numbers or self.numbers)
+        gauge, incisor, scales, linear, offset, spread = cast("AnchoredNumbers", numbers or self.numbers)
         table = glide(self._glide_width, d[1], d[2], tables, ops) if self._glide_width else None
         u = displacement(gauge, d, ops, table)
         q = spline_input(gauge, scales, u, ops)
-        omega = spline(q, tables["centres"], tables["weights"], linear, ops)
+        omega = spline(q, tables["centres"], tables["weights"], linear, spread, ops)
         return anchored_motion(triple([x - o for x, o in zip(omega, offset)]), u, incisor, ops)
 
 

@@ -29,6 +29,7 @@ from jawusd.evaluator.gauge import (
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.evaluator.operations import triple
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED
+from jawusd.evaluator.spline_formula import spline
 from jawusd.solvers.motion import OPERATIONS, MotionModule
 from jawusd.solvers.solution import applied, attached, capturing, finished, inverse
 
@@ -89,15 +90,17 @@ class AnchoredMotion(MotionModule):
 
     def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rotation, translation [mm] and spatial derivative at u (n, 3) [mm]."""
-        gauge, _, scales, *_ = self._anchored_numbers()
+        gauge, _, scales, *_, spread = self._anchored_numbers()
         # in the order of `AnchoredNumbers`
-        incisor, _, tail, offset = self.singles[_GAUGE_NUMBERS:].split([3, 3, 9, 3])
+        incisor, _, tail, offset = self.singles[_GAUGE_NUMBERS : _GAUGE_NUMBERS + 18].split([3, 3, 9, 3])
         tail = tail.reshape(3, 3)
         sheared, slopes = spline_input(gauge, scales, triple(x.unbind(dim=1)), TENSORS)
         q = torch.stack(sheared, dim=1)
         away = q[:, None] - self.centres
         r = away.norm(dim=2)
-        omega = (r * r * r) @ self.weights + q @ tail - offset
+        columns = triple(q.split(1, dim=1))
+        rows = [tail[i].unbind() for i in range(3)]
+        omega = torch.cat(spline(columns, self.centres, self.weights, rows, spread, OPERATIONS), dim=1) - offset
         by_q = 3.0 * self.weights.T @ (away * r[:, :, None]) + tail.T
         by_u = torch.stack(gradient_by_u(triple(by_q.unbind(dim=2)), scales, _columns(slopes)), dim=2)
         R, J = _rotations(omega)

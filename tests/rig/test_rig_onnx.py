@@ -72,6 +72,15 @@ def test_what_overflows_far_away_spoils_nothing_nearer(name):
         assert np.isfinite(found).all()
 
 
+@pytest.mark.parametrize("name", ["anchored, touching", "additive, touching", "many centres"])
+def test_single_precision_suffices_far_from_the_bound(name):
+    rig, vertices = RIGS[name](), mandible_vertices()
+    d = np.random.default_rng(3).uniform(-200.0, 200.0, (500, 3)).astype(np.float32)
+    (pose,) = run(rig, d, np.float32, ["pose"])
+    difference = moved(pose.astype(np.float64), vertices) - moved(rig.pose(d.astype(np.float64)), vertices)
+    assert np.linalg.norm(difference, axis=-1).max() < 0.05
+
+
 @pytest.mark.parametrize("scale", [0.0, 1e-12, 1e-7, 1e-3, 3.0])
 def test_small_and_large_parameters(kind, scale):
     """Far outside the bounds too, where solvers may pass: no division by zero, no NaN."""
