@@ -161,7 +161,7 @@ def main():
     parser.add_argument("--browser", help="a Chromium")
     given = parser.parse_args()
     began = time.perf_counter()
-    viewer = open_viewer(given.rig, "127.0.0.1", 0)
+    viewer = open_viewer(given.rig, "127.0.0.1", 0, play=False)
     print(f"rig read, meshes made, server up    {time.perf_counter() - began:8.2f} s")
     quiet = QuietPage(viewer)
     page = quiet.page
