@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jawusd.base.arrays import Array
     from jawusd.cli.motion import AuthoredMotion, Changes
     from jawusd.evaluator import JawRig
-    from jawusd.formats.arkit import ArkitMapping
+    from jawusd.formats.arkit import ArkitMapping, BlendShapes
 
 
 Rate = Annotated[
@@ -124,7 +124,8 @@ def animate(
     mapping: Annotated[
         Path | None,
         typer.Option(
-            help="The actor's mapping of --arkit, from arkit-fit. Default: fractions of the ranges.", show_default=False
+            help="The actor's mapping of --arkit, from arkit-fit or skin-fit. Default: fractions of the ranges.",
+            show_default=False,
         ),
     ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer, or .glb for the web.")] = Path("anim.usdc"),
@@ -298,7 +299,8 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
     Args:
         source: CSV of Live Link Face.
         fps: frame rate of the motion, None for the rate of the time codes.
-        mapping: file written by `jawusd arkit-fit`; None for fractions of the ranges.
+        mapping: file written by `jawusd arkit-fit`, or by `jawusd skin-fit` from the same blend shapes; None for
+            fractions of the ranges.
 
     Raises:
         FormatError: the file is invalid or has no row with a face, or the mapping belongs to another subject.
@@ -307,27 +309,51 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
 
     from jawusd.base.errors import FormatError
     from jawusd.cli.motion import AuthoredMotion
-    from jawusd.formats.arkit import read_arkit, shares_of
+    from jawusd.formats.arkit import read_arkit, read_blend_shapes, shares_of
 
-    capture = read_arkit(source, fps)
-    if mapping is None:
-        d = rig.denormalized(shares_of(capture.weights))
+    if mapping is not None and mapping.suffix == ".npz":
+        shapes = read_blend_shapes(source, fps)
+        frames, rate, d = shapes.frames, shapes.fps, _by_skin(rig, shapes, source, mapping)
     else:
-        d = _own_mapping(rig, mapping).d(capture.weights)
+        capture = read_arkit(source, fps)
+        frames, rate = capture.frames, capture.fps
+        own = None if mapping is None else _own_mapping(rig, mapping)
+        d = rig.denormalized(shares_of(capture.weights)) if own is None else own.d(capture.weights)
     if not np.isfinite(d).any():
         raise FormatError("no row has a face (BlendShapeCount is 0 in all rows).", path=source)
-    return AuthoredMotion(capture.frames, d, capture.fps)
+    return AuthoredMotion(frames, d, rate)
+
+
+def _by_skin(rig: JawRig, shapes: BlendShapes, source: Path, path: Path) -> Array:
+    """Return d [mm] (F, 3) of all blend shapes of a face capture."""
+    from jawusd.base.errors import FormatError
+    from jawusd.evaluator.skin import load_skin
+
+    skin = load_skin(path)
+    _check_actor(rig, skin.actor, path)
+    if skin.meta.get("names") != list(shapes.names):
+        raise FormatError(
+            f"has {len(shapes.names)} blend shapes; {path.name} was learned from {skin.columns} columns with other "
+            "names or in another order.",
+            path=source,
+        )
+    return skin(shapes.weights).d
 
 
 def _own_mapping(rig: JawRig, path: Path) -> ArkitMapping:
-    from jawusd.base.errors import FormatError
     from jawusd.formats.arkit import load_mapping
 
-    own, actor = load_mapping(path), str(rig.meta.get("actor", ""))
-    if own.actor != actor:
+    own = load_mapping(path)
+    _check_actor(rig, own.actor, path)
+    return own
+
+
+def _check_actor(rig: JawRig, actor: str, path: Path) -> None:
+    from jawusd.base.errors import FormatError
+
+    if actor != rig.actor:
         raise FormatError(
-            f'is the mapping of "{own.actor}", but the rig is of "{actor}"; parameters differ between subjects.',
+            f'is the mapping of "{actor}", but the rig is of "{rig.actor}"; parameters differ between subjects.',
             path=path,
             hint="Omit --mapping, or animate that subject's rig and use `jawusd retarget`.",
         )
-    return own

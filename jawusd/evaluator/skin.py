@@ -14,7 +14,7 @@ out. The arrays of the file, for M training frames, K columns, C components:
     noise (M,)                   variance of each training frame, relative to that of d
     kernel (4,)                  length, smooth, linear, and the variance of a new frame that skin does not explain
     spread (3, 3)                covariance of d per unit of variance of the process [mm^2]
-    head_error (R, C)            change of the features by one standard deviation of each error of head stabilisation
+    head_error (R, C)            change of the features by one sigma of each shift and rotation of the head
     smooth_count (), familiar_count ()    number of components in the smooth part, and in the test of familiarity
     familiar_limit (2,)          largest variance, and largest squared distance from the components, of a familiar face
     meta                         JSON: actor, names of the columns, frames, held-out errors, false-alarm rate
@@ -125,7 +125,8 @@ class Skin:
     def errors_mm(self) -> dict[str, float]:
         """Mean held-out errors at the incisal point [mm] of "skin" and of guesses, see `fitting.skin.fit_skin`."""
         found = self.meta.get("errors_mm")
-        return {str(k): float(v) for k, v in found.items()} if isinstance(found, Mapping) else {}
+        named = found.items() if isinstance(found, Mapping) else ()
+        return {str(name): float(value) for name, value in named if isinstance(value, int | float)}
 
     @property
     def actor(self) -> str:

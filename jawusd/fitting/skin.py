@@ -24,16 +24,17 @@ from jawusd.fitting.face import COARSE_S, columns_at, incisal_error, offsets_bet
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_points
 
-#: Standard deviation of the error of head stabilisation, beyond that in the training frames [mm, rad].
+#: Root mean square shift and rotation of an error of head stabilisation beyond that in the training frames [mm, rad].
 HEAD_ERROR = (0.3, 0.0026)
 _LEAST_FRAMES, _FRAMES = 60, 300  # least number of seen frames, and number of training frames chosen from them
 _BLOCKS = 6  # contiguous blocks of held-out frames
 _COMPONENTS, _SMOOTH, _INSIDE = 120, 14, 30  # components of all, of the smooth part, and of a familiar face
-_LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames
+_LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames; 12 subjects have 1.4
 _START = (2.0, 3.0, 0.3, 0.001)  # length, smooth, linear, noise: the usual result
 _LOW, _HIGH = np.log([0.2, 0.01, 0.001, 1e-5]), np.log([20.0, 100.0, 100.0, 3.0])
 _STEPS, _MOST_TRIALS = np.log([3.0, 1.7]), 80
 _FALSE_ALARMS = 0.01  # fraction of held-out frames that are flagged as unfamiliar
+_TINY = 1e-9  # least limit of familiarity, for faces of one column
 _CHIN_POINTS = 3
 # Largest error relative to each guess. 12 subjects have 0.4 at most; faces of another moment have 1.0 and more.
 _MOST_SHARE = 0.65
@@ -64,9 +65,8 @@ def fit_skin(
         d: Jaw parameters [mm], shape (F, 3).
         seen: Frames in which d was measured, shape (F,).
         sigma_d: Standard deviation of d [mm], shape (), (3,) or (F, 3).
-        head_error: For points, the standard deviation of the error of head stabilisation that frames to come have
-            beyond that of the training frames: shift [mm] and rotation about the points' centre [rad]. The covariances
-            include it.
+        head_error: For points, the error of head stabilisation that frames to come have beyond that of the training
+            frames: root mean square shift [mm] and rotation about the points' centre [rad]. The covariances include it.
         names: Names of the columns or points, stored in the file.
 
     Returns:
@@ -90,17 +90,17 @@ def fit_skin(
     _check_motion(flat, d, sigma)
     blocks = np.array_split(np.arange(len(rows)), _BLOCKS)
     arrays, held_out, variance = _process(flat, d, sigma, blocks)
-    arrays["head_error"] = (
-        _head_motions(X.mean(axis=0), head_error, arrays) if points else np.zeros((0, len(arrays["basis"])))
-    )
+    arrays["head_error"] = np.zeros((0, len(arrays["basis"])))
+    if points:
+        arrays["head_error"] = _head_motions(X.mean(axis=0), head_error, arrays)
     guesses = {"skin": held_out, "carried": _carried(d, blocks), "mean": np.broadcast_to(d.mean(axis=0), d.shape)}
     if points and X.shape[1] >= _CHIN_POINTS:
         guesses["chin"] = _of_chin(rig, X, d, blocks)
     errors = {name: incisal_error(rig, guess, d) for name, guess in guesses.items()}
     _check_errors(errors)
-    outside = _outside(flat, blocks)
-    arrays["familiar_limit"] = np.array([np.quantile(each, 1 - _FALSE_ALARMS / 2) for each in (variance, outside)])
-    flagged = (np.column_stack([variance, outside]) > arrays["familiar_limit"]).any(axis=1)
+    strange = np.column_stack([variance, _outside(flat, blocks, float(arrays["scale"]))])
+    arrays["familiar_limit"] = np.maximum(np.quantile(strange, 1 - _FALSE_ALARMS / 2, axis=0), _TINY)
+    flagged = (strange > arrays["familiar_limit"]).any(axis=1)
     meta = {
         "actor": rig.actor,
         "names": list(names),
@@ -129,6 +129,7 @@ def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
     known = X[np.isfinite(X).all(axis=1)]
     if not len(known):
         raise FittingError("no frame shows all columns of the face.")
+    known = known[:: max(len(known) // _FRAMES, 1)]
     mean = known.mean(axis=0)
     f = (X - mean) @ np.linalg.svd(known - mean, full_matrices=False)[2][:_CLOCK_COMPONENTS].T
     tried = offsets_between(face_s, times_s)
@@ -258,9 +259,9 @@ def _inside(flat: Array) -> int:
     return max(min(_INSIDE, min(flat.shape) // 2), 1)
 
 
-def _outside(flat: Array, blocks: list[Indices]) -> Array:
+def _outside(flat: Array, blocks: list[Indices], scale: float) -> Array:
     """Return the squared distance of held-out frames from the components of the others, over scale, shape (M,)."""
-    found, scale = np.empty(len(flat)), float(np.linalg.svd(flat - flat.mean(axis=0))[1][0]) / np.sqrt(len(flat))
+    found = np.empty(len(flat))
     for b in blocks:
         others = np.delete(flat, b, axis=0)
         mean = others.mean(axis=0)
@@ -270,7 +271,7 @@ def _outside(flat: Array, blocks: list[Indices]) -> Array:
 
 
 def _head_motions(points: Array, head_error: tuple[float, float], arrays: dict[str, Array]) -> Array:
-    """Return the change of the features by one sigma of each shift and rotation of mean points (N, 3), shape (6, C)."""
+    """Return the change of the features by one sigma along each axis of mean points (N, 3), shape (6, C)."""
     arms = points - points.mean(axis=0)
     shifts = np.repeat(np.eye(3)[:, None], len(points), axis=1) * head_error[0]
     turns = np.cross(np.eye(3)[:, None], arms) * head_error[1]

@@ -104,10 +104,8 @@ def _of_tracks(rig: JawRig, tracks: Tracks) -> JawTake:
         return JawTake(frames, solved.d, solved.state == SolveState.SOLVED, solved.sigma_mm, fps)
     d, sigma = np.full((len(frames), 3), np.nan), np.full((len(frames), 3), np.nan)
     known = tracks.tracked() & np.isfinite(tracks.covariance_relative).all(axis=(1, 2)) & ~tracks.prior_aided
-    d[known] = rig.encode(tracks.T_upper_lower[known]).d
-    J = rig.spatial_jacobian(d[known])
-    information = np.swapaxes(J, 1, 2) @ np.linalg.solve(tracks.covariance_relative[known], J)
-    sigma[known] = np.sqrt(np.einsum("fii->fi", np.linalg.inv(information)))
+    found = rig.encode(tracks.T_upper_lower[known], covariance=tracks.covariance_relative[known])
+    d[known], sigma[known] = found.d, np.sqrt(np.einsum("fii->fi", found.covariance))
     seen = known & (tracks.sigma_mm[:, 0] < _LARGEST_SIGMA_MM)
     return JawTake(frames, d, seen, sigma, fps)
 

@@ -77,6 +77,27 @@ def test_arkit_fit_learns_the_actors_own_mapping(actor, tmp_path):
     assert "format" in text and "arkit-fit" in text
 
 
+@pytest.mark.slow
+def test_animate_takes_what_skin_fit_learned_from_blend_shapes(actor, tmp_path):
+    """Weights made from d with an actor's gains; the learned map recovers d, and other blend shapes are refused."""
+    rig, phase = jawusd.load(actor), 2 * np.pi * np.arange(720) / 24
+    wanted = np.stack([9 - 9 * np.cos(0.31 * phase), 4 * np.sin(0.47 * phase), 2 - 2 * np.cos(0.23 * phase)], axis=1)
+    d = rig.project(wanted)
+    write_parameters(tmp_path / "d.csv", np.arange(720), d)
+    weights = np.stack([d[:, 0] / 60, np.maximum(d[:, 1], 0) / 9, np.maximum(-d[:, 1], 0) / 7, d[:, 2] / 12], axis=1)
+    csv, skin = face_csv(tmp_path / "face.csv", weights + 0.02, fps=24), tmp_path / "skin.npz"
+    run("skin-fit", actor, tmp_path / "d.csv", csv, "-o", skin, "--jaw-fps", 24, "--offset", 0)
+    out = actor.parent / "anim_skin.usdc"
+    run("animate", actor, "--arkit", csv, "--mapping", skin, "-o", out)
+    stage = Usd.Stage.Open(str(out))
+    prim = stage.GetPrimAtPath("/Actor")
+    got = np.array([[prim.GetAttribute(f"jaw:d{i}").Get(float(frame)) for i in (1, 2, 3)] for frame in range(720)])
+    assert np.abs(got - d).max() < 0.6 and np.abs(got - d).mean() < 0.1
+    csv.write_text(csv.read_text().replace("JawLeft", "MouthLeft"))
+    words = ("animate", actor, "--arkit", csv, "--mapping", skin, "-o", tmp_path / "x.usdc")
+    assert "other names" in run(*words, code=3)
+
+
 def test_arkit_table_lists_shapes(actor, tmp_path):
     out = tmp_path / "joint.csv"
     assert json.loads(run("arkit-table", actor, "-o", out, "--json"))["rows"] == 8

@@ -122,7 +122,10 @@ def write(path, arrays, **changes):
 def test_files_hold_the_map(tmp_path):
     arrays, X = example_arrays()
     skin = jawusd.load_skin(write(tmp_path / "skin.npz", arrays))
-    assert skin.actor == "anna" and skin.points and skin.columns == 18
+    assert skin.actor == "anna" and skin.points and skin.columns == 18 and skin.errors_mm == {}
+    bad = {"errors_mm": {"skin": 0.5, "chin": "x"}, "actor": None}
+    other = jawusd.load_skin(write(tmp_path / "other.npz", arrays, **bad))
+    assert other.errors_mm == {"skin": 0.5} and other.actor == ""
     np.testing.assert_array_equal(skin(X).d, Skin(arrays, META)(X).d)
 
 

@@ -80,6 +80,16 @@ def test_plain_columns_are_learned_without_a_chin(take):
     assert error < 2.5
 
 
+def test_one_column_and_those_of_a_mesh_are_learned(take):
+    """One column of noise is refused; a mesh of 2,000 vertices is stored by 120 components."""
+    person, X, d, seen = take
+    with pytest.raises(FittingError, match="at most 65%"):
+        jawusd.fit_skin(person.rig, np.random.default_rng(0).normal(size=(len(d), 1)), d, seen)
+    mesh = np.tile(X, (1, 50, 1))
+    found = jawusd.fit_skin(person.rig, mesh.reshape(len(X), -1), d, seen)
+    assert found.arrays["basis"].shape == (120, 6000) and found(mesh[seen][:50].reshape(50, -1)).familiar.mean() > 0.9
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -6,14 +6,17 @@ import ezc3d
 import numpy as np
 import pytest
 from example_people import save
+from example_tracks import make_tracks
 from run_jawusd import run
 from skin_takes import Skin
 
 import jawusd
 from jawusd.base.errors import FittingError, FormatError
 from jawusd.formats.face_table import FaceTable, read_face_table
+from jawusd.formats.performance import SolvedJaw, SolveState
 from jawusd.formats.poses import write_parameters
-from jawusd.geometry import make_transform, so3_exp, transform_points
+from jawusd.formats.tracks import save_tracks
+from jawusd.geometry import make_transform, se3_exp, so3_exp, transform_points
 from jawusd.pipeline.skin import JawTake, learn_skin, read_face, read_jaw
 
 
@@ -135,6 +138,29 @@ def test_frames_of_a_performance_that_were_interpolated_are_not_seen(take, tmp_p
     np.testing.assert_array_equal(bitten.frames, [0, 1, 2, 3, 4])
     np.testing.assert_array_equal(bitten.seen, [True, False, True, True, True])
     assert (bitten.d[2:] == 0).all()
+
+
+def test_frames_of_tracks_are_seen_with_their_sigmas(take, tmp_path):
+    """Poses with known noise; frames with a prior, without a pose or with a large sigma are not seen."""
+    rig, rng = take[0].rig, np.random.default_rng(0)
+    d = rig.project(rng.uniform([2, -3, 0], [20, 3, 3], (40, 3)))
+    tracks = make_tracks(40)
+    noise = np.diag([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1]) ** 2
+    tracks.T_upper_lower[3:] = se3_exp(rng.multivariate_normal(np.zeros(6), noise, 37)) @ rig.pose(d[3:])
+    tracks.covariance_relative[3:] = noise
+    tracks.prior_aided[5], tracks.sigma_mm[6], tracks.T_upper_lower[7], tracks.meta["fps"] = True, 1.5, np.nan, 24.0
+    save_tracks(tmp_path / "tracks.npz", tracks)
+    jaw = read_jaw(rig, tmp_path / "tracks.npz")
+    assert jaw.fps == 24 and jaw.frames[0] == 30
+    assert not jaw.seen[[2, 5, 6, 7]].any() and jaw.seen[8:].all()
+    assert 0.5 < np.mean(((jaw.d - d)[8:] / jaw.sigma_mm[8:]) ** 2) < 1.6
+    state = np.where(np.arange(40) < 20, SolveState.SOLVED, SolveState.CARRIED).astype(np.int8)
+    tracks.solved = SolvedJaw(d, np.full(d.shape, 0.2), np.ones(40), state, np.ones(40, bool))
+    save_tracks(tmp_path / "tracks.npz", tracks)
+    jaw = read_jaw(rig, tmp_path / "tracks.npz")
+    np.testing.assert_array_equal(jaw.seen, np.arange(40) < 20)
+    np.testing.assert_array_equal(jaw.d, d)
+    assert (jaw.sigma_mm == 0.2).all()
 
 
 def test_a_face_of_another_performance_is_refused(take):
