@@ -198,7 +198,8 @@ def _check_errors(errors: dict[str, float]) -> None:
             raise FittingError(
                 f"the jaw learned from the face has an error of {errors['skin']:.2f} mm at the incisal point on "
                 f"held-out frames, {words} has {errors[name]:.2f} mm: at most {_MOST_SHARE:.0%} of that is accepted.",
-                hint="Check that face and jaw show the same performance on one clock, and that the head is stabilised.",
+                hint="Check that face and jaw show the same performance on one clock, and that the head is stabilised. "
+                "Add points or expressions; if a rigid chin is as good, use inverse kinematics (`rig.ik`).",
             )
 
 
