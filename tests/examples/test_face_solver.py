@@ -23,6 +23,7 @@ def test_a_rig_beats_the_pull_to_the_closed_mouth(example, monkeypatch, tmp_path
     picture = tmp_path / "errors.png"
     monkeypatch.setattr(sys, "argv", ["face_solver.py", "-o", str(picture)])
     example.main()
-    rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines() if len(line.split()) == 7}
+    rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines() if len(line.split()) == 9}
     assert float(rows["rig"][4]) < float(rows["neutral"][4]) < float(rows["turning"][4])
+    assert float(rows["d"][4]) < float(rows["neutral"][4])
     assert picture.read_bytes()[:4] == b"\x89PNG"
