@@ -79,7 +79,6 @@ class Cutter:
 # at 24 fps; a false positive costs the time of one frame.
 _JUMP_MM, _SAME_MM = 0.8, 0.15
 _SAMPLED_VIEWS = 10  # maximum number of frames whose views are kept: a few MB
-_SHORTEST_LOSS = 3  # minimum number of successive lost frames in which the teeth are searched for
 STAGE = "follow"
 
 #: Function that searches for the teeth in some frames, passes what it finds to `Follower.start_at`, and returns it.
@@ -143,12 +142,14 @@ class Follower:
         Raises:
             CaptureError: an image cannot be decoded.
         """
+        from jawusd.tracking.region.recovery import both_ways, recover
+
         frame, begin, tracker, cutter = self._start
         self.sampled_views.clear()
         sampled = set(np.linspace(frames.start, frames.stop - 1, _SAMPLED_VIEWS).astype(int).tolist())
         out, points = {frame: begin}, self._subject.landmarks[:3]
         progress(STAGE, 1, len(frames))
-        for way in _ways(frame, frames):
+        for way in both_ways(frame, frames):
             cuts = _Latest(cutter.walk(self._footage, way))
             for at, found in zip(way, tracker.follow(cuts, begin.poses), strict=True):
                 out[at] = found
@@ -158,43 +159,27 @@ class Follower:
             for jump in _jumps(way, out, points):
                 back = range(jump - way.step, frame, -way.step)
                 _replace(back, tracker.follow(cutter.walk(self._footage, back), out[jump].poses), out, points)
-        self._recover(out, frames, find)
+        recover(out, frames, lambda lost: self._followed_from(lost, frames, find, out))
         return out
 
-    def _recover(self, known: dict[int, RegionPose], frames: range, find: Find) -> None:
-        """Search for the teeth where they were lost, and follow them from there both ways, up to equal known poses.
-
-        Poses that contradict the known ones where they meet, and agree with none, are discarded.
-        """
-        vain: set[int] = set()
-        while lost := next((s for s in _lost_stretches(known, frames) if s.start not in vain), None):
-            nearest = min(
-                (f for f in known if known[f].found[0]), key=lambda f: min(abs(f - lost[0]), abs(f - lost[-1]))
-            )
-            up = known[nearest].poses[0, :3, :3] @ self._subject.T_anatomical_skull[1, :3]
-            again = self._followed_from(lost, frames, find, up, known)
-            if again is None:
-                vain.update(lost)
-            else:
-                known.update(again)
-
     def _followed_from(
-        self, lost: range, frames: range, find: Find, up_world: Array, known: Mapping[int, RegionPose]
+        self, lost: range, frames: range, find: Find, known: Mapping[int, RegionPose]
     ) -> dict[int, RegionPose] | None:
         """Return all poses after a search in lost frames, or None if it fails or contradicts the known poses."""
+        from jawusd.tracking.region.recovery import both_ways, contradicts, nearest_found
+
+        up_world = nearest_found(known, lost).poses[0, :3, :3] @ self._subject.T_anatomical_skull[1, :3]
         try:
             begin = find(lost, up_world)
         except TrackingError:
             return None
         frame, pose, tracker, cutter = self._start
-        again = {**known, begin.frame: pose}
+        again, points = {**known, begin.frame: pose}, self._subject.landmarks[:3]
         meetings = [
-            _replace(
-                way, tracker.follow(cutter.walk(self._footage, way), pose.poses), again, self._subject.landmarks[:3]
-            )
-            for way in _ways(frame, frames)
+            _replace(way, tracker.follow(cutter.walk(self._footage, way), pose.poses), again, points)
+            for way in both_ways(frame, frames)
         ]
-        return None if False in meetings and True not in meetings else again
+        return None if contradicts(meetings) else again
 
 
 class _Latest(Iterator["Cut"]):
@@ -222,36 +207,11 @@ def _jumps(way: range, known: Mapping[int, RegionPose], points: Array) -> list[i
     return [way[k + 2] for k in np.flatnonzero(bend_mm > _JUMP_MM).tolist()]
 
 
-def _ways(frame: int, frames: range) -> tuple[range, range]:
-    """Return the frames after and before a frame, in the order in which they are followed."""
-    return range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)
-
-
-def _lost_stretches(known: Mapping[int, RegionPose], frames: range) -> list[range]:
-    """Return the runs of successive frames on which an arch was not found, except very short ones."""
-    found = np.array([known[frame].found.all() for frame in frames])
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], found, [True]]).astype(int))).reshape(-1, 2).tolist()
-    return [frames[first:stop] for first, stop in edges if stop - first >= _SHORTEST_LOSS]
-
-
 def _replace(way: range, again: Iterator[RegionPose], known: dict[int, RegionPose], points: Array) -> bool | None:
-    """Replace poses by others of the same frames, as long as the two differ and the latter fit more of the contour.
+    """Replace poses as in `replace_poses`; `points` (N, 3) of the lower teeth [mm] tell them apart."""
+    from jawusd.tracking.region.recovery import replace_poses
 
-    A jump means that the tracker recovered from an error, and a loss that it made one; each wrong pose before is
-    plausible by itself.
+    def same(other: RegionPose, before: RegionPose) -> bool:
+        return bool(np.linalg.norm(_places(other, points) - _places(before, points), axis=-1).mean() < _SAME_MM)
 
-    Returns:
-        True if an equal pose ended this, False if a different one that fits at least as well, None if the arches were
-        lost or the take ended.
-    """
-    for frame, found in zip(way, again, strict=False):
-        if not found.found.all():
-            return None
-        if known[frame].found.all():
-            apart_mm = np.linalg.norm(_places(found, points) - _places(known[frame], points), axis=-1).mean()
-            if apart_mm < _SAME_MM:
-                return True
-            if found.objective_px <= known[frame].objective_px:
-                return False
-        known[frame] = found
-    return None
+    return replace_poses(way, again, known, same, lambda other, before: other.objective_px > before.objective_px)

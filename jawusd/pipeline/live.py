@@ -23,7 +23,7 @@ from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.follow import Cutter
 from jawusd.pipeline.picture_search import LEAST_FIT, arches_apart, masked_cameras, orientations
-from jawusd.pipeline.solve import PreparedTeeth, VideoOptions, VideoShot
+from jawusd.pipeline.solve_videos import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
 

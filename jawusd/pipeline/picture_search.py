@@ -88,13 +88,16 @@ class PictureSearch(Generic[T]):
         """Return the first start with a clear fit, or else the best one of a part of the take and an orientation.
 
         `up_world` is the up direction of the head, shape (3,), if the teeth are known on other frames, with which the
-        start can be compared: the first one that fits is then returned. Otherwise, four orientations are tried.
+        start can be compared: several cameras then return the first one that fits. Otherwise, four orientations are
+        tried.
 
         Raises:
             TrackingError: no start fits.
             CaptureError: an image cannot be decoded.
         """
-        clear = LEAST_FIT if up_world is not None else _CLEAR_FIT if len(self.cameras) > 1 else _CLEAR_FIT_SINGLE
+        clear = _CLEAR_FIT_SINGLE
+        if len(self.cameras) > 1:
+            clear = _CLEAR_FIT if up_world is None else LEAST_FIT
         hypotheses = orientations(self.cameras) if up_world is None else [upright_turns(self.cameras, up_world)]
         best: Start[T] | None = None
         tried: list[int] = []

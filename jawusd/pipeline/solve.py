@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
@@ -13,163 +10,27 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 import numpy as np
 
 import jawusd
-from jawusd.base.arrays import Array
 from jawusd.base.errors import OutputError, RigError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import is_inside
-from jawusd.formats.capture import Bootstrap, CameraSource, Capture
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.capture import Capture
 from jawusd.formats.performance import Performance, SolveState, write_performance
 from jawusd.formats.tracks import save_tracks
-from jawusd.geometry import Camera
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.cameras import load_cameras, open_videos
+from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.follow import Cutter
-from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch, Start, picked_start
 from jawusd.pipeline.pictures import VIDEO, write_overlay
 from jawusd.pipeline.segment_guide import combine_guide
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
+from jawusd.pipeline.solve_videos import VideoOptions, solve_videos
 from jawusd.pipeline.state import Progress, no_progress
-from jawusd.pipeline.subject import load_labelled, registered_meshes, subject_of_capture
+from jawusd.pipeline.subject import load_labelled, registered_meshes
 from jawusd.pipeline.track import tracking_config
 
 if TYPE_CHECKING:
-    from jawusd.tracking.config import Mapper
-    from jawusd.tracking.performance.coordinates import Pose
-    from jawusd.tracking.region.appearance import Cut
+    pass
 
 
-@dataclass(frozen=True)
-class VideoOptions:
-    """Options of `solve` for shots without masks."""
-
-    fixed_head: bool = False
-    free_focal: bool = False
-    jobs: int = 2
-
-
-class PreparedTeeth:
-    """The scans of a subject, prepared for tracking.
-
-    Attributes:
-        scans: upper and lower teeth.
-        axes: rotation from scan to anatomical axes (left, up, front), shape (3, 3).
-        search: finds the teeth in images.
-    """
-
-    def __init__(self, capture: Capture, meshes: Mapping[str, Mesh], jaw: JawRig, map_: Mapper) -> None:
-        """Prepare the scans of a capture, registered as in the rig; `map_` runs the search in parallel.
-
-        Raises:
-            TrackingError: the scans are not in occlusion.
-        """
-        from jawusd.tracking.contour.scan import prepare_scan
-        from jawusd.tracking.region.picture_start import PictureStart
-
-        teeth = meshes["upper_teeth"], meshes["lower_teeth"]
-        self.scans = prepare_scan(teeth[0], "upper"), prepare_scan(teeth[1], "lower")
-        self.axes = subject_of_capture(capture, meshes).T_anatomical_skull[:3, :3]
-        self.search = PictureStart(teeth, self.scans, jaw, capture.anatomy.T_anatomical_skull, map_)
-
-
-class VideoShot:
-    """A shot, opened from the videos of its cameras.
-
-    Attributes:
-        cameras: calibrated cameras with a video, by name.
-        footage: the images of those cameras.
-        take: tracks the teeth.
-    """
-
-    def __init__(
-        self,
-        capture: Capture,
-        cameras: Mapping[str, Camera],
-        offsets: Mapping[str, int],
-        teeth: PreparedTeeth,
-        jaw: JawRig,
-        options: VideoOptions,
-    ) -> None:
-        """Open the videos of calibrated cameras, by name.
-
-        Raises:
-            CaptureError: no camera has a video, or one cannot be decoded.
-        """
-        from jawusd.segmentation.picture import ColourFootage
-        from jawusd.tracking.region.performance import PictureShot, PictureTake
-
-        videos = open_videos(capture)
-        self._capture, self._offsets, self._teeth = capture, offsets, teeth
-        self.cameras = {name: camera for name, camera in cameras.items() if name in videos}
-        self.footage = ColourFootage(videos, offsets)
-        shot = PictureShot(
-            cuts=self._cuts,
-            cameras=tuple(self.cameras.values()),
-            frames=range(*(capture.frames or self.footage.range())),
-            fps=capture.fps,
-            fixed_head=options.fixed_head,
-            free_focal=options.free_focal,
-        )
-        self._frames = shot.frames
-        self.take = PictureTake(jaw, teeth.scans, teeth.axes, shot)
-
-    def _cuts(self, placed: Sequence[Camera], centre: Array, frames: range) -> Iterator[Cut]:
-        table = {camera.name: camera for camera in placed}
-        return Cutter(table, self._teeth.scans, centre).walk(self.footage, frames)
-
-    def begin(self, progress: Progress) -> Start[Pose]:
-        """Return a start, from picks in at least two cameras, or from a frame on which the arches are apart.
-
-        Raises:
-            TrackingError: the teeth were not found.
-            CaptureError: an image cannot be decoded.
-        """
-        if self._capture.bootstrap is not None and len(self.cameras) > 1:
-            return self._picked(self._capture.bootstrap)
-
-        def near(sources: Sequence[CameraSource], frame: int) -> Pose | None:
-            return self._teeth.search.at(sources, self.cameras, self._offsets, frame)
-
-        search = PictureSearch(self._capture, self.footage, self.cameras, near, self.take.begun)
-        return search.run(self._frames, progress)
-
-    def _picked(self, bootstrap: Bootstrap) -> Start[Pose]:
-        """Return a start from the picks."""
-        frame = bootstrap.frame
-
-        def begin() -> tuple[Pose, float]:
-            return self.take.begun(frame, self._teeth.search.picked(bootstrap, self.cameras))
-
-        return picked_start(frame, self._frames, begin, LEAST_FIT)
-
-
-def solve_videos(
-    capture: Capture,
-    cameras: Mapping[str, Camera],
-    offsets: dict[str, int],
-    meshes: Mapping[str, Mesh],
-    jaw: JawRig,
-    options: VideoOptions,
-    progress: Progress,
-) -> Performance:
-    """Solve a shot from the videos of its cameras, calibrated and by name; see `solve`.
-
-    Raises:
-        CaptureError: no camera has a video, or one cannot be decoded.
-        TrackingError: the teeth were not found.
-    """
-    with ThreadPoolExecutor(options.jobs) as pool:
-        teeth = PreparedTeeth(capture, meshes, jaw, pool.map)
-        shot = VideoShot(capture, cameras, offsets, teeth, jaw, options)
-        begin = shot.begin(progress)
-        found = shot.take.solve(begin.frame, begin.pose, partial(progress, "solve"))
-    found.notes["start"] = {"by": begin.by, "frame": begin.frame, "fit": begin.fit}
-    found.notes["findings"] = [finding.as_json() for finding in teeth.search.findings]
-    return found
-
-
-#: Suffixes of the files that a performance can be written to.
 SUFFIXES = (".csv", ".npz", ".usdc", ".usda")
 _USD = (".usd", ".usda", ".usdc", ".usdz")
 

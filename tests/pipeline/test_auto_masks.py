@@ -10,11 +10,12 @@ from jawusd.base.errors import FormatError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import make_transform
-from jawusd.pipeline.follow import _jumps, _lost_stretches, _replace
+from jawusd.pipeline.follow import _jumps, _replace
 from jawusd.pipeline.segment_guide import GUIDE, combine_guide, save_guide
 from jawusd.pipeline.segment_record import SUMMARY, auto_masks_folder, with_masks
 from jawusd.pipeline.track import tracking_config
 from jawusd.tracking.config import FOR_TAKES
+from jawusd.tracking.region.recovery import lost_stretches
 from jawusd.tracking.region.tracker import RegionPose
 
 LANDMARKS = np.array([[0, 0, 0], [20, 0, -25], [-20, 0, -25], [50, 40, -80], [-50, 40, -80]], float)
@@ -164,7 +165,7 @@ def test_poses_lost_again_end_a_replacement():
     known, again = _followed(frames, np.zeros(10)), _followed(frames, np.ones(10))
     lost = replace(again[25], found=np.array([True, False]))
     known |= {frame: replace(known[frame], found=np.zeros(2, bool)) for frame in range(22, 26)}
-    assert _lost_stretches(known, frames) == [range(22, 26)]
+    assert lost_stretches(known, frames) == [range(22, 26)]
     assert _replace(range(22, 30), (again[f] if f < 25 else lost for f in range(22, 30)), known, LANDMARKS[:3]) is None
     assert [known[f].poses[1, 0, 3] for f in frames] == pytest.approx([0, 0, 1, 1, 1, 0, 0, 0, 0, 0])
-    assert _lost_stretches(known, frames) == []  # one frame is left
+    assert lost_stretches(known, frames) == []  # one frame is left

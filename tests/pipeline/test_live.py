@@ -25,7 +25,7 @@ from jawusd.pipeline.cameras import load_cameras, open_videos
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.follow import Cutter
 from jawusd.pipeline.live import LiveFrame, OscSender, live, next_instant
-from jawusd.pipeline.solve import PreparedTeeth
+from jawusd.pipeline.solve_videos import PreparedTeeth
 from jawusd.pipeline.subject import load_labelled, registered_meshes
 from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.region.live import LiveTake

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera
@@ -25,12 +26,16 @@ from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother, with_one_head
 from jawusd.tracking.performance.unknowns import HabitPrior
 from jawusd.tracking.region.appearance import Cut, LearnedColours
+from jawusd.tracking.region.recovery import both_ways, contradicts, nearest_found, recover, replace_poses
 from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import fitting_share
 
 #: Returns the cropped images of a range of frames. Arguments: cameras, possibly with changed focal lengths; a world
 #: point near the teeth, which determines the resolution [mm], shape (3,); and the frames.
 Cuts = Callable[[Sequence[Camera], Array, range], Iterator[Cut]]
+#: Searches for the teeth in some frames; returns a frame and the pose there. The second argument is the up direction of
+#: the head in the world, shape (3,). Raises TrackingError.
+Find = Callable[[range, Array], tuple[int, Pose]]
 Progress = Callable[[int, int], None]
 
 # Number of crown faces before and in the last step; spacing of contour samples, and motion that triggers a redraw [px];
@@ -45,6 +50,7 @@ _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
 _ALONE = 2.0  # factor on the variance if there is a single camera, as no other view reveals shifted borders [-]
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
+_SAME_MM = 0.15  # maximum difference of jaw parameters of equal poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +59,7 @@ class PictureShot:
 
     Attributes:
         cuts: source of the cropped images.
+        find: search for the teeth.
         cameras: cameras in the order of the images.
         frames: frame numbers of the reference camera.
         fps: frames per second.
@@ -61,6 +68,7 @@ class PictureShot:
     """
 
     cuts: Cuts
+    find: Find
     cameras: Sequence[Camera]
     frames: range
     fps: float
@@ -126,7 +134,10 @@ class PictureTake:
         """
         shot = self._shot
         cameras, start, factors = self._known_before(frame, start, progress)
-        fits = self._follow(cameras, (frame, start), shot.frames, KNOWN if shot.fixed_head else 1.0, progress)
+        head = KNOWN if shot.fixed_head else 1.0
+        known = dict(zip(shot.frames, self._follow(cameras, (frame, start), shot.frames, head, progress), strict=True))
+        recover(known, shot.frames, lambda lost: self._followed_from(lost, cameras, head, known))
+        fits = [known[frame] for frame in shot.frames]
         smoothed = self._smoothed(shot.frames, fits)
         if shot.free_focal:
             log_focal = smoothed.state.log_focal + np.log(factors)
@@ -180,6 +191,26 @@ class PictureTake:
             follow_back(fits, way, partial(self._turned, cameras, one, fits))
         return [fits[frame] for frame in frames]
 
+    def _followed_from(
+        self, lost: range, cameras: Sequence[Camera], head: float, known: Mapping[int, FrameFit]
+    ) -> dict[int, FrameFit] | None:
+        """Return all fits after a search in lost frames, or None if it fails or contradicts the known fits."""
+        head_pose = self.coordinates.arches(nearest_found(known, lost).pose)[0]
+        try:
+            frame, pose = self._shot.find(lost, head_pose[:3, :3] @ self._axes[1])
+        except TrackingError:
+            return None
+        tracker = self._tracker(cameras, head)
+        begin = tracker.begin(self._first_cut(cameras, frame, pose), pose)
+        if not begin.found.all():
+            return None
+        again, back = {**known, frame: begin}, tracker.reversed_from(begin)
+        meetings = []
+        for way, one in zip(both_ways(frame, self._shot.frames), (tracker, back), strict=True):
+            followed = map(one.step, self._shot.cuts(cameras, self._centre(pose), way))
+            meetings.append(replace_poses(way, followed, again, _same, _better))
+        return None if contradicts(meetings) else again
+
     def _turned(
         self, cameras: Sequence[Camera], one: RigTracker, fits: dict[int, FrameFit], frame: int, before: range
     ) -> Iterator[FrameFit]:
@@ -224,9 +255,19 @@ def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, rang
         before = range(last, way.start - way.step, -way.step)
         for at, fit in zip(before, back(frame, before), strict=False):
             old = fits[at]
-            if not fit.found.all() or (_trust(old) == 2 and _fitting_px(fit) < _CLEARLY * _fitting_px(old)):
+            if not fit.found.all() or not _better(fit, old):
                 break
             fits[at] = max(old, fit, key=lambda one: (one.found.sum(), _fitting_px(one)))
+
+
+def _same(fit: FrameFit, old: FrameFit) -> bool:
+    """Return whether a fit confirms a trusted one."""
+    return _trust(old) == 2 and bool(np.abs(fit.pose.d - old.pose.d).max() < _SAME_MM)
+
+
+def _better(fit: FrameFit, old: FrameFit) -> bool:
+    """Return whether a fit may replace another: one that is not trusted, or that matches clearly less contour."""
+    return _trust(old) < 2 or _fitting_px(fit) >= _CLEARLY * _fitting_px(old)
 
 
 def _trust(fit: FrameFit) -> int:
