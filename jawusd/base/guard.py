@@ -100,7 +100,7 @@ def _check_address_space() -> None:
     space = -1 if resource is None else resource.getrlimit(resource.RLIMIT_AS)[0]  # -1: no limit
     if 0 <= space < _MIN_SPACE_GB * 1e9:
         found = (
-            f"address space is limited to {space / 1e9:.2g} GB (ulimit -v), at least {_MIN_SPACE_GB:g} GB is needed."
+            f"address space is limited to {space / 1e9:.2g} GB (ulimit -v); at least {_MIN_SPACE_GB:g} GB is needed."
         )
         raise ResourceError(found)
 

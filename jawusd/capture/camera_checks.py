@@ -111,7 +111,7 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
         yield Finding(
             "views_alike",
             "warning",
-            f"all viewing directions lie within {max(angles):.1f} degrees, at least {_LEAST_ANGLE_DEG:g} are needed",
+            f"all viewing directions lie within {max(angles):.1f} degrees; at least {_LEAST_ANGLE_DEG:g} are needed",
             max(angles),
             _LEAST_ANGLE_DEG,
             path=path,

@@ -93,7 +93,7 @@ def _single_camera(
     used = np.flatnonzero(seen.any(1))
     if len(used) < FEWEST_VIEWS:
         raise CalibrationError(
-            f"the board is sharp in {len(used)} pictures, at least {FEWEST_VIEWS} are needed.",
+            f"the board is sharp in {len(used)} pictures; at least {FEWEST_VIEWS} are needed.",
             camera=name,
             hint="Film the board again: 40 poses at the position of the teeth, tilted up to 30 degrees, held still.",
         )
@@ -143,7 +143,7 @@ def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array
         views, a, b = max(shared, key=lambda item: item[0])
         if views < FEWEST_VIEWS:
             raise CalibrationError(
-                f"camera {names[b]} shares {views} sharp board views with {names[a]}, at least {FEWEST_VIEWS} are "
+                f"camera {names[b]} shares {views} sharp board views with {names[a]}; at least {FEWEST_VIEWS} are "
                 "needed.",
                 hint="Hold the board so that both cameras see the whole board, and start the board clips together.",
             )

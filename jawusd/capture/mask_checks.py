@@ -74,7 +74,7 @@ def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[Ma
     yield Finding(
         "cameras_contradict",
         "warning",
-        f"its rays through the centre of the teeth miss those of camera {other} by {mm:.0f} mm, at most {_RAYS_MM:g} "
+        f"its rays through the centre of the teeth miss those of camera {other} by {mm:.0f} mm; at most {_RAYS_MM:g} "
         "mm is plausible",
         mm,
         _RAYS_MM,

@@ -241,7 +241,7 @@ def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
     second = float(correlation[far].max()) if far.any() else 0.0
     if peak < _LEAST_SIGMAS * sigma:
         raise SyncError(
-            f"the sounds do not match: the correlation peak is {peak / sigma:.1f} sigma high, at least "
+            f"the sounds do not match: the correlation peak is {peak / sigma:.1f} sigma high; at least "
             f"{_LEAST_SIGMAS:g} are needed."
         )
     if second > _SECOND_PEAK * peak:

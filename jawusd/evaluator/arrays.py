@@ -206,7 +206,7 @@ def _checked(
     if not np.isfinite(value).all():
         raise EvaluatorError(f'"{name}" contains values that are not finite.')
     if (np.abs(value) > _LARGEST).any():
-        raise EvaluatorError(f'"{name}" contains values up to {np.abs(value).max():.3g}, at most {_LARGEST:g} allowed.')
+        raise EvaluatorError(f'"{name}" contains values up to {np.abs(value).max():.3g}; at most {_LARGEST:g} allowed.')
     lengths.update((size, n) for size, n in zip(shape, value.shape) if isinstance(size, str))
     value.flags.writeable = False
     return value

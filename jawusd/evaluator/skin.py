@@ -199,7 +199,7 @@ def _checked(arrays: Mapping[str, Array]) -> dict[str, Array]:
         if not (found[name] > 0).all():
             raise EvaluatorError(f'"{name}" must be positive, found {found[name].min():g}.')
     if sizes["M"] > MOST_FRAMES:
-        raise EvaluatorError(f'"features" has {sizes["M"]} frames, at most {MOST_FRAMES} are allowed.')
+        raise EvaluatorError(f'"features" has {sizes["M"]} frames; at most {MOST_FRAMES} are allowed.')
     most = len(found["basis"])
     for name in ("smooth_count", "familiar_count"):
         if not (1 <= found[name] <= most and found[name] % 1 == 0):

@@ -51,7 +51,7 @@ class Speeds:
             raise ValueError(f"d must have shape (F, 3) and the rate must be positive, got {rows.shape} and {fps}")
         seen = {order: _known(np.diff(rows, order, axis=0)) for order in _NOISE_IN}
         if len(seen[4]) < _MIN_FRAMES:
-            raise ValueError(f"the take has {len(seen[4])} consecutive frames, at least {_MIN_FRAMES} are needed")
+            raise ValueError(f"the take has {len(seen[4])} consecutive frames; at least {_MIN_FRAMES} are needed")
         spread = {order: changes.T @ changes / len(changes) for order, changes in seen.items()}
         noise = np.diag((_SIGMA_OF_MEDIAN * np.median(np.abs(seen[4]), axis=0)) ** 2) / _NOISE_IN[4]
         return cls(*(fps ** (2 * order) * _denoised(spread[order], _NOISE_IN[order] * noise) for order in (1, 2)))

@@ -213,7 +213,7 @@ def _repeats(rows: NDArray[np.int64] | Array, used: Mask) -> Mask:
 def _check(frames: NDArray[np.int64], T: Array) -> None:
     if len(frames) < _FEWEST_POSES:
         raise FittingError(
-            f"{len(frames)} poses are usable, at least {_FEWEST_POSES} are needed.",
+            f"{len(frames)} poses are usable; at least {_FEWEST_POSES} are needed.",
             hint="Capture opening, lateral and protrusive movements, about 30 s in all.",
         )
     defect = rigidity_defect(T)
@@ -229,7 +229,7 @@ def _check_motion(data: TrainingData) -> None:
     moved = float(np.percentile(data.metric.rms(data.motion, data.motion[:1]), 95))
     if moved < _SMALLEST_MOTION_MM:
         raise FittingError(
-            f"the poses hardly differ: the mandible moves by {moved:.2g} mm, at least {_SMALLEST_MOTION_MM:g} mm are "
+            f"the poses hardly differ: the mandible moves by {moved:.2g} mm; at least {_SMALLEST_MOTION_MM:g} mm are "
             "needed.",
             hint="If the jaw did move, check that the translations are in mm.",
         )

@@ -116,7 +116,7 @@ def offsets_between(face_s: Array, times_s: Array) -> Array:
     shorter = min(face_s[-1] - face_s[0], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
     if shorter < _LEAST_SECONDS:
         raise FittingError(
-            f"the takes last {shorter:.1f} s, at least {_LEAST_SECONDS:g} s are needed to learn a mapping."
+            f"the takes last {shorter:.1f} s; at least {_LEAST_SECONDS:g} s are needed to learn a mapping."
         )
     return np.arange(times_s[0] + shorter / 2 - face_s[-1], times_s[-1] - shorter / 2 - face_s[0], COARSE_S)
 
@@ -173,7 +173,7 @@ def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
     step = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     if len(d) * step < _LEAST_SECONDS:
         raise FittingError(
-            f"face and jaw overlap by {len(d) * step:.1f} s, at least {_LEAST_SECONDS:g} s are needed.",
+            f"face and jaw overlap by {len(d) * step:.1f} s; at least {_LEAST_SECONDS:g} s are needed.",
             hint="Check frame rates and offset: --fps, --jaw-fps, --offset.",
         )
     low, high = rig.d_range.T

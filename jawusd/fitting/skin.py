@@ -170,7 +170,7 @@ def _chosen(usable: Mask) -> Indices:
     rows = np.flatnonzero(usable)
     if len(rows) < _LEAST_FRAMES:
         raise FittingError(
-            f"{len(rows)} frames show the teeth and all columns of the face, at least {_LEAST_FRAMES} are needed.",
+            f"{len(rows)} frames show the teeth and all columns of the face; at least {_LEAST_FRAMES} are needed.",
             hint="Check that both files show the same performance, and that no point is hidden throughout.",
         )
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES)).astype(int)]

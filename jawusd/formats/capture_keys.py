@@ -30,8 +30,8 @@ _WORDS = {
     "literal_error": "must be {expected}",
     "string_pattern_mismatch": "is empty or has characters that are not allowed; use only {signs}",
     "string_too_short": "is empty",
-    "too_short": "has {actual_length} entries, at least {min_length} are needed",
-    "too_long": "has {actual_length} entries, at most {max_length} are allowed",
+    "too_short": "has {actual_length} entries; at least {min_length} are needed",
+    "too_long": "has {actual_length} entries; at most {max_length} are allowed",
     "missing": "is missing",
     "too_few": "has too few entries",
 }

@@ -258,7 +258,7 @@ def _with_gaps(data: _Rows, points: Array, path: Path) -> Array:
         raise FormatError(f"line {line}: frames must be increasing whole numbers.", path=path)
     rows = (numbers - numbers[:1]).astype(np.int64)
     if rows.size and rows[-1] >= _MOST_FRAMES:
-        raise FormatError(f"spans {rows[-1] + 1} frames, at most {_MOST_FRAMES} are allowed.", path=path)
+        raise FormatError(f"spans {rows[-1] + 1} frames; at most {_MOST_FRAMES} are allowed.", path=path)
     whole = np.full((int(rows.max(initial=-1)) + 1, *points.shape[1:]), np.nan)
     whole[rows] = points
     return whole

@@ -39,7 +39,7 @@ def read_mesh_bytes(path: Path) -> bytes:
     size = path.stat().st_size
     if size > MOST_BYTES:
         raise CaptureError(
-            f"is {size:,} bytes, at most {MOST_BYTES:,} are allowed.", path=path, hint="Decimate the mesh."
+            f"is {size:,} bytes; at most {MOST_BYTES:,} are allowed.", path=path, hint="Decimate the mesh."
         )
     return path.read_bytes()
 
@@ -52,7 +52,7 @@ def check_count(path: Path, count: int, what: str) -> None:
     """
     most = MOST_VERTICES if what == "vertices" else MOST_TRIANGLES
     if count > most:
-        raise CaptureError(f"has {count:,} {what}, at most {most:,} are allowed.", path=path, hint="Decimate the mesh.")
+        raise CaptureError(f"has {count:,} {what}; at most {most:,} are allowed.", path=path, hint="Decimate the mesh.")
 
 
 def cut_off(path: Path, found: int, said: int, what: str) -> CaptureError:

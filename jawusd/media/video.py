@@ -144,7 +144,7 @@ class Video(Clip):
         if context.width * context.height > MOST_PX:
             container.close()
             raise CaptureError(
-                f"pictures have {context.width} x {context.height} px, at most {MOST_PX} px in total are allowed.",
+                f"pictures have {context.width} x {context.height} px; at most {MOST_PX} px in total are allowed.",
                 path=self.path,
                 hint="Scale it down.",
             )

@@ -78,7 +78,7 @@ def read_lines(picture: NDArray[np.uint8], name: str) -> Drawing:
     keep = lengths[strokes[rows[middle], columns[middle]] - 1] >= _SHORTEST_PX
     if keep.sum() < _FEWEST_POINTS:
         raise TrackingError(
-            f"{name}: {keep.sum()} px of lines are drawn, at least {_FEWEST_POINTS} are needed",
+            f"{name}: {keep.sum()} px of lines are drawn; at least {_FEWEST_POINTS} are needed",
             hint="Draw bright lines along the outlines of the teeth on a black background.",
         )
     return Drawing(name, pixels[keep], normals[keep], (picture.shape[1], picture.shape[0]))

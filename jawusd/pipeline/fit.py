@@ -234,7 +234,7 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
         raise FormatError(f"is not a readable HDF5 file ({error!s:.200}).", path=path) from error
     unit = unit.decode(errors="replace") if isinstance(unit, bytes) else str(unit)
     if unit not in _HDF5_UNITS_MM:
-        raise FormatError(f'group "{name}": unit is "{unit}"; allowed are {", ".join(_HDF5_UNITS_MM)}.', path=path)
+        raise FormatError(f'group "{name}": unit is "{unit}"; must be one of {", ".join(_HDF5_UNITS_MM)}.', path=path)
     T = _poses(held, name, path)
     T[:, :3, 3] *= _HDF5_UNITS_MM[unit]
     return np.arange(len(T)), _checked(T, name, path)

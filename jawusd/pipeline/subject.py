@@ -240,7 +240,7 @@ def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = Non
     unknown = sorted(set(named) - set(LANDMARKS))
     if unknown:
         raise CaptureError(
-            f'[anatomy.landmarks] has unknown "{unknown[0]}"; allowed are {", ".join(LANDMARKS)}.',
+            f'[anatomy.landmarks] has unknown "{unknown[0]}"; must be one of {", ".join(LANDMARKS)}.',
             path=capture.folder / "capture.toml",
         )
     meshes = load_meshes(capture) if meshes is None else meshes

@@ -107,7 +107,7 @@ def fit_poses_of_stage(
             misfit_mm = max(misfit_mm, float(np.sqrt((residual**2).sum(axis=1).mean())))
     if not misfit_mm <= _MAX_MISFIT_MM:
         raise FormatError(
-            f"its meshes {places[0].path} and {places[1].path} are up to {misfit_mm:.2f} mm from those of the rig, "
+            f"its meshes {places[0].path} and {places[1].path} are up to {misfit_mm:.2f} mm from those of the rig; "
             f"at most {_MAX_MISFIT_MM} mm is allowed: they are other meshes, or deformed.",
             path=str(path),
             hint="Choose the prims of skull and mandible with --skull and --mandible.",

@@ -120,7 +120,7 @@ class PickBook:
         for arch in ARCHES:
             whole = sum(len(pick.views) >= _FEWEST_VIEWS for pick in self.picks if pick.arch == arch)
             if whole < _FEWEST:
-                return f"{arch} teeth: {whole} picks with {_FEWEST_VIEWS} views, at least {_FEWEST} are needed"
+                return f"{arch} teeth: {whole} picks with {_FEWEST_VIEWS} views; at least {_FEWEST} are needed"
         for number, pick in enumerate(self.picks):
             if len(pick.views) < _FEWEST_VIEWS:
                 return f"{self.name(number)} has views in {len(pick.views)} of the {_FEWEST_VIEWS} required cameras"

@@ -95,7 +95,7 @@ def test_too_few_views_are_refused_per_camera_and_per_pair(tmp_path):
     apart[0, 12:] = np.nan
     apart[1, :10] = np.nan
     apart[2, 12:] = np.nan
-    with pytest.raises(CalibrationError, match=r"camera c1: .* in 5 pictures, at least 6 .*40 poses"):
+    with pytest.raises(CalibrationError, match=r"camera c1: .* in 5 pictures; at least 6 .*40 poses"):
         calibrate_detections(altered(found, corners_px=few), capture_of(CAMERAS, boards, tmp_path), {})
     with pytest.raises(CalibrationError, match=r"c1 shares 2 sharp board views with"):
         calibrate_detections(altered(found, corners_px=apart), capture_of(CAMERAS, boards, tmp_path), {})

@@ -81,7 +81,7 @@ def test_too_little_address_space_is_one_message(most_mb):
     line = [sys.executable, "-c", limited + "from jawusd.__main__ import main; main()", "check", "capture.toml"]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert done.returncode == ResourceError.exit_code and done.stderr.count("\n") == 1
-    assert "(ulimit -v), at least 1.5 GB is needed" in done.stderr
+    assert "(ulimit -v); at least 1.5 GB is needed" in done.stderr
 
 
 def test_no_core_files_are_left():

@@ -100,7 +100,7 @@ def test_info_says_how_a_frame_was_tracked(tmp_path):
     text = run("info", tmp_path / "tracks.npz", "--frame", 31).splitlines()
     assert text == [
         "frame 31, upper arch: tracked; mask not used: b",
-        "frame 31, lower arch: lost: matched contour 31% of the usual, at least 60% is needed",
+        "frame 31, lower arch: lost: matched contour 31% of the usual; at least 60% is needed",
     ]
     found = json.loads(run("info", tmp_path / "tracks.npz", "--frame", 31, "--json"))["arches"]["lower"]
     assert (found["lost_reason"], found["lost_value"], found["lost_limit"]) == ("low score", 0.31, 0.6)

@@ -221,7 +221,7 @@ def test_changing_the_given_arrays_does_not_change_the_rig():
         ({"incisor": np.array([0.0, np.nan, 0.0])}, '"incisor" contains values that are not finite'),
         ({"incisor": np.array(["a", "b", "c"])}, '"incisor" is not numeric'),
         ({"incisor": np.array([10**400, 0, 0], dtype=object)}, '"incisor" is not numeric'),
-        ({"incisor": np.array([0.0, -1e200, 0.0])}, '"incisor" contains values up to 1e\\+200, at most 1e\\+09'),
+        ({"incisor": np.array([0.0, -1e200, 0.0])}, '"incisor" contains values up to 1e\\+200; at most 1e\\+09'),
         ({"landmarks": np.zeros((0, 3))}, '"landmarks" has 0 points'),
         ({"T_rest": np.diag([1.0, 2.0, 1.0, 1.0])}, '"T_rest" is not rigid'),
         ({"slice_softness_mm": np.array(0.0)}, '"slice_softness_mm" is 0.0; it must be positive'),

@@ -101,7 +101,7 @@ def test_motion_starts_at_the_closed_bite_in_anatomical_axes(person):
 
 def test_unusable_poses_are_refused_by_name(take, anatomy):
     frames = np.arange(len(take))
-    with pytest.raises(FittingError, match="14 poses are usable, at least 15"):
+    with pytest.raises(FittingError, match="14 poses are usable; at least 15"):
         select_poses(frames[:14], take[:14], anatomy)
     scaled = take.copy()
     scaled[5, :3, :3] *= 1.05

@@ -151,5 +151,5 @@ def test_more_picks_than_can_be_tried_are_refused(told):
     views = ", ".join(f'{{ camera = "{name}", x = 1, y = 1 }}' for name in ("left", "right"))
     pick = f"[[bootstrap.upper]]\nvertex = 1\nviews = [{views}]\n"
     (problem,) = told("[boards]", f"[bootstrap]\nframe = 1\n{201 * pick}[boards]")
-    assert "has 201 entries, at most 200 are allowed" in problem
+    assert "has 201 entries; at most 200 are allowed" in problem
     assert told("[boards]", f"[bootstrap]\nframe = 1\n{200 * pick}[boards]") == []

@@ -46,7 +46,7 @@ def test_reasons_of_losses_are_kept_and_may_be_missing(tmp_path):
     tracks.lost_value[2, 1], tracks.lost_limit[2, 1] = 0.31, 0.6
     save_tracks(tmp_path / "t.npz", tracks)
     again = load_tracks(tmp_path / "t.npz")
-    assert again.explain_loss(2, 1) == "matched contour 31% of the usual, at least 60% is needed"
+    assert again.explain_loss(2, 1) == "matched contour 31% of the usual; at least 60% is needed"
     assert again.explain_loss(2, 0) == "no reason is recorded"
     rewrite(tmp_path / "t.npz", lambda arrays: [arrays.pop(f"lost_{name}") for name in ("reason", "value", "limit")])
     assert load_tracks(tmp_path / "t.npz").explain_loss(2, 1) == "no reason is recorded"

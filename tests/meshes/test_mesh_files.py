@@ -261,8 +261,8 @@ def test_a_used_vertex_that_is_not_finite_is_named(tmp_path: Path) -> None:
 def test_counts_are_capped_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     head = ply("<", MIXED).split(b"end_header\n")[0] + b"end_header\n"
     for old, new, words in (
-        (b"element vertex 96", b"element vertex 4000000000", "has 4,000,000,000 vertices, at most 30,000,000 are"),
-        (b"element face 128", b"element face 20000000", "has 20,000,000 faces, at most 10,000,000 are"),
+        (b"element vertex 96", b"element vertex 4000000000", "has 4,000,000,000 vertices; at most 30,000,000 are"),
+        (b"element face 128", b"element face 20000000", "has 20,000,000 faces; at most 10,000,000 are"),
     ):
         (tmp_path / "a.ply").write_bytes(head.replace(old, new))
         with pytest.raises(CaptureError, match=words):
@@ -275,8 +275,8 @@ def test_counts_are_capped_before_anything_is_read(tmp_path: Path, monkeypatch: 
         ("a.obj", obj().encode()),
     ):
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(CaptureError, match="has 192 triangles, at most 191 are"):
+        with pytest.raises(CaptureError, match="has 192 triangles; at most 191 are"):
             load_mesh(tmp_path / name)
     monkeypatch.setattr(mesh_data, "MOST_BYTES", 100)
-    with pytest.raises(CaptureError, match="bytes, at most 100 are"):
+    with pytest.raises(CaptureError, match="bytes; at most 100 are"):
         load_mesh(tmp_path / "a.stl")

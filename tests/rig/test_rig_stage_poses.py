@@ -161,7 +161,7 @@ def test_names_tell_or_are_told(folder, kind):
 
 def test_another_mesh_of_as_many_vertices_is_refused(folder, kind):
     path = exported(folder / "shot.usda", example_rig(kind).pose(D), change=lambda v: v * [1, 1.5, 1])
-    with pytest.raises(FormatError, match="from those of the rig, at most 0.5 mm is allowed"):
+    with pytest.raises(FormatError, match="from those of the rig; at most 0.5 mm is allowed"):
         fit_poses_of_stage(path, folder / "actor.usda")
 
 

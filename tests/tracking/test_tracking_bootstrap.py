@@ -76,7 +76,7 @@ def test_three_contradicting_picks_are_an_error_with_their_residuals():
 
 
 def test_two_picks_are_too_few():
-    with pytest.raises(TrackingError, match="2 picks on the lower teeth, at least 3"):
+    with pytest.raises(TrackingError, match="2 picks on the lower teeth; at least 3"):
         pose_from_picks(_picks(4)[:2], MESH.vertices, CAMERAS, "lower")
 
 

@@ -131,16 +131,16 @@ def test_one_mask_does_not_outvote_two(tracker):
         (
             LostReason.LITTLE_CONTOUR,
             {"least_matched_px": 1e5},
-            r"matched contour \d+ px, at least 100000 px is needed",
+            r"matched contour \d+ px; at least 100000 px is needed",
         ),
         (LostReason.ROUGH_FIT, {"suspect_residual": 0.1}, r"residual 0\.\d\d px, less than 0.0\d px is needed"),
         (
             LostReason.LOW_SCORE,
             {"suspect_residual": 0.1, "lost_residual": 50.0, "suspect_score": 1.8},
-            r"matched contour 1?\d\d% of the usual, at least 180% is needed",
+            r"matched contour 1?\d\d% of the usual; at least 180% is needed",
         ),
-        (LostReason.UNCOVERED_MASK, {"lost_coverage": 1e-5}, r"\d\.\d% of a mask is not covered .*, at most 0%"),
-        (LostReason.UNCERTAIN, {"lost_sigma_mm": 0.001}, r"expected error of the crowns 0\.\d\d mm, at most 0\.00 mm"),
+        (LostReason.UNCOVERED_MASK, {"lost_coverage": 1e-5}, r"\d\.\d% of a mask is not covered .*; at most 0%"),
+        (LostReason.UNCERTAIN, {"lost_sigma_mm": 0.001}, r"expected error of the crowns 0\.\d\d mm; at most 0\.00 mm"),
     ],
 )
 def test_every_check_reports_its_value_and_limit(tracker, reason, limits, words):

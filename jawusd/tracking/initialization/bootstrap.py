@@ -58,7 +58,7 @@ def pose_from_picks(
     """
     if len(picks) < _FEWEST:
         raise TrackingError(
-            f"bootstrap: {len(picks)} picks on the {arch} teeth, at least {_FEWEST} are needed",
+            f"bootstrap: {len(picks)} picks on the {arch} teeth; at least {_FEWEST} are needed",
             hint="Pick more vertices, spread over the arch, each in at least two cameras.",
         )
     sightings = [_sighting(k, pick, vertices, cameras, arch) for k, pick in enumerate(picks, start=1)]

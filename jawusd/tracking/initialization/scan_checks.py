@@ -100,10 +100,10 @@ def _impossible(found: Occlusion) -> Iterator[Finding]:
         yield error("scans_same", message, found.same, _SAME_SHARE, "Name the other arch's file in [scans].")
     if found.opposite < _BESIDE_SHARE and found.turn_rad < _FACING_BACK_RAD:
         message = f"{off}the arches lie {found.aside_mm:.0f} mm beside one another; only {found.opposite:.0%} of the "
-        message += f"smaller one overlaps the other in the bite plane, at least {_BESIDE_SHARE:.0%} is needed"
+        message += f"smaller one overlaps the other in the bite plane; at least {_BESIDE_SHARE:.0%} is needed"
         yield error("scans_beside", message, found.opposite, _BESIDE_SHARE)
     if found.gap_mm > _APART_MM:
-        message = f"{off}they are {found.gap_mm:.1f} mm apart at the closest point, at most {_APART_MM:g} mm is "
+        message = f"{off}they are {found.gap_mm:.1f} mm apart at the closest point; at most {_APART_MM:g} mm is "
         yield error("scans_apart", message + "allowed", found.gap_mm, _APART_MM)
     if found.turn_rad > _FACING_BACK_RAD:
         turn_deg = float(np.degrees(found.turn_rad))
@@ -118,7 +118,7 @@ def _impossible(found: Occlusion) -> Iterator[Finding]:
         yield error("scans_passed", message, 1.0, 0.0)
     if found.through > _THROUGH_SHARE:
         message = f"{off}the arches are inside one another: the lower crowns end more than 2 mm above the upper ones "
-        message += f"over {found.through:.0%} of the bite, at most {_THROUGH_SHARE:.0%} is possible"
+        message += f"over {found.through:.0%} of the bite; at most {_THROUGH_SHARE:.0%} is possible"
         yield error("scans_inside", message, found.through, _THROUGH_SHARE)
 
 
