@@ -1,11 +1,12 @@
 """Track a capture many times with inputs changed by nothing that matters, and compare the runs with the truth.
 
     python tests/benchmarks/luck.py CAPTURE [--runs 10] [--seed 0] [--footage] [--without-picks]
-        [--cameras cam0,cam2] [--turn cam0=1,cam2=2]
+        [--cameras cam0,cam2] [--turn cam0=1,cam2=2] [--noise 16,36]
 
 CAPTURE has truth/truth.npz; with --footage its masks are ignored, with --without-picks its picks. --cameras leaves out
-all others; --turn turns images by counter-clockwise quarter turns, as if these cameras had been mounted so. Every run
-is a process of its own. The first is the capture as it is; the others change one thing each, in turn:
+all others; --turn turns images by counter-clockwise quarter turns, as if these cameras had been mounted so; --noise
+replaces the images of these frames, the last one excluded, by noise, and does not count them as lost. Every run is a
+process of its own. The first is the capture as it is; the others change one thing each, in turn:
 
     1e-9, 1e-3, 0.1, 0.3 px   picks moved by normal noise of that size
     grey                      a grey level of noise, -1, 0 or 1, in the videos (masks stay)
@@ -62,9 +63,18 @@ def moved_picks(picks: Bootstrap, sigma_px: float, rng: np.random.Generator) -> 
 
 
 def rewritten(
-    source: Path, target: Path, reverse: bool = False, rng: np.random.Generator | None = None, turns: int = 0
+    source: Path,
+    target: Path,
+    reverse: bool = False,
+    rng: np.random.Generator | None = None,
+    turns: int = 0,
+    hidden: range = range(0),
 ) -> int:
-    """Write a video without loss, backwards, with a grey level of noise, or turned; return its number of frames."""
+    """Write a video without loss: backwards, with a grey level of noise, turned, or with noise instead of some frames.
+
+    Returns:
+        the number of frames.
+    """
     with av.open(str(source)) as opened:
         stream = opened.streams.video[0]
         pictures = list(opened.decode(stream))
@@ -74,8 +84,10 @@ def rewritten(
         out = made.add_stream("ffv1", rate=rate)
         size = (pictures[0].width, pictures[0].height)[:: -1 if turns % 2 else 1]
         out.width, out.height, out.pix_fmt = *size, layout
-        for picture in reversed(pictures) if reverse else pictures:
+        for index, picture in enumerate(reversed(pictures) if reverse else pictures):
             values = picture.to_ndarray(format=layout)
+            if index in hidden:
+                values = np.random.default_rng(index).integers(0, 256, values.shape, dtype=np.uint8)
             if rng is not None:
                 luma = values[: picture.height].astype(np.int16)
                 luma += rng.integers(-1, 2, luma.shape, dtype=np.int16)
@@ -128,6 +140,19 @@ def mounted(capture: Capture, names: Sequence[str], turns: Mapping[str, int], fo
     return capture.model_copy(update=changed)
 
 
+def interrupted(capture: Capture, frames: range, folder: Path) -> Capture:
+    """Return a capture whose videos show noise on some frames."""
+    offsets, cameras = sync_cameras(capture, lambda *_: None)["offsets"], []
+    for camera in capture.cameras:
+        video, shift = folder / f"{camera.name}_noise.mkv", offsets[camera.name]
+        rewritten(camera.video, video, hidden=range(frames.start - shift, frames.stop - shift))
+        cameras.append(camera.model_copy(update={"video": video}))
+    sync = capture.sync.model_copy(
+        update={"method": "offsets", "offsets": offsets, "reference": capture.sync.reference or capture.cameras[0].name}
+    )
+    return capture.model_copy(update={"cameras": tuple(cameras), "sync": sync})
+
+
 def backwards(capture: Capture, folder: Path) -> Capture:
     """Return a capture played backwards: frame k of a clip of n frames becomes frame n - 1 - k."""
     offsets, cameras, counts = sync_cameras(capture, lambda *_: None)["offsets"], [], {}
@@ -173,8 +198,8 @@ def changed(capture: Capture, kind: str, folder: Path, rng: np.random.Generator)
     return backwards(capture, folder) if kind == "reversed" else capture
 
 
-def scores(capture: Capture, tracks: Tracks, frames: np.ndarray) -> dict[str, object]:
-    """Return what a run gives, against the truth at these frames of the capture."""
+def scores(capture: Capture, tracks: Tracks, frames: np.ndarray, hidden: range) -> dict[str, object]:
+    """Return what a run gives, against the truth at these frames of the capture, of which some were hidden."""
     with np.load(capture.folder / "truth" / "truth.npz") as truth:
         exact = truth["T_upper_lower"][np.searchsorted(truth["frames"], frames)]
     incisor = subject_of_capture(capture, load_meshes(capture)).landmarks[0]
@@ -184,7 +209,7 @@ def scores(capture: Capture, tracks: Tracks, frames: np.ndarray) -> dict[str, ob
     sure = tracks.sigma_mm[known, 0] < SURE_MM
     return {
         "frames": len(frames),
-        "lost": frames[~known].tolist(),
+        "lost": [frame for frame in frames[~known].tolist() if frame not in hidden],
         "mean_mm": float(off_mm.mean()),
         "worst_mm": float(off_mm.max()),
         "silent": int(((off_mm > WRONG_MM) & sure).sum()),
@@ -208,6 +233,8 @@ def one_run(options: argparse.Namespace) -> dict[str, object]:
                 name: int(count) for name, count in (each.split("=") for each in filter(None, options.turn.split(",")))
             }
             capture = mounted(capture, names, turns, Path(folder))
+        hidden = range(*map(int, options.noise.split(","))) if options.noise else range(0)
+        capture = interrupted(capture, hidden, Path(folder)) if hidden else capture
         given = changed(capture, kind, Path(folder), np.random.default_rng(options.seed))
         tracks = track(given, jobs=1 if kind == "thread" else 3)
     frames = tracks.frames
@@ -215,7 +242,7 @@ def one_run(options: argparse.Namespace) -> dict[str, object]:
         first, stop = given.frames or (int(frames[0]), int(frames[-1]) + 1)
         original = capture.frames or (first, stop)
         frames = original[0] + stop - 1 - frames
-    return scores(capture, tracks, frames)
+    return scores(capture, tracks, frames, hidden)
 
 
 def main() -> None:
@@ -230,6 +257,7 @@ def main() -> None:
         "--cameras", default="", help="names of the cameras used, by default all; ignores masks and picks"
     )
     parser.add_argument("--turn", default="", help="name=quarter turns, ...; ignores masks and picks")
+    parser.add_argument("--noise", default="", help="first frame of noise, and the first one after it")
     parser.add_argument("--one", help=argparse.SUPPRESS)  # of the processes that this starts
     options = parser.parse_args()
     if options.one is not None:
@@ -240,7 +268,7 @@ def main() -> None:
     for run in range(options.runs):
         kind = "as it is" if run == 0 else KINDS[(run - 1) % len(KINDS)]
         line = [sys.executable, __file__, str(options.capture), "--one", kind, "--seed", str(options.seed + run)]
-        line += ["--cameras", options.cameras, "--turn", options.turn]
+        line += ["--cameras", options.cameras, "--turn", options.turn, "--noise", options.noise]
         line += ["--without-picks"] if options.without_picks else []
         generic = {"NUMBA_CPU_NAME": "generic"} if kind == "generic" else {}
         line += ["--footage"] if options.footage else []
