@@ -79,7 +79,7 @@ def track_capture_paper(
         first, stop = capture.frames or masks.frames
         begin = bootstrap.frame
         if not first <= begin < stop:
-            raise TrackingError(f"bootstrap.frame is {begin}, frames run from {first} to {stop - 1}")
+            raise TrackingError(f"bootstrap.frame is {begin}; frames run from {first} to {stop - 1}")
         energies = _energies(scans, config, backend, threads, stack)
         records: dict[int, _Record] = {}
         for frames in (range(begin, stop), range(begin - 1, first - 1, -1)):

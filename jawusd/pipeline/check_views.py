@@ -67,7 +67,7 @@ def synchronisation(parts: Parts) -> Iterator[Finding]:
             yield Finding(
                 "taken_as_simultaneous",
                 "warning",
-                f"{', '.join(silent)} without a video: the cameras cannot be aligned and are assumed simultaneous",
+                f"no video for {', '.join(silent)}: the cameras cannot be aligned and are assumed simultaneous",
                 path=parts.description,
                 hint="Give [sync] offsets.",
             )

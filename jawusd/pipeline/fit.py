@@ -174,7 +174,7 @@ def read_trajectory(
     path, fps = Path(path), None
     if options.rigid:
         if options.columns or options.group:
-            raise FormatError("columns and groups are for poses; a table of markers has rigid bodies.", path=path)
+            raise FormatError("columns and groups apply to poses; this is a table of markers.", path=path)
         T, fps = marker_poses(path, options.rigid, options.rest_frame, options.length_unit)
         frames = np.arange(len(T))
     elif path.suffix.lower() in HDF5_SUFFIXES:

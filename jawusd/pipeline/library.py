@@ -185,10 +185,10 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
 
 
 def _caution(motion: PersonalMotion) -> str:
-    persons = f"{len(motion.weights)} library person{'s' if len(motion.weights) > 1 else ''}"
+    persons = f"{len(motion.weights)} library subject{'s' if len(motion.weights) > 1 else ''}"
     start = f"Made from landmarks and {persons}, not from a capture;"
     if motion.learned.expected is None:
-        return f"{start} the expected error is unknown, as the library has a single subject."
+        return f"{start} the expected error is unknown, because the library has a single subject."
     found = motion.learned.expected.summary()
     return f"{start} expected error {found['mean']:.2f} mm, 95 % below {found['p95']:.2f} mm (leave-one-out)."
 

@@ -185,7 +185,7 @@ def _outcome(future: Future[Outcome], item: ListedCapture) -> Outcome:
     error = future.exception() if future.status == "error" else None
     reason = f"{type(error).__name__}: {error}" if error else "the connection to the cluster was lost"
     if type(error).__name__ == "KilledWorker":
-        reason = "every process that worked on it died, perhaps for lack of memory"
+        reason = "every process that ran it died, perhaps because it ran out of memory"
     return Outcome(item.name, str(item.path), FAILED, error=reason)
 
 
@@ -332,10 +332,10 @@ def check_workers(client: Client, folder: Path) -> None:
             raise ClusterError(f"worker {address} cannot run jawusd ({type(answer).__name__}: {answer}).")
         version, sees_folder = answer
         if version != __version__:
-            raise ClusterError(f"worker {address} runs jawusd {version}, this is {__version__}.")
+            raise ClusterError(f"worker {address} runs jawusd {version}, but this process runs {__version__}.")
         if not sees_folder:
             raise ClusterError(
-                f"worker {address} does not see {folder}.",
+                f"worker {address} cannot access {folder}.",
                 hint="Use a folder that all machines share under the same path.",
             )
 

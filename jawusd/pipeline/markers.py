@@ -117,7 +117,7 @@ def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
         raise FormatError("has no points or no frames.", path=path)
     if len(points) >= _MOST_C3D_FRAMES:
         raise FormatError(
-            f"has {_MOST_C3D_FRAMES} frames or more, which C3D cannot count.",
+            f"has {_MOST_C3D_FRAMES} frames or more; C3D files cannot store the number.",
             path=path,
             hint="Export the take as TRC or CSV, or in parts.",
         )
@@ -158,7 +158,8 @@ def _columns(body: RigidBody, names: tuple[str, ...], count: int, called: str, p
             and own.index(str(marker)) != marker - 1
         ):
             raise FormatError(
-                f'"{marker}" is ambiguous: the name of marker {own.index(str(marker)) + 1} and the number of another.',
+                f'"{marker}" is ambiguous: the name of marker {own.index(str(marker)) + 1} '
+                "and the number of another marker.",
                 path=path,
             )
         places = [marker - 1] if isinstance(marker, int) else [k for k, name in enumerate(names) if name == marker]

@@ -189,7 +189,7 @@ def _describe_failure(tried: Sequence[int], best: Start[T] | None, left: range) 
     if frames:
         found += f" ({', '.join(map(str, frames))})"
     if best is not None:
-        found += f"; at best {best.fit:.0%} of the visible contour fits, {LEAST_FIT:.0%} is needed"
+        found += f"; at best {best.fit:.0%} of the visible contour fits; at least {LEAST_FIT:.0%} is needed"
     if left:
         found += f"; frames {left[0]} to {left[-1]} were not searched, because at most {_MOST_TRIED} starts are tried"
     return found

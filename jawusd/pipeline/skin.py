@@ -145,7 +145,7 @@ def read_face(
         face = FaceTable(frames, table.points, table.names, table.fps or fps, table.unit)
     if face.X.ndim == 2:
         if rigid:
-            raise FormatError("has no points, to which --rigid could apply.", path=path)
+            raise FormatError("has no points; --rigid applies to points only.", path=path)
         return face
     points = face.X * LENGTH_UNITS_MM[face.unit or unit]
     if rigid:

@@ -187,7 +187,7 @@ def check_output(
     if out is None:
         return
     if Path(out).suffix.lower() in _USD and Path(rig).suffix.lower() not in _USD:
-        raise RigError("is not a USD rig, which an animation layer needs.", path=rig, hint="Name the rig's actor.usda.")
+        raise RigError("is not a USD rig; an animation layer needs one.", path=rig, hint="Name the rig's actor.usda.")
     if Path(out).suffix.lower() not in SUFFIXES:
         raise OutputError("has an unsupported suffix.", path=out, hint=f"Name a file ending in {', '.join(SUFFIXES)}.")
 

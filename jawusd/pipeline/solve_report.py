@@ -164,5 +164,5 @@ def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
 def solve_limits(cameras: Sequence[str]) -> str:
     """Return what limits the accuracy of a solve from these cameras, in words."""
     if len(cameras) == 1:
-        return "having a single camera: errors are largest along its line of sight"
+        return "a single camera: errors are largest along its line of sight"
     return "the rig: its error at the condyles exceeds that of the outlines"

@@ -91,7 +91,7 @@ def _scans(files: FoundFiles, out: CaptureStart) -> dict[str, PurePath]:
             found[key] = paths[0]
             out.found.append(f"{key}: {paths[0]}")
         elif len(paths) > 1:
-            out.missing.append(f"{key}: {_listed(paths)} are all candidates; name one (a folder is for one person)")
+            out.missing.append(f"{key}: {_listed(paths)} are all candidates; name one (a folder is for one subject)")
         elif what:
             unknown = files.scans.get("", [])
             more = f"; perhaps {_listed(unknown)}, but the name does not show it" if unknown else ""

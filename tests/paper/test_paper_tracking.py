@@ -351,5 +351,5 @@ def test_missing_masks_are_partial_and_too_few_are_lost(masks_folder, tmp_path) 
 def test_what_the_method_cannot_start_from_is_refused(masks_folder) -> None:
     with pytest.raises(TrackingError, match=r"no \[bootstrap\] picks"):
         track(take(masks_folder, bootstrap=None))
-    with pytest.raises(TrackingError, match="bootstrap.frame is 6, frames run from 7 to 7"):
+    with pytest.raises(TrackingError, match="bootstrap.frame is 6; frames run from 7 to 7"):
         track(take(masks_folder, frames=(7, 8)))

@@ -198,12 +198,12 @@ def test_local_workers_listen_to_this_machine_alone_and_a_deadly_capture_is_give
         assert {c.laddr.ip for c in heard} == {"127.0.0.1"}
         assert list(client.run(dask.config.get, "distributed.worker.profile.enabled").values()) == [False]
         many.check_workers(client, ROOT)
-        with pytest.raises(ClusterError, match="does not see"):
+        with pytest.raises(ClusterError, match="cannot access"):
             many.check_workers(client, ROOT / "missing")
         future = client.submit(os._exit, 1)
         future.exception(timeout=60)
         outcome = many._outcome(future, ListedCapture(ROOT, "x"))
-    assert outcome.status == "failed" and "every process that worked on it died" in outcome.error
+    assert outcome.status == "failed" and "every process that ran it died" in outcome.error
 
 
 def silent():

@@ -88,8 +88,8 @@ def test_deep_bite_that_leaves_the_middles_at_one_height_is_accepted(bite):
     ("kind", "message", "change"),
     [
         ("scans_apart", r"they are \d\.\d mm apart at the closest point; at most 4", {"move_mm": (0, -7, 0)}),
-        ("scans_beside", r"the arches lie \d+ mm beside one another", {"move_mm": (30, 0, 0)}),
-        ("scans_beside", r"the arches lie \d+ mm beside one another", {"move_mm": (0, 3, -80)}),
+        ("scans_beside", r"the arches are \d+ mm apart sideways", {"move_mm": (30, 0, 0)}),
+        ("scans_beside", r"the arches are \d+ mm apart sideways", {"move_mm": (0, 3, -80)}),
         ("scans_inside", r"more than 2 mm above the upper ones over \d+%", {"move_mm": (0, 6, 0)}),
         ("scans_passed", "moved through one another", {"move_mm": (0, 14, 0)}),
         ("scans_turned", r"rotated by 1[678]\d degrees", {"turn_deg": (0, 180, 0)}),

@@ -192,7 +192,7 @@ def test_picks_far_from_the_masks_are_reported_and_corrected(pictures):
 
 
 def test_bootstrap_frame_must_lie_in_the_range(pictures):
-    with pytest.raises(TrackingError, match="bootstrap.frame is 8, frames run from 10 to 14"):
+    with pytest.raises(TrackingError, match="bootstrap.frame is 8; frames run from 10 to 14"):
         track(_capture(pictures, frames=(10, 15)))
 
 

@@ -96,13 +96,13 @@ def test_the_search_for_a_mistake_is_bounded_and_reports_what_was_tried(monkeypa
 def test_every_mistake_of_three_cameras_is_tried(monkeypatch):
     searches = _Searches()
     assert _refused(searches, monkeypatch) == (
-        "Undoing any of 20 possible mistakes in masks, scans and calibration does not help on frames 3, 6."
+        "Correcting any of 20 possible mistakes in masks, scans and calibration does not help on frames 3, 6."
     )
     assert searches.count == 40  # of 57 pictures each time
 
 
 def test_a_mistake_that_one_frame_does_not_show_is_looked_for_on_another(monkeypatch):
-    with pytest.raises(TrackingError, match="found only with that undone") as refused:
+    with pytest.raises(TrackingError, match="found only after correcting this") as refused:
         _refused(_Searches({25: 0.2}), monkeypatch)
     assert refused.value.frame == 6
 
@@ -117,7 +117,7 @@ def test_a_scan_that_fits_nowhere_is_named_before_mistakes_are_looked_for_on_oth
 def test_of_mistakes_that_are_not_all_tried_only_a_clear_fit_counts(monkeypatch):
     monkeypatch.setattr(start_causes, "MOST_PICTURES", 20)
     assert "not tried" in _refused(_Searches({5: 0.2}), monkeypatch)
-    with pytest.raises(TrackingError, match="found only with that undone"):
+    with pytest.raises(TrackingError, match="found only after correcting this"):
         _refused(_Searches({5: 0.5}), monkeypatch)
 
 

@@ -77,7 +77,8 @@ def pose_from_picks(
             best, best_cost = pose, cost
     if best is None:
         raise TrackingError(
-            f"bootstrap: the picks on the {arch} teeth lie on a line", hint="Pick front teeth and both sides."
+            f"bootstrap: the picks on the {arch} teeth lie on a line",
+            hint="Pick vertices on the front teeth and on both sides.",
         )
     for _ in range(3):
         good = [s for s in sightings if _miss_mm(s, best) < TOLERANCE_MM]
@@ -91,13 +92,13 @@ def pose_from_picks(
             if (cause := _wrong_sight(picks, vertices, cameras, arch, places, sightings)) is not None:
                 raise TrackingError(
                     f"bootstrap: the picks on the {arch} teeth contradict one another: {cause}",
-                    hint="Check the calibration and the picks' camera names, and that their views show one instant.",
+                    hint="Check the calibration and the picks' camera names, and that their views show the same frame.",
                 )
             misses = ", ".join(f"pick {s.number}: {_miss_mm(s, best):.1f} mm" for s in sightings)
             raise TrackingError(
                 f"bootstrap: the picks on the {arch} teeth contradict one another "
                 f"({misses}; allowed {TOLERANCE_MM} mm)",
-                hint="Check vertex numbers, pixels and camera names of the picks, and that the views show one instant.",
+                hint="Check the vertices, pixels and camera names of the picks, and that views show the same frame.",
             )
         best = _refined(good, best)
     return best, [s.number for s in sightings if s not in good]
@@ -150,7 +151,7 @@ def _wrong_sight(
         return None
     return (
         f"the lines of sight of their views miss one another by up to {max(gaps):.1f} mm (usual: {_GAP_MM:g} mm): "
-        "a calibration or camera name is wrong, or the views show different instants"
+        "a calibration or camera name is wrong, or the views show different frames"
     )
 
 

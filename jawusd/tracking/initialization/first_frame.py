@@ -111,7 +111,7 @@ def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
             return (
                 f"the {ARCH_NAMES[r]} teeth do not fit their masks: {share:.0%} of the visible contour "
                 f"matches (at least {config.first_share:.0%} is needed), {uncovered:.1%} of the masks is not covered "
-                f"(at most {config.lost_coverage:.0%} is allowed), and the match less the penalty for uncovered mask "
+                f"(at most {config.lost_coverage:.0%} is allowed), and the match minus the penalty for uncovered mask "
                 f"is {first.fit[r]:.3f} (at least {_LEAST_FIT} is needed)"
             )
     return None

@@ -114,7 +114,7 @@ def _exchanges(given: Setting) -> Iterator[Mistake]:
         )
         yield Mistake(
             "picks_cameras_exchanged",
-            f"the picks have cameras {a} and {b} exchanged",
+            f"cameras {a} and {b} are exchanged in the picks",
             "Exchange these names in [bootstrap].",
             replace(given, picks=_with_views(given, partial(_renamed, other))),
         )
@@ -173,7 +173,7 @@ def _wrong_lenses(given: Setting) -> Iterator[Mistake]:
                 px = float(np.hypot(*(fitted.K[:2, 2] - camera.K[:2, 2])))
                 kind = "principal_point"
                 cause = f"with its images shifted by {px:.0f} px: its principal point is wrong, or it was turned"
-            message = f"the calibration of camera {name} contradicts the picks, and agrees {cause}"
+            message = f"the calibration of camera {name} contradicts the picks; it agrees {cause}"
             hint = "Calibrate it again, with the lens and mode of the recording."
             yield Mistake(kind, message, hint, setting, True, name)
 

@@ -75,7 +75,7 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
     yield from _rejected(found, frame)
     for name, share in found.on.items():
         if share < _ON:
-            message = f"{share:.0%} of its masks lie on the scans as the picks place them; {_ON:.0%} or more is usual"
+            message = f"{share:.0%} of its masks lie on the scans as posed by the picks; {_ON:.0%} or more is usual"
             hint = "Check picks, masks, calibration and time offsets of this camera."
             yield Finding("masks_off_picks", "warning", message, share, _ON, camera=name, frame=frame, hint=hint)
 
@@ -188,7 +188,7 @@ def _explanation(
 def _explained(mistake: Mistake, undone: _Evidence, found: _Evidence | None, frame: int) -> Finding:
     """Return the finding that reports a mistake: a warning if tracking corrects it, otherwise an error."""
     as_given = "the picks contradict one another" if found is None else _summary(found)
-    message = f"{mistake.message}; as given {as_given}, with that undone {_summary(undone)}"
+    message = f"{mistake.message}; as given, {as_given}; once corrected, {_summary(undone)}"
     severity: Severity = "warning" if mistake.correctable and found is not None else "error"
     return Finding(
         mistake.kind,

@@ -74,7 +74,7 @@ def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | Non
             Finding(
                 "anatomical_axes_off",
                 "warning",
-                f"the up axis of [anatomy] T_anatomical_skull is {tilt_deg:.0f} degrees off the normal of the bite, "
+                f"the up axis of [anatomy] T_anatomical_skull is {tilt_deg:.0f} degrees off the normal of the bite; "
                 f"up to {_AXES_OFF_DEG:g} degrees is usual",
                 tilt_deg,
                 _AXES_OFF_DEG,
@@ -99,7 +99,7 @@ def _impossible(found: Occlusion) -> Iterator[Finding]:
         message = f"the upper and lower teeth scans are the same arch: {found.same:.0%} of their surfaces coincide"
         yield error("scans_same", message, found.same, _SAME_SHARE, "Name the other arch's file in [scans].")
     if found.opposite < _BESIDE_SHARE and found.turn_rad < _FACING_BACK_RAD:
-        message = f"{off}the arches lie {found.aside_mm:.0f} mm beside one another; only {found.opposite:.0%} of the "
+        message = f"{off}the arches are {found.aside_mm:.0f} mm apart sideways; only {found.opposite:.0%} of the "
         message += f"smaller one overlaps the other in the bite plane; at least {_BESIDE_SHARE:.0%} is needed"
         yield error("scans_beside", message, found.opposite, _BESIDE_SHARE)
     if found.gap_mm > _APART_MM:
@@ -129,10 +129,10 @@ def _unusual(found: Occlusion) -> Iterator[Finding]:
         return Finding(kind, "warning", message, value, limit, hint=hint)
 
     if found.gap_mm > _LOOSE_MM:
-        message = f"the teeth scans do not touch: they are {found.gap_mm:.1f} mm apart at the closest point, up to "
+        message = f"the teeth scans do not touch: they are {found.gap_mm:.1f} mm apart at the closest point; up to "
         yield warning("scans_open", f"{message}{_LOOSE_MM:g} mm is usual", found.gap_mm, _LOOSE_MM, _EXPORT)
     if found.depth_mm > _TIGHT_MM:
-        message = f"the crowns of the scans overlap by {found.depth_mm:.1f} mm, up to {_TIGHT_MM:g} mm is "
+        message = f"the crowns of the scans overlap by {found.depth_mm:.1f} mm; up to {_TIGHT_MM:g} mm is "
         bare = [name for name, over in zip(ARCH_NAMES, found.turned_over) if over is None]
         turned = f" Without gum, an upside-down scan ({' or '.join(bare)}) looks the same." if bare else ""
         yield warning("scans_overlap", message + "usual", found.depth_mm, _TIGHT_MM, _EXPORT + turned)
@@ -140,10 +140,10 @@ def _unusual(found: Occlusion) -> Iterator[Finding]:
     if abs(left - right) > _ONE_SIDED_MM:
         tight, loose = ("right", "left") if left > right else ("left", "right")
         message = f"the bite is tilted: the teeth are {abs(left - right):.1f} mm farther apart on the {loose} side "
-        message += f"than on the {tight} side, up to {_ONE_SIDED_MM:g} mm is usual"
+        message += f"than on the {tight} side; up to {_ONE_SIDED_MM:g} mm is usual"
         yield warning("bite_tilted", message, abs(left - right), _ONE_SIDED_MM)
     if found.midlines_mm > _MIDLINES_MM:
-        message = f"the midlines of the two arches are {found.midlines_mm:.1f} mm apart, up to "
+        message = f"the midlines of the two arches are {found.midlines_mm:.1f} mm apart; up to "
         yield warning("midlines_apart", f"{message}{_MIDLINES_MM:g} mm is usual", found.midlines_mm, _MIDLINES_MM)
     for name, width in zip(ARCH_NAMES, found.widths_mm):
         if not _NARROW_MM <= width <= _WIDE_MM:

@@ -230,7 +230,7 @@ def _picked(
     """Return the poses from the picks; if the picks are uncertain, refine them by a search nearby."""
     first, stop = frames or (0, bootstrap.frame + 1)
     if not first <= bootstrap.frame < stop:
-        raise TrackingError(f"bootstrap.frame is {bootstrap.frame}, frames run from {first} to {stop - 1}")
+        raise TrackingError(f"bootstrap.frame is {bootstrap.frame}; frames run from {first} to {stop - 1}")
     poses, left_out, sigma_mm = [], {}, {}
     for scan, mesh, picks in zip(search.solver.scans, meshes, (bootstrap.upper, bootstrap.lower), strict=True):
         pose, wrong = pose_from_picks(picks, mesh.vertices, footage.cameras, scan.name)
@@ -267,7 +267,7 @@ def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mappin
     for scan, picked, found in zip(search.solver.scans, start.poses, poses, strict=True):
         off = float(np.linalg.norm(transform_point(found, scan.centre) - transform_point(picked, scan.centre)))
         if off > max(_PICKS_OFF_MM, 4.0 * sigma_mm[scan.name]):
-            message = f"the picks of the {scan.name} teeth are {off:.1f} mm off the position that the masks show"
+            message = f"the picks of the {scan.name} teeth are {off:.1f} mm from their position according to the masks"
             hint = "The pose from the masks was used. Check the picked vertices and pixels."
             limit = _PICKS_OFF_MM
             out.append(Finding("picks_off", "warning", message, round(off, 2), limit, frame=start.frame, hint=hint))

@@ -203,7 +203,7 @@ def raise_cause(
     for frame in frames[1:]:
         _raise_cause_on(frame, groups, only_clear)
     where = f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames))}"
-    sentence = f"Undoing any of {tried} possible mistakes in masks, scans and calibration does not help on {where}"
+    sentence = f"Correcting any of {tried} possible mistakes in masks, scans and calibration does not help on {where}"
     if tried == count:
         return f"{sentence}."
     return f"{sentence}; {count - tried} more were not tried, since at most {MOST_PICTURES} pictures are searched."
@@ -223,7 +223,7 @@ def _raise_cause_on(frame: int, groups: Sequence[Sequence[_Cause]], only_clear: 
         least = CLEAR_FIT if only_clear or len(explained) < len(causes) else EXPLAINS
         fit, best = max(explained, key=lambda one: one[0], default=(0.0, None))
         if best is not None and fit >= least:
-            message = f"{best.message}: the teeth are found only with that undone"
+            message = f"{best.message}: the teeth are found only after correcting this"
             raise TrackingError(message, frame=frame, hint=best.hint)
     return tried
 
@@ -247,7 +247,7 @@ def raise_for_unmatched_arch(fits: Mapping[int, Array]) -> None:
     name, other = ARCH_NAMES[1 - good], ARCH_NAMES[good]
     raise TrackingError(
         f"the {name} scan does not fit its own masks on any frame on which the {other} scan fits its own: the "
-        f"fit (matched fraction of the contour less a penalty for uncovered mask) is {fit[1 - good]:.2f} against "
+        f"fit (matched fraction of the contour minus a penalty for uncovered mask) is {fit[1 - good]:.2f} against "
         f"{fit[good]:.2f}; at least {EXPLAINS:g} is needed",
         frame=frame,
         hint=f"Check that the {name} scan is a recent one of this subject, and that its masks show the {name} teeth.",
@@ -307,7 +307,7 @@ def _cameras(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
         others = replace(footage, sources=[other for other in footage.sources if other is not source])
         yield _Cause(
             f"camera {source.name} contradicts the other cameras: its calibration is wrong (focal length, principal "
-            "point), it was turned or moved since, or its masks are of another instant",
+            "point), it was turned or moved since, or its masks belong to another frame",
             f"Calibrate camera {source.name} again, check its time offset, or exclude it.",
             search,
             others,

@@ -255,7 +255,7 @@ def registration_findings(found: Registration) -> list[Finding]:
         return [Finding("scan_registration", "note", f"{off}: corrected", value=shift, limit=_OFF_MM)]
     # without a named frame, the mouth may never have closed
     severity: Severity = "warning" if found["named"] else "note"
-    hint = 'Register the scans again, or set registration = "take" in [scans] if the teeth are together there.'
+    hint = 'Register the scans again, or set registration = "take" in [scans] if the teeth are in occlusion there.'
     return [Finding("scan_registration", severity, off, value=shift, limit=_OFF_MM, hint=hint)]
 
 

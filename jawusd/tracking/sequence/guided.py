@@ -76,8 +76,8 @@ class GuidedTracker:
         if bootstrap is None:
             raise TrackingError(
                 "without masks, tracking starts from picks, and the capture has none",
-                hint="Make them on the page of `jawusd view CAPTURE`, or add [bootstrap]: three or more vertices of "
-                "each scan with their pixels in two cameras.",
+                hint="Pick vertices on the page of `jawusd view CAPTURE`, or add [bootstrap]: three or more vertices "
+                "of each scan with their pixels in two cameras.",
             )
         picks = {"upper": bootstrap.upper, "lower": bootstrap.lower}
         return np.stack(

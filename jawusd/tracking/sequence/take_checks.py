@@ -90,8 +90,8 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
                 Finding(
                     "focal_length",
                     "warning",
-                    f"it shows the teeth {_than(own)} than expected from its calibration and the others; at most "
-                    f"{limits.scale:.0%} is usual. Its focal length or its distance is wrong.",
+                    f"it shows the teeth {_than(own)} than expected from its calibration and the other cameras; "
+                    f"at most {limits.scale:.0%} is usual. Its focal length or its distance is wrong.",
                     value=round(100 * own, 2),
                     limit=100 * limits.scale,
                     camera=name,
@@ -121,7 +121,7 @@ def _moved(name: str, turn_rad: float, move_mm: float, clear: float) -> Finding:
     return _camera_moved(
         name,
         turn_deg,
-        f"relative to the other cameras it seems to have turned by {turn_deg:.2f} degrees and moved by "
+        f"it seems to have turned, relative to the other cameras, by {turn_deg:.2f} degrees and moved by "
         f"{move_mm:.1f} mm since its calibration, {clear:.0f} times the uncertainty; "
         f"up to {OF_MASKS.knock:g} times is usual.",
         "It was knocked, or its calibration is wrong: calibrate it again, or exclude it.",
@@ -293,7 +293,7 @@ def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -
                     value=round(float(taken.sum() / seen.sum()), 3),
                     limit=_HALF,
                     camera=name,
-                    hint="Check that they are this camera's, its calibration and its time offset.",
+                    hint="Check that the masks belong to this camera, and check its calibration and time offset.",
                 )
             )
     return out
