@@ -138,7 +138,7 @@ def _lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Array]:
     values = _floats(path, row[2:])
     expected = 2 + (3 if focal == "f" else 4) + terms
     if len(values) != expected:
-        raise CalibrationError(f"camera {row[0]} has {len(values)} values, {row[1]} needs {expected}.", path=path)
+        raise CalibrationError(f"camera {row[0]} has {len(values)} values; {row[1]} needs {expected}.", path=path)
     size = (int(values[0]), int(values[1]))
     fx, fy, cx, cy = (values[2], *values[2:5]) if focal == "f" else values[2:6]
     distortion = values[expected - terms :]

@@ -46,7 +46,7 @@ def _toml(path: Path, _: Mapping[str, Size]) -> list[Camera]:
         raise CalibrationError("is a folder without cameras in a supported format.", path=path, hint=_INSTEAD)
     if path.suffix.lower() in _NOT_READ:
         what = _NOT_READ[path.suffix.lower()]
-        raise CalibrationError(f"is a file of {what}, which is not supported.", path=path, hint=_INSTEAD)
+        raise CalibrationError(f"is a file of {what}; this format is not supported.", path=path, hint=_INSTEAD)
     return load_calibration(path)
 
 

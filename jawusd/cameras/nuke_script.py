@@ -103,7 +103,7 @@ def knob_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...
         values = [[float(word) for word in words if not _is_sign(word)] for words in channels]
     except ValueError as error:
         raise CalibrationError(
-            f'node {node.name}: {knob} is "{text:.60}", only numbers are allowed.',
+            f'node {node.name}: {knob} is "{text:.60}"; it must be a number.',
             path=path,
             hint="Bake expressions, or export again from the tracking program.",
         ) from error
@@ -111,7 +111,7 @@ def knob_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...
     filled = [column * frames if len(column) == 1 else column for column in values]
     if len(filled) != len(default) or any(len(column) != frames for column in filled) or not frames:
         raise CalibrationError(
-            f'node {node.name}: {knob} is "{text:.60}", {len(default)} numbers are needed.', path=path
+            f'node {node.name}: {knob} is "{text:.60}"; {len(default)} numbers are needed.', path=path
         )
     table = np.array(filled).T
     if not np.isfinite(table).all():

@@ -131,7 +131,7 @@ def numbers(path: Path, text: str, count: int, what: str) -> Array:
     except ValueError as error:
         raise CalibrationError(f'{what}: "{text:.60}" is not a list of numbers.', path=path) from error
     if len(values) != count or not np.isfinite(values).all():
-        raise CalibrationError(f"{what} has {len(values)} values, {count} finite numbers are needed.", path=path)
+        raise CalibrationError(f"{what} has {len(values)} values; {count} finite numbers are needed.", path=path)
     return values
 
 

@@ -118,7 +118,7 @@ def _charuco(boards: Boards) -> Search:
     markers, known = _marker_count(boards), len(dictionary.bytesList)
     if markers > known:
         raise CalibrationError(
-            f"[boards] a ChArUco board of {boards.cols} x {boards.rows} inner corners needs {markers} markers, "
+            f"[boards] a ChArUco board of {boards.cols} x {boards.rows} inner corners needs {markers} markers; "
             f"{boards.dictionary} has {known}."
         )
     # Before version 4.6, OpenCV drew boards with an even number of rows with the colours exchanged; these are still

@@ -106,7 +106,7 @@ def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], 
     counts = [len(clip.numbers) for clip in clips]
     shared = sorted(set.intersection(*(set(clip.numbers) for clip in clips)))
     if not shared:
-        raise CalibrationError("the board clips share no picture number.", path=clips[0].path)
+        raise CalibrationError("no picture number occurs in all board clips.", path=clips[0].path)
     if len(set(counts)) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in zip(names, counts))
         notes.append(
@@ -170,7 +170,7 @@ def _check_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, b
         if seen.any() and out[seen].all():
             raise CalibrationError(
                 f"all {seen.sum()} pictures of the board are blurred: its edges are "
-                f"{np.median(row[seen]):.1f} px wide (10 to 90 %), the limit is {limit:.1f} px.",
+                f"{np.median(row[seen]):.1f} px wide (10 to 90 %); the limit is {limit:.1f} px.",
                 camera=name,
                 path=clip.path,
                 hint="Film the board again: in focus, held still, with more light or a shorter exposure.",

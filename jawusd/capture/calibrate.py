@@ -186,7 +186,7 @@ def _advice(
             empty = ", ".join(figure["empty_corners"]) or "parts"
             advice.append(
                 f"camera {name}: the board covered {figure['coverage']:.0%} of the picture and left {empty} empty; "
-                "the lens model is extrapolated there, so keep the teeth out of it."
+                "the lens model is extrapolated there, so keep the teeth out of that area."
             )
     if expected_mm > _LARGE_EXPECTED_MM:
         advice.append(

@@ -55,17 +55,17 @@ def _lens_findings(camera: Camera, path: str) -> Iterator[Finding]:
     focal = float(camera.K[0, 0] / width)
     if not _FOCAL_WIDTHS[0] <= focal <= _FOCAL_WIDTHS[1]:
         low, high = _FOCAL_WIDTHS
-        message = f"its focal length is {focal:.3g} image widths, the usual range is {low:g} to {high:g}"
+        message = f"its focal length is {focal:.3g} image widths; the usual range is {low:g} to {high:g}"
         yield warning("focal_length", message, focal, high if focal > high else low)
     uneven = float(abs(camera.K[1, 1] / camera.K[0, 0] - 1.0))
     if uneven > _SQUARE:
-        message = f"its focal lengths fx and fy differ by {uneven:.1%}, usually by at most {_SQUARE:.0%}"
+        message = f"its focal lengths fx and fy differ by {uneven:.1%}; at most {_SQUARE:.0%} is usual"
         yield warning("pixels_not_square", message, uneven, _SQUARE)
     middle = np.array([width - 1, height - 1]) / 2
     off = float(np.abs(camera.K[:2, 2] - middle).max() / width)
     if off > _CENTRE_SHARE:
-        message = f"its principal point is {off:.0%} of the image width off the centre, usually at most "
-        yield warning("principal_point", message + f"{_CENTRE_SHARE:.0%}", off, _CENTRE_SHARE)
+        message = f"its principal point is {off:.0%} of the image width off the centre; at most "
+        yield warning("principal_point", message + f"{_CENTRE_SHARE:.0%} is usual", off, _CENTRE_SHARE)
     if (worst := _fold(camera)) is not None:
         message = f"its distortion folds over at {worst:.0%} of the way to the corner: it is not invertible there"
         yield warning("distortion_folds", message, worst, 1.0)

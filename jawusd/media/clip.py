@@ -136,7 +136,7 @@ class Clip(ABC):
             raise CaptureError(
                 f"frames {first} to {last - 1} are requested, but the video has frames 0 to {self.count - 1}.",
                 path=self.path,
-                hint="Correct `frames` in capture.toml, or copy the video again if it should be longer.",
+                hint="Correct `frames` in capture.toml, or copy the video again if the video should be longer.",
             )
 
     @abstractmethod

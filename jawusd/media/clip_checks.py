@@ -69,7 +69,7 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
         yield Finding(
             "pictures_repeated",
             "warning",
-            f"frames {listed}{more} repeat the picture before: the camera froze, or pictures were duplicated",
+            f"frames {listed}{more} repeat the previous picture: the camera froze, or pictures were duplicated",
             sum(end - start + 1 for start, end in repeated),
             0,
             path=str(video.path),

@@ -194,7 +194,7 @@ def _names(files: Mapping[int, Path]) -> dict[int, str]:
 def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) -> None:
     if tuple(found) != tuple(allowed):
         raise CaptureError(
-            f"the mask is {found[0]} x {found[1]} px, the camera's pictures are {allowed[0]} x {allowed[1]} px.",
+            f"the mask is {found[0]} x {found[1]} px, but the camera's pictures are {allowed[0]} x {allowed[1]} px.",
             path=path,
             hint="Export the masks at the size of the video.",
         )
@@ -214,7 +214,7 @@ def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> M
         shown = ", ".join(map(str, found[:_FEW])) + (f" and {len(found) - _FEW} more" if len(found) > _FEW else "")
         low, high = sorted(labels)
         raise CaptureError(
-            f"{where}the label image has the values {shown}; 0, {low} and {high} are allowed.",
+            f"{where}the label image has the values {shown}; they must be 0, {low} or {high}.",
             path=path,
             hint="Correct masks.upper_value and masks.lower_value, or export without other labels, antialiasing and "
             "lossy compression.",

@@ -71,7 +71,7 @@ class MaskLevels:
         low, high, _, _ = cv2.minMaxLoc(plane)
         if low == high:
             empty = self.plane == "alpha" or abs(low - self.teeth) > abs(low - self.background)
-            return None, "" if empty else f"is uniformly {low:g}, which means teeth everywhere"
+            return None, "" if empty else f"is uniformly {low:g}, the value of teeth"
         box = self._around_teeth(plane)  # usually a tenth of the image, to save time
         part = self._shares(plane[box])
         inside = cv2.countNonZero(cv2.inRange(part, 128, 255))
@@ -80,7 +80,7 @@ class MaskLevels:
             faint = int(part.max()) <= 255 * _FAINT
             return None, "" if faint else f"reaches only {brightest:g}, but teeth are {self.teeth:g} in other pictures"
         if (gray := cv2.countNonZero(cv2.inRange(part, 26, 229)) / plane.size) > MOST_GRAY:
-            return None, f"is not a mask: {gray:.0%} of it is neither teeth nor background"
+            return None, f"is not a mask: {gray:.0%} of its pixels are neither teeth nor background"
         mask = part if part.shape == plane.shape else self._placed(part, box, plane)
         if inside > mask.size / 2 and border_share(mask, 127.5) > 0.5:
             return (
@@ -247,7 +247,7 @@ def _agreed(shown: Sequence[_Looked], lossy: bool) -> MaskLevels:
         number, levels = next((n, levels) for n, levels in found if levels.gray > MOST_GRAY)
         raise NotMasks(
             number,
-            f"{levels.gray:.0%} of it is gray, so it is not a mask, in which white is tooth and black is background.",
+            f"{levels.gray:.0%} of its pixels are gray; in a mask, teeth are white and the background is black.",
             "Check that `masks` in capture.toml names the masks and not the footage.",
         )
     alike = max(([m for m in masks if _alike(m[1], of[1], lossy)] for of in masks), key=len)

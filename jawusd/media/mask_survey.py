@@ -109,7 +109,7 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
                 "masks_soft",
                 "warning",
                 f"in the masks of {rows} teeth, {levels.soft:.0%} of the segmented pixels lie between background "
-                f"({levels.background:g}) and teeth ({levels.teeth:g}), usually at most {MOST_SOFT:.0%}; the outline "
+                f"({levels.background:g}) and teeth ({levels.teeth:g}); at most {MOST_SOFT:.0%} is usual. The outline "
                 "is placed midway.",
                 value=round(levels.soft, 3),
                 limit=MOST_SOFT,
@@ -123,7 +123,7 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
                 "mask_polarity",
                 "warning",
                 f"the masks of {rows} teeth have the values {levels.background:g} and {levels.teeth:g}, and it is "
-                f"ambiguous which is the background; {levels.teeth:g} is taken as teeth.",
+                f"unclear which is the background; {levels.teeth:g} is taken as teeth.",
                 camera=source.name,
                 hint="Export them with teeth in white on black up to the border of the picture.",
             )

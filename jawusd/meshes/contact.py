@@ -90,10 +90,10 @@ def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Arra
         pair = Pair(*pool.map(lambda row: _solid(*row), placed))
     closed = float(pair.depth(np.eye(4)[None])[0])
     if closed < -_WIDEST_GAP_MM:
-        raise NoContact(f"the closed bite leaves more than {_WIDEST_GAP_MM:g} mm between the arches")
+        raise NoContact(f"in occlusion, the arches are more than {_WIDEST_GAP_MM:g} mm apart")
     if closed > _DEEPEST_MM:
         raise NoContact(
-            f"in the closed bite the teeth penetrate each other by {closed:.1f} mm (at most {_DEEPEST_MM:g} mm allowed)"
+            f"in occlusion, the teeth penetrate each other by {closed:.1f} mm (at most {_DEEPEST_MM:g} mm allowed)"
         )
     return Teeth(pair, closed, T_anatomical_skull, T_rest)
 

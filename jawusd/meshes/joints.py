@@ -85,7 +85,7 @@ def find_joints(skull: Mesh, mandible: Mesh, landmarks: Array, T_anatomical_skul
         _check_near(pair, depth)
     if closed.max() > _DEEPEST_MM:
         raise NoContact(
-            f"in the closed bite a condyle penetrates the skull by {closed.max():.1f} mm (at most {_DEEPEST_MM:g} mm)"
+            f"in occlusion, a condyle penetrates the skull by {closed.max():.1f} mm (at most {_DEEPEST_MM:g} mm)"
         )
     return Joints((left, right), closed, T_anatomical_skull, T_rest)
 

@@ -271,7 +271,7 @@ GOOD = lens_text(RADIAL, (0.04, 0, 0, 0.01, 0, 0, 0, 0))
         (camera_node(rotate="{" + curve(1.0) + " {curve i x1 0 x2 1 x3 2} 0}"), None, "camera left moves between"),
         (camera_node(focal="{{curve i x1 35 x2 40}}"), None, "focal is animated"),
         (camera_node(focal=0), None, "has focal length 0 mm and film back 36 x 20.25 mm; all must be"),
-        (camera_node(focal="{{parent.focal}}"), None, "focal is .*only numbers are allowed"),
+        (camera_node(focal="{{parent.focal}}"), None, "focal is .*it must be a number"),
         (camera_node(translate="{1 2}"), None, "3 numbers are needed"),
         (camera_node(translate="{1 2 nan}"), None, "not finite"),
         (camera_node(win_scale="{1 2}"), None, "win_scale or winroll"),
@@ -312,5 +312,5 @@ def test_sizes_are_needed_and_other_files_named(tmp_path):
     with pytest.raises(CalibrationError, match=r"camera left: .*no footage with that name \(available: none\)"):
         load_cameras_file(tmp_path)
     (tmp_path / "shot.3de").write_text("")
-    with pytest.raises(CalibrationError, match=r"3DEqualizer's project, which is not supported.*\.nk"):
+    with pytest.raises(CalibrationError, match=r"3DEqualizer's project; this format is not supported.*\.nk"):
         load_cameras_file(tmp_path / "shot.3de")

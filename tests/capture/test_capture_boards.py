@@ -204,7 +204,7 @@ def test_pictures_without_a_board_are_refused(tmp_path):
     about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 3.0}
     with pytest.raises(CalibrationError, match="no charuco of DICT_4X4_50"):
         find_boards(NAMES, board(**about, videos=videos), quiet)
-    with pytest.raises(CalibrationError, match="of 11 x 9 inner corners needs 60 markers, DICT_4X4_50 has 50"):
+    with pytest.raises(CalibrationError, match="of 11 x 9 inner corners needs 60 markers; DICT_4X4_50 has 50"):
         find_boards(NAMES, board(**about, cols=11, rows=9, videos=videos), quiet)
 
 

@@ -112,10 +112,10 @@ def test_footage_named_as_masks_is_refused(tmp_path):
     with VideoWriter(path, SIZE, 24, quality_crf=4) as out:
         for k in range(COUNT):
             out.write(footage(k))
-    with pytest.raises(CaptureError, match=r"cam0\.mp4: picture 0: \d+% of it is gray.*masks and not the footage"):
+    with pytest.raises(CaptureError, match=r"cam0\.mp4: picture 0: \d+% of its pixels are gray.*and not the footage"):
         MaskReader(path, SIZE).read(2)
     cv2.imwrite(str(tmp_path / "7.png"), footage(7))
-    with pytest.raises(CaptureError, match=r"7\.png: \d+% of it is gray"):
+    with pytest.raises(CaptureError, match=r"7\.png: \d+% of its pixels are gray"):
         MaskReader(tmp_path / "%d.png", SIZE).read(7)
 
 
@@ -157,8 +157,8 @@ def test_labels_that_mean_nothing_are_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "1.png"), soft)
     cv2.imwrite(str(tmp_path / "2.png"), np.dstack([label_image(2, 128, 0), label_image(2, 0, 128), 0 * soft]))
     for number, values, message in (
-        (0, (1, 2), r"0\.png: the label image has the values 0, 1, 3; 0, 1 and 2 are allowed.*masks\.upper_value"),
-        (1, (255, 128), r"1\.png: the label image has the values 0, .* and \d+ more; 0, 128 and 255 are allowed"),
+        (0, (1, 2), r"0\.png: the label image has the values 0, 1, 3; they must be 0, 1 or 2.*masks\.upper_value"),
+        (1, (255, 128), r"1\.png: the label image has the values 0, .* and \d+ more; they must be 0, 128 or 255"),
         (2, (255, 128), r"2\.png: the label image is coloured"),
     ):
         upper, _ = open_masks(rows_of(tmp_path / "%d.png", *values), SIZE)

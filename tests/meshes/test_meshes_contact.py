@@ -57,7 +57,7 @@ def test_teeth_wound_inside_out_are_the_same(scans, teeth):
 
 def test_scans_that_say_nothing_are_refused(scans):
     upper, lower = scans
-    with pytest.raises(NoContact, match="leaves more than 1 mm"):
+    with pytest.raises(NoContact, match="are more than 1 mm apart"):
         find_teeth(upper, lower, np.eye(4), lifted(-3.0))
     with pytest.raises(NoContact, match="penetrate each other"):
         find_teeth(upper, lower, np.eye(4), lifted(6.0))
