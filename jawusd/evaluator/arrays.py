@@ -164,7 +164,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
         EvaluatorError: an unknown kind, or an array that is missing, of a wrong shape, not finite or out of range.
     """
     if kind not in KINDS:
-        raise EvaluatorError(f'the model is of kind "{kind}"; this jawusd knows {", ".join(KINDS)}.')
+        raise EvaluatorError(f'the model is of kind "{kind}"; this version of jawusd supports {", ".join(KINDS)}.')
     lengths: dict[str, int] = {}
     checked = {name: _checked(name, arrays, spec.shape, lengths) for name, spec in arrays_of(kind).items()}
     for first, group in OPTIONAL.items():
@@ -180,7 +180,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     if kind == ANCHORED and lengths["weights"] != lengths["centres"] + 3:
         raise EvaluatorError(
             f'"spline_weights" has {lengths["weights"]} rows for {lengths["centres"]} centres; '
-            f"it needs one for each centre and 3 linear ones, {lengths['centres'] + 3}."
+            f"it needs one per centre and 3 for the linear part, {lengths['centres'] + 3}."
         )
     return checked
 
@@ -241,7 +241,7 @@ def _check_sections(arrays: dict[str, Array]) -> None:
     angles = np.sort(np.arctan2(directions[:, 1], directions[:, 0]))
     gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
     if gaps.max(initial=0.0) >= np.pi - 1e-9 or len(directions) < 3:
-        raise EvaluatorError('"slice_directions" leave a side open; they must surround the section.')
+        raise EvaluatorError('"slice_directions" do not surround the section: one side is open.')
     for name in ("polygon_d1d2", "polygon_d1d3"):
         counts = arrays[f"{name}_counts"]
         if counts.sum() != len(arrays[name]) or (counts < 3).any() or (counts != np.round(counts)).any():

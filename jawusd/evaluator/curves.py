@@ -115,7 +115,7 @@ class GlideTable:
         rest = table.at_floats(0.0, 0.0)[0]
         if abs(rest) > _REST_MM:
             raise EvaluatorError(
-                f'"glide_d2_factors" and "glide_d3_factors" give {rest:g} mm at the closed bite, not 0.'
+                f'"glide_d2_factors" and "glide_d3_factors" give {rest:g} mm in occlusion; it must be 0.'
             )
         return table
 

@@ -80,7 +80,7 @@ def in_millimetres(
     d = sense * (d - d[zero])
     if np.ptp(d) < _SHORTEST_MM:
         raise FittingError(
-            f"the learned {PARAMETERS[axis]} curve moves the incisal point by {np.ptp(d):.2g} mm over its range, at "
+            f"the learned {PARAMETERS[axis]} curve moves the incisal point by {np.ptp(d):.2g} mm over its range; at "
             f"least {_SHORTEST_MM:g} mm are needed.",
             hint="The networks collapsed in training. Try another seed, more starts, or the model 'anchored'.",
         )

@@ -136,7 +136,7 @@ def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> flo
     best = int(np.argmax(following.sum(axis=1)))
     if following[best, 0] < _LEAST_FOLLOWING:
         raise FittingError(
-            f"JawOpen does not follow the opening of the jaw at any clock offset (correlation "
+            f"JawOpen does not correlate with the opening of the jaw at any clock offset (correlation "
             f"{following[best, 0]:.2f} at best, {_LEAST_FOLLOWING:g} required).",
             hint="Use a face capture and a jaw take of the same performance, or set their offset with --offset.",
         )

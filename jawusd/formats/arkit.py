@@ -235,7 +235,7 @@ def _numbers_per_second(
         found = int(at_rate) if at_rate in _RATES and at_rate > highest and step < 1 else given
     if not found:
         raise FormatError(
-            "the frame rate cannot be found from the time codes: there is no full second, or the rate is none of "
+            "the frame rate cannot be found from the time codes: there is no full second, or the rate is not one of "
             f"{', '.join(map(str, _RATES))} frames per second.",
             path=table.path,
             hint="Give the rate with --fps." if fps is None else None,

@@ -47,7 +47,7 @@ def destination(path: str | os.PathLike[str]) -> Path:
     except (OSError, ValueError) as error:  # a name that is too long, circular links, a null byte
         raise OutputError(f"cannot write here: {getattr(error, 'strerror', error)}.", path=path) from error
     if found is not None and not stat.S_ISREG(found):
-        what = "a folder" if stat.S_ISDIR(found) else "neither a file nor a pipe"
+        what = "a folder" if stat.S_ISDIR(found) else "something other than a file or a pipe"
         raise OutputError(f"is {what}; it is not replaced by a file.", path=path, hint="Name another file.")
     return target
 

@@ -162,17 +162,17 @@ class Capture(Strict):
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             raise ValueError(
-                f'[[camera]] name = "{twice[0]}" is used {len(twice)} times, camera names must be unique '
+                f'[[camera]] name = "{twice[0]}" is used {len(twice)} times; camera names must be unique '
                 f"(found {listed}). Give each camera its own name"
             )
         if self.frames is not None and self.frames[0] >= self.frames[1]:
             raise ValueError(
-                f"frames = {list(self.frames)} is empty, the second number must be larger: it is one past the last "
+                f"frames = {list(self.frames)} is empty; the second number must be larger: it is one past the last "
                 "frame. For example: frames = [30, 270]"
             )
         if self.boards is not None and len(self.boards.videos) != len(names):
             raise ValueError(
-                f"[boards] videos lists {len(self.boards.videos)} clips, {len(names)} are needed, one per camera: "
+                f"[boards] videos lists {len(self.boards.videos)} clips; {len(names)} are needed, one per camera: "
                 f"{listed}. List them in the order of the cameras"
             )
         self._check_names_of_cameras(names)
@@ -190,7 +190,7 @@ class Capture(Strict):
             unknown = [name for name in found if name not in names]
             if unknown:
                 raise ValueError(
-                    f'{key} names camera "{unknown[0]}", cameras are {listed}. Use the name from its [[camera]] table'
+                    f'{key} names camera "{unknown[0]}"; cameras are {listed}. Use the name from its [[camera]] table'
                 )
         missing = [name for name in names if self.sync.offsets is not None and name not in self.sync.offsets]
         if missing:

@@ -44,7 +44,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
         raise OutputError(
             f"its [{_TABLE}] was changed by another program since it was read.",
             path=path,
-            hint="Open the capture again to see the current picks.",
+            hint="Open the capture again to load the current picks.",
         )
     try:
         changed = with_bootstrap(text, picks)

@@ -66,7 +66,7 @@ class Masks(Strict):
             return data
         rest = {key: value for key, value in data.items() if key != "labels"}
         if rest.keys() & {"upper", "lower"}:
-            raise ValueError("has both labels and upper or lower, only one kind is allowed. Remove the other")
+            raise ValueError("has both labels and upper or lower; only one kind is allowed. Remove the other")
         return rest | {"upper": data["labels"], "lower": data["labels"]}
 
     @model_validator(mode="after")
@@ -81,7 +81,7 @@ class Masks(Strict):
             raise ValueError("upper_value and lower_value are only for labels, one file for both arches. Remove them")
         if self.upper_value is not None and self.upper_value == self.lower_value:
             raise ValueError(
-                f"upper_value and lower_value are both {self.upper_value}, they must differ. "
+                f"upper_value and lower_value are both {self.upper_value}; they must differ. "
                 "Give each arch its own gray value"
             )
         return self
@@ -154,7 +154,7 @@ class CameraSource(Strict):
     @model_validator(mode="after")
     def _has_source(self) -> CameraSource:
         if self.video is None and self.masks is None:
-            raise ValueError('has neither video nor masks, one is needed. For example: video = "left.mp4"')
+            raise ValueError('has neither video nor masks; one is needed. For example: video = "left.mp4"')
         return self
 
     @property

@@ -115,7 +115,7 @@ def _named_twice(
     # One label file may hold both arches of a camera.
     if not group or other == location or (group == "masks" and other[:2] == location[:2]):
         return None
-    return f"is already used by {_where(other, data)}; each needs its own file.", "Correct one of the two."
+    return f"is already used by {_where(other, data)}; each key needs its own file.", "Correct one of the two."
 
 
 def _link_out(place: Path, folder: Path) -> str | None:

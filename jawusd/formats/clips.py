@@ -97,7 +97,7 @@ def frame_of_timecode(text: str, fps: float) -> int:
         return total
     if number not in (30, 60, 120):
         raise CaptureError(
-            f'the time code "{text}" is drop-frame, which is only defined at 29.97, 59.94 and 119.88, not at {fps:g}.'
+            f'the time code "{text}" is drop-frame, which is defined only at 29.97, 59.94 and 119.88, not at {fps:g}.'
         )
     dropped = number // 15
     if frame < dropped and seconds == 0 and minutes % 10:

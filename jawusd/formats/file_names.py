@@ -86,7 +86,7 @@ def _matching(pattern: Path) -> re.Pattern[str]:
         places = list(sign.finditer(name))
         if len(places) > 1:
             raise CaptureError(
-                "the pattern has two numbers; one is allowed.", path=pattern, hint="Write the fixed one in digits."
+                "the pattern has two numbers; one is allowed.", path=pattern, hint="Write the fixed number in digits."
             )
         if places:
             start, end = places[0].span()

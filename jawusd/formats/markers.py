@@ -155,7 +155,7 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
         )
     for line, row in rows:
         if len(row) != width:
-            raise FormatError(f"line {line} has {len(row)} numbers, {width} are expected.", path=path)
+            raise FormatError(f"line {line} has {len(row)} numbers; {width} are expected.", path=path)
     while width % 3 and not any(row[width - 1].strip() for _, row in rows):  # blank columns at the end
         width -= 1
     if width % 3:
@@ -172,7 +172,7 @@ def _positions(rows: _Rows, first: int, width: int, path: Path, zeros: bool = Tr
         found = [cell if cell.strip() else "nan" for cell in row[first : first + width]]
         if len(found) % 3 or any(cell.strip() for cell in row[first + width :]):
             end = len(row) - first
-            raise FormatError(f"line {line} has {end} numbers, {width} are expected.", path=path)
+            raise FormatError(f"line {line} has {end} numbers; {width} are expected.", path=path)
         cells.append(found + ["nan"] * (width - len(found)))
 
     def named(i: int, j: int) -> str:
@@ -282,7 +282,7 @@ def _whole(cells: list[str] | None, default: int, key: str, path: Path) -> int:
         return default
     value = to_numbers([cells[:1]], lambda *_: key, path)[0, 0]
     if value % 1 != 0 or not 0 <= value <= _MOST_FRAMES:
-        raise FormatError(f"{key} is {cells[0]}, a whole number is expected.", path=path)
+        raise FormatError(f"{key} is {cells[0]}; it must be a whole number.", path=path)
     return int(value)
 
 
@@ -291,7 +291,7 @@ def _rate(cells: list[str] | None, key: str, path: Path) -> float | None:
         return None
     value = float(to_numbers([cells[:1]], lambda *_: key or "the rate", path)[0, 0])
     if not 0 < value < np.inf:
-        raise FormatError(f"{key or 'the rate'} is {cells[0]}, more than 0 per second is expected.", path=path)
+        raise FormatError(f"{key or 'the rate'} is {cells[0]}; it must be more than 0 per second.", path=path)
     return value
 
 

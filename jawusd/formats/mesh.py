@@ -110,7 +110,7 @@ class Mark(NamedTuple):
     apart_mm: float  # maximum distance with this colour; negative: penetration deeper than in occlusion
 
 
-DEEP = Mark((120, 40, 200), "deeper than in the closed bite", -0.15)
+DEEP = Mark((120, 40, 200), "deeper than in occlusion", -0.15)
 TOUCHING = (
     Mark((200, 20, 30), "touching", 0.05),
     Mark((240, 120, 30), "within 0.2 mm", 0.2),

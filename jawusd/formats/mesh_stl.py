@@ -76,6 +76,6 @@ def _text(path: Path, data: bytes) -> Array:
     rows = _VERTEX.findall(body)
     if len(rows) != 3 * facets:
         raise CaptureError(
-            f"has {len(rows)} vertices in {facets} facets, three each are needed.", path=path, hint="Export it again."
+            f"has {len(rows)} vertices in {facets} facets; each facet needs three.", path=path, hint="Export it again."
         )
     return np.fromiter(map(float, chain.from_iterable(rows)), np.float64).reshape(-1, 3, 3)

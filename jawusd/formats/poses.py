@@ -90,7 +90,7 @@ def _json_table(path: Path) -> TextTable:
     names = list(records[0])
     for index, record in enumerate(records, start=1):
         if set(record) != set(names):
-            raise FormatError(f"record {index} has other keys than the first one.", path=path)
+            raise FormatError(f"record {index} has different keys from the first one.", path=path)
     rows = [[str(record[name]) for name in names] for record in records]
     return TextTable(path, names, rows, [f"record {index}" for index in range(1, len(rows) + 1)])
 

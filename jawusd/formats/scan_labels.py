@@ -80,7 +80,7 @@ def load_scan_labels(path: str | os.PathLike[str], mesh: Mesh) -> ScanLabels:
     labels = take(arrays, "labels", (None,), path)
     if meta.get("scan_sha256") != scan_hash(mesh) or len(labels) != len(mesh.vertices):
         raise FormatError(
-            f"was made for another version of the scan ({len(labels)} vertices, the scan has {len(mesh.vertices)}).",
+            f"was made for another version of the scan ({len(labels)} vertices; the scan has {len(mesh.vertices)}).",
             path=path,
             hint="Create new labels with `jawusd scans --force`, or delete the file.",
         )

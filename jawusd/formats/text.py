@@ -57,7 +57,7 @@ def _not_toml(text: str, said: str) -> tuple[str, str]:
     if "\\" in line:
         return said, 'Write paths with slashes, such as "video/left.mp4", also on Windows.'
     if re.search("[\u2018-\u201f\u00ab\u00bb]", line):
-        return said, 'Write straight quotes, such as name = "anna"; word processors replace them by curly ones.'
+        return said, 'Write straight quotes, such as name = "anna"; word processors replace them with curly ones.'
     return said, 'Write text in quotes, such as name = "anna", and tables in brackets, such as [scans].'
 
 

@@ -65,7 +65,7 @@ _EXPLANATIONS = {
     LostReason.NONE: "no reason is recorded",
     LostReason.FEW_MASKS: "{value:.0f} masks used; at least {limit:.0f} are needed",
     LostReason.LITTLE_CONTOUR: "matched contour {value:.0f} px; at least {limit:.0f} px is needed",
-    LostReason.ROUGH_FIT: "residual {value:.2f} px, less than {limit:.2f} px is needed",
+    LostReason.ROUGH_FIT: "residual {value:.2f} px; less than {limit:.2f} px is needed",
     LostReason.LOW_SCORE: "matched contour {value:.0%} of the usual; at least {limit:.0%} is needed",
     LostReason.UNCOVERED_MASK: "{value:.1%} of a mask is not covered by the scan; at most {limit:.0%} is allowed",
     LostReason.UNCERTAIN: "expected error of the crowns {value:.2f} mm; at most {limit:.2f} mm is allowed",

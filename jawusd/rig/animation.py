@@ -115,7 +115,7 @@ def root_prim_of(actor: Path) -> str:
     names = [prim.GetName() for prim in rig_prims(stage) if prim.GetPath().IsRootPrimPath()]
     if len(names) != 1:
         raise RigError(
-            "has not exactly one rig as a root prim, which the layer needs as its sublayer.",
+            "must have exactly one rig as a root prim; the layer needs it as its sublayer.",
             path=actor,
             hint="Choose the rig of a shot with --prim.",
         )

@@ -64,7 +64,7 @@ def _units(actor: Usd.Prim) -> Iterator[Fault]:
     for name in ("metersPerUnit", "upAxis") if own != root else ():
         found, wanted = (layer.pseudoRoot.GetInfo(name) for layer in (root, own))
         if root.pseudoRoot.HasInfo(name) and own.pseudoRoot.HasInfo(name) and found != wanted:
-            difference = f"the stage has {name} = {found}, the layer of the rig {wanted}"
+            difference = f"the stage has {name} = {found}, but the layer of the rig has {wanted}"
             if sublayered:
                 yield Fault("error", actor, f"{difference}: set both to the same value, or reference the rig instead.")
             elif name == "upAxis" and np.allclose(axes := _axes(actor, _FIRST), np.diag(np.diag(axes))):
@@ -73,7 +73,7 @@ def _units(actor: Usd.Prim) -> Iterator[Fault]:
     size = float(np.cbrt(abs(np.linalg.det(_axes(actor, _FIRST))))) * metres / _MM
     known = UsdGeom.StageHasAuthoredMetersPerUnit(stage) and not sublayered
     if known and size and not _SIZES[0] <= size <= _SIZES[1]:
-        message = f"is {size:.3g} times life size: the stage has {metres:g} m per unit, the actor is in mm. "
+        message = f"is {size:.3g} times life size: the stage has {metres:g} m per unit, but the actor is in mm. "
         yield Fault("warning", actor, f"{message}Scale the actor by {_MM / metres:g}.")
 
 
@@ -94,7 +94,7 @@ def _shape(actor: Usd.Prim) -> Iterator[Fault]:
     if uneven.any():
         first = int(np.argmax(uneven))
         listed = ", ".join(f"{scale:.4g}" for scale in scales[first])
-        message = f"is scaled unevenly, by itself or its parents, at {times[first]}: scales {listed}."
+        message = f"has a non-uniform scale, its own or that of its parents, at {times[first]}: scales {listed}."
         yield Fault("error", actor, message)
     elif mirrored.any():
         message = f"is mirrored at {times[int(np.argmax(mirrored))]}: left and right of the jaw are swapped."

@@ -191,7 +191,7 @@ def upgrade_rig(prim: Usd.Prim, where: object) -> None:
         raise FormatError(f"jaw:formatVersion is {version!r}, expected a positive integer.", path=str(where))
     if version > FORMAT_VERSION:
         raise VersionError(
-            f"the rig has format version {version}, this jawusd reads up to {FORMAT_VERSION}.",
+            f"the rig has format version {version}; this jawusd reads up to {FORMAT_VERSION}.",
             path=str(where),
             hint="Update jawusd.",
         )

@@ -137,7 +137,7 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str |
 
 def _mark_placeholder(mesh: Sdf.PrimSpec, condyles: str) -> None:
     """Mark a mesh as a placeholder in all metadata that programs display."""
-    text = f"Not anatomy: a placeholder grown from the lower scan, there was no mandible mesh. Condyles: {condyles}."
+    text = f"Not anatomy: a placeholder grown from the lower scan; there was no mandible mesh. Condyles: {condyles}."
     mesh.SetInfo("displayName", "Mandible (placeholder)")
     mesh.SetInfo("documentation", text)
     mesh.customData = {"placeholder": True}

@@ -221,7 +221,7 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
     """
     if not stage.HasAuthoredTimeCodeRange():
         raise FormatError(
-            "has no start and end time code, so the frames to read are unknown.",
+            "has no start and end time code; they determine the frames to read.",
             path=str(path),
             hint="Give an animation layer, or set both in the shot.",
         )

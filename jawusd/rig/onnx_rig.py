@@ -40,7 +40,7 @@ def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
     path = Path(path)
     decode = read_sidecar(path)
     if [entry.name for entry in decode.graph.input] != ["d"]:
-        raise FormatError('is an encoder; give the decoder, whose input is "d".', path=path)
+        raise FormatError('is an encoder; the decoder, with the input "d", is needed.', path=path)
     rig = rig_in(decode, path) or _rig_beside(path, prim)
     check_made_from(decode, rig, path)
     encoder = path.with_name(f"{path.stem}_encode.onnx")

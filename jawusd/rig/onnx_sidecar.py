@@ -161,7 +161,7 @@ def rig_in(model: onnx.ModelProto, path: str | os.PathLike[str]) -> JawRig | Non
             return JawRig(arrays, header)
     except (ValueError, RecursionError, EvaluatorError) as error:
         raise FormatError(f"has no usable rig in its metadata ({error}).", path=path) from error
-    raise FormatError("has no usable rig in its metadata: these must be JSON objects.", path=path)
+    raise FormatError("has no usable rig in its metadata: its entries must be JSON objects.", path=path)
 
 
 def _properties(model: onnx.ModelProto) -> dict[str, str]:
@@ -199,7 +199,7 @@ def check_written(path: str | os.PathLike[str], rig: JawRig) -> None:
     """
     error_mm = onnx_error_mm(path, rig, sample_valid(rig, PROBES))
     if not error_mm <= ALLOWED_MM:
-        raise RigError(f"is {error_mm:.3f} mm from the model, allowed {ALLOWED_MM} mm.", path=path)
+        raise RigError(f"is {error_mm:.3f} mm from the model; allowed {ALLOWED_MM} mm.", path=path)
 
 
 def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded: str | None = None) -> float:
@@ -280,7 +280,7 @@ def read_sidecar(path: str | os.PathLike[str], recorded: str | None = None) -> o
     except Exception as error:  # the exceptions of protobuf and onnx have no common base class
         raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error
     if model.functions or model.graph.sparse_initializer:  # the check above does not look for other files in these
-        raise FormatError("has functions or sparse weights, which graphs written by jawusd do not have.", path=path)
+        raise FormatError("has functions or sparse weights; graphs written by jawusd have neither.", path=path)
     found = _properties(model).get("format")
     if found != FORMAT:
         raise FormatError(f"has the format {found!r}, expected {FORMAT!r}.", path=path)

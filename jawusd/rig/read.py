@@ -99,7 +99,7 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
     if not isinstance(meta, dict):
         raise FormatError("jaw:meta must be a JSON object.", path=str(where))
     if meta.get("kind") != kind:
-        raise FormatError(f"jaw:model:kind is {kind!r}, jaw:meta says {meta.get('kind')!r}.", path=str(where))
+        raise FormatError(f"jaw:model:kind is {kind!r}, but jaw:meta has {meta.get('kind')!r}.", path=str(where))
     try:
         rig = JawRig(arrays, meta)
     except EvaluatorError as error:
@@ -154,7 +154,7 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     axes, counts = (d1, d2, d3), [len(d1), len(d2), len(d3)]
     found = _numbers(prim, "jaw:decoder:shape", where).tolist()
     if found != counts or min(counts) < 2 or any((np.diff(axis) <= 0).any() for axis in axes):
-        raise FormatError(f"jaw:decoder:shape is {[int(n) for n in found]}, the knots are {counts}.", path=str(where))
+        raise FormatError(f"jaw:decoder:shape is {[int(n) for n in found]}; the knots are {counts}.", path=str(where))
     twists = _numbers(prim, "jaw:decoder:twists", where).astype(np.float32)
     shape = (*counts, 6) if stored_as == "grid" else (sum(counts), 6)
     if twists.size != math.prod(shape):

@@ -63,11 +63,11 @@ def check_model(prim: Usd.Prim) -> Iterator[Finding]:
         return
     own, made_for = recorded_hashes(prim)
     if own not in (None, rig.model_hash):
-        message = "the model is not the one it was baked from (jaw:modelHash): files of several actors were mixed, "
+        message = "the rig was baked from another model (jaw:modelHash): files of several actors were mixed, "
         message += "or model values such as ranges were edited. `jawusd publish` gives each actor unique file names."
         yield _finding("error", "Model", prim, message)
     if made_for not in (None, rig.model_hash):
-        message = f"the model is not the one that its motion was made with ({PARAMETERS[0]} names another). "
+        message = f"the motion was made with another model (see {PARAMETERS[0]}). "
         message += "Either files of several actors were mixed: run `jawusd publish` on them first. "
         message += "Or the rig was rebuilt since: run `jawusd rebake` on the motion."
         yield _finding("error", "Model", prim, message)
@@ -87,7 +87,7 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
     read = table.pose(d, rig.T_rest)
     error_mm = landmark_distance(rig, read, rig.pose(d)).max()
     if error_mm > table.max_error_mm + _TABLE_SLACK_MM:
-        message = f"the table is {error_mm:.3f} mm from the model, maxError says {table.max_error_mm:.3f} mm."
+        message = f"the table is {error_mm:.3f} mm from the model; maxError is {table.max_error_mm:.3f} mm."
         yield _finding("error", "Table", prim, message)
 
 
@@ -114,7 +114,7 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
             yield _finding("error", "Onnx", prim, f"{asset.path} {error.message}")
             continue
         if not error_mm <= ALLOWED_MM:
-            message = f"{asset.path} is {error_mm:.3f} mm from the model, allowed {ALLOWED_MM} mm."
+            message = f"{asset.path} is {error_mm:.3f} mm from the model; allowed {ALLOWED_MM} mm."
             yield _finding("error", "Onnx", prim, message)
 
 
@@ -149,7 +149,7 @@ def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
     bones, body = bones_of(mandible), UsdGeom.Xformable(mandible)
     names = [(op.GetOpName(), op.GetTypeName()) for op in body.GetOrderedXformOps()]
     if bones is None and (names != _OPS or body.GetResetXformStack()):
-        message = f"the ops are {names}, expected translate (double3) and orient (quatd)."
+        message = f"the ops are {names}; expected translate (double3) and orient (quatd)."
         if body.GetResetXformStack():
             message = "!resetXformStack! detaches it from the actor: it does not move with the actor."
         yield _finding("error", "Mandible", mandible, message)
@@ -195,7 +195,7 @@ def _check_baked(
     if not over_mm[worst] <= 0:
         message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from that of d "
         message += f"({allowed_mm[worst]:.2f} allowed)."
-        message += " Only d is keyed, the mandible is not: bake it with" if unkeyed else " To make them agree, run"
+        message += " Only d is keyed, not the mandible: bake it with" if unkeyed else " To make them agree, run"
         message += " `jawusd rebake`."
         yield _finding("error", "Mandible", mandible, message)
 

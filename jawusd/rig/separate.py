@@ -59,7 +59,7 @@ def _python() -> str:
     for program in (own, own.with_name("mayapy"), own.with_name("hython"), Path(sys.prefix, "bin", "python3")):
         if program.stem.lower().startswith(known) and program.is_file():
             return str(program)
-    raise errors.RigError("untrusted=True needs a Python interpreter, and none was found next to this program.")
+    raise errors.RigError("untrusted=True needs a Python interpreter, but none was found next to this program.")
 
 
 def main() -> None:

@@ -178,7 +178,7 @@ def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
     for layer in stage.GetUsedLayers():
         if not layer.anonymous and file_of_layer(layer).resolve() not in known:
             raise RigError(
-                f"is composed of {layer.identifier:.200}, to which it does not refer.", path=checked[0].identifier
+                f"is composed of {layer.identifier:.200}, but does not refer to it.", path=checked[0].identifier
             )
 
 

@@ -35,7 +35,7 @@ _PREFIX = "jawusd:"
 
 # UsdValidation accepts validators written in Python since OpenUSD 26.05.
 _PLUGGABLE = UsdValidation is not None and hasattr(UsdValidation.ValidationRegistry, "RegisterStageValidator")
-_NO_STOCK = "OpenUSD's own validators were not run: usd-core is older than 26.5."
+_NO_STOCK = "OpenUSD's own validators were not run: they need usd-core 26.5 or newer."
 
 
 def register_validators() -> bool:

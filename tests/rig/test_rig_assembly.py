@@ -186,7 +186,7 @@ BROKEN = [
     (hide_the_mandible_for_a_while, "Assembly", "is hidden at 40"),
     (give_the_mandible_the_purpose_of_guides, "Assembly", "is hidden"),
     (squash_the_set, "Assembly", "scales 1, 1, 0.5"),
-    (shear_the_actor_for_a_while, "Assembly", "scaled unevenly, by itself or its parents, at 31"),
+    (shear_the_actor_for_a_while, "Assembly", "non-uniform scale, its own or that of its parents, at 31"),
     (mirror_the_actor, "Assembly", "mirrored"),
     (scale_the_geometry, "Mandible", "the skull is moved"),
     (scale_the_mandible, "Mandible", "expected translate"),

@@ -167,5 +167,5 @@ def test_a_layer_over_a_shot_asks_for_the_rig(hero):
     stage = Usd.Stage.CreateNew(str(hero / "shot.usda"))
     stage.DefinePrim("/Shot/Anna", "Xform").GetReferences().AddReference("./actor.usda")
     stage.Save()
-    with pytest.raises(RigError, match="not exactly one rig as a root prim"):
+    with pytest.raises(RigError, match="must have exactly one rig as a root prim"):
         write_animation(hero / "over.usdc", hero / "shot.usda", FRAMES, D, FPS)

@@ -223,7 +223,7 @@ def test_a_motion_made_for_another_model_is_found(anchored_folder):
     rig = example_rig()
     other = JawRig({**rig.arrays, "landmarks": rig.landmarks + 0.01}, rig.meta)
     write_animation(folder / "anim.usdc", folder / "actor.usda", [1, 2], np.zeros((2, 3)), 24, rig=other)
-    assert "made with (jaw:d1 names another)" in run("validate", folder / "anim.usdc", code=1)
+    assert "made with another model (see jaw:d1)" in run("validate", folder / "anim.usdc", code=1)
     run("rebake", folder / "actor.usda", folder / "anim.usdc", "-o", folder / "baked.usdc", "--root")
     run("validate", folder / "baked.usdc")
 

@@ -133,7 +133,7 @@ def test_one_mask_does_not_outvote_two(tracker):
             {"least_matched_px": 1e5},
             r"matched contour \d+ px; at least 100000 px is needed",
         ),
-        (LostReason.ROUGH_FIT, {"suspect_residual": 0.1}, r"residual 0\.\d\d px, less than 0.0\d px is needed"),
+        (LostReason.ROUGH_FIT, {"suspect_residual": 0.1}, r"residual 0\.\d\d px; less than 0.0\d px is needed"),
         (
             LostReason.LOW_SCORE,
             {"suspect_residual": 0.1, "lost_residual": 50.0, "suspect_score": 1.8},

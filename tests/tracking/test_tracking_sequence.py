@@ -159,7 +159,7 @@ def test_every_lost_frame_of_a_spoiled_stretch_names_its_reason(take, tmp_path):
     tracks = load_tracks(tmp_path / "tracks.npz")
     assert ((tracks.status == LOST) == (tracks.lost_reason > 0)).all()
     assert np.isfinite(tracks.lost_value).sum() == np.isfinite(tracks.lost_limit).sum() == 2
-    assert re.fullmatch(r"residual 1\.\d\d px, less than 0\.\d\d px is needed", tracks.explain_loss(5, 1))
+    assert re.fullmatch(r"residual 1\.\d\d px; less than 0\.\d\d px is needed", tracks.explain_loss(5, 1))
     assert tracks.explain_loss(6, 1) == "1 masks used; at least 2 are needed"
     assert track_summary(tracks)["lost_reasons"] == {"lower": {"few masks": 1, "rough fit": 1}}
     assert "  lower arch lost by: few masks 1, rough fit 1" in track_lines(track_summary(tracks))
