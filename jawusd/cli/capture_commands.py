@@ -195,7 +195,7 @@ def scans(
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Label again, and overwrite existing labels, even reviewed ones.")
+        bool, typer.Option("--force", help="Label again and overwrite existing labels, including reviewed ones.")
     ] = False,
     allow_outside: Outside = False,
     as_json: Json = False,

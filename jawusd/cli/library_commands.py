@@ -176,7 +176,7 @@ def _library_lines(opened: Library, entries: Sequence[Entry], apart_mm: Mapping[
         alike = f"  differs by {apart_mm[entry.path]:.1f} mm" if apart_mm else ""
         partial = "  lacks a movement" if entry.not_shown else ""
         lines.append(f"{row}{entry.condylar_distance_mm:10.1f}  {entry.path}{alike}{partial}")
-    lines.append(f"{len(entries)} rigs, {opened.reread} of the folder's new or changed")
+    lines.append(f"{len(entries)} rigs; {opened.reread} of the folder are new or changed")
     return lines + [f"skipped {path}: {why}" for path, why in opened.skipped.items()]
 
 

@@ -146,7 +146,7 @@ def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Ch
     if beside.any():
         moved = f"moved by {float(moved_mm[beside].max()):.2f} mm at most"
         why = "to stay inside between samples" if keys is motion.keys else "with their keys"
-        lines.append(f"{int(beside.sum())} frames beside them {moved}, {why}")
+        lines.append(f"{int(beside.sum())} frames next to them {moved}, {why}")
     figures = {"lost": lost, "clamped": clamped, "largest_clamp_mm": largest, "mean_clamp_mm": mean}
     figures |= {"moved_beside": int(beside.sum())}
     frames = np.union1d(inside.times, motion.frames)

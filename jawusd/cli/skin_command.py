@@ -64,7 +64,7 @@ HeadError = Annotated[
     typer.Option(
         min=0.0,
         metavar="MM DEGREES",
-        help="Standard deviation of the error of head stabilisation in later takes beyond that of this one.",
+        help="Additional standard deviation of the error of head stabilisation in later takes, compared with this one.",
     ),
 ]
 

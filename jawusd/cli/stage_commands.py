@@ -216,7 +216,7 @@ def still_lines(largest_mm: float, frames: int) -> list[str]:
     """Return a warning if the mandible of a stage does not move, as after export of drivers without baking."""
     if largest_mm > _STILL_MM:
         return []
-    return [f"the mandible does not move in {frames} frames: exported without baking? Bake it to keys first"]
+    return [f"the mandible does not move in {frames} frames: was it exported without baking? Bake it to keys first"]
 
 
 def judged_lines(judged: dict[str, float]) -> list[str]:

@@ -38,7 +38,7 @@ def build_lines(summary: BuildSummary, verbose: bool = False) -> list[str]:
 def _verdict_lines(report: ReportSummary, verbose: bool) -> list[str]:
     """Return the verdict of the report, what else to do, and if verbose the reasons."""
     if "verdict" not in report:
-        return ["No verdict, as there is no report."]
+        return ["No verdict, because there is no report."]
     verdict = report["verdict"]
     also = verdict.get("todo", [])[1:]
     listed = also if verbose else also[:_MOST_TODO]
@@ -63,7 +63,7 @@ def _key_lines(summary: BuildSummary) -> list[str]:
     """Return the results of a build that matter most, in a few lines."""
     track, fit = summary["track"], summary["fit"]
     sigma_mm = {name: value for name, value in track["sigma_mm"].items() if value is not None}
-    lines = ["the capture names no calibration: made one from its boards"] if summary["calibrate"] else []
+    lines = ["the capture names no calibration: one was made from its boards"] if summary["calibrate"] else []
     lines += [_sync_line(summary), f"tracked {track['tracked']} of {track['frames']} frames"]
     if "incisor" in sigma_mm:
         lines[-1] += f", expected error at the incisor {sigma_mm['incisor']:.2f} mm"
@@ -89,7 +89,7 @@ def _stage_lines(summary: BuildSummary) -> list[str]:
     lines = _findings(summary)[0]
     if summary["calibrate"]:
         lines += [
-            "the capture names no calibration: made one from its boards",
+            "the capture names no calibration: one was made from its boards",
             *calibration_lines(summary["calibrate"]),
         ]
     lines += [_sync_line(summary), *(f"  note: {note}" for note in summary["sync"].get("notes", []))]
@@ -230,7 +230,7 @@ def contact_words(contact: object) -> str:
     if not isinstance(closed, float) or not isinstance(error, float):
         return f"clearance of the teeth is unknown: {found.get('missing', 'contact was not measured')}"
     meet = f"scans penetrate by {closed:.2f} mm" if closed > 0 else f"scans are {-closed:.2f} mm apart"
-    return f"{meet} in the closed bite; clearances to {error:.2f} mm"
+    return f"{meet} in occlusion; clearances are accurate to {error:.2f} mm"
 
 
 _FARTHEST_MM = 1.5  # maximum distance that `meshes.collision` measures
@@ -250,6 +250,6 @@ def joint_words(joints: object) -> str:
     if closed <= -_FARTHEST_MM:
         where = f"more than {_FARTHEST_MM:g} mm from the bone of the skull"
     if error == 0.0:  # no surface is within that distance
-        return f"{where} in the closed bite, and not within {NEAR_MM:g} mm of it anywhere inside the bound"
+        return f"{where} in occlusion, and not within {NEAR_MM:g} mm of it anywhere inside the bound"
     deeper = f"up to {-limit:.2f} mm into it in captured poses; " if limit < -AUTHORED_MM else ""
-    return f"{where} in the closed bite; {deeper}clearances to {error:.2f} mm, not used to reject poses"
+    return f"{where} in occlusion; {deeper}clearances are accurate to {error:.2f} mm, and are not used to reject poses"

@@ -233,7 +233,7 @@ def _sentence(solved: SolvedJaw, has_findings: bool) -> str:
         said.append("some frames are interpolated from their neighbours: see their sigma for the expected error")
     if not solved.valid.all():
         said.append(
-            "some poses lie outside the rig's bound: the masks are wrong, or the person exceeded the captured range"
+            "some poses lie outside the rig's bound: the masks are wrong, or the subject exceeded the captured range"
         )
     if has_findings:
         said.append("there are findings")

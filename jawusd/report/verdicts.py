@@ -44,7 +44,7 @@ _SENTENCES = {
         BAD: "Much of the take is lost or uncertain: check masks and calibration at the worst frames below.",
     },
     "fit": {
-        GOOD: "Three parameters reproduce this person's poses to a fraction of a millimetre.",
+        GOOD: "Three parameters reproduce this subject's poses to a fraction of a millimetre.",
         LOOK: "The model is usable, but see the checks marked below.",
         BAD: "The model does not describe this take: see which check failed.",
     },
@@ -199,7 +199,7 @@ def _track(tracks: Tracks) -> Verdict:
             todo = f"Check masks and calibration of camera {one.camera}."
             checks.append(Check("unused camera", f"{one.camera}: {one.message}", "", LOOK, todo))
         elif one.kind in _WRONG_SCANS:
-            todo = "Check that the scans are of this person, complete, in mm and not mirrored."
+            todo = "Check that the scans are of this subject, complete, in mm and not mirrored."
             checks.append(Check("scans", one.message, "must match the masks", BAD, todo))
     # False positives: 7 of 30 valid subjects (`population.py --persons 30 --seed 9500`), 3 of them with a true
     # underbite.

@@ -39,7 +39,7 @@ class Clip:
         frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
         known = np.all(np.isfinite(d), axis=1)
         if not known.any():
-            raise FormatError("no frame has parameters, so there is nothing to play.", path=name)
+            raise FormatError("no frame has parameters; there is nothing to play.", path=name)
         if (np.diff(frames[known]) <= 0).any():
             raise FormatError("the frame numbers do not increase.", path=name)
         return cls(name, frames[known], d[known], float(fps))

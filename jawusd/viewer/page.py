@@ -30,8 +30,8 @@ _PLACEHOLDER = small_text(
 )
 _NO_CONTACTS = small_text("The scans do not define the occlusion: tooth collisions are not prevented.", "opacity:.7")
 _PLOT_HELP = (
-    '<div style="font-size:11px;opacity:.7;padding:0 12px">blue: bound of this person; dashed: outline of the captured '
-    "poses; grey: captured poses</div>"
+    '<div style="font-size:11px;opacity:.7;padding:0 12px">blue: bound of this subject; dashed: outline of the '
+    "captured poses; grey: captured poses</div>"
 )
 
 

@@ -26,15 +26,15 @@ NAMES = ("opening", "laterotrusion", "protrusion")
 _HINTS = (
     "Opening d1 [mm] along this subject's own path.",
     "Laterotrusion d2 [mm] at the incisal point, + to the subject's left.",
-    "Protrusion d3 [mm] relative to this person's opening path, which itself leads backwards: + in front, - behind.",
+    "Protrusion d3 [mm] relative to this subject's opening path, which itself leads backwards: + in front, - behind.",
 )
 _DRAG_HELP = small_text(
-    "You can also drag the jaw: the grabbed point follows the pointer as far as this person can move. In depth it "
-    "follows this person's opening path; with Shift it keeps its depth.",
+    "You can also drag the jaw: the grabbed point follows the pointer as far as this subject can move. In depth it "
+    "follows this subject's opening path; with Shift it keeps its depth.",
     "opacity:.7",
 )
 _KEYS_HELP = small_text("Undo: Ctrl+Z, redo: Ctrl+Shift+Z (Mac: Cmd)", "opacity:.7")
-_MARGIN_HELP = "Distance of the pose from this person's bound, in d; negative outside."
+_MARGIN_HELP = "Distance of the pose from this subject's bound, in d; negative outside."
 _CAPTURED_HELP = "Distance in d to the nearest captured pose: the larger it is, the more the model extrapolates."
 _VALID_HELP = "Valid range of this parameter at the current values of the others."
 _MOVED_HELP = "Displacement from the closed bite, in anatomical axes: to the subject's left, down, forward."
@@ -58,7 +58,7 @@ class PosePanel:
         self._client, self._session, self._scene, self._changed = client, session, scene, changed
         gui = client.gui
         self.sliders = [self._add_slider(index, label) for index, label in enumerate(f"{name} [mm]" for name in NAMES)]
-        self.keep_valid = gui.add_checkbox("keep valid", True, hint="Stop sliders at the bound of this person.")
+        self.keep_valid = gui.add_checkbox("keep valid", True, hint="Stop sliders at the bound of this subject.")
         self.keep_valid.on_update(guarded(client, self._keep))
         gui.add_html(_DRAG_HELP)
         self.reading = gui.add_html("")

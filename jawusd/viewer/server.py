@@ -215,5 +215,5 @@ def _check_address(host: str) -> None:
     except OSError as error:
         raise OutputError(
             f"cannot listen on {host}: {error.strerror}.",
-            hint="Use the default, 127.0.0.1, for browsers on this machine.",
+            hint="Use the default, 127.0.0.1, to serve browsers on this machine.",
         ) from error

@@ -166,7 +166,7 @@ class Session:
             RuntimeError: nothing is grabbed.
         """
         if self._handle is None:
-            raise RuntimeError("drag_to was called before grab")
+            raise RuntimeError("`drag_to` was called before `grab`")
         target = np.asarray(p_skull, dtype=np.float64)
         look = np.zeros(3) if sight is None else np.asarray(sight, dtype=np.float64)
         if abs(self.rig.T_anatomical_skull[1, :3] @ look) > _STEEP * np.linalg.norm(look):

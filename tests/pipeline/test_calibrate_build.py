@@ -141,7 +141,7 @@ def test_the_summary_of_a_build_says_what_was_made(calibrated):
         "track": {"tracked": 1, "frames": 1, "lost": [], "recovered": 0, "without_a_camera": 0, "prior_aided": 0,
                   "calibration_rescaled_px": {}, "sigma_mm": {}, "coverage_error_percent": 0.1},
     }  # fmt: skip
-    made = "the capture names no calibration: made one from its boards"
+    made = "the capture names no calibration: one was made from its boards"
     assert build_lines(summary)[1] == build_lines(summary, verbose=True)[1] == made
     assert len(build_lines(summary, verbose=True)) > len(build_lines(summary))
     assert not any("calibration" in line for line in build_lines(summary | {"calibrate": None}))

@@ -81,7 +81,7 @@ def test_a_take_without_motion_is_said_to_have_none(frames, anchored_folder):
         stage = Usd.Stage.Open(str(path))
         stage.SetEndTimeCode(stage.GetStartTimeCode())
         stage.Save()
-    said = f"the mandible does not move in {frames} frames: exported without baking?"
+    said = f"the mandible does not move in {frames} frames: was it exported without baking?"
     for command, name in (("encode", "d.csv"), ("rebake", "anim.usdc"), ("animate", "again.usdc")):
         assert said in run(command, actor, path, "-o", anchored_folder / name)
     found = json.loads(run("encode", actor, path, "-o", anchored_folder / "e.csv", "--json"))
