@@ -161,8 +161,8 @@ def to_frames(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
         nearest = round(step.time_frames)
         between = abs(step.time_frames - nearest) < _BETWEEN_FRAMES and 0 < nearest < len(numbers)
         picture = nearest if between else min(int(step.time_frames), len(numbers) - 1)
-        # A step between two images may be anywhere in the gap; the time of a step within an exposure follows from the
-        # brightness of the image.
+        # A step between two exposures may have occurred at any time in the gap between them; the time of a step within
+        # an exposure follows from the brightness of the image.
         gap = float(numbers[picture] - numbers[picture - 1] - 1) if between else 0.0
         out.append(Step(float(numbers[picture]) + step.time_frames - picture, step.rising, max(0.0, gap)))
     return out

@@ -20,7 +20,7 @@ from jawusd.geometry.se3 import rigidity_defect
 _RIGID_TOLERANCE = 1e-6
 
 _POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
-_LARGEST = 1e9  # [mm, rad] far beyond any jaw, but small enough that sums of squares do not overflow
+_LARGEST = 1e9  # limit of values [mm, rad]: far beyond any jaw, but small enough that sums of squares do not overflow
 _RISING = ("slice_d1", "path_limits", "glide_d2", "glide_d3", "curve1_knots", "curve2_knots", "curve3_knots")
 
 

@@ -14,7 +14,7 @@ from jawusd.base.arrays import Array, Indices
 Rows = TypeVar("Rows", Array, Indices)  # an array of rows, or of row indices
 
 CHUNK_ROWS = 2048
-LARGEST = 1e9  # [mm] far beyond any jaw, but small enough that cubes do not overflow
+LARGEST = 1e9  # limit of values [mm]: far beyond any jaw, but small enough that cubes do not overflow
 
 
 def as_floats(values: ArrayLike, name: str) -> Array:

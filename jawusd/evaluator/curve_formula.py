@@ -40,7 +40,7 @@ _CURVE_TABLES = ("start", "power0", "power1", "power2", "power3")
 
 
 def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) -> dict[str, Rows]:
-    """Return the tables of a C1 cubic Hermite curve, continued straight outside its knots, see `curve`.
+    """Return the tables of a C1 cubic Hermite curve, continued straight outside its knots; see `curve`.
 
     Args:
         name: Prefix of the names of the tables.
@@ -49,8 +49,8 @@ def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) 
         slopes: Derivatives at the knots, n rows.
 
     Returns:
-        The knots, and the start and the polynomial coefficients, powers 0..3, of each of the n + 1 intervals, including
-        the straight ends.
+        The knots; and for each of the n + 1 intervals, including the two straight ends, its start and its polynomial
+        coefficients, powers 0 to 3.
     """
     still = [0.0] * len(values[0])
     pieces = [[[knots[0]], values[0], slopes[0], still, still]]

@@ -36,7 +36,7 @@ ON_BOUND_MM = 1e-6
 FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
 LIMIT_SOFTNESS_MM = 4.0  # rounding of the kinks at both path limits
 ARCH_BOW_MM = 10.0  # scale of the quadratic arch terms, d2^2 / 10 mm; gives all coefficients a similar magnitude
-DROP_BEND = 0.15  # [1/mm] second-order coefficient of the bent drop terms
+DROP_BEND = 0.15  # second-order coefficient of the bent drop terms [1/mm]
 DROP_SATURATION_MM2 = 16.0  # squared distance, (4 mm)^2, beyond which the drop terms become straight
 
 Arrays = Mapping[str, Sequence[float]]  # the named arrays of a rig, flattened row by row

@@ -43,7 +43,7 @@ class Operations(Protocol[N, Table]):
         """Return the coefficients a, b and c of `jawusd.geometry.rodrigues` at a squared angle [rad^2]."""
 
     def polynomials(self, coefficients: Sequence[Sequence[float]], x: N) -> Sequence[N]:
-        """Return several polynomials of x, see `polynomial`."""
+        """Return several polynomials of x; see `polynomial`."""
 
     def log_sum_exp(self, terms: Sequence[N]) -> N:
         """Return the logarithm of the sum of the exponentials of all terms."""

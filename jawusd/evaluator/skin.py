@@ -60,7 +60,7 @@ class SkinJaw(NamedTuple):
         d: Jaw parameters [mm], shape (..., 3), not projected to the rig's bound; NaN where a column is not finite.
         covariance: Covariance of d [mm^2], shape (..., 3, 3).
         familiar: The face resembles the training frames, shape (...); elsewhere d may be wrong by more than its
-            covariance says.
+            covariance indicates.
     """
 
     d: Array

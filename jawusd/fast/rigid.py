@@ -33,7 +33,8 @@ for _function in (
 ):
     register_jitable(forceinline=True, nogil=True, error_model="numpy")(_function)
 
-_SERIES_SQUARED = 0.09  # [rad^2] below this, derivatives of the coefficients use series: closed forms lose digits
+# Squared angle [rad^2] below which derivatives of the coefficients use series, since closed forms lose precision.
+_SERIES_SQUARED = 0.09
 
 
 @device

@@ -134,7 +134,7 @@ def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
     """Fit the sum of three curves.
 
     Args:
-        shown: which parameters the data exercise, shape (3,); the curves of the others are pure translations.
+        shown: which parameters the data excite, shape (3,); the curves of the others are pure translations.
         trim_mad: see `FittingConfig`.
     """
     u = data.displacement()
@@ -233,7 +233,7 @@ def fit_pca(data: TrainingData, shown: Mask) -> FittedForm:
     The note `singular_values_mm` lists the singular values of the weighted twists, as rms displacement of the mandible.
 
     Args:
-        shown: parameters that the data exercise, shape (3,); the others become pure translations.
+        shown: parameters that the data excite, shape (3,); the others become pure translations.
 
     Raises:
         FittingError: the components do not move the incisal point in independent directions.

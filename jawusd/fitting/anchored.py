@@ -45,7 +45,8 @@ _FARTHER_MM = 4.0  # maximum extrapolation beyond the captured slides
 CENTRES = 80
 _ROUNDS = 4
 _SCALES_MM = np.array([10.0, 7.0, 5.0])  # length scales of f along opening, sideways and forward
-_HIDDEN_SCALE_MM = 1e9  # length scale that makes f independent of a parameter that the data do not exercise
+# Length scale for parameters that the data do not excite, so large that f does not depend on them.
+_HIDDEN_SCALE_MM = 1e9
 _SMOOTHING = 10.0 ** np.arange(-6.0, 4.0)
 _CV_BLOCK, _CV_FOLDS = 25, 5  # number of frames held out together (one second), and number of folds
 _CV_CAP_MM = 1.0
@@ -171,7 +172,8 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
     """Fit the anchored model.
 
     Args:
-        shown: which of opening, laterotrusion, protrusion the data exercise, shape (3,); f ignores the others.
+        shown: which of opening, laterotrusion and protrusion the data excite, shape (3,); the fitted function f does
+            not depend on the others.
         trim_mad: see `FittingConfig`.
     """
     u = data.displacement()
@@ -197,7 +199,10 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
 
 @dataclass(frozen=True)
 class _Chart:
-    """Map from incisal displacements u (N, 3) [mm] to spline arguments q (N, 3): a shear by the path, and scales."""
+    """Map from incisal displacements u (N, 3) [mm] to spline arguments q (N, 3).
+
+    It is a shear along the habitual path followed by a scaling.
+    """
 
     path: Gauge
     scales: Array

@@ -27,8 +27,8 @@ from jawusd.evaluator.bounds import SliceHull
 PLANES = {"polygon_d1d2": [0, 1], "polygon_d1d3": [0, 2]}
 
 _SMALLEST_RANGE_MM = 0.5  # minimum range used for normalisation; smaller ranges are noise, which would be amplified
-_SLIVER = 1e-12  # triangles with a smaller doubled area are degenerate, normalised units
-_THIN = 0.02  # distance by which the hull of collinear points is widened, normalised units
+_SLIVER = 1e-12  # triangles with twice their area below this [normalised units] are degenerate
+_THIN = 0.02  # distance by which the hull of collinear points is widened [normalised units]
 
 DIRECTIONS = 16
 KNOTS = 48
@@ -61,7 +61,7 @@ def alpha_shape(points: Array, alpha: float) -> tuple[Array, Array]:
     """Return the outer rings of an alpha shape of points (N, 2) [mm].
 
     Args:
-        alpha: largest circumradius of a triangle, in range-normalised units.
+        alpha: largest circumradius of a triangle [range-normalised units].
 
     Returns:
         Vertices of all rings [mm], shape (P, 2), each ring open (its first vertex is not repeated), counter-clockwise,

@@ -41,9 +41,9 @@ _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
 #: A point of the bound lies in a gap if it is farther than this from all captured poses, per parameter [mm].
 FAR_MM = np.array([3.0, 2.0, 2.0])
 _MOST_GAPS = 0.15  # if a larger fraction of the bound lies in gaps, more should be recorded
-# Ranges (1st to 99th percentile) below which a parameter counts as not exercised [mm].
+# Ranges (1st to 99th percentile) below which a parameter counts as not excited [mm].
 _SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
-# Movements that exercise each parameter. Sentences on what a take lacks end in ": record" and a movement.
+# Movements that excite each parameter. Sentences on what a take lacks end in ": record" and a movement.
 _MOVEMENTS = ("opening as wide as possible, three times", "full slides to both sides", "a full protrusion")
 
 
@@ -184,7 +184,7 @@ def missing_movements(d: Array, shown: Mask) -> list[str]:
 
     Args:
         d: parameters of the captured poses [mm], shape (N, 3).
-        shown: parameters that the data exercise, shape (3,); `shown_parameters` reports the others.
+        shown: parameters that the data excite, shape (3,); `shown_parameters` reports the others.
     """
     widest = float(d[:, 0].max())
     found = []

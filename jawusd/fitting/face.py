@@ -169,7 +169,7 @@ def _correlation(a: Array, b: Array) -> float:
 
 
 def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
-    """Reject a take that is too short or does not exercise every direction."""
+    """Reject a take that is too short or does not contain motion in every direction."""
     step = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     if len(d) * step < _LEAST_SECONDS:
         raise FittingError(

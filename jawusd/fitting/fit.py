@@ -39,7 +39,7 @@ Result = TypeVar("Result")
 #: Called with the number of steps done and the total.
 Progress = Callable[[int, int], None]
 Method = Literal["anchored", "additive", "paper", "pca"]
-#: Fitter of one method; the mask (3,) selects the parameters that the data exercise.
+#: Fitter of one method; the mask (3,) selects the parameters that the data excite.
 FormFitter = Callable[[TrainingData, Mask, "FittingConfig"], FittedForm]
 
 _MOST_CAPTURED = 2000  # maximum number of captured poses whose parameters a model stores
@@ -69,7 +69,7 @@ class FittingConfig:
     # frames whose residual exceeds the median by this many normalised median absolute deviations count as tracking
     # failures and are discarded
     trim_mad: float = 4.5
-    alpha: float = 0.23  # maximum triangle circumradius in the paper's alpha shapes, range-normalised units
+    alpha: float = 0.23  # maximum triangle circumradius in the paper's alpha shapes [range-normalised units]
     starts: int = 4  # number of random initialisations of the networks of method "paper"; the best is kept
     seed: int = 0  # seed of the first initialisation
 

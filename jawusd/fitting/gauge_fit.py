@@ -14,7 +14,7 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.gauge import Gauge
 
-SOFTNESS_MM = 2.0  # radius of the rounding of the arch at d2 = 0, which keeps slider motion smooth there
+SOFTNESS_MM = 2.0  # radius of the fillet at the apex of the Gothic arch, d2 = 0; it keeps slider motion smooth there
 FADE_MM = 14.0  # opening at which tooth guidance has decreased to 1/e
 
 _PATH_DEGREE, _PATH_ITERATIONS, _PATH_RIDGE = 5, 40, 1e-5
@@ -88,7 +88,7 @@ def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
 
     Args:
         path: the gauge of the habitual path alone.
-        shown: which of opening, laterotrusion, protrusion the data exercise, shape (3,).
+        shown: which of opening, laterotrusion and protrusion the data excite, shape (3,).
 
     Returns:
         The gauge; if no stiffness makes it invertible, the gauge of the path alone, which always is.

@@ -22,7 +22,7 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mxf", ".mts", ".mpg
 PICTURES = (".png", ".tif", ".tiff", ".exr", ".dpx", ".jpg", ".jpeg")
 MESHES = (".ply", ".stl", ".obj", ".dcm")
 
-# File types that are wrong for a group of keys of capture.toml, with their suffixes.
+# File types that are not accepted by a group of keys in capture.toml, with their suffixes.
 _WRONG = {
     "scans": (("a video", VIDEOS), ("a picture", PICTURES)),
     "footage": (("a mesh", MESHES), ("a calibration", (".toml", ".json", ".xml", ".csv", ".yml", ".yaml"))),
@@ -140,7 +140,7 @@ def _offer(folder: Path) -> str:
 
 
 def wrong_kind(key: str, path: PurePath) -> str | None:
-    """Return why the type of a file is wrong for a key of capture.toml, and what is needed; None if it is right.
+    """Return why a key in capture.toml does not accept the type of a file, and what it accepts; None if it does.
 
     Args:
         key: the key, such as `upper_teeth`, `video`, `calibration`.

@@ -260,7 +260,7 @@ def write_table(
 class JointDelta:
     """The joint transform of one ARKit shape."""
 
-    shape: str  # ARKit's name of the shape
+    shape: str  # ARKit's name for the blend shape
     weight: float  # weight of the shape, 0 .. 1
     d: Array  # parameters of the pose [mm], shape (3,)
     translation_mm: Array  # translation of the joint, skull axes, shape (3,)

@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 from typing import Protocol, TypeVar
 
-SMALL_SQUARED_ANGLE = 1e-4  # [rad^2] below this, closed forms lose digits; the series are exact to double precision
+# Squared angle [rad^2] below which the closed forms lose precision; the series used instead are exact to double
+# precision.
+SMALL_SQUARED_ANGLE = 1e-4
 
 
 class Number(Protocol):

@@ -27,7 +27,9 @@ _NEAR = 24  # maximum difference of values of one level after blur or lossy codi
 _FLAT = 10  # maximum difference between adjacent pixels inside a region [of 255]; edges have larger differences
 _ALIKE = 0.15  # maximum difference of a level between images of one source, as a fraction of the contrast
 _MOST_THIRD = 0.25  # maximum flat area of a third level, relative to the second largest; soft edges have no flat area
-_SHARP = 0.8  # minimum fraction of a third level's area within 1 of its value; labels exceed it, photographs do not
+# Minimum fraction of a third gray level's pixels that lie within 1 of its value for the level to count as a label;
+# photographs stay below it.
+_SHARP = 0.8
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class Pair:
         return self._deepest(T_upper_lower, -FARTHEST_MM, np.inf)
 
     def is_deeper(self, T_upper_lower: Array, limit_mm: float) -> Mask:
-        """Return where `depth` exceeds a limit, shape (n,), faster than by computing the depth."""
+        """Return where `depth` exceeds a limit, shape (n,); faster than computing the depth itself."""
         return self._deepest(T_upper_lower, max(limit_mm, -FARTHEST_MM), limit_mm) > limit_mm
 
     def _deepest(self, T_upper_lower: Array, least: float, enough: float) -> Array:

@@ -124,13 +124,13 @@ def wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float
 def sample_field(
     surfaces: Surfaces, rig: JawRig, step_mm: float = _STEP_MM, most_opening_mm: float = _MOST_OPENING_MM
 ) -> ContactField:
-    """Sample the clearance of a rig's poses over its bound, with a finer step where surfaces are close.
+    """Sample the clearance on a grid of poses over a rig's bound, with a finer step where surfaces are close.
 
     Args:
         surfaces: The opposing surfaces.
         rig: The rig.
         step_mm: Grid step; twice this where the surfaces are apart.
-        most_opening_mm: Largest opening of the field, unless the surfaces separate at a smaller one.
+        most_opening_mm: Largest opening that is sampled; less if the surfaces separate earlier.
     """
     box = _box(surfaces, rig, step_mm, most_opening_mm)
     field = _sampled(surfaces, rig, box, step_mm, _sampled(surfaces, rig, box, 2.0 * step_mm))

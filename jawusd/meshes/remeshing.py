@@ -51,7 +51,7 @@ def proxy_of(mesh: Mesh, count: int) -> Mesh:
 
 
 def bone_proxy_of(mesh: Mesh, count: int) -> Mesh:
-    """Return a bone of about `count` faces, repaired to a manifold after edge collapse."""
+    """Return a bone decimated to about `count` faces by edge collapse, then repaired to be manifold."""
     return manifold(proxy_of(mesh, count))
 
 
@@ -79,7 +79,7 @@ def decimated_scan(
 
 
 def manifold(mesh: Mesh) -> Mesh:
-    """Return a surface repaired to a manifold.
+    """Return a surface, repaired to be manifold.
 
     Coincident points are merged, degenerate and duplicate faces dropped; at edges with more than two faces, only the
     two largest are kept; connected faces are wound consistently; parts that touch in one point get separate points.

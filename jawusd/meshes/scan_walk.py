@@ -18,7 +18,8 @@ from jawusd.meshes.scan_surface import ScanSurface
 # Step weights decay with inward curvature like exp(-_CREASE_DECAY_MM * curvature).
 _CREASE_DECAY_MM = 2.5
 _SHARPEST = 3.0  # maximum curvature used in the step weights [1/mm]
-# Fraction of steps after which a walk ends in crown or gum at random, with the probability given by the local colour.
+# Weight of colour: the probability that a walk stops is about this per step. It then ends in crown or gum at random,
+# with the probability given by the local colour.
 _COLOUR_WEIGHT = 0.02
 _COLOUR_STEP = 0.3  # minimum difference in crown probability between neighbours for colour to support a border
 _TOLERANCE, _STEPS = 1e-3, 600

@@ -115,14 +115,14 @@ def fit_paper(
     """Fit the paper's model.
 
     Args:
-        shown: parameters that the data exercise, shape (3,).
+        shown: parameters that the data excite, shape (3,).
         literal: whether to keep the paper's groups (1), (2, 3), (4, 5), whichever motion the components describe.
         starts: number of random initialisations; the sum with the smallest training error is kept.
         seed: seed of the first initialisation.
         nets: cache of trained networks with five components, by seed, updated in place.
 
     Raises:
-        FittingError: the data do not exercise a parameter, or no component moves the incisal point in its direction.
+        FittingError: the data do not excite a parameter, or no component moves the incisal point in its direction.
     """
     from jawusd.paper.nlpca import train_nlpca  # imported late: it imports torch, which takes two seconds
 

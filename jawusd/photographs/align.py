@@ -25,7 +25,7 @@ _STAGES = (
 )
 _AT_WIDTH_PX = 1440.0  # reference image width, to which distances in px are scaled
 _TURN_PX = 10.0  # weight of direction when lines are matched to outlines, see `features`, at that width
-_CLEAR_MISFIT = 0.2  # maximum misfit of a photograph whose bite is used to start the others
+_CLEAR_MISFIT = 0.2  # maximum misfit of a photograph whose bite is used to initialise the others
 _GATE_MM, _MOST_MISFIT = 0.5, 0.45  # final misfit: its gate, and its maximum for scans of the same subject
 _SAME_HAND = 1.15  # minimum ratio of misfits with the other and the chosen mirroring; below it, the choice is ambiguous
 _APART_MM = 1.5  # maximum plausible distance between the bite from one photograph and that from all
@@ -152,7 +152,10 @@ def _result(
 
 
 def _line_distances(photo: Photo, joint: Bite, rows: ArchPair) -> tuple[Array, Array]:
-    """Return distances from the outlines of all drawn points (N,), and of those off the gum line (M,) [px of 1440]."""
+    """Return distances of all drawn points from the outlines (N,), and of the points not on the gum line (M,).
+
+    Unit: pixels at an image width of 1440 px.
+    """
     to_usual = _AT_WIDTH_PX / photo.drawing.size_px[0]
     found = match(seen_outlines(rows.fine, photo, joint), photo.drawing, _TURN_PX / to_usual)
     distance = to_usual * np.linalg.norm(found.outlines.pixels - photo.drawing.pixels, axis=1)

@@ -84,7 +84,7 @@ def load(path: str, prim_path: str | None = None) -> Rig:
 
 
 def find_rigs(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Return the rig prims of a stage, found by raw metadata, so that the schema plugin is not needed."""
+    """Return the rig prims in a stage, found by raw metadata, so that the schema plugin is not needed."""
     applied = [(prim, prim.GetMetadata("apiSchemas")) for prim in stage.Traverse()]
     return [prim for prim, names in applied if names is not None and SCHEMA in names.GetAddedOrExplicitItems()]
 

@@ -145,7 +145,7 @@ def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -
 
 @raises_format_error(0)
 def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, tuple[int, int]]]) -> list[Camera]:
-    """Read the perspective cameras of a stage, named after their prims, in mm, with OpenCV axes and pixels.
+    """Read the perspective cameras in a stage, named after their prims, in mm, with OpenCV axes and pixels.
 
     Prims of equal names are named after their paths. The image spans the aperture, shifted by its offsets. Its size
     [px] is `jaw:imageSize` or that of the footage; `jaw:distortion` contains OpenCV's coefficients. Moving cameras are

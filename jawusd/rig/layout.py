@@ -110,7 +110,7 @@ def has_jaw_api(prim: Usd.Prim) -> bool:
 
 
 def rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Return the active prims of a stage with JawRigAPI, including unloaded ones and those inside instances."""
+    """Return the active prims with JawRigAPI in a stage, including unloaded ones and those inside instances."""
     found = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsDefined & ~Usd.PrimIsAbstract)
     return [prim for prim in stage.Traverse(found) if has_jaw_api(prim)]
 

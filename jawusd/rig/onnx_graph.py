@@ -113,7 +113,7 @@ class Graph:
         return self.op("ReduceSum", a, self.constant([1], np.int64), keepdims=1)
 
     def reshape(self, a: Value, shape: Sequence[int]) -> Value:
-        """Return a value in another shape."""
+        """Return a value, reshaped."""
         return self.op("Reshape", a, self.constant(shape, np.int64))
 
     def sqrt(self, x: Value) -> Value:

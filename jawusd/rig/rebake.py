@@ -189,7 +189,7 @@ def write_over(
     prim_path: str,
     carried: ArrayLike = (),
 ) -> Path:
-    """Write a motion for one rig of a stage as a layer over the stage, keeping the frame rate of the motion.
+    """Write a motion for one rig in a stage as a layer over the stage, keeping the frame rate of the motion.
 
     Args:
         out: File to write; it sublayers the stage.
@@ -209,7 +209,7 @@ def write_over(
 
 
 class Rebaked(NamedTuple):
-    """Motion for a rig of a stage: times (F,), d (F, 3) [mm], and the rig's prim if the stage has several rigs."""
+    """Motion for a rig in a stage: times (F,), d (F, 3) [mm], and the rig's prim if the stage has several rigs."""
 
     rig: JawRig
     times: Array

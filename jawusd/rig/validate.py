@@ -71,7 +71,7 @@ def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
 
 
 def _rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Return the rig prims of a stage, one for each prototype that instances share."""
+    """Return the rig prims in a stage, one for each prototype that instances share."""
     first: dict[Sdf.Path, Usd.Prim] = {}
     for prim in rig_prims(stage):
         first.setdefault(prim.GetPrimInPrototype().GetPath() if prim.IsInstanceProxy() else prim.GetPath(), prim)

@@ -26,8 +26,8 @@ _MOST = 6.0  # maximum magnitude of the log-odds from colour alone [-]
 _ROUNDS, _STEPS = 5, 8  # number of reclassifications of the pixels under crowns, and of Newton steps for each
 _LIGHT = 1  # index of the lightness term
 _RIDGE = 0.01  # ridge penalty on the weights, which keeps them finite if the colours are separable
-# Two files are written in turn, since a run may be killed between saving the colours of a frame and recording the frame
-# as done.
+# Two files are written alternately, since a run may be killed between saving the colours of a frame and recording the
+# frame as done.
 _FILES = ("colours_0.npz", "colours_1.npz")
 
 

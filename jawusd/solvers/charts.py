@@ -35,7 +35,7 @@ from jawusd.solvers.solution import applied, attached, capturing, finished, inve
 
 _STEPS_CAPTURED = 7  # number of iterations of the inverse gauge in a captured graph; anatomical parameters need 5
 _GAUGE_NUMBERS = 26  # number of scalars in `GaugeNumbers`
-_SERIES_SQUARED = 0.09  # [rad^2] below this, derivatives of the angle coefficients use series
+_SERIES_SQUARED = 0.09  # squared angle [rad^2] below which derivatives of the angle coefficients use series
 
 
 def _glide(table: object, d2: Tensor, d3: Tensor) -> tuple[Tensor, Tensor, Tensor]:

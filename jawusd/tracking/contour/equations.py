@@ -44,7 +44,7 @@ class OutlineSums(NamedTuple):
     Attributes:
         precision: sum w J^T J, shape (2, C, 6, 6).
         gradient: sum w J d, shape (2, C, 6).
-        habit_slope: sum w h J, which couples poses with habits, shape (2, C, 3, 6).
+        habit_slope: sum w h J, which couples poses with mask biases, shape (2, C, 3, 6).
         habit_distance, habit_weight: sum w h d and sum w h h^T, shapes (2, C, 3) and (2, C, 3, 3).
         weight, square: sum w and sum w d^2, shape (2, C).
         matched_px: contour length within the gate, shape (2, C).

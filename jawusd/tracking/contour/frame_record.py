@@ -55,7 +55,7 @@ class FrameSummary:
     Attributes:
         poses: T_world_upper and T_world_lower, shape (2, 4, 4).
         status, used, coverage: as in `FrameRecord`.
-        score_px: matched contour per arch and view [px], shape (2, C).
+        score_px: length of matched contour per arch and view [px], shape (2, C).
         residual_px: standard deviation of the residuals per arch, shape (2,).
     """
 

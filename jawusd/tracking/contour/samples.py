@@ -13,7 +13,7 @@ from jawusd.base.arrays import Array
 from jawusd.tracking.contour.scan import CROWN, GUM, Faces, Scan
 
 # Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the image, contour length that the
-# sample represents [px], inverse depth [1/mm]; then the effect of annotator habits on the outline along the normal:
+# sample represents [px], inverse depth [1/mm]; then the effect of annotator bias on the outline along the normal:
 # fraction of free edge and of gum line [-], and pixels per mm by which the gum line is moved along the crown surface.
 X, Y, Z, U, V, NX, NY, LENGTH, INVERSE_DEPTH, EDGE_SHARE, GUM_SHARE, GUM_SLOPE = range(12)
 COLUMNS = 12

@@ -87,7 +87,7 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
             shares = _uncovered_shares(replace(footage, sources=exchange.sources), solver, poses, frame)
         except CaptureError:
             continue  # mask videos differ in length from the clips of the cameras they would be assigned to
-        # A swap that leaves a camera without masks on this frame is not evidence against it.
+        # If a swap leaves a camera without masks in this frame, that does not count against the swap.
         both = np.isfinite(given) & np.isfinite(shares)
         if (given[both] >= _ODD_SHARE).any():
             found.append((float(shares[both].mean()), float(given[both].mean()), exchange))
@@ -143,7 +143,7 @@ SIZE_HINT = "Check the scans' unit and scaling, and the square size of the calib
 
 @dataclass(frozen=True, eq=False)
 class _Cause:
-    """A mistake, with the search and footage that undo it."""
+    """A suspected input error, with the search and footage after correcting it."""
 
     message: str
     hint: str

@@ -55,7 +55,7 @@ class Coordinates:
         return np.stack([pose.head, pose.head @ self.jaw.pose(pose.d)])
 
     def pose_of(self, arches: Array) -> Pose:
-        """Return the pose of the rig nearest to poses of both arches, shape (2, 4, 4)."""
+        """Return the rig pose nearest to the given poses of the two arches, shape (2, 4, 4)."""
         return Pose(arches[0].copy(), self.jaw.encode(se3_inverse(arches[0]) @ arches[1])[0])
 
     def slopes(self, pose: Pose) -> tuple[Array, Array]:

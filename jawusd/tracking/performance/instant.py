@@ -23,7 +23,7 @@ _QUICK_FACES, _QUICK_REDRAW_PX = 6_000, 2.0
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Prior on head and jaw in a frame."""
+    """Prior on the poses of head and jaw in one video frame."""
 
     pose: Pose
     precision: Array  # inverse variances of the deviation from the expected pose, shape (9,)

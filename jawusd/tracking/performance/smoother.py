@@ -70,7 +70,7 @@ class Smoother:
             fixed_head: whether the head pose is constant.
             free_focal: whether to estimate the focal lengths.
             length_px: correlation length of outline errors; default: estimated from the residuals.
-            habits: prior on the offsets of outlines from the teeth's edges.
+            habits: prior on the offsets between mask outlines and tooth edges.
             wider: ratio of true to computed variance of a frame's unknowns.
         """
         self._wider = wider

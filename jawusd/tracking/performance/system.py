@@ -39,7 +39,7 @@ class TakeSystem:
     """
 
     def __init__(self, frames: int, local: int, shared: int) -> None:
-        """Start with zero equations."""
+        """Start without equations."""
         self.frames, self.local, self.shared = frames, local, shared
         # Entry k contains the blocks that couple each frame with the k-th frame after it.
         self._blocks = [np.zeros((max(frames - k, 0), local, local)) for k in range(3)]

@@ -19,16 +19,16 @@ from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinate
 from jawusd.tracking.performance.instant import bound_equations
 from jawusd.tracking.performance.views import PRIOR_LOG_FOCAL, with_focal
 
-_HABITS = 3  # number of habits per arch, as in `OutlineSums`
+_HABITS = 3  # number of bias parameters per arch, as in `OutlineSums`
 
 
 @dataclass(frozen=True)
 class HabitPrior:
-    """Prior on an annotator's habits: the offsets of outlines from the teeth's edges.
+    """Prior on annotator bias: the offsets between mask outlines and tooth edges.
 
     Attributes:
         sigma: standard deviations at free edges [px], at the gum line [px], and along the gum surface [mm].
-        frames: number of independent frames with as much information about the habits as a whole take.
+        frames: number of independent frames with as much information about the bias as a whole take.
     """
 
     sigma: tuple[float, float, float]
@@ -85,7 +85,7 @@ class Unknowns:
         self._habits = slice(6 if fixed_head else 0, (6 if fixed_head else 0) + 2 * _HABITS)
         self.focal = slice(self._habits.stop, self._habits.stop + free_focal)
         self.shared = self.focal.stop
-        # Factor by which the number of frames overstates the information about habits, as frames are not independent.
+        # Factor by which the number of frames overstates the information about bias, as frames are not independent.
         self.redundancy = np.ones(self.shared)
         self.redundancy[self._habits] = max(1.0, frames / habits.frames)
 
@@ -114,7 +114,7 @@ class Unknowns:
             if solution is None or not found[r]:
                 continue
             sums = solution.outline
-            # Rows: six twist components of the arch, three habits.
+            # Rows: six twist components and three biases of the arch.
             to_twist, to_habit = np.zeros((6, size)), np.zeros((_HABITS, size))
             to_twist[:, :LOCAL] = slope
             to_habit[:, LOCAL + _HABITS * r : LOCAL + _HABITS * (r + 1)] = np.eye(_HABITS)

@@ -44,9 +44,9 @@ _ROUGH_FACES, _FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 6_000, 20_000, 
 # Number of frames from which a fixed head pose and unknown focal lengths are estimated in advance, and number of rounds
 # for focal lengths.
 _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
-# Prior on the offsets of colour borders from the teeth's edges in a take, and correlation length of the residual errors
-# [px]. Teeth darken towards their free edges, where borders lie up to half a pixel inside; gum-line offsets are learned
-# while tracking.
+# Prior on the offsets between colour borders and tooth edges in a take, and correlation length of the residuals along
+# an outline [px]. Teeth darken towards their free edges, where borders lie up to half a pixel inside; gum-line offsets
+# are learned while tracking.
 _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
 _ALONE = 2.0  # factor on the variance if there is a single camera, as no other view reveals shifted borders [-]
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one

@@ -13,7 +13,7 @@ _SHORTEST_LOSS = 3  # minimum number of successive lost frames in which the teet
 
 
 class Located(Protocol):
-    """Poses of both arches in a frame."""
+    """Poses of both arches in one video frame."""
 
     @property
     def found(self) -> Mask:

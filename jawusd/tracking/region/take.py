@@ -36,7 +36,7 @@ _LEAST_SHARE = 0.3  # matched fraction of a camera's contour, relative to the be
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 _MOST = 0.6  # minimum length of a run of good frames, as a fraction of the take, for suggesting to trim the take's ends
 
-#: Prior on the offsets of colour borders from the teeth's edges. Borders lie up to half a pixel inside, as teeth darken
+#: Prior on the offsets between colour borders and tooth edges. Borders lie up to half a pixel inside, as teeth darken
 #: towards their edges; gum-line offsets are learned while tracking.
 BORDERS = AnnotatorPrior(edge_px=0.3, gum_px=0.08, gum_mm=0.02, arch_px=0.25, arch_mm=0.01, camera_px=0.08, frames=5.0)
 FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)

@@ -35,7 +35,7 @@ _WIDE_MM = 40.0  # maximum expected opening of a jaw that was not visible
 
 @dataclass(frozen=True, eq=False)
 class RegionPose:
-    """Poses of both arches in a frame."""
+    """Poses of both arches in one video frame."""
 
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4); predictions for arches not found
     found: Mask  # arches found, shape (2,)

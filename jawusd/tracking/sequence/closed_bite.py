@@ -97,12 +97,12 @@ _BITE_MM = 0.03
 _ARCH_MM = 25.0
 # degrees of freedom of the Student distribution: about one registration in a hundred is off by ten sigmas
 _DEGREES_OF_FREEDOM = 4.0
-#: Fraction of the outline error variance that is constant over a take, in addition to annotator habits [-]: if it were
-#: larger, noise in a few closed frames would shift the whole take.
+#: Fraction of the outline error variance that is constant over a take, in addition to annotator bias [-]: if it were
+#: larger, noise in a few frames with closed teeth would shift the whole take.
 STEADY = 0.3
 _FEWEST_FRAMES = 2
-# Number of effectively independent measurements per closed frame, and its maximum for all together: neighbouring frames
-# have nearly the same outline error.
+# Number of effectively independent measurements per frame with closed teeth, and its maximum for all together:
+# neighbouring frames have nearly the same outline error.
 _NEW_PER_FRAME, _MOST_FRAMES = 0.25, 3.0
 _USUAL_FRAMES = 2000  # number of evenly spread frames from which the median covariance of a long take is computed
 
@@ -188,7 +188,7 @@ def steady_part(outline: Array, habits: Array) -> Array:
 
     Args:
         outline: covariance due to the outline errors of single frames.
-        habits: covariance due to annotator habits, of the same shape.
+        habits: covariance due to annotator bias, of the same shape.
     """
     return np.asarray(STEADY * outline + habits, np.float64)
 
@@ -295,7 +295,7 @@ def observe_bite(
     extrinsics: Extrinsics,
     variance_px3: Array,
 ) -> None:
-    """Add the observation that the teeth are together to a take, which makes habits that separate them unlikely.
+    """Add the observation that the teeth are together to a take, which makes biases that separate them unlikely.
 
     `variance_px3` is the outline variance times correlation length per arch [px^3], shape (2,).
     """

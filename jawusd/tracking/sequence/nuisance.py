@@ -44,7 +44,7 @@ class Nuisances:
     covariance: Array
 
     def plus(self, more: Nuisances) -> Nuisances:
-        """Return the sum of these estimates and further ones of delays and habits."""
+        """Return the sum of these estimates and further ones of delays and annotator biases."""
         shift = self.shift_px + more.shift_px
         return replace(more, delays=self.delays + more.delays, habits=self.habits + more.habits, shift_px=shift)
 
@@ -106,7 +106,7 @@ DRAWN_BESIDE_CROWNS = replace(DRAWN, frames=0.75)
 
 
 class _Layout:
-    """Indices of the unknowns of a take: delays, habits, camera twists."""
+    """Indices of the unknowns of a take: delays, annotator biases, camera twists."""
 
     def __init__(self, cameras: int, annotator: AnnotatorPrior = DRAWN) -> None:
         self.cameras, self._annotator = cameras, annotator
@@ -126,11 +126,11 @@ class _Layout:
         return slice(self.twists + 6 * camera, self.twists + 6 * camera + 6)
 
     def habits(self, arch: int, camera: int) -> Array:
-        """Return the matrix from the unknowns to the habits of an arch in a camera, shape (3, size)."""
+        """Return the matrix from the unknowns to the mask biases of an arch in a camera, shape (3, size)."""
         return np.asarray(self._habits[arch, camera])
 
     def prior_sigma(self) -> Array:
-        """Return the prior standard deviations of delays and habits, shape (twists,)."""
+        """Return the prior standard deviations of delays and annotator biases, shape (twists,)."""
         of = self._annotator
         arch = [of.arch_px, of.arch_px, of.arch_mm]
         habits = [of.edge_px, of.gum_px, of.gum_mm, *arch, *arch]
@@ -147,7 +147,7 @@ class TakeEquations:
     """Normal equations of the nuisance parameters of a take, with the poses eliminated frame by frame.
 
     The residual of a sample is d = J (x + delay_c v + A y_c) + h . b_c with the pose correction x of its frame, the
-    arch's velocity v, the camera's twist y_c transferred to the arch's centre by A, and the habits b_c of the masks.
+    arch's velocity v, the camera's twist y_c transferred to the arch's centre by A, and the biases b_c of the masks.
     Delays, habits and twists are shared by all frames, which gives a bordered block-diagonal system, solved by its
     Schur complement (as in bundle adjustment, Triggs et al. 1999).
     """
@@ -201,7 +201,7 @@ class TakeEquations:
         return self._S, self._r
 
     def prior_covariance(self) -> Array:
-        """Return the prior covariance of delays and habits, zero for camera twists, shape (U, U)."""
+        """Return the prior covariance of delays and annotator biases, zero for camera twists, shape (U, U)."""
         return np.diag(np.r_[self._layout.prior_sigma() ** 2, np.zeros(6 * self._layout.cameras)])
 
     def solve(self, config: TrackingConfig, cameras_move: bool) -> Nuisances:
@@ -251,7 +251,7 @@ def pose_response(records: Mapping[int, FrameRecord], frame: int, arch: int, ext
 
 
 def corrected_pose(records: Mapping[int, FrameRecord], frame: int, arch: int, nuisances: Nuisances) -> Array:
-    """Return the pose of an arch, shape (4, 4), corrected to first order for delays and habits, but not for twists."""
+    """Return the pose of an arch, shape (4, 4), corrected to first order for delays and mask biases, not for twists."""
     velocity = velocity_twist(records, frame, arch)
     solution = records[frame].solution
     outline, habits = solution.outline, nuisances.habits[arch]

@@ -170,7 +170,7 @@ def _bite_report(bite: ClosedBite | None, rest: RestFrames, findings: list[dict[
 
 
 def _habits_report(nuisances: Nuisances, camera_names: tuple[str, ...]) -> TracksMeta:
-    """Return the meta data about the habits of the annotator."""
+    """Return the meta data about annotator bias."""
 
     def by_camera(values: Array) -> dict[str, list[float]]:
         return dict(zip(camera_names, values.T.tolist(), strict=True))

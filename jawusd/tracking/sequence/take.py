@@ -126,7 +126,7 @@ class _Take(Passes):
     """Tracks a take, estimates its nuisance parameters, and aligns its frames again."""
 
     def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
-        """Estimate delays, habits and camera poses; if they are significant, correct them and align all frames again.
+        """Estimate delays, annotator biases and camera poses; correct significant ones and align all frames again.
 
         Camera poses are corrected only if `may_move`, since wrong lenses or scan sizes have effects similar to those of
         moved cameras.
