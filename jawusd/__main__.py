@@ -6,7 +6,7 @@ from jawusd.base import guard
 
 
 def main() -> None:
-    """Run the command line in a process with limits, see `jawusd.base.guard`."""
+    """Run the command line in a process with limits; see `jawusd.base.guard`."""
     guard.run_in_child()
     from jawusd.cli.main import main as run
 

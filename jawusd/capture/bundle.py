@@ -38,7 +38,7 @@ class Bundle:
     T_world_board: Array  # board to world [mm], shape (V, 4, 4)
     corners_px: Array  # corners used, NaN elsewhere, shape (C, V, N, 2)
     residuals_px: Array  # projected minus observed, NaN where not used, shape (C, V, N, 2)
-    parameters: Array  # the camera parameters, see `camera_from`, shape (12 C - 6,)
+    parameters: Array  # the camera parameters (see `camera_from`), shape (12 C - 6,)
     covariance: Array  # covariance of the camera parameters, shape (12 C - 6, 12 C - 6)
 
 

@@ -118,7 +118,7 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
 
 
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
-    """Project a motion into the bound, see `JawRig.keep_inside`; frames without parameters are kept.
+    """Project a motion into the bound (see `JawRig.keep_inside`); frames without parameters are kept.
 
     For a smooth motion, only the keys are projected if that suffices, so that they remain connected by curves.
     """
@@ -221,7 +221,7 @@ def follow_curves(rig: JawRig, motion: AuthoredMotion, knots: Knots) -> Authored
 def carried_over(
     source_rig: Path, source: Path, target: JawRig, prim: str | None = None
 ) -> tuple[AuthoredMotion, Changes]:
-    """Read a motion of one rig and retarget it to another, see `pipeline.library.retarget`.
+    """Read a motion of one rig and retarget it to another; see `pipeline.library.retarget`.
 
     Args:
         source: an animation layer, keys, or a table of d or of poses.

@@ -35,7 +35,7 @@ def emit(data: Mapping[str, object], as_json: bool, lines: Callable[[], list[str
 
 
 def say(line: object, err: bool = False) -> None:
-    """Print one line, with control characters from files escaped, see `shown`."""
+    """Print one line, with control characters from files escaped; see `shown`."""
     typer.echo(shown(line), err=err)
 
 

@@ -131,7 +131,7 @@ def read_stage_motion(
         stage: a stage, or a file that Blender converts to one.
         prim: path of the rig's prim in the stage, or in the rig's file if the stage comes from Blender.
         mandible, skull: prims above the meshes.
-        origin: which to use if d and mandible disagree, see `motion_of_stage`.
+        origin: which to use if d and mandible disagree; see `motion_of_stage`.
 
     Raises:
         JawusdError: there is no such motion.

@@ -157,7 +157,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     """Return the arrays of a rig of the given kind, checked, as read-only float64.
 
     Args:
-        arrays: Named arrays, see `jawusd.evaluator.schema`; others are ignored.
+        arrays: Named arrays (see `jawusd.evaluator.schema`); others are ignored.
         kind: "anchored" or "additive".
 
     Raises:

@@ -185,7 +185,7 @@ class RigClearance:
             saturates at about 1.5 mm and is constant far outside the bound. That of the teeth is 0 in the closed bite.
 
         Raises:
-            EvaluatorError: The rig has no such clearance, see `contact` and `joints`.
+            EvaluatorError: The rig has no such clearance; see `contact` and `joints`.
             ValueError: Another value of ``of``.
         """
         field = self._field(of)

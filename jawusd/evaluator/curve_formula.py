@@ -1,4 +1,4 @@
-"""Cubic Hermite curves, written once for every number type, see `jawusd.evaluator.formula`."""
+"""Cubic Hermite curves, written once for every number type; see `jawusd.evaluator.formula`."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def point_velocities(R: Array, t: Array, S: Array, points: Array) -> Array:
     Args:
         R: Rotations, shape (n, 3, 3).
         t: Translations [mm], shape (n, 3).
-        S: Their spatial derivatives, see `jawusd.evaluator.models`, shape (n, 6, 3).
+        S: Their spatial derivatives (see `jawusd.evaluator.models`), shape (n, 6, 3).
         points: Points before the motion [mm], shape (p, 3).
     """
     image = points @ np.swapaxes(R, 1, 2) + t[:, None]
@@ -174,7 +174,7 @@ class Encoder:
     Args:
         model: The jaw model.
         frames: The coordinate frames of the rig.
-        vectors: The four vectors that represent the landmarks, see `landmark_vectors`.
+        vectors: The four vectors that represent the landmarks; see `landmark_vectors`.
     """
 
     def __init__(self, model: JawModelForm, frames: RigFrames, vectors: Array) -> None:

@@ -223,7 +223,7 @@ class JawFormula(Protocol):
 
 
 class AnchoredNumbers(NamedTuple):
-    """The scalars of an anchored model, see `AnchoredModel`; `linear` has 3 inputs times 3 outputs [rad].
+    """The scalars of an anchored model (see `AnchoredModel`); `linear` has 3 inputs times 3 outputs [rad].
 
     `spread` is as from `spread_of`.
     """
@@ -273,7 +273,7 @@ class AnchoredFormula:
         ops: Operations[N, Table],
         numbers: Numbers | None = None,
     ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite, see `JawFormula`."""
+        """Return the motion away from the closed bite; see `JawFormula`."""
         gauge, incisor, scales, linear, offset, spread = cast("AnchoredNumbers", numbers or self.numbers)
         table = glide(self._glide_width, d[1], d[2], tables, ops) if self._glide_width else None
         u = displacement(gauge, d, ops, table)
@@ -300,7 +300,7 @@ class AdditiveFormula:
         ops: Operations[N, Table],
         numbers: Numbers | None = None,
     ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite, see `JawFormula`; the model has no scalars."""
+        """Return the motion away from the closed bite (see `JawFormula`); the model has no scalars."""
         first, second, third = (curve(f"curve{i}", x, tables, ops) for i, x in enumerate(d, start=1))
         twist = ops.split([x + y + z for x, y, z in zip(first, second, third)], 6)
         return twist_motion(triple(twist[:3]), triple(twist[3:]), ops)

@@ -93,7 +93,7 @@ class RigJudging(RigClearance, RigArrays):
             residual_limit_mm: Largest landmark distance to the model; default: the rig's own limit.
             tolerance_mm: How far outside the bound a measured pose may lie; default: the rig's own tolerance. With 0
                 the poses are judged as authored: teeth may then penetrate less deeply than in measured poses.
-            bound: Which bound, see `margin`.
+            bound: Which bound; see `margin`.
             times_s: Times of the poses along the last batch axis, shape (F,); required with a speed limit.
             speed_limit_mm_s: Largest speed of a landmark since the last valid pose; None disables the check.
 
@@ -190,7 +190,7 @@ class GoodPose(NamedTuple):
 
 
 class VerdictStream:
-    """Judge the poses of a stream one at a time, see `JawRig.verdicts`.
+    """Judge the poses of a stream one at a time; see `JawRig.verdicts`.
 
     Speeds are measured from the last valid pose, so that one wrong pose does not make the next one invalid.
 

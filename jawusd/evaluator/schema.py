@@ -14,7 +14,7 @@ class ArraySpec(NamedTuple):
     """Shape and USD attribute of one array.
 
     Attributes:
-        attribute: USD attribute, with the values in row-major order; None for `d_range`, see `D_RANGE_ATTRIBUTES`.
+        attribute: USD attribute, with the values in row-major order; None for `d_range` (see `D_RANGE_ATTRIBUTES`).
         shape: Axis lengths; axes of the same name have the same length.
         kind: The only model kind with this array; None for both.
         integer: Integers in USD; in memory all arrays are float64.

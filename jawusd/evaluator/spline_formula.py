@@ -29,7 +29,7 @@ def spline(
     of ``p^3 W_i`` and of ``p q c_i W_i`` vanish.
 
     Args:
-        q: The argument, see `spline_input`.
+        q: The argument; see `spline_input`.
         centres: The centres c_i, one per row.
         weights: The kernel weights W_i, one per row.
         linear: The linear terms, 3 inputs times 3 outputs.

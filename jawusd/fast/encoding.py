@@ -268,7 +268,7 @@ def _finite(T: Array) -> bool:
 
 @device
 def _rigid(T: Array) -> bool:
-    """Return whether T (4, 4) is rigid to the evaluator's tolerance, see `geometry.rigidity_defect`."""
+    """Return whether T (4, 4) is rigid to the evaluator's tolerance; see `geometry.rigidity_defect`."""
     defect = max(abs(T[3, 0]), abs(T[3, 1]), abs(T[3, 2]), abs(T[3, 3] - 1.0))
     for i in range(3):
         for k in range(i, 3):

@@ -119,7 +119,7 @@ def judge_rows(
     margin_limit_mm: float,
     out: Array,
 ) -> None:
-    """Write d, residual, margin [mm] and reason (n, 6) of poses T (n, 4, 4), see `encoding.judge`.
+    """Write d, residual, margin [mm] and reason (n, 6) of poses T (n, 4, 4); see `encoding.judge`.
 
     Encoding and judging share one function because compiling it takes a tenth of the total compile time.
     """

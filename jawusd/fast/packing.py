@@ -25,7 +25,7 @@ CLOSED = 21  # (4, 4): Q in pose = L M Q
 TO_ANATOMICAL = 37  # (4, 4): inverse of L
 FROM_CLOSED = 53  # (4, 4): inverse of Q
 ADJOINT = 69  # (6, 6): twists from the anatomical to the skull frame
-VECTORS = 105  # (4, 4): vectors that represent the landmarks, see `evaluator.encoding`
+VECTORS = 105  # (4, 4): vectors that represent the landmarks; see `evaluator.encoding`
 REST = 121  # start of the part that depends on the kind
 ANCHORED_KIND, ADDITIVE_KIND = KINDS.index(ANCHORED), KINDS.index(ADDITIVE)
 

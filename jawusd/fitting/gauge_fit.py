@@ -14,7 +14,7 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.gauge import Gauge
 
-SOFTNESS_MM = 2.0  # radius of the fillet at the apex of the Gothic arch, d2 = 0; it keeps slider motion smooth there
+SOFTNESS_MM = 2.0  # radius of the fillet at the apex of the gothic arch, d2 = 0; it keeps slider motion smooth there
 FADE_MM = 14.0  # opening at which tooth guidance has decreased to 1/e
 
 _PATH_DEGREE, _PATH_ITERATIONS, _PATH_RIDGE = 5, 40, 1e-5
@@ -42,7 +42,7 @@ class GaugeFit:
     """A fitted gauge with the results of its invertibility check."""
 
     gauge: Gauge
-    smallest_minor: float  # smallest principal minor of the Jacobian over the box, see `smallest_minor()`
+    smallest_minor: float  # smallest principal minor of the Jacobian over the box; see `smallest_minor()`
     # factor on the ridge penalties, above 1 if a less stiff gauge was not invertible; None without a glide surface
     stiffness: float | None
 

@@ -100,7 +100,7 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
 
 
 def read_blend_shapes(path: str | os.PathLike[str], fps: float | None = None) -> BlendShapes:
-    """Read all blend shapes of a face capture of Live Link Face, see `read_arkit`; rotations are left out.
+    """Read all blend shapes of a face capture of Live Link Face (see `read_arkit`); rotations are left out.
 
     Raises:
         FormatError: as for `read_arkit`, or there are no blend shapes.
@@ -317,7 +317,7 @@ class ArkitMapping(BaseModel):
 
 
 def moved_terms(weights: Array, neutral: Array, dead_zone: Array) -> Array:
-    """Return u and u_open * u of weights (..., 4), see `ArkitMapping`, shape (..., 8)."""
+    """Return u and u_open * u of `ArkitMapping` for weights (..., 4), shape (..., 8)."""
     change = weights - neutral
     u = np.sign(change) * np.maximum(np.abs(change) - dead_zone, 0.0)
     return np.concatenate([u, u[..., :1] * u], axis=-1)

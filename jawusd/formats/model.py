@@ -27,7 +27,7 @@ _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_
 class JawModel:
     """A fitted model and its parameters of the captured poses."""
 
-    arrays: dict[str, Array]  # the decoder's named arrays, see `jawusd.evaluator`
+    arrays: dict[str, Array]  # the decoder's named arrays; see `jawusd.evaluator`
     frames: NDArray[np.int64]  # captured frame numbers, shape (F,)
     d: Array  # parameters of the captured poses [mm], NaN for lost frames, shape (F, 3)
     residual_mm: Array  # rms landmark distance between pose and model [mm], NaN for lost frames, shape (F,)

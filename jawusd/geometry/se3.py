@@ -47,7 +47,7 @@ def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
     With points (..., N, 3), one set per transform, the leading axes are broadcast.
 
     Raises:
-        ValueError: a single point, see `transform_point`.
+        ValueError: a single point; see `transform_point`.
     """
     T, points = np.asarray(T, dtype=np.float64), np.asarray(points, dtype=np.float64)
     if points.ndim < 2:

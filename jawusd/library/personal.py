@@ -56,7 +56,7 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
 
     Args:
         target: Landmarks of the target subject with the teeth together [mm], shape (5, 3).
-        shares: Parameters as fractions of the ranges, see `JawRig.normalized`, shape (K, 3).
+        shares: Parameters as fractions of the ranges (see `JawRig.normalized`), shape (K, 3).
     """
     rest = donor.landmarks
     d = donor.rig.denormalized(shares)

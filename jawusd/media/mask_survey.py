@@ -61,7 +61,7 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
 
 
 def odd_pictures(source: CameraSource, arch: str, odd: Sequence[str]) -> list[Finding]:
-    """Return findings about mask images that are inconsistent with the others, see `MaskReader.odd`."""
+    """Return findings about mask images that are inconsistent with the others; see `MaskReader.odd`."""
     if not odd:
         return []
     more = f"; and {len(odd) - _LISTED} more" if len(odd) > _LISTED else ""

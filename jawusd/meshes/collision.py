@@ -48,7 +48,7 @@ class Solid:
 
     grid: DistanceGrid
     samples: Samples
-    entering: float  # fraction of vertical lines whose first crossing enters the solid, see `outer_faces`
+    entering: float  # fraction of vertical lines whose first crossing enters the solid; see `outer_faces`
 
 
 @dataclass(frozen=True, eq=False)

@@ -108,7 +108,7 @@ def _solid(name: str, mesh: Mesh, T: Array, up: float) -> Solid:
 
 
 def wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> Solid:
-    """Return the solid of triangles of either winding, see `jawusd.meshes.collision.solid`.
+    """Return the solid of triangles of either winding; see `jawusd.meshes.collision.solid`.
 
     Raises:
         NoContact: The winding is inconsistent; the message names the mesh.

@@ -80,7 +80,7 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
 
     Args:
         corners: all triangles [mm], shape (F, 3, 3), y vertical, counter-clockwise seen from outside.
-        outer: faces that bound the solid, see `outer_faces`, shape (F,).
+        outer: faces that bound the solid (see `outer_faces`), shape (F,).
         box: extent of the grid, rows low and high [mm], shape (2, 3).
         step_mm: grid step.
         up: see `outer_faces`.

@@ -24,7 +24,7 @@ _STAGES = (
     (1.0, (1.0,) * 8),
 )
 _AT_WIDTH_PX = 1440.0  # reference image width, to which distances in px are scaled
-_TURN_PX = 10.0  # weight of direction when lines are matched to outlines, see `features`, at that width
+_TURN_PX = 10.0  # weight of direction when lines are matched to outlines (see `features`), at that width
 _CLEAR_MISFIT = 0.2  # maximum misfit of a photograph whose bite is used to initialise the others
 _GATE_MM, _MOST_MISFIT = 0.5, 0.45  # final misfit: its gate, and its maximum for scans of the same subject
 _SAME_HAND = 1.15  # minimum ratio of misfits with the other and the chosen mirroring; below it, the choice is ambiguous

@@ -16,8 +16,8 @@ from jawusd.geometry import transform_points
 from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.tracking.contour.scan import Faces, Scan
 
-_FEWEST_FACES = 50  # minimum number of faces of a piece; smaller ones are scanning artefacts
-_MOST_TEETH = 120  # maximum number of teeth per arch, since the labels of both arches are stored in one byte
+_FEWEST_FACES = 50  # minimum number of faces of a tooth; smaller pieces are scanning artefacts
+_MOST_TEETH = 120  # maximum number of separate teeth per arch, since the labels of both arches are stored in one byte
 # Substitute wall for missing gum: number of segments, start as a fraction of the crown height [-], height [mm].
 _WALL_PARTS, _WALL_FROM, _WALL_MM = 24, 0.75, 15.0
 _SMOOTH_PX = 2.0  # standard deviation of the Gaussian that averages the direction of an outline
@@ -28,7 +28,7 @@ class Crowns:
     """One arch split into pieces: single teeth where the scan separates them, otherwise the whole arch."""
 
     scan: Scan
-    teeth: tuple[Faces, ...]  # crown faces of every tooth, each of shape (F, 3)
+    teeth: tuple[Faces, ...]  # faces of every tooth or group of connected teeth, each of shape (F, 3)
     to_gum: Array  # unit vector from the crowns to their gum, scan coordinates, shape (3,)
 
 
@@ -39,7 +39,7 @@ class Outlines:
     Attributes:
         points: points on the crowns, scan coordinates of their own arch [mm], shape (N, 3).
         arch: 0 upper, 1 lower, shape (N,).
-        tooth: tooth number, from 1, continuing from the upper to the lower arch, shape (N,).
+        tooth: tooth number, from 1, continuing from the upper to the lower arch, shape (N,); connected teeth share one.
         pixels: image positions [px], shape (N, 2).
         normals: unit normals pointing out of the tooth in the image, shape (N, 2).
         gum: 1 where the outline faces its gum, decreasing to 0 at a right angle [-], shape (N,).

@@ -213,7 +213,7 @@ class ArchPair:
 class PhotoStart:
     """Initial pose of one photograph."""
 
-    misfit: float  # misfit of its lines, see `Aligner.misfit` [-]
+    misfit: float  # misfit of its lines (see `Aligner.misfit`) [-]
     other_misfit: float  # misfit with the opposite choice of mirroring
     mirrored: bool
     bite: Bite  # pose and bite from this photograph alone, at reduced size

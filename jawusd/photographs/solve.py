@@ -177,7 +177,7 @@ class Match:
     Attributes:
         outlines: the matched outline point of each drawn point.
         off_px: signed distance of the outline from the drawn point along the outline's normal, shape (N,).
-        apart: distance in position and direction, see `features` [px], shape (N,).
+        apart: distance in position and direction (see `features`) [px], shape (N,).
     """
 
     outlines: Outlines

@@ -281,7 +281,7 @@ def plan_build(capture: Capture | str | os.PathLike[str], out: Path, options: Bu
 
     Raises:
         CaptureError, FormatError: the capture cannot be read.
-        OutputError: the build cannot write to this folder, see `check_folder`.
+        OutputError: the build cannot write to this folder; see `check_folder`.
     """
     as_read = open_capture(capture, allow_outside=options.allow_outside)
     check_folder(out, resume=options.resume, fresh=options.fresh)

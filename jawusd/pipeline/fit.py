@@ -59,7 +59,7 @@ _MOST_NUMBERS = 16_000_000  # maximum number of array elements: a million 4 x 4 
 class TrajectoryOptions:
     """Conventions of a file of poses."""
 
-    # for tables: the file's column names by jawusd's column names, see `formats.poses.read_poses`
+    # for tables: the file's column names by jawusd's column names; see `formats.poses.read_poses`
     columns: Mapping[str, str] = field(default_factory=dict)
     length_unit: str = "mm"  # a key of `LENGTH_UNITS_MM`, for files that do not state their unit
     invert: bool = False  # whether the poses map skull to mandible
@@ -67,7 +67,7 @@ class TrajectoryOptions:
     # None: in the file, the pose in occlusion is the identity
     rest_frame: int | None = None
     group: str | None = None  # trajectory of an HDF5 file; None: the raw trajectory
-    # rigid bodies in a table of markers, see `pipeline.markers.marker_poses`; empty if the file contains poses
+    # rigid bodies in a table of markers (see `pipeline.markers.marker_poses`); empty if the file contains poses
     rigid: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -136,7 +136,7 @@ def _part(path: PurePath, paired: str) -> str:
 
     Args:
         path: the mesh.
-        paired: its arch according to an ambiguous word, see `_paired`; "" if unknown.
+        paired: its arch according to an ambiguous word (see `_paired`); "" if unknown.
     """
     own, all_words = set(_split_words(PurePath(path.name))), set(_split_words(path))
     for own_words, arch in ((own, ""), (all_words, ""), (all_words, paired)):

@@ -36,8 +36,8 @@ def marker_poses(
     """Return T_head_jaw (F, 4, 4) [mm] of a table of markers, NaN where a rigid body is occluded, and the frame rate.
 
     Args:
-        path: the table, see `formats.markers.read_markers`, or C3D.
-        rigid: descriptions of the rigid bodies "head" and "jaw", see `formats.rigid_bodies.read_body`; without "head",
+        path: the table (see `formats.markers.read_markers`), or C3D.
+        rigid: descriptions of the rigid bodies "head" and "jaw" (see `formats.rigid_bodies.read_body`); without "head",
             the table is in head coordinates.
         rest_frame: frame that defines the shape of rigid bodies for which only the markers are named.
         unit: unit of the rigid bodies, and of tables that do not state a unit; a key of `LENGTH_UNITS_MM`.
@@ -74,7 +74,7 @@ def in_head(
     """Return points (F, N, 3) [mm] relative to the head, NaN where it is occluded.
 
     Args:
-        rigid: description of the rigid body "head", see `formats.rigid_bodies.read_body`.
+        rigid: description of the rigid body "head"; see `formats.rigid_bodies.read_body`.
         rest_frame: frame that defines the shape of the head, if only its markers are named.
         unit: unit of the rigid body, a key of `LENGTH_UNITS_MM`.
 

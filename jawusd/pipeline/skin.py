@@ -123,7 +123,7 @@ def read_face(
         path: the file; see `formats.markers`, `formats.arkit` and `formats.face_table`.
         fps: frames per second, if the file does not state them.
         unit: unit of points, if the file does not state it.
-        rigid: the rigid body "head" of markers on the head, see `formats.rigid_bodies`; points are then given relative
+        rigid: the rigid body "head" of markers on the head (see `formats.rigid_bodies`); points are then given relative
             to it. Default: the head is still, or the points are stabilised.
         rest_frame: frame that defines the shape of the head, if only its markers are named.
 

@@ -196,7 +196,7 @@ class _Reported(TypedDict, total=False):
 
 
 def recorded_verdict(folder: Path) -> str | None:
-    """Return the verdict on a build, see `verdict_sentence`.
+    """Return the verdict on a build; see `verdict_sentence`.
 
     None for other folders, for builds without a report, and if build.json is corrupt, which `changed_files` reports.
     """

@@ -77,7 +77,7 @@ class Workspace:
         self.reused: list[str] = []
 
     def hashes(self, parts: Iterable[str]) -> dict[str, str]:
-        """Return content hashes of parts of the capture, see `capture_inputs.input_files`; raises CaptureError."""
+        """Return content hashes of parts of the capture (see `capture_inputs.input_files`); raises CaptureError."""
         return self._watch.hashes(self.capture, parts)
 
     def run(

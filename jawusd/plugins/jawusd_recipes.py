@@ -140,7 +140,7 @@ def maya_bake(
     *,
     measured: bool = False,
 ) -> None:
-    """Key the mandible at every frame from first to last according to the controls, see `poses`."""
+    """Key the mandible at every frame from first to last according to the controls; see `poses`."""
     from maya import cmds
 
     names = [f"{kind}{axis}" for kind in ("translate", "rotate") for axis in "XYZ"]
@@ -180,7 +180,7 @@ def houdini_bake(
     *,
     measured: bool = False,
 ) -> None:
-    """Key the mandible's object at every frame from first to last according to the controls, see `poses`."""
+    """Key the mandible's object at every frame from first to last according to the controls; see `poses`."""
     import hou
 
     orders = {
@@ -213,7 +213,7 @@ def unreal_keys(
 ) -> None:
     """Add a transform track to a mandible's binding in a level sequence, from keys of (d1, d2, d3) [mm] by frame.
 
-    The track has a key at every frame from the first to the last, see `every_frame` and `poses`.
+    The track has a key at every frame from the first to the last; see `every_frame` and `poses`.
     """
     import unreal
 

@@ -48,7 +48,7 @@ def write_document(
 
 
 def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> str:
-    """Return the report as HTML, see `write_document`; text from files is escaped."""
+    """Return the report as HTML (see `write_document`); text from files is escaped."""
     verdicts = judge(data)
     verdict = summary(verdicts)
     return (

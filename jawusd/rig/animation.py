@@ -63,7 +63,7 @@ def write_animation(
         carried: Frames whose d was not measured but interpolated from neighbouring frames; listed in
             `customLayerData["carriedFrames"]`.
         skinned: Paths of meshes that `actor_skel.usdc`, in the same folder and with the same motion, binds. If not
-            empty, a variant is added, see `add_skeleton_variant`.
+            empty, a variant is added; see `add_skeleton_variant`.
 
     Raises:
         RigError: The actor is missing, frames do not increase, no frame has d, or the frame rate is not positive.

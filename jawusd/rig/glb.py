@@ -30,7 +30,7 @@ def write_glb(
     d: ArrayLike,
     fps: float,
 ) -> Path:
-    """Write the meshes of an actor and its motion in the skull frame; frame 0 is at 0 s, see `frame_at_zero`.
+    """Write the meshes of an actor and its motion in the skull frame; frame 0 is at 0 s (see `frame_at_zero`).
 
     The mandible has a key at every whole frame, and more where interpolation would deviate from the model. The
     animation's `extras` state the frame rate, first and last frame, and the frame at 0 s.

@@ -30,7 +30,7 @@ FloatType = type[np.float32] | type[np.float64]
 
 @dataclass(frozen=True)
 class Value(Symbol):
-    """A value in a graph: a column (n, 1), or an array of m columns (n, m), see `jawusd.evaluator.operations`."""
+    """A value in a graph: a column (n, 1), or an array of m columns (n, m); see `jawusd.evaluator.operations`."""
 
     graph: Graph = field(repr=False)
     name: str
@@ -113,7 +113,7 @@ class Graph:
         return self.op("ReduceSum", a, self.constant([1], np.int64), keepdims=1)
 
     def reshape(self, a: Value, shape: Sequence[int]) -> Value:
-        """Return a value, reshaped."""
+        """Return a value reshaped."""
         return self.op("Reshape", a, self.constant(shape, np.int64))
 
     def sqrt(self, x: Value) -> Value:

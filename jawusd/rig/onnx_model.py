@@ -34,7 +34,7 @@ _STEP_MM = 1e-3  # step of the differences in d
 _START_DAMPING = 1e-6
 _MIN_DAMPING = 1e-12
 # Columns of a point of the search: d, its cost (squared distance), half the gradient of the cost, and half its Hessian,
-# as Gauss-Newton approximates it and in full, see `_PAIRS`.
+# as Gauss-Newton approximates it and in full; see `_PAIRS`.
 _POINT = {"d": 3, "cost": 1, "slope": 3, "gauss_newton": 6, "newton": 6}
 _LOOP_STATE = {"point": sum(_POINT.values()), "trial": 3, "damping": 1}  # numbers of columns passed on by iterations
 _PAIRS = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]  # stored entries of a symmetric matrix

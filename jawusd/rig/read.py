@@ -170,7 +170,7 @@ def _numbers(prim: Usd.Prim, name: str, where: object) -> Array:
 
 
 class TableDescription(TypedDict):
-    """Sampled decoder of a rig, see `DecoderTable`."""
+    """Sampled decoder of a rig; see `DecoderTable`."""
 
     format: str
     shape: list[int]

@@ -123,7 +123,7 @@ def check_file_access(path: Path) -> list[Sdf.Layer]:
     Layers of a rig may refer only to files in the rig's folder or below, with links resolved. Layers that use a rig
     (animations, shots) may refer to rigs outside their folder, but not to other files outside. Asset paths in attribute
     values are checked too, because their files are read (ONNX) or packed (images). Files in allowed folders are always
-    accepted, see `base.inputs`. Paths are resolved as OpenUSD does, including search paths and variable expressions.
+    accepted; see `base.inputs`. Paths are resolved as OpenUSD does, including search paths and variable expressions.
 
     Returns:
         The layers, which stay loaded as long as they are referenced.

@@ -245,7 +245,7 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _coefficient_slopes(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    """Return db/dx and dc/dx at squared angles x [rad^2], see `jawusd.fast.rigid.coefficient_slopes`."""
+    """Return db/dx and dc/dx at squared angles x [rad^2]; see `jawusd.fast.rigid.coefficient_slopes`."""
     small = x < _SERIES_SQUARED
     far = torch.where(small, torch.ones_like(x), x)
     series_b = -1 / 24 + x * (1 / 360 + x * (-1 / 13440 + x * (1 / 907200 - x / 95800320)))

@@ -50,7 +50,7 @@ class Expansion(NamedTuple):
 
 
 class Hull(Formula):
-    """The slice hull of a rig, see `jawusd.evaluator.bounds`.
+    """The slice hull of a rig; see `jawusd.evaluator.bounds`.
 
     Raises:
         EvaluatorError: the bound of the rig is empty.

@@ -108,7 +108,7 @@ class JawLayer(nn.Module):
     All functions compute in the precision of the layer: autocast and TensorFloat-32 are off within them. A captured
     graph, however, uses the matrix multiplication precision that the surrounding program has set.
 
-    ``layer.temporal(d, fps)`` is a prior on motion between frames, see `TemporalPrior`; None if the rig has no
+    ``layer.temporal(d, fps)`` is a prior on motion between frames (see `TemporalPrior`); None if the rig has no
     speeds.
 
     Args:
@@ -250,7 +250,7 @@ class JawLayer(nn.Module):
         """Return the nearest d [mm], shape (..., 3), and the residuals (..., 12) [mm]."""
         T = self._rows(T_skull_mandible, (4, 4), "T_skull_mandible")
         moved = (self.to_anatomical @ T @ self.incisor)[:, :3] - (self.closed @ self.incisor)[:3]
-        # images of the four vectors that represent the landmarks, see `evaluator.encoding`
+        # images of the four vectors that represent the landmarks; see `evaluator.encoding`
         target = (self.to_anatomical @ T @ self.vectors)[:, :3]
         d, residuals = encoded(self.motion, self.vectors_at_rest, target, moved)
         batch = T_skull_mandible.shape[:-2]

@@ -1,6 +1,6 @@
 """The model's formulas in torch: differentiable, in float32 or float64, on any device.
 
-A number is a column of a batch, shape (n, 1); a number that is an array, see `jawusd.evaluator.operations`, has shape
+A number is a column of a batch, shape (n, 1); a number that is an array (see `jawusd.evaluator.operations`) has shape
 (n, m).
 """
 

@@ -210,11 +210,11 @@ class Person:
         self._envelope = Envelope(self.pose, self.mandible_points, exponent=1.3 if envelope == "competing" else None)
 
     def pose(self, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike) -> Array:
-        """Return mandible poses (..., 4, 4) on the subject's three-parameter manifold, see `controlled_pose`."""
+        """Return mandible poses (..., 4, 4) on the subject's three-parameter manifold; see `controlled_pose`."""
         return controlled_pose(self.joint, opening, lateral, protrusion)
 
     def pose_with_extra(self, controls: ArrayLike, extra_mm: ArrayLike) -> Array:
-        """Return poses (..., 4, 4) with movements outside the three controls, see `controlled_pose`.
+        """Return poses (..., 4, 4) with movements outside the three controls; see `controlled_pose`.
 
         Args:
             controls: opening, lateral, protrusion, shape (..., 3).

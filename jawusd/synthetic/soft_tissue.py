@@ -123,7 +123,7 @@ class Face:
         return (rest + weight * (moved.reshape(rest.shape) - rest)).reshape(-1, 3)
 
     def _edge(self, lips: LipState) -> Array:
-        """Return the lip outline with the teeth closed, x and y, shape (columns, 2)."""
+        """Return the inner lip outline with the teeth closed, x and y, shape (columns, 2)."""
         middle = -1.0
         upper, lower = lips.upper_mm - middle, middle - (self._incisor_y - lips.lower_mm)
         shape = np.abs(self._sin) ** 0.8

@@ -90,7 +90,7 @@ class TrackingConfig:
     # Fraction of the recent median score below which an arch is suspect [-]: closing lips seldom hide so much in a few
     # frames.
     suspect_score: float = 0.6
-    # Fraction of the recent median score [-]: closing lips cannot explain a drop in score below it.
+    # Fraction of the recent median score [-]: below it, closing lips are not a sufficient explanation of the drop.
     alarming_score: float = 0.3
     # Multiple of the recent median residual spread above which an arch is suspect [-].
     suspect_residual: float = 1.4

@@ -61,7 +61,7 @@ class ViewedCapture:
     # (width, height) of the images of every camera with footage, in the capture's order
     sizes_px: Mapping[str, tuple[int, int]]
     cameras: Mapping[str, Camera]  # calibrated cameras by name; empty without a calibration
-    scans: Mapping[str, Mesh]  # scans by arch [mm], "upper" and "lower"; vertex order and coordinates of the files
+    scans: Mapping[str, Mesh]  # by arch, "upper" and "lower": vertices in the order and coordinates [mm] of the files
     crowns: Mapping[str, Mask]  # by arch: which faces of a scan are teeth, shape (F,); the others are gum
     labels: Mapping[str, NDArray[np.uint8]]  # by arch: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,)
     T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)

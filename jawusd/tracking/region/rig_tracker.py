@@ -61,7 +61,7 @@ class RigTracker:
         """Configure the tracker; call `begin` first.
 
         Args:
-            head: factor on the head's standard deviations, see `Prediction`.
+            head: factor on the head's standard deviations; see `Prediction`.
             free_focal: whether to compute derivatives with respect to focal lengths.
             effort: computational effort per frame.
             whole: solver whose scans have more faces, for the last step; default: none.
