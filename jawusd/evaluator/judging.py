@@ -204,7 +204,7 @@ class VerdictStream:
         self._time_s, self._positions = -np.inf, np.empty((0, 3))
 
     def __call__(self, T_skull_mandible: ArrayLike, time_s: float) -> Verdicts:
-        """Return the verdict on the next pose (4, 4), taken at a time [s] later than that of the pose before.
+        """Return the verdict on the next pose (4, 4), taken at a time [s] after that of the previous pose.
 
         Raises:
             ValueError: a wrong shape, or a time that is not finite or not later.

@@ -49,12 +49,12 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "familiar_count": (),
     "familiar_limit": (2,),
 }
-MOST_FRAMES = 2000  # a matrix of this size is inverted when a file is read
+MOST_FRAMES = 2000  # maximum M; a matrix (M, M) is inverted when a file is read
 _LARGEST = 1e12  # maximum magnitude of the values in a file
 
 
 class SkinJaw(NamedTuple):
-    """The jaw of faces, from `Skin`.
+    """Jaw parameters of faces, from `Skin`.
 
     Attributes:
         d: Jaw parameters [mm], shape (..., 3), not projected to the rig's bound; NaN where a column is not finite.
@@ -159,14 +159,14 @@ class Skin:
 
 
 def components(X: Array, mean: Array, basis: Array, scale: float) -> tuple[Array, Array]:
-    """Return features (n, C) of columns X (n, K), and the squared length (n,) of what they leave out over scale."""
+    """Return features (n, C) of columns X (n, K), and the squared length (n,) of the residual over scale."""
     centred = (X - mean) / scale
     f = centred @ basis.T
     return f, np.maximum((centred * centred).sum(axis=1) - (f * f).sum(axis=1), 0.0)
 
 
 def load_skin(path: str | os.PathLike[str]) -> Skin:
-    """Read a map from skin to d, as `jawusd skin-fit` writes it.
+    """Read a map from skin to d, written by `jawusd skin-fit`.
 
     Raises:
         FormatError: another kind of file, a corrupt file, or arrays missing, of a wrong shape or out of range.

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from jawusd.evaluator.operations import Operations, Rows, Table, triple
 from jawusd.geometry.rodrigues import N, Triple, dot
 
-_VANISHING = 1e-12  # maximum size of sums that count as zero, relative to the sum of all weights
+_VANISHING = 1e-12  # sums below this fraction of the sum of all weights count as zero
 
 
 def spline(

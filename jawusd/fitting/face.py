@@ -68,8 +68,8 @@ def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s
     shares_error = incisal_error(rig, rig.denormalized(shares_of(weights)), d)
     if error >= shares_error:
         raise FittingError(
-            f"the mapping learned from this take has an error of {error:.2f} mm on held-out parts, fixed "
-            f"fractions of the ranges have {shares_error:.2f} mm: it would not be an improvement.",
+            f"the mapping learned from this take has an error of {error:.2f} mm on held-out parts; fixed "
+            f"fractions of the ranges have {shares_error:.2f} mm. It would not be an improvement.",
             hint="Check that both takes show the same performance; without a mapping, `animate --arkit` uses these.",
         )
     return ArkitFit(mapping, error, shares_error, offset_s, len(d))
@@ -181,7 +181,7 @@ def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
     worst = int(np.argmin(reach))
     if reach[worst] < _LEAST_REACH:
         raise FittingError(
-            f"the take covers {max(reach[worst], 0.0):.0%} of the range of {_DIRECTIONS[worst]}, "
+            f"the take covers {max(reach[worst], 0.0):.0%} of the range of {_DIRECTIONS[worst]}; "
             f"{_LEAST_REACH:.0%} is needed to learn the mapping.",
             hint="Record wide opening, both sides and forward, teeth together and apart, for half a minute.",
         )

@@ -1,7 +1,7 @@
-"""Learn one subject's jaw from facial skin, on frames in which the teeth were seen.
+"""Learn one subject's jaw from facial skin, on frames with visible teeth.
 
-As in Zoss et al. 2019 ("Accurate Markerless Jaw Tracking for Facial Performance Capture"), the skin is regressed on
-frames of known jaw; here to the three parameters of the subject's rig, by a Gaussian process, which also gives
+As in Zoss et al. 2019 ("Accurate Markerless Jaw Tracking for Facial Performance Capture"), the jaw is regressed
+on the skin in frames in which it is known. Here, a Gaussian process predicts the three parameters of the rig, with
 covariances.
 """
 
@@ -24,22 +24,23 @@ from jawusd.fitting.face import COARSE_S, columns_at, incisal_error, offsets_bet
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_points
 
-#: Root mean square shift and rotation of an error of head stabilisation beyond that in the training frames [mm, rad].
+#: Default root mean square shift [mm] and rotation [rad] of the head that remain in later frames, in addition to
+#: those in the training frames.
 HEAD_ERROR = (0.3, 0.0026)
-_LEAST_FRAMES, _FRAMES = 60, 300  # least number of seen frames, and number of training frames chosen from them
-_BLOCKS = 6  # contiguous blocks of held-out frames
-_COMPONENTS, _SMOOTH, _INSIDE = 120, 14, 30  # components of all, of the smooth part, and of a familiar face
+_LEAST_FRAMES, _FRAMES = 60, 300  # minimum number of seen frames, and maximum number of training frames
+_BLOCKS = 6  # number of contiguous blocks that are held out in turn
+_COMPONENTS, _SMOOTH, _INSIDE = 120, 14, 30  # components: all, smooth part, test of familiarity
 _LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames; 12 subjects have 1.4
-_START = (2.0, 3.0, 0.3, 0.001)  # length, smooth, linear, noise: the usual result
+_START = (2.0, 3.0, 0.3, 0.001)  # initial length, smooth, linear and noise; typical of the result
 _LOW, _HIGH = np.log([0.2, 0.01, 0.001, 1e-5]), np.log([20.0, 100.0, 100.0, 3.0])
 _STEPS, _MOST_TRIALS = np.log([3.0, 1.7]), 80
 _FALSE_ALARMS = 0.01  # fraction of held-out frames that are flagged as unfamiliar
-_TINY = 1e-9  # least limit of familiarity, for faces of one column
+_TINY = 1e-9  # minimum limit of the squared distance, for faces of one column
 _CHIN_POINTS = 3
-# Largest error relative to each guess. 12 subjects have 0.4 at most; faces of another moment have 1.0 and more.
+# Maximum error relative to each guess: at most 0.4 for 12 subjects; 1.0 and more for faces of other frames.
 _MOST_SHARE = 0.65
-_CLOCK_COMPONENTS = 12  # number of components of the face from which the offset of its clock is estimated
-_LEAST_EXPLAINED = 0.5  # minimum fraction of the variance of opening and laterotrusion that they must explain
+_CLOCK_COMPONENTS = 12  # number of components from which the offset of the face's clock is estimated
+_LEAST_EXPLAINED = 0.5  # minimum fraction of the variance of opening and laterotrusion explained by them
 _NAMES = ("opening", "laterotrusion", "protrusion")
 
 
@@ -65,7 +66,7 @@ def fit_skin(
         d: Jaw parameters [mm], shape (F, 3).
         seen: Frames in which d was measured, shape (F,).
         sigma_d: Standard deviation of d [mm], shape (), (3,) or (F, 3).
-        head_error: For points, the error of head stabilisation that frames to come have beyond that of the training
+        head_error: For points, the additional error of head stabilisation in later frames, compared with the training
             frames: root mean square shift [mm] and rotation about the points' centre [rad]. The covariances include it.
         names: Names of the columns or points, stored in the file.
 
@@ -76,7 +77,7 @@ def fit_skin(
 
     Raises:
         ValueError: wrong shapes.
-        FittingError: too few frames, too little motion, or an error above 65 % of that of a guess.
+        FittingError: too few frames, too little motion, or an error above 65 % of a guess's error.
     """
     X, d = np.asarray(X, dtype=np.float64), np.asarray(d, dtype=np.float64)
     points = X.ndim == 3
@@ -139,14 +140,14 @@ def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
     if explained[best] < _LEAST_EXPLAINED:
         raise FittingError(
             f"the face does not follow the jaw at any clock offset: it explains {explained[best]:.0%} of opening and "
-            f"laterotrusion at best, {_LEAST_EXPLAINED:.0%} is required.",
+            f"laterotrusion at best; {_LEAST_EXPLAINED:.0%} is required.",
             hint="Use a face and a jaw of the same performance, or set their offset with --offset.",
         )
     return refined_offset(float(tried[best]), face_s, f, times_s, d)
 
 
 def _explained(f: Array, d: Array) -> float:
-    """Return the least fraction of the variances of columns of d (N, n) that is linear in features (N, C)."""
+    """Return the smallest fraction of the variance of a column of d (N, n) that is linear in features (N, C)."""
     rows = np.isfinite(f).all(axis=1)
     if rows.sum() < _LEAST_FRAMES:
         return 0.0
@@ -181,7 +182,7 @@ def _check_motion(flat: Array, d: Array, sigma: Array) -> None:
     least = int(np.argmin(moved))
     if moved[least] < _LEAST_MOVED_MM:
         raise FittingError(
-            f"the {_NAMES[least]} varies by {moved[least]:.2f} mm (standard deviation) where the teeth are seen, at "
+            f"the {_NAMES[least]} varies by {moved[least]:.2f} mm (standard deviation) where the teeth are seen; at "
             f"least {_LEAST_MOVED_MM:g} mm is needed to learn it.",
             hint="Record opening, both sides and forward movement with parted lips.",
         )
@@ -197,7 +198,7 @@ def _check_errors(errors: dict[str, float]) -> None:
         if name in errors and errors["skin"] > _MOST_SHARE * errors[name]:
             raise FittingError(
                 f"the jaw learned from the face has an error of {errors['skin']:.2f} mm at the incisal point on "
-                f"held-out frames, {words} has {errors[name]:.2f} mm: at most {_MOST_SHARE:.0%} of that is accepted.",
+                f"held-out frames; {words} has {errors[name]:.2f} mm. At most {_MOST_SHARE:.0%} of that is accepted.",
                 hint="Check that face and jaw show the same performance on one clock, and that the head is stabilised. "
                 "Add points or expressions; if a rigid chin is as good, use inverse kinematics (`rig.ik`).",
             )
@@ -256,12 +257,12 @@ def _process(flat: Array, d: Array, sigma: Array, blocks: list[Indices]) -> tupl
 
 
 def _inside(flat: Array) -> int:
-    """Return the number of components of a familiar face: half of those there are, if there are few."""
+    """Return the number of components in the test of familiarity: at most half of the available ones."""
     return max(min(_INSIDE, min(flat.shape) // 2), 1)
 
 
 def _outside(flat: Array, blocks: list[Indices], scale: float) -> Array:
-    """Return the squared distance of held-out frames from the components of the others, over scale, shape (M,)."""
+    """Return squared distances of held-out frames from the components of the other frames, over scale, shape (M,)."""
     found = np.empty(len(flat))
     for b in blocks:
         others = np.delete(flat, b, axis=0)
@@ -272,7 +273,7 @@ def _outside(flat: Array, blocks: list[Indices], scale: float) -> Array:
 
 
 def _head_motions(points: Array, head_error: tuple[float, float], arrays: dict[str, Array]) -> Array:
-    """Return the change of the features by one sigma along each axis of mean points (N, 3), shape (6, C)."""
+    """Return how features change by one sigma of shift and rotation per axis of mean points (N, 3), shape (6, C)."""
     arms = points - points.mean(axis=0)
     shifts = np.repeat(np.eye(3)[:, None], len(points), axis=1) * head_error[0]
     turns = np.cross(np.eye(3)[:, None], arms) * head_error[1]
@@ -281,7 +282,7 @@ def _head_motions(points: Array, head_error: tuple[float, float], arrays: dict[s
 
 
 def _carried(d: Array, blocks: list[Indices]) -> Array:
-    """Return d of the last frame before each block, of the first one after it for the first block, shape (M, 3)."""
+    """Return d of the last frame before each block, shape (M, 3); for the first block, of the first frame after it."""
     held = [d[b[0] - 1] if b[0] else d[b[-1] + 1] for b in blocks]
     return np.concatenate([np.repeat(each[None], len(b), axis=0) for each, b in zip(held, blocks, strict=True)])
 

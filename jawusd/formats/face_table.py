@@ -1,9 +1,9 @@
-"""Tables of a face per frame: any columns, or points, in CSV of any locale (see `jawusd.base.tables`).
+"""Tables with a face per row: any columns, or points, in CSV of any locale (see `jawusd.base.tables`).
 
     frame,brow_left,jaw_open,...                 any columns in one unit, such as curves of a rig or weights
     time_s,chin_x,chin_y,chin_z,lip_x,...        points, if all columns come in threes NAME_x, NAME_y, NAME_z
 
-The first row names the columns; one of them is `frame` or `time_s`. A blank or nan is hidden.
+The first row names the columns; one of them is `frame` or `time_s`. Blank cells and nan mean hidden.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
     others = [k for k in range(len(lower)) if k not in clocks]
     if len({lower[k] for k in clocks}) != len(clocks) or not clocks or not others or not table.rows:
         raise FormatError(
-            f"has the columns {', '.join(table.header[:8])} and {len(table.rows)} rows; one column frame or time_s, "
-            "others, and rows are needed.",
+            f"has the columns {', '.join(table.header[:8])} and {len(table.rows)} rows; it must have one column frame "
+            "or time_s, other columns, and rows.",
             path=table.path,
         )
     clock = lower.index("time_s") if "time_s" in lower else clocks[0]
@@ -96,7 +96,7 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
 
 
 def _points_of(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of points whose x, y, z the columns are, empty if they are not."""
+    """Return the names of the points if the columns are x, y, z of points, otherwise an empty tuple."""
     found = [_AXIS.fullmatch(name) for name in names]
     labels = [(match[1], match[2].lower()) for match in found if match]
     named = tuple(labels[k][0] for k in range(0, len(labels), 3))

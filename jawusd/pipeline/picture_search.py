@@ -29,10 +29,11 @@ _TRIED = (4, 1, 1, 1)
 # cameras or the detection are wrong, and more tries would not help. The limit is a number instead of a time, so that
 # results do not depend on the machine.
 _MOST_TRIED = 42
-# Maximum fraction of the line between the arches that may be bridged if the arches are to count as apart. Of 64 images
-# of eight mouths, all below it were separated correctly.
+# Maximum fraction of the line between the arches that may be bridged if the arches are to count as apart. All of 64
+# images of eight mouths with a smaller fraction were separated correctly.
 _MOST_BRIDGED = 0.1
-# Minimum length of the vertical, of length 1, in the image plane of a camera whose orientation is known from it.
+# Minimum projected length of the unit up vector in the image plane; if shorter, it does not determine the
+# orientation of the image.
 _SHORTEST_UP = 0.5
 #: Limits of the fraction of the visible contour that matches the colours. Starts below `LEAST_FIT` are rejected; the 20
 #: starts found in one take, all but one within 0.5 mm, had 0.19 to 0.48, and starts from images turned the wrong way at
@@ -85,11 +86,11 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
-        """Return the first start with a clear fit, or else the best one of a part of the take and an orientation.
+        """Return the first start with a clear fit, otherwise the best of a part of the take and an orientation.
 
-        `up_world` is the up direction of the head, shape (3,), if the teeth are known on other frames, with which the
-        start can be compared: several cameras then return the first one that fits. Otherwise, four orientations are
-        tried.
+        `up_world` is the up direction of the head, shape (3,), if known from other frames. With it, one orientation is
+        tried, and with several cameras the first start that fits is returned, because it can be compared with those
+        frames. Without it, four orientations are tried.
 
         Raises:
             TrackingError: no start fits.

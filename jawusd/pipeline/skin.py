@@ -1,4 +1,4 @@
-"""Learn the jaw from facial skin: reads a face and a jaw of one performance, and brings them to one clock."""
+"""Learn the jaw from facial skin: read a face and a jaw of one performance, and align their clocks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from jawusd.formats.poses import read_poses_or_parameters
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.markers import LENGTH_UNITS_MM, in_head, read_c3d
 
-SIGMA_MM = 0.15  # of d, where a file does not state it
+SIGMA_MM = 0.15  # standard deviation of d if the file does not state it
 _LARGEST_SIGMA_MM = 1.0  # poses with a larger standard deviation at the incisal point do not count as seen
 
 
@@ -51,7 +51,7 @@ class JawTake:
         return replace(self, fps=fps)
 
     def with_bite(self, first: int, last: int) -> JawTake:
-        """Return the take with d = 0 in frames first to last, in which the teeth are in occlusion."""
+        """Return the take with d = 0 from frame first to last, where the teeth are in occlusion."""
         bite = np.arange(first, last + 1, dtype=np.float64)
         kept = (self.frames < first) | (self.frames > last)
         frames = np.concatenate([self.frames[kept], bite])

@@ -1,4 +1,4 @@
-"""Solve a shot without masks, by the colours of its videos."""
+"""Solve a shot without masks, using the colours of its videos."""
 
 from __future__ import annotations
 

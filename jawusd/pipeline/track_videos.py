@@ -1,4 +1,4 @@
-"""Track captures without masks, by the colours of their footage."""
+"""Track captures without masks, using the colours of their footage."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _LEAST_PICKED_FIT = 0.1
 def track_videos(
     capture: Capture, offsets: dict[str, int], meshes: Mapping[str, Mesh], jobs: int, progress: Progress
 ) -> Tracks:
-    """Track both arches by the colours of the videos; see `track`.
+    """Track both arches using the colours of the videos; see `track`.
 
     Args:
         offsets: frame offset by camera.
@@ -132,7 +132,7 @@ class ArchSearch:
             return found.poses, fit
 
         begin = PictureSearch(self.capture, self.footage, cameras, near, judged).run(frames, progress, up_world)
-        self.follower.start_at(begin.frame, begin.pose)  # again, since the search may have tried others
+        self.follower.start_at(begin.frame, begin.pose)  # again: the search may have tried other starts after this one
         return begin
 
     def again(self, frames: range, up_world: Array) -> Start[Array]:

@@ -1,4 +1,4 @@
-"""Search for teeth that stay lost, and follow them from there both ways until known poses are met."""
+"""Search for teeth that stay lost, and follow them forwards and backwards until known poses are met."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def lost_stretches(known: Mapping[int, P], frames: range) -> list[range]:
 
 
 def nearest_found(known: Mapping[int, P], lost: range) -> P:
-    """Return the poses nearest to lost frames on which both arches were found."""
+    """Return the poses of the frame nearest to a lost run among those with both arches found."""
     return known[min((frame for frame in known if known[frame].found.all()), key=lambda frame: abs(frame - lost.start))]
 
 
@@ -66,7 +66,7 @@ def replace_poses(
 ) -> bool | None:
     """Replace poses by others of the same frames, as long as the two differ and the latter are better.
 
-    A tracker that recovers, or loses the teeth, made an error before: each wrong pose is plausible by itself.
+    Where a tracker recovers or loses the teeth, its poses were wrong before, although each is plausible by itself.
 
     Args:
         way: frames in tracking order.
@@ -75,7 +75,7 @@ def replace_poses(
         same, better: compare another pose with a known one.
 
     Returns:
-        True if an equal pose ended this, False if a different one did that is not worse, None if the arches were lost
+        True if an equal known pose was met, False if a different one that is not worse, None if the arches were lost
         or the take ended.
     """
     for frame, other in zip(way, followed, strict=False):
