@@ -70,7 +70,7 @@ def cameras():
     arc = [(mouth[0] + 95 * math.cos(t), mouth[1] + 95 * math.sin(t)) for t in (math.radians(d) for d in range(53, 91))]
     parts += [path(arc, "one"), text(404, 234, "about 40&#176;", "start", "small")]
     parts += [text(330, 268, "about 0.2 m", "end", "small")]
-    return svg(680, 380, "Three cameras around the mouth, seen from above, with soft lights at both sides", parts)
+    return svg(680, 380, "Three cameras around the mouth, seen from above, with soft lights on both sides", parts)
 
 
 def exercises():

@@ -1,4 +1,4 @@
-"""Link the first use of every term of the glossary, on every page, to what the glossary says of it."""
+"""Link the first use of every term of the glossary, on every page, to its entry in the glossary."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""The page of all commands, from what each says with --help."""
+"""The page of all commands, from the output of each with --help."""
 
 import html
 

@@ -91,7 +91,9 @@ def check_format(found: object, family: str, version: int, path: str | os.PathLi
         raise FormatError(f'format is "{found}", expected "{family}/{version}".', path=path)
     if int(number) > version:
         raise VersionError(
-            f'format is "{found}", this jawusd reads up to "{family}/{version}".', path=path, hint="Update jawusd."
+            f'format is "{found}"; this version of jawusd reads formats up to "{family}/{version}".',
+            path=path,
+            hint="Update jawusd.",
         )
     return int(number)
 

@@ -6,8 +6,8 @@ All readers share these rules:
 * line ends: LF, CRLF, CR;
 * separator: tab, semicolon or comma, the first that splits header and first row into the same number of cells; if there
   is none, the first that splits the header; a line `sep=;` overrides this;
-* decimal sign: a point, or a comma if no number of the table has a point. Thousands separators are not supported, and
-  the ambiguous `1,234` is rejected.
+* decimal separator: a point, or a comma if no number of the table has a point. Thousands separators are not supported,
+  and the ambiguous `1,234` is rejected.
 
 Blank lines, comments and blank columns at the end are skipped.
 """
@@ -100,7 +100,7 @@ class TextTable:
             rows: indices of rows, None for all.
 
         Raises:
-            FormatError: a cell is not a number, or the decimal sign is ambiguous.
+            FormatError: a cell is not a number, or the decimal separator is ambiguous.
         """
         chosen = range(len(self.rows)) if rows is None else rows
         cells = [[self.rows[i][k] for k in columns] for i in chosen]
@@ -207,7 +207,7 @@ def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str],
         path: the file, for messages.
 
     Raises:
-        FormatError: a cell is not a number, or the decimal sign is ambiguous.
+        FormatError: a cell is not a number, or the decimal separator is ambiguous.
     """
     if any("," in cell for row in cells for cell in row):
         cells = _with_points(cells, named, path)
@@ -238,7 +238,7 @@ def _with_points(cells: Sequence[Sequence[str]], named: Callable[[int, int], str
     if point is not None:
         raise FormatError(
             f'{named(i, j)} is "{cell}" and {named(*point[:2])} is "{point[2]}": commas and points cannot both be '
-            "decimal signs, and thousands separators are not allowed.",
+            "decimal separators, and thousands separators are not allowed.",
             path=path,
             hint="Write all decimals with points, without thousands separators.",
         )

@@ -84,7 +84,7 @@ def _image_rows(path: Path) -> Iterator[list[str]]:
             continue
         if len(row) < 10 or not all(_is_number(word) for word in row[:9]):
             raise CalibrationError(
-                f'"{" ".join(row):.80}" is not an image line: ID, 4 + 3 pose values, camera ID and name are needed.',
+                f'"{" ".join(row):.80}" is not an image line; expected ID, 4 + 3 pose values, camera ID and name.',
                 path=path,
             )
         after_image = True

@@ -24,7 +24,8 @@ from jawusd.capture.scale import (
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera
 
-#: Called with the cameras and the failed check of the picks, whose `reason` says why they do not determine the scale.
+#: Called with the cameras and the failed check of the picks; its `reason` explains why they do not determine the
+#: scale.
 MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 
 _ENOUGH_VIEWS = 40  # recommended number of views; the shape error is a quarter of that with 20 views
@@ -86,7 +87,7 @@ def calibrate_capture(
     """
     if capture.boards is None:
         raise CalibrationError(
-            "has no [boards].",
+            "has no [boards] table.",
             path=capture.folder / "capture.toml",
             hint="Film a chessboard at the position of the teeth and name the clips there, or give a calibration file.",
         )
@@ -107,7 +108,7 @@ def calibrate_detections(
     """
     boards = capture.boards
     if boards is None:
-        raise CalibrationError("has no [boards].", path=capture.folder / "capture.toml")
+        raise CalibrationError("has no [boards] table.", path=capture.folder / "capture.toml")
     points = board_points(boards)
     start = initial_cameras(
         detections.names, detections.sizes_px, detections.corners_px, points, board_symmetries(boards)

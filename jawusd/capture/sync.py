@@ -1,7 +1,7 @@
 """Synchronise cameras by light flashes or, if there are none, by sound.
 
-Images are counted by their presentation times: in a video of variable rate, frame k is the image shown k nominal frame
-durations after the first one.
+Images are counted by their presentation times: in a video with a variable frame rate, frame k is the image shown k
+nominal frame durations after the first one.
 """
 
 from __future__ import annotations

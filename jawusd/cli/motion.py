@@ -74,8 +74,8 @@ def _read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
     check_input(source)
     if source.suffix.lower() == ".npz":
         raise FormatError(
-            "is an npz file; keys, or a table of d or of poses, are needed.",
-            hint="`jawusd encode` writes the d of tracks as a table.",
+            "is an npz file; expected key frames, or a table of d values or poses.",
+            hint="`jawusd encode` writes the d values of tracks as a table.",
         )
     if source.suffix.lower() == ".json" and source.read_bytes().lstrip()[:1] == b"{":
         keys = load_keys(source)
@@ -224,7 +224,7 @@ def carried_over(
     """Read a motion of one rig and retarget it to another; see `pipeline.library.retarget`.
 
     Args:
-        source: an animation layer, keys, or a table of d or of poses.
+        source: an animation layer, key frames, or a table of d values or poses.
         prim: path of the rig's prim, if the source is a stage with several.
 
     Raises:

@@ -57,7 +57,7 @@ class RigAuthoring(RigArrays):
         return d.reshape(*batch, 3)
 
     def keep_inside(self, times: ArrayLike, d: ArrayLike) -> Inside:
-        """Return a motion moved inside the bound, both at its samples and on the straight lines between them.
+        """Return a motion clamped to the bound, both at its samples and on the straight lines between them.
 
         Poses outside the bound are moved inside continuously, and no step becomes more than 5 % longer than in the
         given motion. Where the path inside the bound is too long for this limit, the motion just before and after it is

@@ -49,7 +49,7 @@ class Inside(NamedTuple):
 
 
 def kept_inside(bound: SliceHull, times: Array, d: Array, *, ends_stay: bool = False) -> Inside:
-    """Return a motion moved inside the bound, at its samples and between them.
+    """Return a motion clamped to the bound, at its samples and between them.
 
     Args:
         times: Increasing times, shape (F,).

@@ -201,11 +201,11 @@ class RigClearance:
             return field
         if of == "teeth":
             raise EvaluatorError(
-                "this rig has no clearance of the teeth.",
+                "this rig has no clearance data for the teeth.",
                 hint="Fit or bake it with scans of both dental arches in occlusion.",
             )
         raise EvaluatorError(
-            "this rig has no clearance of the condyles.",
+            "this rig has no clearance data for the condyles.",
             hint="Fit or bake it with meshes of skull and mandible that include the joints.",
         )
 

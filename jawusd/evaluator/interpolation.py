@@ -15,7 +15,7 @@ from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.clamping import kept_inside
 from jawusd.evaluator.curves import HermiteCurve
 
-_SAMPLES = 129  # number of samples of a segment that is moved inside
+_SAMPLES = 129  # number of samples of a segment that is clamped to the bound
 # Fractions of a segment at which it is checked against the bound, dense at its ends, since keys may lie on the bound.
 _CHECK_SHARES = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 1025))
 _ROUNDING_MM = 1e-9

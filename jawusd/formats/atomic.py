@@ -48,7 +48,7 @@ def destination(path: str | os.PathLike[str]) -> Path:
         raise OutputError(f"cannot write here: {getattr(error, 'strerror', error)}.", path=path) from error
     if found is not None and not stat.S_ISREG(found):
         what = "a folder" if stat.S_ISDIR(found) else "something other than a file or a pipe"
-        raise OutputError(f"is {what}; it is not replaced by a file.", path=path, hint="Name another file.")
+        raise OutputError(f"is {what}; it is not replaced by a file.", path=path, hint="Choose another file name.")
     return target
 
 
@@ -60,7 +60,7 @@ def refuse_existing(path: Path, force: bool) -> None:
     """
     destination(path)
     if os.path.lexists(path) and not force and not is_stream(path):
-        raise OutputError("exists already.", path=path, hint="Name another file, or overwrite it with --force.")
+        raise OutputError("exists already.", path=path, hint="Choose another file name, or overwrite with --force.")
 
 
 def is_stream(path: Path) -> bool:

@@ -23,7 +23,7 @@ _ALLOWED_SHOWN = 300  # maximum length of a list of keys in messages [characters
 Location = tuple[int | str, ...]
 #: Messages by pydantic's error type; names in braces are keys of the error's context.
 _WORDS = {
-    "greater_than": "must be more than {gt:g}",
+    "greater_than": "must be greater than {gt:g}",
     "greater_than_equal": "must be {ge:g} or more",
     "less_than": "must be less than {lt:g}",
     "less_than_equal": "must be {le:g} or less",

@@ -55,7 +55,7 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
             )
         found.append(item)
     if not found:
-        raise FormatError("lists no captures; one path per line is expected.", path=path)
+        raise FormatError("lists no captures; expected one path per line.", path=path)
     return found
 
 

@@ -103,7 +103,7 @@ def _misnamed(location: Location, full: Path) -> tuple[str, str | None] | None:
     """Return the problem with the type of a file, and a hint."""
     key = next((str(part) for part in reversed(location) if isinstance(part, str)), "")
     kind = wrong_kind(key, full)
-    return None if kind is None else (kind, f"Name another file for {key}.")
+    return None if kind is None else (kind, f"Choose another file for {key}.")
 
 
 def _named_twice(

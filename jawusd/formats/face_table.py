@@ -75,7 +75,7 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
     if len({lower[k] for k in clocks}) != len(clocks) or not clocks or not others or not table.rows:
         raise FormatError(
             f"has the columns {', '.join(table.header[:8])} and {len(table.rows)} rows; it must have one column frame "
-            "or time_s, other columns, and rows.",
+            "or time_s, other columns, and at least one row.",
             path=table.path,
         )
     clock = lower.index("time_s") if "time_s" in lower else clocks[0]

@@ -151,15 +151,15 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
     cells = [cell.strip() for _, row in rows for cell in row] if separator == "," else []
     if any(map(_LEADING_ZERO.fullmatch, cells)) and not any("." in cell for cell in cells):
         raise FormatError(
-            "uses commas both as decimal signs and as separators.", path=path, hint="Write decimals with points."
+            "uses commas both as decimal and as column separators.", path=path, hint="Write decimals with points."
         )
     for line, row in rows:
         if len(row) != width:
-            raise FormatError(f"line {line} has {len(row)} numbers; {width} are expected.", path=path)
+            raise FormatError(f"line {line} has {len(row)} numbers; expected {width}.", path=path)
     while width % 3 and not any(row[width - 1].strip() for _, row in rows):  # blank columns at the end
         width -= 1
     if width % 3:
-        raise FormatError(f"has {width} numbers per frame; three per marker are expected.", path=path, hint=READ)
+        raise FormatError(f"has {width} numbers per frame; expected three per marker.", path=path, hint=READ)
     return _positions(rows, 0, width, path, zeros=not probe)
 
 
@@ -172,7 +172,7 @@ def _positions(rows: _Rows, first: int, width: int, path: Path, zeros: bool = Tr
         found = [cell if cell.strip() else "nan" for cell in row[first : first + width]]
         if len(found) % 3 or any(cell.strip() for cell in row[first + width :]):
             end = len(row) - first
-            raise FormatError(f"line {line} has {end} numbers; {width} are expected.", path=path)
+            raise FormatError(f"line {line} has {end} numbers; expected {width}.", path=path)
         cells.append(found + ["nan"] * (width - len(found)))
 
     def named(i: int, j: int) -> str:
@@ -239,7 +239,7 @@ def _read_vicon(rows: _Rows, path: Path) -> MarkerTable:
         raise FormatError("its section Trajectories has no markers or no frames.", path=path)
     found = {units[k].lower() for k in places if k < len(units)}
     if len(found) != 1:
-        raise FormatError(f"its markers have the units {', '.join(sorted(found))}; one is expected.", path=path)
+        raise FormatError(f"its markers have the units {', '.join(sorted(found))}; expected one unit.", path=path)
     points = np.concatenate(
         [_positions([(line, row[k : k + 3]) for line, row in data], 0, 3, path) for k in places], axis=1
     )
@@ -291,7 +291,7 @@ def _rate(cells: list[str] | None, key: str, path: Path) -> float | None:
         return None
     value = float(to_numbers([cells[:1]], lambda *_: key or "the rate", path)[0, 0])
     if not 0 < value < np.inf:
-        raise FormatError(f"{key or 'the rate'} is {cells[0]}; it must be more than 0 per second.", path=path)
+        raise FormatError(f"{key or 'the rate'} is {cells[0]}; it must be greater than 0 per second.", path=path)
     return value
 
 

@@ -216,7 +216,7 @@ def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> M
         raise CaptureError(
             f"{where}the label image has the values {shown}; they must be 0, {low} or {high}.",
             path=path,
-            hint="Correct masks.upper_value and masks.lower_value, or export without other labels, antialiasing and "
+            hint="Correct masks.upper_value and masks.lower_value, or export without other labels, antialiasing or "
             "lossy compression.",
         )
     return np.where(plane == labels[0], np.uint8(255), np.uint8(0))

@@ -241,7 +241,7 @@ def _agreed(shown: Sequence[_Looked], lossy: bool) -> MaskLevels:
         raise NotMasks(
             number,
             f"it has the levels {', '.join(f'{value:g}' for value in values)}; a mask has two, background and teeth.",
-            "Export one mask per arch; or name one file for both arches as masks.labels, with upper_value and "
+            "Export one mask per arch, or name one file for both arches as masks.labels, with upper_value and "
             "lower_value.",
         )
     masks = [(number, levels) for number, levels in found if levels.gray <= MOST_GRAY]

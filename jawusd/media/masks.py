@@ -185,8 +185,8 @@ def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> T
         return video
     if source.count > len(video.numbers):
         raise CaptureError(
-            f"the masks are numbered up to {source.count - 1}, but the camera's video, of variable rate, has only "
-            f"pictures 0 to {len(video.numbers) - 1} (in {video.count} frames).",
+            f"the masks are numbered up to {source.count - 1}, but the camera's video, with a variable frame rate, has "
+            f"only pictures 0 to {len(video.numbers) - 1} (in {video.count} frames).",
             path=path,
             hint="Number masks by the pictures of the video, or convert it to a constant rate before making masks.",
         )

@@ -173,7 +173,7 @@ class Video(Clip):
                     dts.append(packet.pts if packet.dts is None else packet.dts)
                     key.append(packet.is_keyframe)
         except av.FFmpegError:
-            # Truncated file: use the images before the truncation; `announced` tells whether more were declared.
+            # Truncated file: use the images before the truncation. A caller compares their number with `announced`.
             pass
         order = np.argsort(pts, kind="stable")
         times = np.array(pts, np.int64)[order]

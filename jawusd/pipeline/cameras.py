@@ -180,7 +180,7 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     if min(abs(recorded[0] * share * height / width - recorded[1]) for share in (1.0, aspect)) > 1.0:
         raise CalibrationError(
             f"calibrated for pictures of {width} x {height} px, but {path.name} has "
-            f"{recorded[0]} x {recorded[1]} px, another aspect ratio.",
+            f"{recorded[0]} x {recorded[1]} px: the aspect ratios differ.",
             camera=camera.name,
             path=capture.calibration,
             hint="Calibrate in the recording mode of the take: sizes alone do not tell how pictures are cropped.",
@@ -215,7 +215,7 @@ def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[s
 
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.
-        CalibrationError: a video has another aspect ratio than its camera's calibration.
+        CalibrationError: the aspect ratio of a video differs from that of its camera's calibration.
     """
     cameras = load_cameras(capture)
     placed = cameras if tracks is None else tracked_cameras(cameras, tracks)

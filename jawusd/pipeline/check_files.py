@@ -271,8 +271,8 @@ def boards(parts: Parts) -> Iterator[Finding]:
             yield Finding(
                 "board_shape",
                 "error",
-                f"its board clip is {video.size_px[0]} x {video.size_px[1]} px, its video {own.size_px[0]} x "
-                f"{own.size_px[1]} px, another aspect ratio",
+                f"its board clip ({video.size_px[0]} x {video.size_px[1]} px) and its video ({own.size_px[0]} x "
+                f"{own.size_px[1]} px) have different aspect ratios",
                 path=str(path),
                 camera=camera.name,
                 hint="Record the boards in the recording mode of the take.",

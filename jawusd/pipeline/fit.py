@@ -202,7 +202,7 @@ def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int, path: Path) -> Ar
         raise FormatError(f"has no frame {wanted}{between}.", path=path)
     found = T[rows[0]]
     if not np.isfinite(found).all():
-        raise FormatError(f"frame {wanted} has no pose.", path=path, hint="Name another frame in occlusion.")
+        raise FormatError(f"frame {wanted} has no pose.", path=path, hint="Choose another frame in occlusion.")
     return found
 
 

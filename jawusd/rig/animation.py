@@ -77,14 +77,14 @@ def write_animation(
     rig = load_rig(actor) if rig is None else rig
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     if frames.ndim != 1 or d.shape != (len(frames), 3):
-        raise ValueError(f"frames (F,) and d (F, 3) are needed, got {frames.shape} and {d.shape}")
+        raise ValueError(f"expected frames (F,) and d (F, 3), got {frames.shape} and {d.shape}")
     known = np.isfinite(d).all(axis=1)
     if not known.any():
         raise RigError("no frame has parameters; there is nothing to animate.", path=out)
     if not np.isfinite(frames).all() or (np.diff(frames) <= 0).any():
         raise RigError("the frame numbers of an animation must increase.", path=out)
     if not fps > 0:
-        raise RigError(f"{fps} frames per second; it must be more than 0.", path=out)
+        raise RigError(f"{fps} frames per second; the rate must be greater than 0.", path=out)
     if frames[-1] - frames[0] > _MAX_FRAMES or np.abs(frames).max() > _FARTHEST_FRAME:
         raise RigError(
             f"frames {frames[0]:g} to {frames[-1]:g}; an animation has at most {_MAX_FRAMES} frames within "
@@ -240,11 +240,11 @@ def write_splines(
     out = Path(out)
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     if d.shape != (len(frames), 3):
-        raise ValueError(f"frames (F,) and d (F, 3) are needed, got {frames.shape} and {d.shape}")
+        raise ValueError(f"expected frames (F,) and d (F, 3), got {frames.shape} and {d.shape}")
     tangents = np.zeros_like(d) if slopes is None else np.asarray(slopes, dtype=np.float64)
     cubic = np.zeros(max(len(frames) - 1, 0), dtype=bool) if curved is None else np.asarray(curved, dtype=bool)
     if tangents.shape != d.shape or len(cubic) != max(len(frames) - 1, 0):
-        raise ValueError(f"slopes (F, 3) and curved (F - 1,) are needed, got {tangents.shape} and {cubic.shape}")
+        raise ValueError(f"expected slopes (F, 3) and curved (F - 1,), got {tangents.shape} and {cubic.shape}")
     if not len(frames) or not np.isfinite(d).all() or not (np.diff(frames) > 0).all():
         raise RigError("keys need increasing frames and finite values.", path=out)
     layer = new_layer(fps, f"/{root_prim_of(Path(animation))}")

@@ -184,14 +184,14 @@ def upgrade_rig(prim: Usd.Prim, where: object) -> None:
 
     Raises:
         FormatError: The version is not a positive integer.
-        VersionError: The version is newer than this jawusd supports.
+        VersionError: The rig's format is newer than this version of jawusd supports.
     """
     version = read_value(prim, "jaw:formatVersion", where)
     if not isinstance(version, int) or version < 1:
         raise FormatError(f"jaw:formatVersion is {version!r}, expected a positive integer.", path=str(where))
     if version > FORMAT_VERSION:
         raise VersionError(
-            f"the rig has format version {version}; this jawusd reads up to {FORMAT_VERSION}.",
+            f"the rig has format version {version}; this version of jawusd reads up to {FORMAT_VERSION}.",
             path=str(where),
             hint="Update jawusd.",
         )

@@ -178,7 +178,7 @@ class JawLayer(nn.Module):
         """
         field = {"teeth": self.teeth, "condyles": self.condyles}[of]
         if field is None:
-            raise EvaluatorError(f"the rig of this JawLayer has no clearance of the {of}.")
+            raise EvaluatorError(f"the rig of this JawLayer has no clearance data for the {of}.")
         return cast("Tensor", field(self._rows(d, (3,), "d"))).reshape(d.shape[:-1])
 
     @full_precision

@@ -118,7 +118,7 @@ def choose_picks(
     facing = np.stack([_seen(camera, points, normals, occluders) for camera in cameras], -1)
     good = np.flatnonzero((facing > 0).sum(-1) >= 2)
     if len(good) < count:
-        raise ValueError(f"only {len(good)} tips of teeth are visible in two cameras, {count} are needed")
+        raise ValueError(f"only {len(good)} tips of teeth are visible in two cameras; expected {count}")
     picks = []
     for i in spread_out(points[good], count):
         k = good[i]

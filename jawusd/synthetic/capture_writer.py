@@ -67,7 +67,7 @@ class DemoConfig:
 
     def __post_init__(self) -> None:
         if self.frames <= OPEN_HOLD + REST_HOLD:
-            raise ValueError(f"frames must be more than {OPEN_HOLD + REST_HOLD}, got {self.frames}")
+            raise ValueError(f"frames must be greater than {OPEN_HOLD + REST_HOLD}, got {self.frames}")
         if min(self.size_px) < 64 or self.size_px[0] % 2 or self.size_px[1] % 2:
             raise ValueError(f"size_px must be even and at least 64, got {self.size_px}")
         if self.boards < 1:

@@ -53,7 +53,7 @@ class Renderer:
             ValueError: the cameras differ in size.
         """
         if len({camera.size_px for camera in cameras}) != 1:
-            raise ValueError(f"cameras must share one size, got {[camera.size_px for camera in cameras]}")
+            raise ValueError(f"all cameras must have the same image size, got {[camera.size_px for camera in cameras]}")
         self._gl = _context()
         self._cameras = cameras
         self._size = cameras[0].size_px

@@ -111,7 +111,7 @@ class Session:
         self._change(f"d{index + 1}", replace(self.work, d=triple(kept)))
 
     def set_pose(self, d: ArrayLike) -> None:
-        """Set all parameters [mm] (3,); with `keep_valid` they are moved inside the bound."""
+        """Set all parameters [mm] (3,); with `keep_valid` they are clamped to the bound."""
         d = np.asarray(d, dtype=np.float64)
         self._change(None, replace(self.work, d=triple(self._inside(d) if self.keep_valid else d)))
 
@@ -121,7 +121,7 @@ class Session:
         self._gesture = None
 
     def set_keep_valid(self, keep: bool) -> None:
-        """Set whether sliders stay inside the bound; switching it on moves the pose inside."""
+        """Set whether sliders stay inside the bound; switching it on clamps the pose."""
         self.keep_valid = bool(keep)
         self._gesture = None
         if keep and not self.rig.is_inside(self.d):
@@ -131,7 +131,7 @@ class Session:
         return d if self.rig.is_inside(d) else self.rig.project(d)
 
     def _kept(self, d: Array, index: int) -> Array:
-        """Return d (3,) moved inside the bound while changing parameter `index` as little as possible."""
+        """Return d (3,) clamped to the bound while changing parameter `index` as little as possible."""
         if float(self.rig.margin(d)) >= 0.0:
             return d
         d = d.copy()

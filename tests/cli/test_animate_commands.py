@@ -150,7 +150,7 @@ def test_keys_outside_come_inside_and_keep_their_tangents(actor, tmp_path):
     [
         ("none.csv", "frame,d1,d2,d3\n", "none.csv: the motion has no frames"),
         ("twice.csv", "frame,d1,d2,d3\n1,0,0,0\n1,5,0,0\n", "twice.csv: frames must increase: frame 1 follows 1"),
-        ("tracks.npz", "PK", "tracks.npz: is an npz file; keys, or a table of d or of poses, are needed."),
+        ("tracks.npz", "PK", "tracks.npz: is an npz file; expected key frames, or a table of d values or poses."),
     ],
 )
 def test_a_source_that_cannot_be_animated_is_named(actor, tmp_path, name, text, words):

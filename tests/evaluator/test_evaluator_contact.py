@@ -88,7 +88,7 @@ def test_condyles_have_clearances_that_reject_no_pose():
     plain = touching_rig()
     np.testing.assert_array_equal(rig.validate(rig.pose(d)).reason, plain.validate(plain.pose(d)).reason)
     assert rig.model_hash != plain.model_hash
-    with pytest.raises(EvaluatorError, match="no clearance of the condyles"):
+    with pytest.raises(EvaluatorError, match="no clearance data for the condyles"):
         plain.clearance(d, of="condyles")
     with pytest.raises(ValueError, match="tongue"):
         rig.clearance(d, of="tongue")
@@ -97,7 +97,7 @@ def test_condyles_have_clearances_that_reject_no_pose():
 def test_a_rig_without_scans_says_so():
     rig = JawRig(example_arrays(), example_meta())
     assert rig.contact is None
-    with pytest.raises(EvaluatorError, match="has no clearance of the teeth"):
+    with pytest.raises(EvaluatorError, match="has no clearance data for the teeth"):
         rig.clearance([0.0, 0.0, 0.0])
 
 

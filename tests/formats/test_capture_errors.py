@@ -47,7 +47,7 @@ def test_a_good_file_is_read(told):
         ("[scans]", "[scans]\nsquare_mm = 2.0", '"square_mm" belongs to [boards]'),
         ("fps = 24.0\n", "", "fps is missing. For example: fps = 23.976."),
         ("fps = 24.0", 'fps = "24 fps"', 'fps = "24 fps": a number is needed (frames per second)'),
-        ("fps = 24.0", "fps = -24.0", "fps = -24.0 must be more than 0"),
+        ("fps = 24.0", "fps = -24.0", "fps = -24.0 must be greater than 0"),
         ("fps = 24.0", "fps = 24.0\nframes = [9, 3]", "frames = [9, 3] is empty"),
         ("fps = 24.0", "fps = 24.0\nframes = [9]", "frames has too few entries. For example: frames = [30, 270]."),
         ("fps = 24.0", 'fps = 24.0\nframes = "all"', 'frames = "all": a list in brackets is needed'),

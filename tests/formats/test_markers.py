@@ -56,12 +56,12 @@ def test_a_marker_description_and_numbers(tmp_path):
     ("text", "words"),
     [
         ("", "has no frames"),
-        ("1 2 3\n1 2\n", "line 2 has 2 numbers; 3 are expected"),
+        ("1 2 3\n1 2\n", "line 2 has 2 numbers; expected 3"),
         ("1 2 3 4\n", "has 4 numbers per frame"),
         ("frame,m00\n1,2\n", "is not a table of marker positions"),
         ("a b c\n1 2 3\n", "is not a table of marker positions"),
         ("0 8 1\nLinear x 0.02\n1 2 3\n", "line 2 must be like"),
-        ("0 8 1\nLinear 6 0.02\n1 2 3\n", "line 3 has 3 numbers; 6 are expected"),
+        ("0 8 1\nLinear 6 0.02\n1 2 3\n", "line 3 has 3 numbers; expected 6"),
     ],
 )
 def test_each_mistake_of_a_table_is_named(tmp_path, text, words):
@@ -217,7 +217,7 @@ def test_frames_that_a_table_leaves_out_show_no_markers(tmp_path):
     [
         ("a.tsv", qtm(cells()[:4]), "its header declares 6 frames, but it has 4"),
         ("a.trc", trc(cells()[:5]), "its header declares 6 frames, but it has 5"),
-        ("a.trc", trc(cells(ZEROS))[:-40], "numbers; 12 are expected"),
+        ("a.trc", trc(cells(ZEROS))[:-40], "numbers; expected 12"),
         ("a.trc", trc(cells(), unit="inch"), 'lengths are in "inch"; the unit must be one of mm, cm, m'),
         ("a.trc", trc(cells(), frames=[1, 2, 2, 3, 4, 5]), "must be increasing whole numbers"),
         ("a.tsv", qtm(cells()).replace("\t4\n", "\t5\n", 1), "declares 5 markers but names 4"),
@@ -226,8 +226,8 @@ def test_frames_that_a_table_leaves_out_show_no_markers(tmp_path):
         ("a.csv", vicon(cells()).replace("X,Y,Z", "RX,RY,RZ"), "has no markers"),
         ("a.csv", "Format Version,1.23,Take Name,t\n\n,Type,Marker\n", "OptiTrack Motive, not a supported marker"),
         ("a.mot", "Coordinates\nversion=1\n", "is a motion file of OpenSim"),
-        ("a.csv", joined(cells(NANS), ",").replace(".", ","), "commas both as decimal signs and as separators"),
-        ("a.csv", german(joined(cells())).replace(",", ".", 1), "commas and points cannot both be decimal signs"),
+        ("a.csv", joined(cells(NANS), ",").replace(".", ","), "commas both as decimal and as column separators"),
+        ("a.csv", german(joined(cells())).replace(",", ".", 1), "commas and points cannot both be decimal separators"),
         ("a.csv", "1,234;2,345;3,456\n", '"1,234" is ambiguous, 1.234 or 1234'),
         ("a.txt", "time x y z\n0 1 2 3\n", "Supported are C3D, TSV of Qualisys"),
     ],

@@ -124,7 +124,7 @@ def test_every_reader_reads_tables_of_every_locale(tmp_path, reader, locale):
         ("frame;d1;d2;d3\n1;1,234;2,345;3,456\n", '"1,234" is ambiguous, 1.234 or 1234'),
         ("frame\td1\td2\td3\n1\t10,500\t2\t3\n", 'line 2, column "d1": "10,500" is ambiguous, 10.500 or 10500'),
         ('frame,d1,d2,d3\n1,"12,345",2,3\n', '"12,345" is ambiguous, 12.345 or 12345'),
-        ("frame;d1;d2;d3\n1;1,5;2.5;3\n", "commas and points cannot both be decimal signs"),
+        ("frame;d1;d2;d3\n1;1,5;2.5;3\n", "commas and points cannot both be decimal separators"),
         ("frame;d1;d2;d3\n1;1.234,5;2,5;3\n", "thousands separators are not allowed"),
         ('frame,d1,d2,d3\n1,"1,234.5",2.5,3\n', "thousands separators are not allowed"),
         ("frame;d1;d2;d3\n1;1,234,567;2,5;3\n", '"1,234,567" is not a number'),

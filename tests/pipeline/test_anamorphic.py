@@ -43,5 +43,5 @@ def test_a_calibration_of_the_widened_picture_fits_the_clip(folder):
 
 
 def test_without_the_aspect_it_is_another_shape(folder):
-    with pytest.raises(CalibrationError, match="another aspect ratio"):
+    with pytest.raises(CalibrationError, match="the aspect ratios differ"):
         cameras(folder, STORED.scaled((128, 48)))

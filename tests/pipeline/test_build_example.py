@@ -236,7 +236,7 @@ def truncated_video(folder):
     [
         (missing_mask_folder, CaptureError, "masks"),
         pytest.param(masks_of_another_size, CaptureError, "320", marks=pytest.mark.slow),
-        pytest.param(calibration_of_another_shape, CaptureError, "another aspect ratio", marks=pytest.mark.slow),
+        pytest.param(calibration_of_another_shape, CaptureError, "the aspect ratios differ", marks=pytest.mark.slow),
         pytest.param(scan_in_metres, CaptureError, "metres", marks=pytest.mark.slow),
         pytest.param(calibration_without_rotation, CaptureError, "not orthonormal", marks=pytest.mark.slow),
         (pick_outside_its_image, CaptureError, "outside"),

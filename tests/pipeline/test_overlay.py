@@ -157,7 +157,7 @@ def test_what_cannot_be_drawn_is_refused(capture, tmp_path):
         (tmp_path / "file").write_text("")
         write_overlay(opened, OFFSETS, some_tracks(), tmp_path / "file" / "out", quiet)
     save_calibration(capture / "calibration.toml", [CAMERAS[0].scaled((480, 300)), CAMERAS[1]])
-    with pytest.raises(CalibrationError, match="camera left: calibrated for .* another aspect ratio"):
+    with pytest.raises(CalibrationError, match="camera left: calibrated for .* the aspect ratios differ"):
         write_overlay(open_capture(capture), OFFSETS, some_tracks(), tmp_path / "out", quiet)
     assert not (tmp_path / "out").exists()
 

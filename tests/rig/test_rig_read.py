@@ -84,7 +84,7 @@ def test_description_is_that_of_the_rig(folder, kind):
 def test_a_newer_rig_is_refused(anchored_folder):
     actor = anchored_folder / "actor.usda"
     edit(actor, set_value("jaw:formatVersion", 3))
-    with pytest.raises(VersionError, match="version 3; this jawusd reads up to 2"):
+    with pytest.raises(VersionError, match="version 3; this version of jawusd reads up to 2"):
         load_rig(actor)
 
 

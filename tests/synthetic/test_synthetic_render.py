@@ -210,5 +210,5 @@ def test_missing_egl_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_cameras_of_different_size_are_refused() -> None:
-    with pytest.raises(ValueError, match="share one size"):
+    with pytest.raises(ValueError, match="the same image size"):
         render.Renderer([*build_cameras(SIZE)[:1], *build_cameras((640, 360))[1:]])
