@@ -150,7 +150,7 @@ def check_width(table: TextTable, index: int, separator: str = "") -> None:
     if found != wanted:
         more = separator == "," and found > wanted
         raise FormatError(
-            f"{table.places[index]} has {found} values, the header has {wanted} columns.",
+            f"{table.places[index]} has {found} values, but the header has {wanted} columns.",
             path=table.path,
             hint="Commas separate the columns here: write decimals with points." if more else "Correct that line.",
         )

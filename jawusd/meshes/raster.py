@@ -25,7 +25,7 @@ from jawusd.base.arrays import Mask
 _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _ONE = np.uint64(1)
 _LOW6 = 63
-_MIN_DEPTH = np.float32(1e-3)  # [mm] triangles with a corner closer than this, or behind the camera, are not drawn
+_MIN_DEPTH = np.float32(1e-3)  # minimum depth [mm]: triangles with a corner closer, or behind the camera, are not drawn
 
 
 def _array(dtype: types.Type, mutable: bool = False) -> types.Array:

@@ -172,7 +172,7 @@ def _rate(opened: Mapping[PurePath, Clip], out: CaptureStart) -> float | None:
     found = float(np.median(list(rates.values())))
     for path, rate in rates.items():
         if abs(rate / found - 1) > 5e-3:
-            out.notes.append(f"{path} has {rate:.5g} fps, the others {found:.5g}")
+            out.notes.append(f"{path} has {rate:.5g} fps, but the others have {found:.5g}")
     usual = min(_USUAL_RATES, key=lambda rate: abs(float(rate) / found - 1))
     return round(float(usual) if abs(float(usual) / found - 1) < _RATE_TOLERANCE else found, 5)
 
@@ -190,7 +190,7 @@ def _named_as_calibrated(
     if len(fits) == len(names):
         return fits
     out.missing.append(
-        f"the camera names: the calibration has {', '.join(calibrated)}, the clips are {_listed(list(names))}; "
+        f"the camera names: the calibration has {', '.join(calibrated)}, but the clips are {_listed(list(names))}; "
         "give each [[camera]] its name in the calibration"
     )
     return names

@@ -77,7 +77,7 @@ def _poses(motion: Array) -> str:
 def _packed(part: ReplayPart) -> dict[str, object]:
     mesh = part.mesh
     if len(mesh.vertices) > np.iinfo(np.uint16).max:
-        raise ValueError(f"a mesh of the replay has {len(mesh.vertices)} vertices, the limit is 65535")
+        raise ValueError(f"a mesh of the replay has {len(mesh.vertices)} vertices; the limit is 65535")
     low = mesh.vertices.min(0)
     step = float(np.ptp(mesh.vertices, axis=0).max()) / np.iinfo(np.uint16).max or 1.0
     vertices = np.round((mesh.vertices - low) / step).astype("<u2")

@@ -112,7 +112,7 @@ class KeyMasks:
             if gray.shape[::-1] != tuple(self._sizes_px[camera]):
                 size = self._sizes_px[camera]
                 raise CaptureError(
-                    f"the strokes are {gray.shape[1]} x {gray.shape[0]} px, the images are {size[0]} x {size[1]} px.",
+                    f"the strokes are {gray.shape[1]} x {gray.shape[0]} px; the images are {size[0]} x {size[1]} px.",
                     path=path,
                     hint="Draw them over a frame of the video at its original size.",
                 )

@@ -55,6 +55,6 @@ def check_precision(name: str, found: torch.dtype, own: torch.dtype | None = Non
         raise TypeError(f"{name} is {found}; it must be float32 or float64. Convert it: {name}.float().")
     if own is not None and found != own:
         raise TypeError(
-            f"{name} is {found}, the layer computes in {own}. "
+            f"{name} is {found}; the layer computes in {own}. "
             f"Convert one of them: layer.to({found}) or {name}.to({own})."
         )

@@ -192,7 +192,7 @@ def test_realityscan_csv(tmp_path):
         load_cameras_file(path, 1000.0, sizes)
     short = ",".join(lines[2].split(",")[:7])
     path.write_text(f"{'note,' * 8}{lines[1].lstrip('#')}\n{'1,' * 8}{short}\n")
-    with pytest.raises(FormatError, match="line 2 has 15 values, the header has 24 columns"):
+    with pytest.raises(FormatError, match="line 2 has 15 values, but the header has 24 columns"):
         load_cameras_file(path, 1000.0, sizes)
 
 

@@ -30,7 +30,7 @@ IN_THE_FILE = [
     ("masks that are one word", "video = ", "mask = ", '("left")', '"mask"', "video, masks", 'mean "masks"'),
     ("no rate", "fps = 24.0\n", "", "fps", "is missing", "", "fps = 23.976"),
     ("a rate with its unit", "fps = 24.0", 'fps = "24 fps"', "fps", '"24 fps"', "a number", "fps = 23.976"),
-    ("a rate below 0", "fps = 24.0", "fps = -24.0", "fps", "-24.0", "more than 0 (frames per second)", "fps = 23.976"),
+    ("a rate < 0", "fps = 24.0", "fps = -24.0", "fps", "-24.0", "greater than 0 (frames per second)", "fps = 23.976"),
     ("frames that end first", "name", "frames = [9, 3]\nname", "frames", "[9, 3]", "must be larger", "[30, 270]"),
     ("one frame", "name", "frames = [9]\nname", "frames", "too few", "", "frames = [30, 270]"),
     ("frames in words", "name", 'frames = "all"\nname', "frames", '"all"', "a list in brackets", "[30, 270]"),

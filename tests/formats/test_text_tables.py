@@ -146,7 +146,7 @@ def test_numbers_that_may_be_two_are_refused(tmp_path, text, words):
         ("frame;d1;d2;d3\n1;0,123;1,234;2,345\n", [0.123, 1.234, 2.345]),  # no thousands begin with 0
         ("frame;d1;d2;d3\n1;1,5;-1,234;+2,345\n", [1.5, -1.234, 2.345]),  # the first tells
         ("frame;d1;d2;d3\n1;1,5e1;,25;3,\n", [15, 0.25, 3]),
-        ("frame;d1;d2;d3\n1;1.234;2;3\n", [1.234, 2, 3]),  # a point alone is the decimal sign
+        ("frame;d1;d2;d3\n1;1.234;2;3\n", [1.234, 2, 3]),  # a point alone is the decimal separator
         ('frame,d1,d2,d3,note\n1,1.5,2,3,"1,234; or so"\n', [1.5, 2, 3]),  # other columns do not count
         ("frame,note;more,d1,d2,d3\n1,x,1,2,3\n", [1, 2, 3]),
         ("# from a; spreadsheet\nframe,d1,d2,d3\n1,1,2,3\n", [1, 2, 3]),

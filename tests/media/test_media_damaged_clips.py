@@ -68,7 +68,7 @@ def test_damaged_tables_are_found(codec, table, tmp_path):
 
 @pytest.mark.parametrize("number", [0, 5, 35])
 def test_one_bit_of_ffv1_is_found_by_its_checksum(number, tmp_path):
-    """FFmpeg shows the slice of the picture before, and says nothing."""
+    """FFmpeg shows the slice of the previous image without a message."""
     path = write_clip(tmp_path, "ffv1")
     data, (at, size) = bytearray(path.read_bytes()), packets(path)[number]
     data[at + size // 2] ^= 4

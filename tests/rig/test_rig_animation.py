@@ -78,8 +78,8 @@ def test_animation_in_another_folder_finds_its_actor(folder, tmp_path):
         ([1, np.nan], np.zeros((2, 3)), 24, "must increase"),
         ([1, 2], np.full((2, 3), np.nan), 24, "nothing to animate"),
         ([], np.zeros((0, 3)), 24, "nothing to animate"),
-        ([1, 2], np.zeros((2, 3)), 0, "more than 0"),
-        ([1, 2], np.zeros((2, 3)), np.nan, "more than 0"),
+        ([1, 2], np.zeros((2, 3)), 0, "greater than 0"),
+        ([1, 2], np.zeros((2, 3)), np.nan, "greater than 0"),
     ],
 )
 def test_motions_that_make_no_animation(anchored_folder, frames, d, fps, message):

@@ -286,7 +286,7 @@ def test_meshes_that_make_no_rig_are_refused(tmp_path, change, message):
 
 
 def test_frame_rate_and_motion_are_checked_before_anything_is_written(tmp_path):
-    with pytest.raises(RigError, match="more than 0"):
+    with pytest.raises(RigError, match="greater than 0"):
         bake_rig(tmp_path, example_rig(), example_meshes(), name="x", fps=0.0)
     with pytest.raises(ValueError, match="both or neither"):
         bake_rig(tmp_path, example_rig(), example_meshes(), name="x", fps=FPS, frames=[1, 2])

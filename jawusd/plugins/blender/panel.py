@@ -37,7 +37,7 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
             box.prop(actor, f'["{jaw.KEEP}"]', text="Keep valid")
             captured, shown = actor.get(jaw.FPS), context.scene.render.fps / context.scene.render.fps_base
             if captured and abs(captured - shown) > 0.01:
-                box.label(text=f"captured at {captured:g} fps, the scene has {shown:g}", icon="TIME")
+                box.label(text=f"captured at {captured:g} fps; the scene has {shown:g}", icon="TIME")
             box.operator(operators.JAWUSD_OT_key.bl_idname).actor = actor.name
             row = box.row()
             for place in ("INCISOR", "CHIN"):
