@@ -55,7 +55,7 @@ def test_an_exact_mapping_is_found_again(take):
         (lambda face, times, d: (face, times, d * [1, 1, 0.1]), "range of movement forward"),
         (lambda face, times, d: (face, times, np.minimum(d, [99, 0.5, 99])), "range of movement to the left"),
         (lambda face, times, d: (face, times, np.maximum(d, [-99, -0.5, -99])), "range of movement to the right"),
-        (lambda face, times, d: (face, times, d[np.random.default_rng(0).permutation(len(d))]), "does not follow"),
+        (lambda face, times, d: (face, times, d[np.random.default_rng(0).permutation(len(d))]), "does not correlate"),
         (lambda face, times, d: (still(face, 3), times, d), "movement forward never changes"),
         (lambda face, times, d: (face, times, np.full_like(d, np.nan)), "at least 10 s"),
     ],
