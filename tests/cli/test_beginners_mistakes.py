@@ -63,7 +63,7 @@ MISTAKES = [
     ("a folder for init that is none", ["init", "nowhere"], ["there is no such folder"]),
     ("a video for init", ["init", "left.mp4"], ["is a file", "Name the folder"]),
     ("a second init", ["init", "."], ["exists already", "--force"]),
-    ("two people in one folder", ["init", "two"], ["anna_upper.stl, bob_upper.stl", "a folder is for one person"]),
+    ("two people in one folder", ["init", "two"], ["anna_upper.stl, bob_upper.stl", "a folder is for one subject"]),
     ("one clip to align", ["sync", "left.mp4"], ["left.mp4"]),
     ("clips without a flash", ["sync", "left.mp4", "right.mp4"], ["shows no light flash"]),
     ("a clip twice", ["sync", "left.mp4", "left.mp4"], ["given twice"]),

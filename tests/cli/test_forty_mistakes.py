@@ -95,7 +95,7 @@ TYPED = [
     ("an output out of reach", ["build", ".", "-o", "/dev/null/out"], "out", "cannot write here", "", "Choose a"),
     ("a rig for a capture", ["check", "rig"], "rig", "no such file", "", "That folder contains a rig; name"),
     ("a capture for a rig", ["info", "."], ".", "without actor.usda", "", "jawusd build"),
-    ("two people in one folder", ["init", "two"], "", "anna_upper.stl, bob_upper.stl", "one person", "name one"),
+    ("two people in one folder", ["init", "two"], "", "anna_upper.stl, bob_upper.stl", "one subject", "name one"),
     ("a lens alone", ["cameras", "lens.nk", "-o", "a.toml"], "lens.nk", "no Camera node", "", "Export Project"),
     ("a project of a tracker", ["cameras", "shot.3de", "-o", "a.toml"], "shot.3de", "project", "not supported", "Nuke"),
     ("cameras to what is not written", ["cameras", "cal.toml", "-o", "a.fbx"], "a.fbx", '".fbx"', "", "Name a .toml"),

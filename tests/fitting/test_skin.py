@@ -83,7 +83,7 @@ def test_plain_columns_are_learned_without_a_chin(take):
 def test_one_column_and_those_of_a_mesh_are_learned(take):
     """One column of noise is refused; a mesh of 2,000 vertices is stored by 120 components."""
     person, X, d, seen = take
-    with pytest.raises(FittingError, match="at most 65%"):
+    with pytest.raises(FittingError, match="At most 65%"):
         jawusd.fit_skin(person.rig, np.random.default_rng(0).normal(size=(len(d), 1)), d, seen)
     mesh = np.tile(X, (1, 50, 1))
     found = jawusd.fit_skin(person.rig, mesh.reshape(len(X), -1), d, seen)
@@ -97,7 +97,7 @@ def test_one_column_and_those_of_a_mesh_are_learned(take):
         (lambda X, d, seen: (np.where(np.arange(40)[:, None] == 7, np.nan, X), d, seen), "0 frames show the teeth"),
         (lambda X, d, seen: (X, d * [1, 0.01, 1], seen), "the laterotrusion varies by"),
         (lambda X, d, seen: (0 * X + 3, d, seen), "no column of the face changes"),
-        (lambda X, d, seen: (np.roll(X, 480, axis=0).reshape(len(X), -1), d, seen), "at most 65%"),
+        (lambda X, d, seen: (np.roll(X, 480, axis=0).reshape(len(X), -1), d, seen), "At most 65%"),
     ],
 )
 def test_takes_that_cannot_tell_are_refused(take, change, said):

@@ -56,7 +56,7 @@ def test_another_version_of_the_scan_is_refused(tmp_path: Path) -> None:
         ({"source": "guessed"}, "source is", FormatError),
         ({"weak_share": 2}, "weak_share is", FormatError),
         ({"weak_share": "x"}, "weak_share is", FormatError),
-        ({"format": "jawusd-scan-labels/2"}, "reads up to", VersionError),
+        ({"format": "jawusd-scan-labels/2"}, "reads formats up to", VersionError),
         ({"format": "jawusd-tracks/1"}, "format is", FormatError),
         ({"scan_sha256": None}, "another version", FormatError),
     ],
