@@ -120,7 +120,7 @@ def test_ik_reaches_a_reachable_target(actor):
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (("pose", "{actor}", "--d", "1", "2"), 2, "requires 3 arguments"),
+        (("pose", "{actor}", "--d", "1", "2"), 2, "needs three numbers"),
         (("pose", "{actor}", "--d", "1", "2", "nan"), 2, "finite"),
         (("pose", "{tmp}/none.usda", "--d", "1", "2", "3"), 8, "none.usda"),
         (("encode", "{actor}", "{tmp}/nan.csv"), 3, 'column "tx" is nan'),

@@ -36,9 +36,15 @@ def test_newer_versions_are_refused_with_advice(tmp_path):
         evaluator.load(write(tmp_path / "m.npz", format="jawusd-model/3"))
 
 
-@pytest.mark.parametrize("found", ["jawusd-tracks/1", "jawusd-model", "jawusd-model/x", None])
-def test_other_formats_are_refused(tmp_path, found):
-    with pytest.raises(FormatError, match="format is"):
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        *((name, "format is") for name in ("jawusd-tracks/1", "jawusd-model", "jawusd-model/x")),
+        (None, 'states no format; its format must be "jawusd-model/2"'),
+    ],
+)
+def test_other_formats_are_refused(tmp_path, found, said):
+    with pytest.raises(FormatError, match=said):
         evaluator.load(write(tmp_path / "m.npz", format=found))
 
 
