@@ -66,7 +66,7 @@ def test_poses_jacobians_and_parameters_agree():
 def test_a_surface_that_moves_the_closed_bite_is_refused():
     arrays = touching_arrays()
     arrays["glide_d3_factors"] = arrays["glide_d3_factors"] * [1.0, 1.0, 0.5]
-    with pytest.raises(EvaluatorError, match="closed bite"):
+    with pytest.raises(EvaluatorError, match="in occlusion; it must be 0"):
         JawRig({**example_arrays(), **arrays}, example_meta())
 
 
