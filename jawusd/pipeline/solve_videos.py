@@ -114,7 +114,6 @@ class VideoShot:
         """
         if self._capture.bootstrap is not None and len(self.cameras) > 1:
             return self._picked(self._capture.bootstrap)
-
         return self._searched(self._frames, progress)
 
     def _again(self, frames: range, up_world: Array) -> tuple[int, Pose]:

@@ -49,7 +49,7 @@ def test_an_expression_that_was_not_trained_is_flagged(take, skin):
 
 
 def test_an_error_of_the_head_keeps_sigmas_honest(take):
-    """Takes to come are stabilised worse than the calibration, and the map was told so."""
+    """Later takes are stabilised worse than the calibration, and the fit was given their stabilisation error."""
     person, X, d, seen = take
     Z, T = person.closed_speech(frames=480, away=(UNTRAINED,), head=(1.0, 0.5))
     true, z2 = person.rig.encode(T).d, []

@@ -58,6 +58,12 @@ def test_every_stretch_is_searched_once_and_what_is_left_of_it_again():
     assert lost_stretches(known, FRAMES) == [range(14, 20)]
 
 
+def test_a_take_without_any_teeth_is_left_alone():
+    known = take(FRAMES)
+    recover(known, FRAMES, lambda lost: nearest_found(known, lost))
+    assert lost_stretches(known, FRAMES) == [FRAMES]
+
+
 def test_equal_poses_end_a_replacement():
     known = take([20, 21, 22])
     assert replaced(known, {frame: Pose(float(frame)) for frame in range(20, 28)}) is True

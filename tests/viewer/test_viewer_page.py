@@ -222,7 +222,7 @@ def test_the_captured_take_plays_as_the_page_opens_until_it_is_paused(quiet):
     np.testing.assert_allclose(session.d, clip.at(paused), atol=1e-9)
     time.sleep(0.2)
     assert motion.frame == paused and motion.play.label == "play"
-    quiet.enter(motion.play, True)  # goes on from there
+    quiet.enter(motion.play, True)  # continues from there
     assert motion.player.playing and motion.frame >= paused
     quiet.enter(quiet.page.pose.sliders[0], 11.0)  # posing pauses
     assert not motion.player.playing and session.d[0] == 11.0 and quiet.notices == []

@@ -24,13 +24,15 @@ P = TypeVar("P", bound=Located)
 
 
 def recover(known: dict[int, P], frames: range, again: Callable[[range], Mapping[int, P] | None]) -> None:
-    """Update poses where the teeth were lost for several frames.
+    """Update poses where the teeth were lost for several frames; without any found poses, nothing is done.
 
     Args:
         known: poses by frame, updated in place.
         frames: all frames.
         again: searches in lost frames; returns the poses of all frames, or None if it found nothing.
     """
+    if not any(pose.found.all() for pose in known.values()):
+        return
     vain: set[int] = set()
     while lost := next((s for s in lost_stretches(known, frames) if s.start not in vain), None):
         found = again(lost)
