@@ -74,7 +74,7 @@ class CapturePage:
         self.turn()
 
     def refresh(self) -> None:
-        """Draw the current state; requests that arrive while drawing are merged into one."""
+        """Draw the current state; merge the requests that arrive while drawing into one."""
         self._wanted += 1
         if self._drawing is None or self._drawing.done():
             self._drawing = asyncio.get_running_loop().create_task(self._draw())

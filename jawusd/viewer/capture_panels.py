@@ -19,10 +19,10 @@ SPACE, ALL = "3-D", "all cameras"
 _LOOKS: dict[str, Look] = {"outlines of the teeth": "outlines", "tinted teeth": "tinted", "footage alone": "footage"}
 _STEPS = {"-10": -10, "-1": -1, "+1": 1, "+10": 10}
 _NONE = "none"
-_PICKING_HINT = "Works in the picture of a single camera and on the scans in 3-D, not with all cameras side by side."
+_PICKING_HINT = "Works in the image of a single camera and on the scans in 3-D, not with all cameras side by side."
 _HELP = (
-    "Click a vertex on a scan, then the same point in the pictures of at least two cameras at the same frame. Set at "
-    "least three picks per arch, spread over front teeth and both sides. Wheel: zoom; right button: pan."
+    "Click a vertex on a scan, then the same point in the images of at least two cameras at the same frame. Set at "
+    "least three picks per arch, spread over the front teeth and both sides. Wheel: zoom; right button: pan."
 )
 
 
@@ -43,7 +43,7 @@ class FootagePanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Add the widgets to the current container; call `turned` after a change of view, `changed` after others."""
+        """Add the widgets to the current container; call `turned` if the view changes, `changed` on other changes."""
         self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
         self._loading = False
         self.view = next(iter(capture.sizes_px))
@@ -87,7 +87,7 @@ class FootagePanel:
 
     @property
     def on_wall(self) -> bool:
-        """Return whether the view is that of all cameras side by side."""
+        """Return whether the view shows all cameras side by side."""
         return self.view == ALL
 
     @property
@@ -109,7 +109,7 @@ class FootagePanel:
         self._changed()
 
     def refresh(self) -> None:
-        """Update the widgets from view and frame."""
+        """Update the widgets from the current view and frame."""
         self._show(self.frame)
 
     def show_loading(self, loading: bool) -> None:
@@ -134,7 +134,7 @@ class FootagePanel:
             self._playhead.content = plot_seek(drawn, capture.frames, self._plot.across, self.slider._impl.uuid)
             lines.append(frame_html(capture.tracks, frame))
         else:
-            lines.append("no poses: pass the folder of a build, or the file of a solve, with --tracks")
+            lines.append("no poses; pass the folder of a build or the file of a solve with --tracks")
         if self._loading:
             lines.append("<b>loading this frame</b>")
         if frame in self.worst:
@@ -159,7 +159,7 @@ class FootagePanel:
         self.player.start(float(self.frame), self._capture.fps, span, lambda: bool(self.loop.value))
 
     def _play_to(self, frame: float) -> None:
-        """Show the frame of a playback time; frames are skipped if the page cannot draw all."""
+        """Show the frame at a playback time; if the page cannot draw every frame, some are skipped."""
         shown = min(int(frame), self._capture.frames[1])
         if shown != self.frame:
             self.frame = shown
@@ -186,11 +186,11 @@ class FootagePanel:
 
 
 class PicksPanel:
-    """Widgets of the picks.
+    """Widgets for setting the picks.
 
     Attributes:
         book: the picks.
-        side: side of the scans facing the viewer, one of `picking.SIDES`.
+        side: side of the scans that faces the viewer, one of `picking.SIDES`.
         scans_shown: whether scans are drawn in front of the image.
     """
 
@@ -202,7 +202,7 @@ class PicksPanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Add the widgets to the current container; call `turned` after a change of side, `changed` after others."""
+        """Add the widgets to the current container; call `turned` if the side changes, `changed` on other changes."""
         self._client, self._capture, self._footage = client, capture, footage
         self._turned, self._changed = turned, changed
         self.book, self.side = PickBook(capture.picks), "front"
@@ -226,7 +226,7 @@ class PicksPanel:
         self.refresh()
 
     def show_fit(self, words: str) -> None:
-        """Show a sentence about the consistency of the picks."""
+        """Show a sentence that says whether the picks are consistent."""
         self._fit = words
         self.refresh()
 

@@ -36,8 +36,8 @@ class CaptureScene:
     """3-D scene of a capture in one page.
 
     Attributes:
-        T_page_world: world to page frame, which has the axes of the first camera, so that images are upright, shape (4,
-            4).
+        T_page_world: world to page frame, shape (4, 4); the page frame has the axes of the first camera, so that images
+            are upright.
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
@@ -123,7 +123,7 @@ class CaptureScene:
         self._frustums[name].image = np.ascontiguousarray(image[::step, ::step])
 
     def place(self, in_space: bool, poses: Mapping[str, Array]) -> None:
-        """Show the image or the cameras in 3-D, and the scans whose poses (4, 4) are given and finite."""
+        """Show either the image or the cameras in 3-D, and the scans whose poses (4, 4) are given and finite."""
         with self._client.atomic():
             self._layout.visible, self._space.visible = not in_space, in_space
             for arch, frame in self._arches.items():
@@ -134,7 +134,7 @@ class CaptureScene:
                 frame.visible = shown
 
     def show_marks(self, book: PickBook, camera: str | None, frame: int, layout: PickingLayout | None) -> None:
-        """Mark the picks on the scans, and those of this frame in the image of a camera."""
+        """Mark the picks on the scans and, in the image of a camera, the picks of this frame."""
         with self._client.atomic():
             for mark in self._marks:
                 mark.remove()
@@ -183,7 +183,7 @@ class CaptureScene:
 
 
 def set_first_view(server: viser.ViserServer) -> None:
-    """Start every page in front of the image, upright."""
+    """Start every page with an upright virtual camera in front of the image."""
     server.scene.set_up_direction("-y")
     first = server.initial_camera
     first.position, first.look_at, first.up = (0.0, 0.0, -_FIRST_EYE_MM), (0.0, 0.0, 0.0), UP

@@ -1,4 +1,4 @@
-"""Motion on a timeline: clips of parameters over frames, the keys of clips, and playback."""
+"""Motion on a timeline: jaw parameters over frames, key frames, and playback."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MOST_PER_S = 30.0  # maximum updates per second, to limit network load
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Parameters at increasing frames, linearly interpolated."""
+    """Jaw parameters at increasing frame numbers, linearly interpolated."""
 
     name: str
     frames: Array  # frame numbers, shape (F,)
@@ -31,7 +31,7 @@ class Clip:
 
     @classmethod
     def of(cls, name: str, frames: ArrayLike, d: ArrayLike, fps: float) -> Clip:
-        """Return a clip of frame numbers (F,) and parameters (F, 3) [mm]; lost frames (NaN) are interpolated.
+        """Build a clip from frame numbers (F,) and parameters (F, 3) [mm]; interpolate lost frames (NaN).
 
         Raises:
             FormatError: no frame has parameters, or the frames do not increase.
@@ -50,19 +50,19 @@ class Clip:
         return float(self.frames[0]), float(self.frames[-1])
 
     def at(self, frames: ArrayLike) -> Array:
-        """Return parameters [mm] (..., 3) at frames (...); constant before the first and after the last frame."""
+        """Return the parameters [mm] (..., 3) at frames (...), constant before the first and after the last frame."""
         at = np.asarray(frames, dtype=np.float64)
         return np.stack([np.interp(at, self.frames, column) for column in self.d.T], axis=-1)
 
 
 def with_key(keys: KeyTrack, frame: float, d: tuple[float, float, float]) -> KeyTrack:
-    """Return the keys with one added or replaced at a frame."""
+    """Return the keys with the key at a frame added or replaced."""
     added = Key(frame=float(frame), d=d)
     return tuple(sorted([*(key for key in keys if key.frame != frame), added], key=lambda key: key.frame))
 
 
 def without_key(keys: KeyTrack, frame: float) -> KeyTrack:
-    """Return the keys without the one at a frame.
+    """Return the keys without the key at a frame.
 
     Raises:
         FormatError: there is no key at that frame.
@@ -81,12 +81,12 @@ def at_frames(keys: KeyTrack, frames: Sequence[float]) -> KeyTrack:
         FormatError: the numbers of frames and keys differ, or two keys would have the same frame.
     """
     if len(frames) != len(keys) or len(set(frames)) != len(keys):
-        raise FormatError(f"{len(set(frames))} frames for {len(keys)} keys: every key needs its own frame.")
+        raise FormatError(f"{len(keys)} keys at {len(set(frames))} different frames; every key needs its own frame.")
     return tuple(Key(frame=float(frame), d=key.d) for key, frame in zip(keys, sorted(frames), strict=True))
 
 
 def frame_after(frame: float, elapsed_s: float, fps: float, span: tuple[float, float], loop: bool) -> float | None:
-    """Return the frame to show `elapsed_s` seconds after `frame`; None past the end without a loop.
+    """Return the frame to show `elapsed_s` seconds after `frame`; None past the end if playback does not loop.
 
     Playback starts at the beginning of the span if `frame` lies outside it.
     """
@@ -101,10 +101,10 @@ def frame_after(frame: float, elapsed_s: float, fps: float, span: tuple[float, f
 
 
 class Player:
-    """Playback of a motion in the event loop."""
+    """Playback of a motion in the asyncio event loop."""
 
     def __init__(self, show: Callable[[float], None], ended: Callable[[], None]) -> None:
-        """Call `show` with every frame number during playback, and `ended` whenever it stops, except by `close`."""
+        """Call `show` with every frame number during playback, and `ended` when it stops, except through `close`."""
         self._show, self._ended = show, ended
         self._task: asyncio.Task[None] | None = None
 
@@ -119,7 +119,7 @@ class Player:
         self._task = asyncio.get_running_loop().create_task(self._run(frame, fps, span, loop))
 
     def stop(self) -> None:
-        """Stop playback; no effect when stopped."""
+        """Stop playback, if it is running."""
         if self.playing:
             self.close()
             self._ended()

@@ -23,30 +23,30 @@ from jawusd.viewer.widgets import Choice, assign, errors_shown, guarded, limit_u
 
 KEYS = "keys"
 _LENGTH = 100
-_MOST_THUMBS = 40  # maximum number of keys for which there is a multi-slider
+_MOST_THUMBS = 40  # maximum number of keys that are shown in a multi-slider
 
 
 class Playback:
-    """The line that names the motion and its frame, and the button that plays and pauses it."""
+    """Line of text that names the motion and its current frame, and button that plays and pauses it."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
-        """Add both to the current container."""
+        """Add the line and the button to the current container."""
         self._line = client.gui.add_html("")
         self.button = client.gui.add_button("play", icon=viser.Icon.PLAYER_PLAY)
 
     def show(self, motion: str, frame: float, span: tuple[float, float] | None) -> None:
-        """Name the motion, its frame, and its first and last frame; without a span, the motion has no frames."""
+        """Show the motion's name, its current frame, and its first and last frame (None if it has no frames)."""
         where = "nothing to play" if span is None else f"frame {frame:.0f} of {span[0]:.0f} to {span[1]:.0f}"
         self._line.content = small_text(f"{html.escape(motion)}, {where}", "padding-top:6px")
 
     def show_playing(self, playing: bool) -> None:
-        """Label the button by what it does."""
+        """Label the button with its effect: play or pause."""
         self.button.label = "pause" if playing else "play"
         self.button.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
 
 
 class MotionPanel:
-    """Timeline of one page and its current frame."""
+    """Timeline of one page, with the current frame."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class MotionPanel:
         self.frame = 0.0
 
     def clip(self) -> Clip | None:
-        """Return the selected motion; None without keys or while its file is being read."""
+        """Return the selected motion; None if it has no keys, or while its file is being read."""
         return self._session.key_clip() if self.source.value == KEYS else self._loaded.get(self.source.value)
 
     def add_clip(self, clip: Clip) -> None:
@@ -107,7 +107,7 @@ class MotionPanel:
         self._changed()
 
     def refresh(self) -> None:
-        """Update the widgets from session and frame."""
+        """Update the widgets from the session and the current frame."""
         work = self._session.work
         chosen = self.source.value
         drawn = (chosen, self._loaded.get(chosen), work.keys, work.interpolation, work.fps)
@@ -146,7 +146,7 @@ class MotionPanel:
         self.thumbs.visible = visible
 
     async def play_take(self) -> None:
-        """Play the captured take, if there is one, unless the visitor has done something while it was read."""
+        """Play the captured take, if there is one, unless the visitor did something while it was being read."""
         take, source, work = self._actor.take, self.source.value, self._session.work
         if take is None:
             return
@@ -236,7 +236,7 @@ class MotionPanel:
 
 
 class FilePanel:
-    """Widgets that read and write files."""
+    """Widgets that load and save files."""
 
     def __init__(
         self,
@@ -246,7 +246,7 @@ class FilePanel:
         motion: MotionPanel,
         changed: Callable[[], None],
     ) -> None:
-        """Add the widgets to the current container; call `changed` after keys were loaded."""
+        """Add the widgets to the current container; call `changed` after keys have been loaded."""
         self._client, self._session, self._actor = client, session, actor
         self._motion, self._changed = motion, changed
         gui = client.gui

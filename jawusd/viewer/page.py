@@ -20,7 +20,7 @@ from jawusd.viewer.session import Session
 from jawusd.viewer.viewed import ViewedActor
 from jawusd.viewer.widgets import begin_panel, guarded, small_text
 
-#: Key that keeps the depth of a dragged point instead of the habitual path.
+#: Keyboard key with which a dragged point keeps its depth instead of following the habitual path.
 FREE_DEPTH: Literal["shift"] = "shift"
 _PANEL_PX, _PLOTS_PX = 350, 310
 _PLACEHOLDER = small_text(
@@ -28,7 +28,7 @@ _PLACEHOLDER = small_text(
     "condyles, not the shape of the bone.",
     f"color:{VERMILION}",
 )
-_NO_CONTACTS = small_text("The scans do not define the occlusion: tooth collisions are not prevented.", "opacity:.7")
+_NO_CONTACTS = small_text("The scans do not define the occlusion, so tooth collisions are not prevented.", "opacity:.7")
 _PLOT_HELP = (
     '<div style="font-size:11px;opacity:.7;padding:0 12px">blue: bound of this subject; dashed: outline of the '
     "captured poses; grey: captured poses</div>"
@@ -36,7 +36,7 @@ _PLOT_HELP = (
 
 
 class StaticPlots:
-    """The static parts of a rig's plots, drawn once for all pages."""
+    """Static parts of a rig's plots, drawn once for all pages."""
 
     def __init__(self, rig: JawRig) -> None:
         """Draw the four plots of a rig."""
@@ -71,7 +71,7 @@ class PlotPanel:
 
 
 def begin_page(client: viser.ClientHandle, actor: ViewedActor) -> JawScene:
-    """Draw the jaw without panels."""
+    """Draw the jaw; the panels are added later."""
     begin_panel(client, actor.name)
     scene = JawScene(client, actor)
     scene.look(FIRST_VIEW)
@@ -109,7 +109,7 @@ class Page:
         self.refresh()
 
     def play_take(self) -> None:
-        """Start to read the captured take, if there is one, and then to play it."""
+        """Start to read the captured take, if there is one, and play it afterwards."""
         self._opening = asyncio.get_running_loop().create_task(self.motion.play_take())
 
     def _add_contacts(self, actor: ViewedActor) -> ContactPanel | None:
@@ -120,7 +120,7 @@ class Page:
             return ContactPanel(self.client, actor.rig, actor.contacts, self.refresh)
 
     def _posed(self) -> None:
-        """Pause the motion, which would move the jaw on, and update everything."""
+        """Pause playback, which would overwrite the pose, and update everything."""
         self.motion.player.stop()
         self.refresh()
 

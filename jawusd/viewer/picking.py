@@ -1,4 +1,4 @@
-"""Picks of one visitor, and the layout of image and scans in which they are made.
+"""The picks of one visitor, and the layout of the image and scans in which they are set.
 
 The layout frame has x to the right, y down and z away from the camera, in mm. The image lies in z = 0, centred on the
 origin, and is scaled so that its teeth are about as large as the scans.
@@ -25,15 +25,15 @@ _FEWEST, _FEWEST_VIEWS = 3, 2  # minimum number of picks per arch, and of views 
 FOV_RAD = 0.35
 #: Rotation of the scans about the subject's vertical and transverse axis [deg], by the side that faces the viewer.
 SIDES = {"front": (0.0, 0.0), "left": (-60.0, 0.0), "right": (60.0, 0.0), "biting side": (0.0, 65.0)}
-_TEETH_MM = 60.0  # width in the layout to which the region around the teeth is scaled
+_TEETH_MM = 60.0  # width of the region around the teeth in the layout
 _GAP_MM = 5.0
-_EDGE = 1e-9  # barycentric tolerance, so that rays cannot pass between adjacent faces
+_EDGE = 1e-9  # tolerance of barycentric coordinates, so that rays cannot pass between adjacent faces
 _MARGIN = 1.05
 
 
 @dataclass
 class PickDraft:
-    """A possibly incomplete pick: a vertex of an arch's scan and its pixel (x, y) by camera."""
+    """A possibly incomplete pick: a vertex of an arch's scan, and its pixel (x, y) in each camera."""
 
     arch: str
     vertex: int
@@ -46,7 +46,7 @@ class PickBook:
     Attributes:
         picks: the picks in the order they were made.
         frame: frame of the reference camera to which all pixels belong; None before the first pixel.
-        selected: index of the pick whose pixel the next click sets; None without picks.
+        selected: index of the pick whose pixel is set by the next click; None without picks.
     """
 
     def __init__(self, given: Bootstrap | None = None) -> None:
@@ -61,7 +61,7 @@ class PickBook:
                     self.picks.append(PickDraft(arch, pick.vertex, {v.camera: (v.x, v.y) for v in pick.views}))
 
     def name(self, number: int) -> str:
-        """Return the name of a pick: U1, U2 .. on the upper arch, L1 .. on the lower, numbered as in tracking."""
+        """Return the name of a pick: U1, U2, ... (upper arch) or L1, L2, ... (lower arch), numbered as in tracking."""
         arch = self.picks[number].arch
         return f"{arch[0].upper()}{sum(pick.arch == arch for pick in self.picks[: number + 1])}"
 
@@ -83,7 +83,7 @@ class PickBook:
         others = any(pick.views for k, pick in enumerate(self.picks) if k != self.selected)
         if self.frame is not None and frame != self.frame and others:
             raise ValueError(
-                f'the picks belong to frame {self.frame}, not {frame}: press "show their frame", or remove "all"'
+                f'the picks belong to frame {self.frame}, not {frame}: press "show their frame", or remove all'
             )
         pick = self.picks[self.selected]
         if frame != self.frame:
@@ -120,10 +120,10 @@ class PickBook:
         for arch in ARCHES:
             whole = sum(len(pick.views) >= _FEWEST_VIEWS for pick in self.picks if pick.arch == arch)
             if whole < _FEWEST:
-                return f"{arch} teeth: {whole} picks with {_FEWEST_VIEWS} views; at least {_FEWEST} are needed"
+                return f"{arch} teeth: {whole} picks are set in {_FEWEST_VIEWS} cameras; at least {_FEWEST} are needed"
         for number, pick in enumerate(self.picks):
             if len(pick.views) < _FEWEST_VIEWS:
-                return f"{self.name(number)} has views in {len(pick.views)} of the {_FEWEST_VIEWS} required cameras"
+                return f"{self.name(number)} has pixels in {len(pick.views)} cameras; {_FEWEST_VIEWS} are needed"
         return ""
 
     def bootstrap(self) -> Bootstrap:
@@ -146,7 +146,7 @@ def _finished(pick: PickDraft) -> Pick:
 
 @dataclass(frozen=True)
 class PickingLayout:
-    """Layout of an image of a given size [px] and the scans, with a region of the image in view."""
+    """Layout of the scans and an image of a given size [px], a region of which is in view."""
 
     size_px: tuple[int, int]
     region: Region
@@ -225,7 +225,7 @@ def region_around(points_px: ArrayLike, size_px: tuple[int, int]) -> Region:
 
 
 def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: ArrayLike) -> tuple[int, float] | None:
-    """Return the vertex nearest to where a world ray hits a posed scan, and the distance [mm]; None without a hit."""
+    """Return the vertex nearest to where a world ray hits a posed scan, and its distance [mm]; None without a hit."""
     inverse = se3_inverse(T_world_scan)
     o = transform_point(inverse, np.asarray(origin, dtype=np.float64))
     d = inverse[:3, :3] @ np.asarray(direction, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Plots as SVG text: the bounds, Posselt's figures and the curves of an animation.
+"""Plots as SVG text: bounds, Posselt's figures, and the curves of an animation.
 
 The static part of a plot is sent once under an id. Updates refer to it with `<use>` and take a few hundred bytes. Text
 inherits the page's colour, so that it is legible on light and dark pages.
@@ -45,7 +45,7 @@ class Plot:
     across: ClassVar[tuple[float, float]] = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
 
     def definition(self) -> str:
-        """Return hidden HTML that defines the static part; needed once per page."""
+        """Return hidden HTML that defines the static part; every page needs it once."""
         style = "position:absolute"
         return f'<svg width="0" height="0" style="{style}"><defs><g id="{self.name}">{self.static}</g></defs></svg>'
 
@@ -73,7 +73,7 @@ def posselt_plot(rig: JawRig, axis: int) -> Plot:
     """Plot Posselt's figure: the border movements of the lower incisal point.
 
     Args:
-        axis: 1 frontal (x is to the left, d3 = 0), 2 sagittal (x is forward, d2 = 0).
+        axis: 1 for the frontal plane (x to the left, d3 = 0), 2 for the sagittal plane (x forward, d2 = 0).
     """
     origin = rest_places(rig)[INCISOR]
     columns = [0, 1] if axis == 1 else [2, 1]
@@ -88,7 +88,7 @@ def posselt_plot(rig: JawRig, axis: int) -> Plot:
 
 
 def posselt_point(places: Array, rest: Array, axis: int) -> tuple[float, float]:
-    """Return the point of landmarks (5, 3) in Posselt's figure `axis`, given the landmarks at rest [mm]."""
+    """Return the point in Posselt's figure `axis` for landmarks (5, 3), given the landmarks at rest [mm]."""
     moved = places[INCISOR] - rest[INCISOR]
     return float(moved[0 if axis == 1 else 2]), float(moved[1])
 
@@ -131,8 +131,8 @@ def plot_seek(drawn: str, ends: tuple[float, float], across: tuple[float, float]
 
     Args:
         drawn: SVG of the plot, one element.
-        ends: first and last frame of its axis.
-        across: their positions as fractions of the plot's width.
+        ends: first and last frame of the plot's axis.
+        across: positions of the two frames as fractions of the plot's width.
         slider: id of the slider in the page.
     """
     low, high = across
@@ -158,7 +158,7 @@ def _thinned(points: Array) -> Array:
 
 
 def place(plot: Plot, points: Array) -> Array:
-    """Return pixels (n, 2) of data points (n, 2), clipped to the frame."""
+    """Return the pixels (n, 2) of data points (n, 2), clipped to the plotted area."""
     low, high = np.array(plot.low), np.array(plot.high)
     share = np.clip((points - low) / (high - low), 0.0, 1.0)
     x = _LEFT + share[:, 0] * (_WIDTH - _LEFT - _RIGHT)
@@ -175,7 +175,7 @@ def framed(
     *,
     pad: tuple[bool, bool] = (True, True),
 ) -> Plot:
-    """Return a plot with axes, ticks and labels whose range contains data (n, 2), padded along x and y if `pad`."""
+    """Return a plot with axes, ticks and labels whose range contains data (n, 2), widened along x and y if `pad`."""
     low, high = data.min(axis=0), data.max(axis=0)
     room = np.maximum(0.06 * (high - low), 0.5) * pad
     low, high = low - room, high + room

@@ -1,4 +1,4 @@
-"""Panels of the pose: sliders with pose-dependent limits, read-outs, pins, undo, views, and tooth contacts."""
+"""Panels that control the pose: sliders with pose-dependent limits, read-outs, pins, undo, views, tooth contacts."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ NAMES = ("opening", "laterotrusion", "protrusion")
 _HINTS = (
     "Opening d1 [mm] along this subject's own path.",
     "Laterotrusion d2 [mm] at the incisal point, + to the subject's left.",
-    "Protrusion d3 [mm] relative to this subject's opening path, which itself leads backwards: + in front, - behind.",
+    "Protrusion d3 [mm] relative to this subject's opening path, which leads backwards: + in front of it, - behind it.",
 )
 _DRAG_HELP = small_text(
     "You can also drag the jaw: the grabbed point follows the pointer as far as this subject can move. In depth it "
-    "follows this subject's opening path; with Shift it keeps its depth.",
+    "follows this subject's opening path; while you hold Shift, it keeps its depth.",
     "opacity:.7",
 )
 _KEYS_HELP = small_text("Undo: Ctrl+Z, redo: Ctrl+Shift+Z (Mac: Cmd)", "opacity:.7")
-_MARGIN_HELP = "Distance of the pose from this subject's bound, in d; negative outside."
+_MARGIN_HELP = "Distance in d from the pose to this subject's bound; negative outside."
 _CAPTURED_HELP = "Distance in d to the nearest captured pose: the larger it is, the more the model extrapolates."
 _VALID_HELP = "Valid range of this parameter at the current values of the others."
 _MOVED_HELP = "Displacement from the closed bite, in anatomical axes: to the subject's left, down, forward."
-# Extension of the sliders beyond the rig's ranges if poses outside are allowed, as a fraction of the range.
+# Extension of the sliders beyond the rig's ranges if poses outside the bound are allowed, as a fraction of the range.
 _BEYOND = 0.25
 _PINNABLE = tuple(name for name in LANDMARKS if not name.startswith("molar"))
 _LEGEND = "<br>".join(
@@ -49,7 +49,7 @@ _NOTHING = np.full((8, 8, 3), 255, np.uint8)
 
 
 class PosePanel:
-    """Widgets that pose the jaw; `sliders` are those of d1, d2, d3 [mm]."""
+    """Widgets that pose the jaw; `sliders` set d1, d2 and d3 [mm]."""
 
     def __init__(
         self, client: viser.ClientHandle, session: Session, scene: JawScene, changed: Callable[[], None]
@@ -137,7 +137,7 @@ class PosePanel:
 
 
 def slider_ends(limits: Array, d_range: Array, keep_valid: bool) -> list[tuple[float, float]]:
-    """Return lower and upper end of the three sliders [mm].
+    """Return the lower and the upper end of each of the three sliders [mm].
 
     Args:
         limits: valid range at the current pose, shape (3, 2) [mm].
@@ -156,7 +156,7 @@ def _outwards(value: float, sign: int) -> float:
 
 
 def verdict_html(readout: Readout) -> str:
-    """Return HTML that states in words and colour whether a pose is inside the bound."""
+    """Return HTML that shows in words and colour whether a pose is inside the bound."""
     color, verdict = (GREEN, "inside the bound") if readout.inside else (VERMILION, "OUTSIDE the bound")
     margin = f'<span title="{_MARGIN_HELP}">margin {_plain(readout.margin_mm)} mm</span>'
     return small_text(f'<b style="color:{color}">&#9679; {verdict}</b>, {margin}', "padding-top:6px")
@@ -198,7 +198,7 @@ def _moved(moved_mm: tuple[float, float, float]) -> str:
 
 
 class ContactPanel:
-    """Image of both arches with their contacts, drawn only while switched on."""
+    """Image of both arches with their contacts; it is drawn only while it is switched on."""
 
     def __init__(
         self,
@@ -221,7 +221,7 @@ class ContactPanel:
         self._changed()
 
     def refresh(self, d: tuple[float, float, float]) -> None:
-        """Show the contacts of a pose [mm] if the image is on."""
+        """Show the contacts at parameters d [mm] if the image is switched on."""
         if not self.shown.value or d == self._drawn:
             return
         try:

@@ -35,7 +35,7 @@ class Readout:
 
 
 def landmark_places(rig: JawRig, d: Array) -> Array:
-    """Return the landmarks for d (..., 3) [mm], anatomical frame [mm], shape (..., 5, 3)."""
+    """Return the landmarks at parameters d (..., 3) [mm], in the anatomical frame [mm], shape (..., 5, 3)."""
     T = rig.T_anatomical_skull @ rig.pose(d)
     return transform_points(T, rig.landmarks)
 
@@ -47,7 +47,7 @@ def rest_places(rig: JawRig) -> Array:
 
 
 def measure_pose(rig: JawRig, d: Array) -> Readout:
-    """Return the measures of the pose of parameters d (3,) [mm]."""
+    """Return the measures of the pose at parameters d (3,) [mm]."""
     moved = landmark_places(rig, d) - rest_places(rig)
     margin = float(rig.margin(d))
     incisor, left, right = (triple(moved[index]) for index in (INCISOR, *CONDYLES))
@@ -73,8 +73,8 @@ def habitual_path(rig: JawRig, samples: int = 60) -> Array:
 
 
 def border_path(rig: JawRig, axis: int, samples: int = 40) -> Array:
-    """Return a closed curve of parameters (n, 3) [mm] on the bound, over d1 and d2 (axis 1) or d1 and d3 (axis 2)."""
-    # Samples are denser at both ends, where the bound narrows.
+    """Return the outline of the bound over d1 and d2 (axis 1) or d1 and d3 (axis 2), parameters (n, 3) [mm]."""
+    # Samples are denser at both ends of the opening, where the bound narrows.
     low, high = rig.d_range[0]
     opening = low + (high - low) * 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, samples)))
     ends = rig.ranges(opening)

@@ -1,4 +1,4 @@
-"""Editing the crown, gum and base labels of the teeth scans with a brush: label state and its panel."""
+"""Edit the crown, gum and base labels of the teeth scans with a brush: state of the labels, and panel."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _RADIUS_MM = (0.3, 8.0, 0.1, 1.5)  # radius of the brush: minimum, maximum, step
 
 
 class ScanBrush:
-    """Editable labels of both scans of one page, with undo.
+    """Editable labels of both scans in one page, with undo.
 
     Attributes:
         labels: label of every vertex as in `formats.mesh`, uint8 (V,), by arch.
@@ -53,7 +53,7 @@ class ScanBrush:
         return len(self._strokes)
 
     def undo(self) -> str | None:
-        """Undo the last stroke; return its arch, None if there is none."""
+        """Undo the last stroke; return its arch, or None if there is no stroke."""
         if not self._strokes:
             return None
         arch, where, before = self._strokes.pop()
@@ -66,7 +66,7 @@ class ScanBrush:
         self.changed.discard(arch)
 
     def faces_with(self, arch: str, label: int) -> Mask:
-        """Return which faces of an arch have a label at the majority of their corners, shape (F,)."""
+        """Return a mask of an arch's faces that have a label at most of their corners, shape (F,)."""
         corner = self.labels[arch][self._scans[arch].faces]
         tooth = ((corner != GUM) & (corner != BASE)).sum(axis=1) >= 2
         base = (corner == BASE).sum(axis=1) >= 2
@@ -74,11 +74,11 @@ class ScanBrush:
 
 
 def surface_near(mesh: Mesh, vertex: int, radius_mm: float) -> Indices:
-    """Return the vertices connected to a vertex by faces within a radius of it."""
+    """Return the vertices within a radius of a vertex that are connected to it by faces within that radius."""
     inside = np.linalg.norm(mesh.vertices - mesh.vertices[vertex], axis=1) <= radius_mm
     faces = mesh.faces[inside[mesh.faces].all(axis=1)]
     members = np.flatnonzero(inside)
-    # Merge coincident vertices, since the triangles of a soup share none.
+    # Merge coincident vertices, since the faces of a triangle soup share no vertices.
     place = np.unique(mesh.vertices[members], axis=0, return_inverse=True)[1].reshape(-1)
     of_vertex = np.full(len(mesh.vertices), -1, np.int64)
     of_vertex[members] = place
@@ -94,7 +94,7 @@ def surface_near(mesh: Mesh, vertex: int, radius_mm: float) -> Indices:
 
 
 class ScanLabelsPanel:
-    """Widgets of the brush.
+    """Widgets that control the brush.
 
     Attributes:
         brush: the labels.
@@ -108,7 +108,7 @@ class ScanLabelsPanel:
         turned: Callable[[], None],
         painted: Callable[[str], None],
     ) -> None:
-        """Add the widgets to the current container; call `turned` when switched, `painted` with an arch to redraw."""
+        """Add the widgets; call `turned` when painting is switched on or off, `painted` with an arch to redraw it."""
         self._client, self._capture, self._turned, self._painted = client, capture, turned, painted
         self.brush = ScanBrush(capture.scans, capture.labels)
         self.label = BRUSHES["crown"]
@@ -128,7 +128,7 @@ class ScanLabelsPanel:
         self._show_state()
 
     def click(self, arch: str, vertex: int) -> None:
-        """Paint around a vertex."""
+        """Paint the surface around a vertex."""
         if self.brush.paint(arch, vertex, self.radius.value, self.label):
             self._painted(arch)
         self._show_state()

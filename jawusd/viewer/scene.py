@@ -55,7 +55,7 @@ def add_lights(scene: viser.SceneApi, up: tuple[float, float, float]) -> None:
     scene.configure_default_lights(cast_shadow=False)
     # Use a hemisphere light: without a GPU, an environment map takes most of the frame time.
     scene.configure_environment_map(None)
-    turned = (1.0, 0.0, 0.0, 0.0) if up[1] > 0 else (0.0, 1.0, 0.0, 0.0)  # the light comes from its own +y
+    turned = (1.0, 0.0, 0.0, 0.0) if up[1] > 0 else (0.0, 1.0, 0.0, 0.0)  # viser lights from the local +y axis
     scene.add_light_hemisphere("/light", ground_color=_GROUND, intensity=_AMBIENT, wxyz=turned)
 
 
@@ -117,7 +117,7 @@ class JawScene:
         return self._scene.add_line_segments(name, ends, colors=color, thickness=2.5, thickness_units="screen")
 
     def _add_paths(self, actor: ViewedActor) -> list[viser.SceneNodeHandle]:
-        """Draw the opening paths of incisal point and condyles, and their captured positions."""
+        """Draw the paths of the incisal point and the condyles during opening, and their captured positions."""
         d = captured_d(actor.rig)
         captured = landmark_places(actor.rig, d[:: max(1, -(-len(d) // _MOST_CAPTURED))])
         path = habitual_path(actor.rig)
@@ -140,12 +140,12 @@ class JawScene:
         return handles
 
     def show_paths(self, visible: bool) -> None:
-        """Show or hide paths and captured positions."""
+        """Show or hide the paths and the captured positions."""
         for handle in self._paths:
             handle.visible = visible
 
     def move(self, T_skull_mandible: Array, inside: bool) -> None:
-        """Pose the mandible, coloured if the pose is invalid."""
+        """Pose the mandible; colour it if the pose is invalid."""
         T = self._T_world_skull @ T_skull_mandible
         with self._client.atomic():
             self._jaw.position = tuple(T[:3, 3])
@@ -165,7 +165,7 @@ class JawScene:
             self._held.visible = self._line.visible = visible
 
     def show_pins(self, places_skull: dict[str, Array]) -> None:
-        """Mark pinned landmarks at their positions (3,) [mm], skull frame."""
+        """Mark the pinned landmarks at their positions (3,) [mm] in the skull frame."""
         for name, ball in self._pins.items():
             if name in places_skull:
                 ball.position = tuple(transform_point(self._T_world_skull, places_skull[name]))
@@ -177,11 +177,11 @@ class JawScene:
         return transform_point(se3_inverse(self._T_world_skull), np.array(position))
 
     def sight_to(self, position: tuple[float, float, float]) -> Array:
-        """Return the direction from the camera to a position in the page's world, skull frame, shape (3,)."""
+        """Return the direction in the skull frame from the camera to a position in the page's world, shape (3,)."""
         return self._T_world_skull[:3, :3].T @ (np.array(position) - self._client.camera.position)
 
     def look(self, preset: str) -> None:
-        """Move the camera to a preset; close-ups of a condyle make the mandible translucent."""
+        """Move the camera to a preset view; make the mandible translucent in close-ups of a condyle."""
         camera = self._client.camera
         target, eye = preset_view(self._rest, preset, camera.image_width / max(camera.image_height, 1))
         if self._mandible is not None and self._bone != _PLACEHOLDER:
@@ -191,7 +191,7 @@ class JawScene:
 
 
 def preset_view(rest: Array, preset: str, aspect: float = 1.0) -> tuple[Array, Array]:
-    """Return target (3,) and camera position (3,) of a preset [mm].
+    """Return the target (3,) and the camera position (3,) of a preset view [mm].
 
     Args:
         rest: landmarks at rest, shape (5, 3) [mm].

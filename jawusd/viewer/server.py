@@ -29,14 +29,14 @@ log = logging.getLogger(__name__)
 
 # Time between sending the jaw and the panels: without a GPU, building the panels blocks a browser for almost a second.
 _HEAD_START_S = 0.5
-_SHOW_EVERY_S = 0.1  # minimum interval between live poses
+_SHOW_EVERY_S = 0.1  # minimum interval between live poses that are drawn
 
 
 class _WithoutTraceback(logging.Filter):
     """Log failed connections in one line without traceback, since any program may send invalid bytes."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Replace the traceback by the error's name; drop no record."""
+        """Replace the traceback by the name of the error; keep every record."""
         if record.exc_info and record.exc_info[1] is not None:
             log.debug("a connection failed", exc_info=record.exc_info)
             record.msg, record.args = (
@@ -53,7 +53,7 @@ _WITHOUT_TRACEBACK = _WithoutTraceback()
 def _report_task(loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
     """Log in one line that a message from a page could not be processed."""
     error = context.get("exception")
-    log.warning("a message of a page failed (%s)", _words(error or context.get("message")))
+    log.warning("a message from a page could not be processed (%s)", _words(error or context.get("message")))
     if isinstance(error, BaseException):
         log.debug("error of that message", exc_info=error)
 
@@ -64,10 +64,10 @@ def _words(error: object) -> str:
 
 
 class _LocalServer(viser.ViserServer):
-    """A viser server that never opens a public tunnel, which any page could request."""
+    """A viser server that never opens a public tunnel; with viser's own server, any page can request one."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Reject requests to share through viser's relay."""
+        """Reject requests to share the page through viser's relay."""
         log.warning("refused a page's request for a public address")
         return None
 
@@ -91,7 +91,7 @@ class PageServer(ABC):
         _check_address(host)
         with contextlib.redirect_stdout(sys.stderr):  # viser prints a greeting, but stdout is for results
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
-        logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # no effect if already added
+        logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # no effect if added before
         self._server.get_event_loop().set_exception_handler(_report_task)
         set_theme(self._server.gui)
         self._server.on_client_connect(self._connected)
@@ -118,7 +118,7 @@ class PageServer(ABC):
             page.close()
 
     def _trusted(self, client: viser.ClientHandle) -> bool:
-        """Return whether the page came from this server; browsers let pages of any site connect to localhost."""
+        """Return whether the page came from this server, since browsers let pages of any site connect to localhost."""
         request = self._server._websock_server._live_connections[client.client_id].request
         if request is None:
             return False
@@ -138,7 +138,7 @@ class Viewer(PageServer):
     """Server of a rig."""
 
     def __init__(self, actor: ViewedActor, host: str, port: int, *, play: bool = True) -> None:
-        """Start serving an actor, whose captured take pages `play` first; see `PageServer`."""
+        """Start to serve an actor; see `PageServer`. With `play`, a new page plays the captured take."""
         self._actor, self._play = actor, play
         self._static = StaticPlots(actor.rig)
         self._shown_s = -math.inf
@@ -146,7 +146,7 @@ class Viewer(PageServer):
         set_first_view(self._server, self._static.rest)
 
     def show(self, d: Array) -> None:
-        """Show a pose of the jaw [mm] (3,) on all open pages; poses that arrive too fast to draw are dropped."""
+        """Show the jaw at parameters (3,) [mm] on all open pages; drop poses that arrive too fast to be drawn."""
         now = time.monotonic()
         if now - self._shown_s < _SHOW_EVERY_S:
             return
@@ -194,7 +194,7 @@ def is_own_page(host: str, origin: str | None, local: bool) -> bool:
     Args:
         host: the Host header, name and port.
         origin: the Origin header; only browsers send one.
-        local: whether the server listens on a loopback address; another name in `host` then means DNS rebinding.
+        local: whether the server listens on a loopback address; any other name in `host` then indicates DNS rebinding.
     """
     name = urlsplit(f"//{host}").hostname or ""
     if local and not is_loopback(name):
@@ -203,7 +203,7 @@ def is_own_page(host: str, origin: str | None, local: bool) -> bool:
 
 
 def _check_address(host: str) -> None:
-    """Check that an address can be bound, since viser would search for a free port forever.
+    """Check that an address can be bound; otherwise, viser would search for a free port forever.
 
     Raises:
         OutputError: the address cannot be bound.

@@ -1,4 +1,4 @@
-"""State of one visitor's work on a rig: parameters, pins, keys and undo. Independent of the page."""
+"""State of one visitor's work on a rig, independent of the page: parameters, pins, keys and undo."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Interpolation = Literal["linear", "smooth"]
 # Weight of a pinned landmark's squared distance relative to that of the dragged point: dragging by 5 mm moves the
 # pinned landmark by a fraction of a millimetre.
 _PIN_WEIGHT = 100.0
-# Cosine of the angle to the vertical below which a view counts as one from above or below.
+# Cosine of the angle between viewing direction and vertical above which a view counts as from above or below.
 _STEEP = 0.8
 _MOST_UNDO = 200
 _SHARES = np.linspace(1.0, 0.0, 65)
@@ -30,7 +30,7 @@ _SHARES = np.linspace(1.0, 0.0, 65)
 
 @dataclass(frozen=True)
 class Pin:
-    """Position of a landmark when it was pinned, mandible and skull frame [mm]."""
+    """Position of a landmark at the time it was pinned, in the mandible and in the skull frame [mm]."""
 
     name: str
     p_mandible: tuple[float, float, float]
@@ -52,7 +52,7 @@ class Session:
     """Posing, dragging and keying of a rig by one visitor; with `keep_valid` sliders stay inside the bound."""
 
     def __init__(self, rig: JawRig, fps: float) -> None:
-        """Start in occlusion without keys."""
+        """Start in occlusion and without keys."""
         self.rig = rig
         self.work = Work(d=triple(rig.project(np.zeros(3))), fps=fps)
         self.keep_valid = True
@@ -83,7 +83,7 @@ class Session:
     def limits(self) -> Array:
         """Return the lower and upper limit of each parameter [mm], shape (3, 2).
 
-        The opening has its full range. The limits of d2 are those of valid poses at the current d1 and d3, and the
+        The limits of d1 are its full range. The limits of d2 are those of valid poses at the current d1 and d3, and the
         limits of d3 those at the current d1 and d2. If there are no valid poses, the other parameter is taken as 0; if
         there are still none, both limits are the current value.
         """
@@ -146,18 +146,18 @@ class Session:
         return self._inside(d)
 
     def grab(self, p_skull: ArrayLike) -> None:
-        """Grab the point of the mandible at p_skull [mm] (3,), skull frame."""
+        """Grab the point of the mandible at p_skull [mm] in the skull frame, shape (3,)."""
         self._handle = transform_point(se3_inverse(self.pose()), np.asarray(p_skull, dtype=np.float64))
         self._gesture = None
 
     def drag_to(self, p_skull: ArrayLike, sight: ArrayLike | None = None) -> Array:
-        """Move the grabbed point to where the pointer is, by inverse kinematics that respects the pins.
+        """Move the grabbed point to the pointer, by inverse kinematics that respects the pins.
 
         Args:
-            p_skull: A point under the pointer [mm], skull frame, shape (3,).
-            sight: Direction in which the pointer is seen, skull frame, shape (3,): the point moves to the line through
-                p_skull, and its depth follows the subject's habitual path. None moves it to p_skull itself. So does a
-                view from above or below, whose depth is the opening.
+            p_skull: Point under the pointer [mm], skull frame, shape (3,).
+            sight: Viewing direction, skull frame, shape (3,): the grabbed point moves to the line through p_skull in
+                this direction, and its depth follows the subject's habitual path. If None, or if the view is from above
+                or below, so that its depth is the opening, the point moves to p_skull itself.
 
         Returns:
             The target that the grabbed point was moved towards [mm], skull frame, shape (3,).
@@ -217,7 +217,7 @@ class Session:
         self.set_keys(with_key(self.work.keys, frame, self.work.d))
 
     def load_keys(self, loaded: Keys) -> None:
-        """Replace keys, frame rate and interpolation by those of a file."""
+        """Replace the keys, the frame rate and the interpolation by those of a file."""
         work = replace(self.work, keys=loaded.keys, fps=loaded.fps, interpolation=loaded.interpolation)
         self._change(None, work)
 
@@ -236,12 +236,12 @@ class Session:
         self._change("fps", replace(self.work, fps=float(fps)))
 
     def saved_keys(self) -> Keys | None:
-        """Return the keys in the form of a file; None without keys."""
+        """Return the keys in the form in which they are saved; None without keys."""
         work = self.work
         return Keys(fps=work.fps, interpolation=work.interpolation, keys=work.keys) if work.keys else None
 
     def key_clip(self) -> Clip | None:
-        """Return the animation of the keys as `jawusd animate` writes it, inside if `keep_valid`; None without keys."""
+        """Return the keys' animation as `jawusd animate` writes it, clamped if `keep_valid`; None without keys."""
         saved = self.saved_keys()
         if saved is None:
             return None

@@ -27,7 +27,7 @@ _STATUS: dict[int, str] = {
     RECOVERED: "recovered",
     PARTIAL: "tracked without one camera",
 }
-_COLORS = (ORANGE, BLUE)  # upper and lower arch, as in the outlines in the images
+_COLORS = (ORANGE, BLUE)  # colours of the upper and lower arch, as in the outlines drawn into the images
 _NAMES = ("d1 opening", "d2 laterotrusion", "d3 protrusion")
 _BAND = 2.0  # half width of the bands [sigma]: 95 % of normally distributed errors
 _MOST_SAMPLES = 400
@@ -47,7 +47,7 @@ def frames_to_inspect(tracks: Tracks, fps: float) -> list[int]:
 
 
 def frame_html(tracks: Tracks, frame: int) -> str:
-    """Return HTML that describes the tracking or the solve of a frame."""
+    """Return HTML that describes how a frame was tracked or solved."""
     if tracks.solved is not None:
         return solve_html(tracks, tracks.solved, frame)
     index = tracks.row_of(frame)
@@ -87,7 +87,7 @@ def coverage_plot(tracks: Tracks, span: tuple[int, int], worst: list[int]) -> Pl
 
 
 def solve_plot(tracks: Tracks, solved: SolvedJaw, span: tuple[int, int]) -> Plot:
-    """Plot d of a solved take over a range of frames, with bands of two sigma and a strip for the states."""
+    """Plot d1, d2, d3 of a solved take over a range of frames, with bands of two sigma and a strip of frame states."""
     step = max(1, -(-len(tracks.frames) // _MOST_SAMPLES))
     frames = tracks.frames[::step].astype(np.float64)
     d, sigma = solved.d[::step], solved.sigma_mm[::step]
@@ -104,7 +104,7 @@ def solve_plot(tracks: Tracks, solved: SolvedJaw, span: tuple[int, int]) -> Plot
 
 
 def _corners(span: tuple[int, int], low: float, high: float) -> Array:
-    """Return two opposite corners (2, 2) of a plot over a range of frames and values, at least one frame wide."""
+    """Return two opposite corners (2, 2) of a plot over ranges of frames, at least one frame wide, and of values."""
     return np.array([[span[0], low], [max(span[1], span[0] + 1), high]], np.float64)
 
 
@@ -115,7 +115,7 @@ def _band(plot: Plot, frames: Array, d: Array, sigma: Array, color: str) -> str:
 
 
 def _strip(plot: Plot, tracks: Tracks, solved: SolvedJaw, state: SolveState) -> str:
-    """Return a bar along the axis for the frames in a state."""
+    """Return SVG bars along the axis at the frames with a given state."""
     rows = np.flatnonzero(solved.state == state)
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
     ends = [(float(tracks.frames[run[0]]) - 0.5, float(tracks.frames[run[-1]]) + 0.5) for run in runs]
@@ -125,7 +125,7 @@ def _strip(plot: Plot, tracks: Tracks, solved: SolvedJaw, state: SolveState) -> 
 
 
 def solve_html(tracks: Tracks, solved: SolvedJaw, frame: int) -> str:
-    """Return HTML that describes the solve of a frame, in the colours of its outlines."""
+    """Return HTML that describes the solution in a frame, in the colours of the frame's outlines."""
     row = tracks.row_of(frame)
     if row is None:
         return "not solved"

@@ -24,7 +24,7 @@ STILL, MOVING = ("skull", "upper_teeth", "upper_gum"), ("mandible", "lower_teeth
 Look = Literal["outlines", "tinted", "footage"]
 #: A region of an image: left, top, right, bottom [px].
 Region = tuple[float, float, float, float]
-_STEPS, _NEAR = 8, 0.93  # maximum number of iterations, and fraction of the requested number of faces that ends them
+_STEPS, _NEAR = 8, 0.93  # maximum number of iterations, and fraction of the requested face count at which they stop
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class ViewedActor:
     # meshes [mm] by the names in `STILL` and `MOVING`, decimated for display; each is optional
     meshes: Mapping[str, Mesh]
     placeholders: frozenset[str]  # names of meshes that are placeholders, not anatomy
-    fps: float  # frames per second of new animations
+    fps: float  # frame rate of new animations
     folder: Path  # folder of the rig, to which animations are written
     # returns the available motions: the captured take and the animation layers beside the rig
     clip_names: Callable[[], tuple[str, ...]]
@@ -96,10 +96,11 @@ class ViewedCapture:
 
 
 def for_view(mesh: Mesh, most_faces: int) -> Mesh:
-    """Return a mesh decimated to at most `most_faces` faces for display; smaller meshes are unchanged.
+    """Return a mesh decimated to at most `most_faces` faces for display; leave smaller meshes unchanged.
 
-    Vertex clustering (Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993).
-    The next cell size assumes that the number of faces is inversely proportional to the square of the cell size.
+    The method is vertex clustering (Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex
+    scenes", 1993). The next cell size assumes that the number of faces is inversely proportional to the square of the
+    cell size.
     """
     if len(mesh.faces) <= most_faces:
         return mesh
@@ -134,7 +135,7 @@ def is_solid(mesh: Mesh) -> bool:
 
 
 def _clustered(mesh: Mesh, cell_mm: float) -> Mesh:
-    """Return the mesh with the vertices of each grid cell merged to their mean."""
+    """Return the mesh with the vertices in each grid cell replaced by their mean."""
     cells = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell_mm).astype(np.int64)
     sizes = cells.max(axis=0) + 1
     flat = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
@@ -147,7 +148,7 @@ def _clustered(mesh: Mesh, cell_mm: float) -> Mesh:
     faces = owner[mesh.faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # Cyclic permutations of three vertices are the same face; a flipped one is its back.
+    # Cyclic permutations of three vertices describe the same face; a flipped order describes its back.
     first = faces.argmin(axis=1)[:, None]
     turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
     return Mesh(means, np.unique(turned, axis=0), colors)

@@ -1,4 +1,4 @@
-"""Elements shared by all pages: theme, messages, guarded callbacks, small text and uploads."""
+"""Elements shared by all pages: theme, messages, callbacks with error handling, small text and uploads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 Event = TypeVar("Event")
 Value = TypeVar("Value")
-#: The event of a button group.
+#: Event of a button group.
 Choice = viser.GuiEvent[viser.GuiButtonGroupHandle]
 MOST_BYTES = 8 << 20
 _MOST_LETTERS = 80  # maximum length of a file name in messages [characters]
@@ -31,8 +31,8 @@ def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
     gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, dark_mode=dark)
 
 
-# Sets the page title and, below viser's phone breakpoint, lets the panel fill the width, but at most half of the
-# height.
+# Set the page title. On screens narrower than viser's phone breakpoint, let the panel fill the width, but at most half
+# of the height.
 _STYLE = """<style onload="document.title={title}">
 @media (max-width: 36em) {{
   .mantine-Paper-root:has(.jawusd-page) {{ width: 100% !important; max-height: 50% !important; }}
@@ -59,7 +59,7 @@ def add_dark_checkbox(client: viser.ClientHandle) -> None:
 
 
 def assign(widget: viser.GuiInputHandle[Value], value: Value) -> None:
-    """Set the value of a widget if it differs, which avoids redundant messages to the page."""
+    """Set the value of a widget if it differs from the current one, to avoid redundant messages to the page."""
     if widget.value != value:
         widget.value = value  # type: ignore[misc]  # mypy does not find viser's setter
 
@@ -70,7 +70,7 @@ class _Widget(Protocol):
 
 
 def enable(widget: _Widget, on: bool) -> None:
-    """Enable or disable a widget; button groups, which viser cannot disable, are hidden."""
+    """Enable or disable a widget; hide button groups, which viser cannot disable."""
     if isinstance(widget, viser.GuiButtonGroupHandle):
         if widget.visible != on:
             widget.visible = on
@@ -79,7 +79,7 @@ def enable(widget: _Widget, on: bool) -> None:
 
 
 def small_text(html: str, style: str = "") -> str:
-    """Return HTML as a block of small text."""
+    """Wrap HTML in a block of small text."""
     return f'<div style="font-size:12px;padding:2px 12px;{style}">{html}</div>'
 
 
@@ -118,7 +118,7 @@ def guarded(
 
 
 def upload_name(upload: viser.UploadedFile, suffixes: tuple[str, ...]) -> tuple[str, str]:
-    """Return the name of an upload for messages, and its suffix.
+    """Return the name of an uploaded file, for messages, and its suffix.
 
     Raises:
         FormatError: the suffix is not one of those allowed.
@@ -134,8 +134,8 @@ def upload_name(upload: viser.UploadedFile, suffixes: tuple[str, ...]) -> tuple[
 def limit_uploads(client: viser.ClientHandle, button: viser.GuiUploadButtonHandle | None) -> None:
     """Abort uploads that are larger than `MOST_BYTES`, concurrent, or not meant for the page's button.
 
-    viser buffers the parts of an upload without a limit, for any widget named in the message. viser's handlers
-    run before those installed here.
+    viser buffers the parts of an upload without a limit, for any widget that the message names. Its own handlers run
+    before those installed here.
     """
     gui = client.gui
     pending = gui._current_file_upload_states

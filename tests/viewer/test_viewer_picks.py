@@ -46,7 +46,7 @@ def test_what_is_missing_is_said_and_not_written():
         book.bootstrap()
     book = filled()
     book.add("lower", 99)
-    assert book.missing().startswith("L4 has views in 0")
+    assert book.missing().startswith("L4 has pixels in 0")
     book.remove()
     assert book.missing() == ""
 

@@ -125,4 +125,4 @@ def test_tasks_that_fail_are_one_line(viewer, caplog):
             break
         time.sleep(0.05)
     (record,) = [record for record in caplog.records if record.levelno >= logging.WARNING]
-    assert "a message of a page failed" in record.getMessage() and record.exc_info is None
+    assert "a message from a page could not be processed" in record.getMessage() and record.exc_info is None
