@@ -6,7 +6,8 @@
     python -m jawusd.evaluator validate MODEL poses.csv
 
 Poses are CSV with the columns frame, m00 ... m33 (row-major T_skull_mandible [mm]). Results go to stdout as CSV, or
-JSON with --json. Exit codes: 0 success, 1 invalid poses, 2 usage, 3 and up errors (see jawusd.base.errors).
+JSON with --json. Exit codes: 0 success, 1 invalid poses, 2 wrong usage, 3 and higher other errors (see
+jawusd.base.errors).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:
-        # the reader (head, less) closed the pipe; keep the interpreter quiet at exit
+        # the reading program (head, less) closed the pipe; prevent an error message at exit
         sys.stderr.close()
         return 0
 
@@ -153,11 +154,11 @@ def _read_poses(path: Path) -> tuple[list[int], Array]:
     table = read_table(path, _MAX_BYTES)
     missing = [name for name in ("frame", *_MATRIX_COLUMNS) if name not in table.header]
     if missing:
-        raise FormatError(f'has no "{missing[0]}"; required columns: frame, m00 ... m33.', path=path)
+        raise FormatError(f'has no "{missing[0]}" column; required columns: frame, m00 ... m33.', path=path)
     frames = table.numbers([table.header.index("frame")])[:, 0]
     uneven = np.flatnonzero((frames != np.round(frames)) | ~(np.abs(frames) <= 2**53))
     if uneven.size:
-        raise FormatError(f"{table.places[uneven[0]]}: frames must be whole numbers.", path=path)
+        raise FormatError(f"{table.places[uneven[0]]}: frame numbers must be whole numbers.", path=path)
     values = table.numbers([table.header.index(name) for name in _MATRIX_COLUMNS])
     return frames.astype(np.int64).tolist(), values.reshape(-1, 4, 4)
 

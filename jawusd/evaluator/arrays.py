@@ -20,16 +20,17 @@ from jawusd.geometry.se3 import rigidity_defect
 _RIGID_TOLERANCE = 1e-6
 
 _POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
-_LARGEST = 1e9  # limit of values [mm, rad]: far beyond any jaw, but small enough that sums of squares do not overflow
+# maximum magnitude of values [mm, rad]: far beyond any jaw, but small enough that sums of squares do not overflow
+_LARGEST = 1e9
 _RISING = ("slice_d1", "path_limits", "glide_d2", "glide_d3", "curve1_knots", "curve2_knots", "curve3_knots")
 
 
 class HeldOut(NamedTuple):
-    """How far frames of the take lie outside a bound that was built without them.
+    """Distances by which frames of a take lie outside a bound that was built without them.
 
     Attributes:
         share: Fraction of these frames within the tolerance.
-        p95_mm: Distance outside the bound that 95 % of these frames do not exceed; 0 if they lie inside.
+        p95_mm: 95th percentile of the distance of these frames outside the bound; frames inside count as 0.
         tolerance_mm: The tolerance of the rig.
     """
 
@@ -39,7 +40,7 @@ class HeldOut(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The share and the distance in words."""
+        """The fraction of frames and, if it exceeds the tolerance, the 95th percentile, in words."""
         within = f"{100 * self.share:.0f} % of held-out frames lie within the tolerance of {self.tolerance_mm:.1f} mm"
         return within if self.p95_mm <= self.tolerance_mm else f"{within}; 95 % within {self.p95_mm:.1f} mm"
 
@@ -83,7 +84,7 @@ class RigArrays:
 
     @property
     def inferred(self) -> tuple[str, ...]:
-        """Descriptions of the parts that were inferred, not measured on this subject."""
+        """Descriptions of the parts of the rig that were inferred, not measured on this subject."""
         found = self.meta.get("inferred")
         return tuple(str(each) for each in found) if isinstance(found, list | tuple) else ()
 
@@ -124,12 +125,12 @@ class RigArrays:
 
     @property
     def tolerance_mm(self) -> float:
-        """How far outside the bound a measured pose may lie and still be valid [mm]; authored poses must lie inside."""
-        return float(self.arrays["tolerance_mm"]) + 0.0  # older files store the negated limit: avoid -0.0
+        """Maximum distance [mm] of a valid measured pose outside the bound; authored poses must lie inside."""
+        return float(self.arrays["tolerance_mm"]) + 0.0  # avoids -0.0 for older files, which store the negated limit
 
     @property
     def held_out(self) -> HeldOut | None:
-        """How far held-out frames of the take lie outside the bound; None if unknown."""
+        """Distances by which held-out frames of the take lie outside the bound; None if unknown."""
         if "held_out_share" not in self.arrays:
             return None
         share, p95_mm = (float(self.arrays[name]) for name in ("held_out_share", "held_out_p95_mm"))
@@ -154,10 +155,10 @@ class RigArrays:
 
 
 def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Array]:
-    """Return the arrays of a rig of the given kind, checked, as read-only float64.
+    """Check the arrays of a rig of the given kind, and return them as read-only float64.
 
     Args:
-        arrays: Named arrays (see `jawusd.evaluator.schema`); others are ignored.
+        arrays: Named arrays (see `jawusd.evaluator.schema`); arrays with other names are ignored.
         kind: "anchored" or "additive".
 
     Raises:
@@ -180,7 +181,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     if kind == ANCHORED and lengths["weights"] != lengths["centres"] + 3:
         raise EvaluatorError(
             f'"spline_weights" has {lengths["weights"]} rows for {lengths["centres"]} centres; '
-            f"it needs one per centre and 3 for the linear part, {lengths['centres'] + 3}."
+            f"expected {lengths['centres'] + 3}: one per centre and 3 for the linear part."
         )
     return checked
 
@@ -202,11 +203,11 @@ def _checked(
     wanted = [lengths.get(size, size) if isinstance(size, str) else size for size in shape]
     fits = value.ndim == len(shape) and all(isinstance(w, str) or w == n for w, n in zip(wanted, value.shape))
     if not fits:
-        raise EvaluatorError(f'"{name}" has shape {value.shape}, expected ({", ".join(map(str, wanted))}).')
+        raise EvaluatorError(f'"{name}" has shape {value.shape}; expected ({", ".join(map(str, wanted))}).')
     if not np.isfinite(value).all():
         raise EvaluatorError(f'"{name}" contains values that are not finite.')
     if (np.abs(value) > _LARGEST).any():
-        raise EvaluatorError(f'"{name}" contains values up to {np.abs(value).max():.3g}; at most {_LARGEST:g} allowed.')
+        raise EvaluatorError(f'"{name}" has magnitudes up to {np.abs(value).max():.3g}; the maximum is {_LARGEST:g}.')
     lengths.update((size, n) for size, n in zip(shape, value.shape) if isinstance(size, str))
     value.flags.writeable = False
     return value
@@ -216,7 +217,9 @@ def _check_values(arrays: dict[str, Array]) -> None:
     for name in ("T_anatomical_skull", "T_rest"):
         defect = float(rigidity_defect(arrays[name]))
         if defect > _RIGID_TOLERANCE:
-            raise EvaluatorError(f'"{name}" is not rigid: off by {defect:.2g}, allowed {_RIGID_TOLERANCE:g}.')
+            raise EvaluatorError(
+                f'"{name}" is not rigid: its defect is {defect:.2g}; the maximum is {_RIGID_TOLERANCE:g}.'
+            )
     for name in _POSITIVE:
         if name in arrays and not (arrays[name] > 0).all():
             raise EvaluatorError(f'"{name}" is {arrays[name].tolist()}; it must be positive.')
@@ -227,11 +230,11 @@ def _check_values(arrays: dict[str, Array]) -> None:
         raise EvaluatorError(f'"landmarks" has {len(arrays["landmarks"])} points; at least 3 are needed.')
     low, high = arrays["d_range"].T
     if not (low < high).all() or high[0] <= 0:
-        raise EvaluatorError(f'"d_range" is {arrays["d_range"].tolist()} mm; rows must be (low, high), opening > 0.')
+        raise EvaluatorError(f'"d_range" is {arrays["d_range"].tolist()} mm; it needs low < high and an opening > 0.')
     if arrays["tolerance_mm"] < 0 or arrays["residual_limit_mm"] <= 0:
-        raise EvaluatorError('"residual_limit_mm" must be positive and "tolerance_mm" not negative.')
+        raise EvaluatorError('"residual_limit_mm" must be positive, and "tolerance_mm" must not be negative.')
     if "held_out_share" in arrays and not (0 <= arrays["held_out_share"] <= 1 and arrays["held_out_p95_mm"] >= 0):
-        raise EvaluatorError('"held_out_share" must be from 0 to 1 and "held_out_p95_mm" not negative.')
+        raise EvaluatorError('"held_out_share" must be from 0 to 1, and "held_out_p95_mm" must not be negative.')
 
 
 def _check_sections(arrays: dict[str, Array]) -> None:
@@ -247,5 +250,5 @@ def _check_sections(arrays: dict[str, Array]) -> None:
         if counts.sum() != len(arrays[name]) or (counts < 3).any() or (counts != np.round(counts)).any():
             raise EvaluatorError(
                 f'"{name}_counts" is {counts.tolist()}; it must split the {len(arrays[name])} corners of "{name}" into '
-                "outlines of 3 or more."
+                "outlines of at least 3 corners."
             )

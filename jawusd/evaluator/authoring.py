@@ -40,8 +40,8 @@ class RigAuthoring(RigArrays):
         Args:
             frames: Increasing key times, shape (K,).
             d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
-            at: Query times, any shape; outside the keys the nearest key is used.
-            method: "linear", straight lines in d as in the paper, or "smooth", a C1 curve, monotone between keys.
+            at: Query times, any shape; before the first key and after the last one, d is constant.
+            method: "linear" for straight lines in d as in the paper, or "smooth" for a C1 curve, monotone between keys.
             inside: Where the smooth curve between two valid keys would leave the bound, follow the bound instead; the
                 curve is then only continuous. See `keep_inside` for keys outside the bound.
 
@@ -65,7 +65,7 @@ class RigAuthoring(RigArrays):
 
         Args:
             times: Increasing sample times, shape (F,).
-            d: Jaw parameters [mm], linear in between, shape (F, 3).
+            d: Jaw parameters [mm], interpolated linearly, shape (F, 3).
 
         Returns:
             The samples at the given times, and additional ones where straight lines between them would leave the bound.
@@ -77,7 +77,7 @@ class RigAuthoring(RigArrays):
         return kept_inside(self.bound, *as_keys(times, d))
 
     def ranges(self, d1: ArrayLike, d2: ArrayLike = 0.0, d3: ArrayLike = 0.0) -> Ranges:
-        """Return the valid ranges of d2 and of d3, each varied alone from (d1, d2, d3).
+        """Return the valid ranges of d2 and of d3, each varied with the other two parameters fixed.
 
         Args:
             d1: Opening [mm]; d1, d2, d3 broadcast to one shape (...).
@@ -85,7 +85,7 @@ class RigAuthoring(RigArrays):
             d3: Protrusion [mm] while d2 varies.
 
         Returns:
-            The limits [mm]; NaN where the section does not reach that line. The bound closes a few tenths of a mm
+            The limits [mm]; NaN where no value is valid. The bound closes a few tenths of a mm
             before the ends of ``d_range[0]``; beyond that point, the limits at the nearest valid opening are returned.
         """
         each = (as_floats(x, name) for x, name in ((d1, "d1"), (d2, "d2"), (d3, "d3")))
@@ -99,8 +99,8 @@ class RigAuthoring(RigArrays):
     def normalized(self, d: ArrayLike) -> Array:
         """Return d as fractions of this subject's ranges, for retargeting to another subject.
 
-        The opening is divided by the full opening, d2 and d3 by the range on their side of the habitual path at that
-        opening (at least 0.5 mm).
+        The opening is divided by the full opening; d2 and d3 are divided by the range on their side of the habitual
+        path at that opening (at least 0.5 mm).
 
         Args:
             d: Jaw parameters [mm], shape (..., 3).

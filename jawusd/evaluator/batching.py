@@ -14,7 +14,7 @@ from jawusd.base.arrays import Array, Indices
 Rows = TypeVar("Rows", Array, Indices)  # an array of rows, or of row indices
 
 CHUNK_ROWS = 2048
-LARGEST = 1e9  # limit of values [mm]: far beyond any jaw, but small enough that cubes do not overflow
+LARGEST = 1e9  # maximum magnitude of values [mm]: far beyond any jaw, but small enough that cubes do not overflow
 
 
 def as_floats(values: ArrayLike, name: str) -> Array:
@@ -33,7 +33,7 @@ def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
     """Return values as float64 rows (n, *tail) and the batch shape.
 
     Raises:
-        ValueError: the trailing axes are not ``tail``, or what `as_floats` rejects.
+        ValueError: the trailing axes are not ``tail``, or `as_floats` rejects the values.
     """
     values = as_floats(values, name)
     if values.shape == tail:  # fast path for one row
@@ -46,15 +46,15 @@ def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
 
 
 def usable_rows(rows: Array) -> Array:
-    """Return the rows (n, ...), all NaN where a value is not finite or is above 1e9."""
-    usable = np.asarray((np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim))))  # comparison is false for NaN
+    """Return the rows (n, ...); a row becomes NaN if one of its values is not finite or exceeds 1e9."""
+    usable = np.asarray((np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim))))  # comparisons with NaN are false
     if usable.all():
         return rows
     return np.where(usable.reshape(-1, *(1,) * (rows.ndim - 1)), rows, np.nan)
 
 
 def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
-    """Return the `usable_rows` of values (see `rows_of`) and the batch shape."""
+    """Return values as rows and the batch shape, as by `rows_of`; see `usable_rows` for rows that become NaN."""
     rows, batch = rows_of(values, tail, name)
     return usable_rows(rows), batch
 
@@ -70,7 +70,7 @@ def in_chunks(function: Callable[[Rows], Array], rows: Rows) -> Array:
 
 
 def pairs_in_chunks(function: Callable[[Rows], tuple[Array, Array]], rows: Rows) -> tuple[Array, Array]:
-    """Return two arrays computed as by `in_chunks`, for a function that returns both."""
+    """Return the two arrays of ``function(rows)``, computed in chunks as by `in_chunks`."""
     if len(rows) <= CHUNK_ROWS:
         return function(rows)
     parts = [function(rows[i : i + CHUNK_ROWS]) for i in range(0, len(rows), CHUNK_ROWS)]

@@ -42,7 +42,7 @@ class SliceHull:
         offset_mm: Distance by which the bound extends beyond its supports.
         slopes: Derivatives of v_k, v_low and v_high with respect to d, shape (K + 2, 3), without the d1 derivatives of
             v_k, which depend on d1 and are 0 here.
-        formula: The same bound for one d, in floats.
+        formula: The same bound for one d, evaluated in Python floats.
         first_mm: Smallest captured opening.
         last_mm: Largest captured opening.
     """
@@ -91,7 +91,7 @@ class SliceHull:
         return distance, gradient
 
     def signed_distance_curvature(self, d: Array) -> tuple[Array, Array, Array]:
-        """Return signed distance (n,), gradient (n, 3) and the Hessian's part from the rounding, (n, 3, 3) [1/mm].
+        """Return signed distance (n,), gradient (n, 3) and part of the Hessian, that of the rounding, (n, 3, 3) [1/mm].
 
         The rest of the Hessian, from the curvature of the supports along d1, is omitted: the result is positive
         semidefinite, so that solver steps point downhill.
@@ -113,7 +113,7 @@ class SliceHull:
     def nearest_opening(self, d: Array) -> Array:
         """Return d (n, 3) [mm] with openings beyond the ends of the bound moved to the nearest valid opening.
 
-        Rows that are not inside at the first or last opening are unchanged.
+        Rows that would not lie inside at the first or last opening are unchanged.
         """
         inner = d.copy()
         inner[:, 0] = np.clip(d[:, 0], self.first_mm, self.last_mm)
@@ -162,7 +162,7 @@ class SliceHull:
 
     def candidates(self) -> Array:
         """Return starting points (n, 3) [mm] of searches, spread over the valid volume and denser near its surface."""
-        reach = self.offset_mm - self.softness_mm  # rounding closes the sections at both end openings
+        reach = self.offset_mm - self.softness_mm  # because of the rounding, sections shrink to points at both ends
         low, high = self.first_mm - reach, self.last_mm + reach
         points = []
         for d1 in np.linspace(low, high, _CANDIDATE_SLICES):
@@ -231,17 +231,17 @@ class Ranges(NamedTuple):
 
 
 def normalized(bound: SliceHull, d_range: Array, d: Array) -> Array:
-    """Return d (n, 3) [mm] as fractions: d1 of the full opening, d2, d3 of the range on their side at that opening."""
+    """Return d (n, 3) [mm] as fractions of the full opening (d1) and of the ranges on their sides there (d2, d3)."""
     return d / _scale(bound, d_range, d[:, 0], d)
 
 
 def denormalized(bound: SliceHull, d_range: Array, shares: Array) -> Array:
-    """Return the d (n, 3) [mm] of fractions (n, 3), the inverse of `normalized`."""
+    """Return the d (n, 3) [mm] of fractions (n, 3); the inverse of `normalized`."""
     return shares * _scale(bound, d_range, shares[:, 0] * d_range[0, 1], shares)
 
 
 def _scale(bound: SliceHull, d_range: Array, d1: Array, sides: Array) -> Array:
-    """Return the lengths [mm] of a fraction of 1, (n, 3), at openings d1 (n,), for the signs of ``sides`` (n, 3)."""
+    """Return the ranges (n, 3) [mm] at openings d1 (n,), on the sides given by the signs of ``sides`` (n, 3)."""
     knots = bound.supports.knots
     on_path = np.zeros((len(d1), 3))
     on_path[:, 0] = np.clip(d1, knots[0], knots[-1])
@@ -287,7 +287,7 @@ def _edges(vertices: Array, counts: Array) -> Array:
 
 
 def _distance_to_edges(points: Array, edges: Array) -> Array:
-    """Return the distance (n,) of points (n, 2) to the edges, negative inside by the even-odd rule; NaN for NaN."""
+    """Return the signed distance (n,) of points (n, 2) to edges, negative inside (even-odd rule); NaN for NaN."""
     start, along = edges[:, 0], edges[:, 1] - edges[:, 0]
     x, y = points[:, 0, None], points[:, 1, None]
     rx, ry = x - start[:, 0], y - start[:, 1]

@@ -1,4 +1,4 @@
-"""Bring motions inside the bound, continuously and no faster than they were.
+"""Move motions inside the bound, continuously and at hardly more than their original speed.
 
 Poses outside are moved towards the spine of the bound. Where the resulting path is longer than the original one, it is
 shortened by shortcuts through the interior. The motion then follows the path no faster than the original allows at each
@@ -30,7 +30,7 @@ _CHECK_MM, _NEAR_MM, _MAX_ROUNDS, _ROUNDING_MM = 0.03, 1e-3, 8, 1e-9
 _LINE_MM = 0.1  # sample spacing of shortcuts
 _SHORTCUTS = 24  # number of end points tried at once for a shortcut
 _TIGHT_POINTS, _TIGHT_ROUNDS, _TIGHT_GAIN_MM = 49, 20, 0.01
-_TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)  # fractions of the distance to the straight line, in the order tried
+_TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)  # fractions of the way to the straight line, in the order tried
 
 
 class Inside(NamedTuple):
@@ -105,7 +105,7 @@ def _runs(moved: Mask) -> list[tuple[int, int]]:
 
 
 def _widened(path: Array, allowed: Array, first: int, last: int) -> tuple[int, int]:
-    """Return the run of samples, widened until the motion has enough time for the path or includes all samples."""
+    """Return the run of samples, widened until its duration suffices for the path or it includes all samples."""
     reach, end = max(last - first, 1), len(path) - 1
     while first > 0 or last < end:
         if lengths(path[first : last + 1])[-1] <= _TIME_SHARE * (allowed[last] - allowed[first]):
@@ -117,7 +117,7 @@ def _widened(path: Array, allowed: Array, first: int, last: int) -> tuple[int, i
 def _retimed(bound: SliceHull, spine: Spine, path: Array, allowed: Array, ends_stay: bool) -> Array:
     """Return the path (n, 3) retimed so that the length up to each point grows no faster than ``allowed`` (n,) [mm].
 
-    The ends stay fixed, unless the time is too short for the whole path and ``ends_stay`` is off.
+    The ends stay fixed, unless the time is too short for the whole path and ``ends_stay`` is false.
     """
     allowed = allowed - allowed[0]
     if (np.diff(lengths(path)) <= np.diff(allowed) + _STILL_MM).all():
@@ -137,7 +137,7 @@ def _retimed(bound: SliceHull, spine: Spine, path: Array, allowed: Array, ends_s
 
 
 def _thinned(bound: SliceHull, times: Array, d: Array, given: Mask) -> Inside:
-    """Return the original samples, and as few others as keep the lines between them inside."""
+    """Return the original samples, and the others that are needed to keep the lines between samples inside."""
     keep = given.copy()
     while True:
         kept = np.flatnonzero(keep)
@@ -166,7 +166,7 @@ def _without_gaps(bound: SliceHull, spine: Spine, motion: Inside) -> Inside:
 
 
 def _leaves(bound: SliceHull, start: Array, end: Array) -> Mask:
-    """Return which straight lines, from points inside (n, 3) to others (n, 3), leave the bound."""
+    """Return which straight lines from points (n, 3) inside the bound to other points (n, 3) leave it."""
     length = np.linalg.norm(end - start, axis=1)
     margin = np.minimum(-distances(bound, start), -distances(bound, end))
     near = np.flatnonzero(margin < _STEEPEST * length)
@@ -180,7 +180,7 @@ def _leaves(bound: SliceHull, start: Array, end: Array) -> Mask:
     worst = np.maximum.reduceat(distance, first) if len(near) else distance
     close = np.flatnonzero((worst > -_NEAR_MM) & (worst <= _ROUNDING_MM))
     at = share[first[close] + _positions(distance == worst[line], first, count)[close]]
-    for shift in np.linspace(-1.0, 1.0, 17):  # refined around the sample with the smallest margin
+    for shift in np.linspace(-1.0, 1.0, 17):  # points around the sample with the smallest margin
         closer = np.clip(at + shift / count[close], 0.0, 1.0)
         nearer = distances(bound, start[close] + closer[:, None] * offset[close])
         worst[close] = np.maximum(worst[close], nearer)
@@ -206,7 +206,7 @@ def along(path: Array, length: Array, at: Array) -> Array:
 
 
 def short_enough(bound: SliceHull, path: Array, allowed: Array) -> Array:
-    """Return a path (n, 3) inside, shortened through the interior if it is longer than ``allowed`` (n,) permits."""
+    """Return a path (n, 3) inside the bound, shortened through its interior where it exceeds ``allowed`` (n,)."""
     most = allowed[-1] - allowed[0]
     if lengths(path)[-1] <= most:
         return path
@@ -231,7 +231,8 @@ def _cut_short(bound: SliceHull, path: Array) -> Array:
 def _tightened(bound: SliceHull, corners: Array, most_mm: float) -> Array:
     """Return a path (n, 3) between the same ends, tightened until it is no longer than ``most_mm``.
 
-    Segments of it, long ones first, are moved towards the straight line between their ends as far as the bound allows.
+    Segments of the path, long ones first, are moved towards the straight line between their ends as far as the bound
+    allows.
     """
     length = lengths(corners)
     path = along(corners, length, np.union1d(np.linspace(0.0, length[-1], _TIGHT_POINTS), length))
@@ -260,7 +261,7 @@ def _flatten(bound: SliceHull, segment: Array) -> None:
 
 
 def _clear(bound: SliceHull, start: Array, ends: Array) -> Mask:
-    """Return which straight lines from a point (3,) to others (m, 3) stay inside."""
+    """Return which straight lines from a point (3,) to other points (m, 3) stay inside the bound."""
     count = int(np.clip(np.ceil(np.linalg.norm(ends - start, axis=1).max() / _LINE_MM), 2, 400))
     share = np.linspace(0.0, 1.0, count + 1)[1:-1]
     points = start + share[:, None, None] * (ends - start)

@@ -1,7 +1,8 @@
 """Clearance: how far teeth, or condyles and skull, are from penetrating deeper than in the closed bite.
 
-It is the penetration depth of the closed bite minus that of the pose, sampled from the scans on a grid over d when the
-rig is built. Interpolation is trilinear; outside the grid, where the mouth is open, the nearest value is used.
+The clearance is the penetration depth of the closed bite minus that of the pose, sampled from the scans on a grid over
+d when the rig is built. Interpolation is trilinear; outside the grid, where the mouth is open, the nearest value is
+used.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from jawusd.evaluator.verdicts import Verdicts
 
 #: Stored values are multiples of this length [mm].
 UNIT_MM = 0.01
-#: How much deeper than in the closed bite teeth may penetrate in an authored pose [mm].
+#: Maximum penetration [mm] of the teeth in an authored pose beyond that of the closed bite.
 AUTHORED_MM = 0.15
-#: The interpolation error is measured where the clearance is below this [mm].
+#: Clearance [mm] below which the interpolation error is measured.
 NEAR_MM = 0.5
 
 
@@ -53,8 +54,8 @@ class ContactField:
         step_mm: Sample spacing along each axis, shape (3,).
         values: Clearances [mm], shape (n1, n2, n3).
         closed_mm: Penetration depth of the scans in the closed bite; negative for a gap.
-        error_mm: Largest interpolation error at random valid parameters with a clearance below `NEAR_MM`, or 0.
-        limit_mm: Smallest clearance of the captured poses, at most 0; measured poses with a smaller one collide.
+        error_mm: Largest interpolation error at random valid parameters with a clearance below `NEAR_MM`; at least 0.
+        limit_mm: Smallest clearance of the captured poses, at most 0; measured poses with a smaller clearance collide.
     """
 
     first_mm: Array
@@ -72,7 +73,7 @@ class ContactField:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array], of: Meeting) -> ContactField | None:
-        """Return the field in the named arrays of a rig, or None."""
+        """Return the clearance field in the named arrays of a rig; None if there is none."""
         name = PREFIXES[of]
         if f"{name}_values" not in arrays:
             return None
@@ -85,7 +86,7 @@ class ContactField:
         )
 
     def arrays(self, of: Meeting) -> dict[str, Array]:
-        """Return the field's arrays by their names in a rig."""
+        """Return the arrays of the clearance field by their names in a rig."""
         named = {
             "first_mm": self.first_mm,
             "step_mm": self.step_mm,
@@ -126,7 +127,7 @@ class ContactField:
         return Clearance(value, gradient)
 
     def collides(self, d: Array, limit_mm: float) -> Mask:
-        """Return where d (n, 3) [mm] has less clearance than ``limit_mm``; False for NaN."""
+        """Return which d (n, 3) [mm] have less clearance than ``limit_mm``; False for NaN."""
         return self.clearance(d).clearance_mm < limit_mm - self.error_mm
 
     def collides_at(self, d: Array, limit_mm: float) -> bool:
@@ -182,11 +183,12 @@ class RigClearance:
 
         Returns:
             The clearance [mm], shape (...), and its derivative with respect to d [mm/mm], shape (..., 3). The clearance
-            saturates at about 1.5 mm and is constant far outside the bound. That of the teeth is 0 in the closed bite.
+            saturates at about 1.5 mm and is constant far outside the bound. The clearance of the teeth is 0 in the
+            closed bite.
 
         Raises:
             EvaluatorError: The rig has no such clearance; see `contact` and `joints`.
-            ValueError: Another value of ``of``.
+            ValueError: ``of`` is not one of these names.
         """
         field = self._field(of)
         rows, batch = rows_of(d, (3,), "d")
@@ -233,5 +235,5 @@ def check_contact(arrays: Mapping[str, Array], name: str) -> None:
     step, limit, error = (arrays[f"{name}_{each}_mm"] for each in ("step", "limit", "error"))
     if (step <= 0).any() or limit > 0 or error < 0:
         raise EvaluatorError(
-            f'"{name}_step_mm" must be positive, "{name}_limit_mm" at most 0 and "{name}_error_mm" not negative.'
+            f'"{name}_step_mm" must be positive, "{name}_limit_mm" at most 0 and "{name}_error_mm" at least 0.'
         )

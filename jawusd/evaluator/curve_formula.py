@@ -9,7 +9,7 @@ from jawusd.geometry.rodrigues import N
 
 
 def cubic(h: N, y0: N, y1: N, m0: N, m1: N) -> tuple[N, N, N, N]:
-    """Return the coefficients, powers 0..3, of the cubic Hermite polynomial over an interval of length h.
+    """Return the coefficients, powers 0 to 3, of the cubic Hermite polynomial over an interval of length h.
 
     Args:
         h: Length of the interval.

@@ -1,6 +1,6 @@
-"""Piecewise cubic curves with given values and slopes, and the tooth-glide surface, a sum of products of two of them.
+"""Piecewise cubic curves with given values and slopes, and the tooth-glide surface, a sum of products of two curves.
 
-Curves are the building block of additive models and of bounds.
+Additive models and bounds consist of such curves.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def flat_ended(knots: Array, values: Array) -> HermiteCurve:
 class GlideTable:
     """The tooth-glide surface measured on scans: how far the jaw must open to slide with the teeth together.
 
-    ``sum_r a_r(d2) b_r(d3)`` [mm], each factor a C1 cubic Hermite curve that is constant outside its knots. The sum is
-    stored expanded, as one bicubic polynomial for every cell between knots.
+    The surface is ``sum_r a_r(d2) b_r(d3)`` [mm]; each factor is a C1 cubic Hermite curve, constant outside its knots.
+    The sum is stored expanded, as one bicubic polynomial for every cell between knots.
 
     Attributes:
         knots: Increasing knots of d2 and of d3 [mm].
@@ -120,12 +120,12 @@ class GlideTable:
         return table
 
     def arrays(self) -> dict[str, Array]:
-        """Return the surface's arrays by their names in a rig."""
+        """Return the arrays of the glide surface by their names in a rig."""
         (k2, k3), (f2, f3) = self.knots, self.factors
         return {"glide_d2": k2, "glide_d2_factors": f2, "glide_d3": k3, "glide_d3_factors": f3}
 
     def at_floats(self, d2: float, d3: float) -> tuple[float, float, float]:
-        """Return the drop [mm] at d2, d3 [mm], and its derivatives with respect to both."""
+        """Return the drop of the jaw [mm] at d2, d3 [mm], and its derivatives with respect to both."""
         i, j = bisect_right(self._rising[0], d2), bisect_right(self._rising[1], d3)
         s, t = d2 - self._first[0][i], d3 - self._first[1][j]
         powers = np.array(((1.0, s, s * s, s * s * s), (0.0, 1.0, 2.0 * s, 3.0 * s * s)))
@@ -134,7 +134,7 @@ class GlideTable:
         return down, ((b[3] * t + b[2]) * t + b[1]) * t + b[0], (3.0 * a[3] * t + 2.0 * a[2]) * t + a[1]
 
     def at_arrays(self, d2: Array, d3: Array) -> tuple[Array, Array, Array]:
-        """Return the drop [mm] at d2, d3 [mm], any shape, and its derivatives with respect to both."""
+        """Return the drop of the jaw [mm] at d2, d3 [mm], any shape, and its derivatives with respect to both."""
         i, j = self.knots[0].searchsorted(d2, side="right"), self.knots[1].searchsorted(d3, side="right")
         s, t = d2 - self.starts[0][i], d3 - self.starts[1][j]
         c = self.coefficients[i, j]

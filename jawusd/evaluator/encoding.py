@@ -31,7 +31,7 @@ Derivative = Callable[[Array], tuple[Array, Array, Array]]
 # Weight of a distance along the sight relative to one across it. It matters only at the bound: elsewhere, two equations
 # across the sight and one along it determine d.
 _DEPTH_WEIGHT = 0.1
-_MIN_PRECISION = 1e-12  # addition to precisions of d, relative to their trace
+_MIN_PRECISION = 1e-12  # minimum precision of d in every direction, relative to its trace
 
 
 def landmark_vectors(landmarks: Array) -> Array:
@@ -46,13 +46,13 @@ def landmark_vectors(landmarks: Array) -> Array:
 
 
 class Handles(NamedTuple):
-    """Points that inverse kinematics moves.
+    """Points of the mandible that inverse kinematics moves to targets.
 
     Attributes:
         vectors: Homogeneous points of the mandible at rest, anatomical frame [mm], scaled by their weights, shape
             (4, m).
-        sight: Unit vectors along which their distances do not count, anatomical frame, shape (3, m), 0 for points whose
-            whole distance counts; None if all do.
+        sight: Unit vectors along which distances to the targets do not count, anatomical frame, shape (3, m); 0 for
+            points whose whole distance counts; None if all are such points.
     """
 
     vectors: Array
@@ -84,7 +84,7 @@ class Handles(NamedTuple):
         """Return rows (m, 3) that map d to weighted offsets from the habitual path along the sight of each handle."""
         if self.sight is None:
             return np.zeros((0, 3))
-        # d2 and d3 displace the incisal point from the path along the anatomical x and z
+        # d2 and d3 displace the incisal point from the habitual path along the anatomical x and z axes
         along = np.stack([np.zeros(self.sight.shape[1]), self.sight[0], self.sight[2]], axis=1)
         return _DEPTH_WEIGHT * self.vectors[3][:, None] * along
 
@@ -96,7 +96,7 @@ class Handles(NamedTuple):
         return values - np.einsum("am,nm...->nam...", self.sight, along)
 
     def features(self, images: Array, d: Array) -> Array:
-        """Return what is compared: images (n, 3, m) across the sight [mm], then the depths of d (n, 3) [mm].
+        """Return the features to compare: images (n, 3, m) [mm] across the sight, then the depths of d (n, 3) [mm].
 
         Returns:
             Features [mm], shape (n, 3 m), or (n, 4 m) with a sight.
@@ -159,8 +159,8 @@ class WeightedEncoding(NamedTuple):
     Attributes:
         d: The most likely jaw parameters [mm], shape (..., 3).
         residual_mm: RMS landmark distance of their pose, shape (...).
-        covariance: Covariance of d [mm^2], shape (..., 3, 3): that of the noise of the pose, and that of the rig's own
-            error where the rig states it.
+        covariance: Covariance of d [mm^2], shape (..., 3, 3), from the noise of the pose and, if the rig states its own
+            error, from that error as well.
     """
 
     d: Array
@@ -219,8 +219,8 @@ class Encoder:
     def covariance(self, d: Array, T: Array, whitening: Array, own: Array) -> Array:
         """Return the covariances (n, 3, 3) [mm^2] of the most likely d (n, 3), disregarding the bound.
 
-        With J the derivative of ``W xi``, that of noise is ``(J^T J)^-1``, and a second error of the pose with
-        covariance O adds ``G O G^T`` with the gain ``G = (J^T J)^-1 J^T W`` (Barfoot 2017, section 3.1).
+        With J the derivative of ``W xi``, the covariance from noise is ``(J^T J)^-1``, and a second error of the pose
+        with covariance O adds ``G O G^T`` with the gain ``G = (J^T J)^-1 J^T W`` (Barfoot 2017, section 3.1).
 
         Args:
             d, T, whitening: As for `most_likely`.
@@ -231,7 +231,7 @@ class Encoder:
         measured = make_transform(*self._frames.motions(T[known]))
         _, J = self._whitened(d[known], measured, whitening[known] @ self._frames.adjoint)
         precision = np.swapaxes(J, 1, 2) @ J
-        # where a parameter does not move the jaw, its variance is large, not infinite
+        # keeps the variance of a parameter that does not move the jaw finite
         floor = _MIN_PRECISION * np.einsum("nii->n", precision)[:, None, None] * np.eye(3)
         noise = np.linalg.inv(precision + floor)
         gain = noise @ np.swapaxes(J, 1, 2) @ whitening[known]
@@ -242,7 +242,7 @@ class Encoder:
         """Return ``W xi`` (n, 6) with ``measured = exp(xi) motion(d)``, and its derivative (n, 6, 3) in d."""
         R_d, t_d, S = self._model.decode_derivative(d)
         xi = se3_log(measured @ se3_inverse(make_transform(R_d, t_d)))
-        # exp(xi(d + e)) = exp(xi) exp(-S e), and the right Jacobian is the left one at -xi
+        # exp(xi(d + e)) = exp(xi) exp(-S e); the right Jacobian is the left Jacobian at -xi
         return np.einsum("nij,nj->ni", W, xi), -W @ se3_left_jacobian_inverse(-xi) @ S
 
 

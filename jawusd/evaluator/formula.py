@@ -16,7 +16,8 @@ lower incisal point, anatomical frame (x left, y up, z anterior):
     z = gz(d1) + rho(d2, d1) + d3
 
 gx, gz: the habitual opening path; rho: the gothic arch of a lateral excursion; drop: how far the jaw must open to slide
-with the teeth together, fading out with opening. Where scans provide it, a table ``sum_r a_r(d2) b_r(d3)`` is added.
+with the teeth together, fading out with opening. If it was measured on scans, a table ``sum_r a_r(d2) b_r(d3)`` is
+added to drop.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table
 from jawusd.evaluator.spline_formula import spline, spread_of
 from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 
-# Tolerance of the inside test: parameters on the bound may round to either side of it.
+# Tolerance [mm] of the inside test: parameters on the bound may round to either side of it.
 ON_BOUND_MM = 1e-6
 FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
 LIMIT_SOFTNESS_MM = 4.0  # rounding of the kinks at both path limits
@@ -131,7 +132,7 @@ def fade(gauge: GaugeNumbers, d1: N, ops: Operations[N, Table]) -> N:
 
 
 def glide(width: int, d2: N, d3: N, tables: Mapping[str, Table], ops: Operations[N, Table]) -> N:
-    """Return the glide surface's table [mm] at d2, d3 [mm]: the sum of the products of ``width`` pairs of curves."""
+    """Return the drop [mm] of the glide table at d2, d3 [mm]: the sum of products of ``width`` pairs of curves."""
     side, front = (ops.split(curve(name, x, tables, ops), width) for name, x in (("glide2", d2), ("glide3", d3)))
     total = side[0] * front[0]
     for a, b in zip(side[1:], front[1:]):
@@ -140,7 +141,7 @@ def glide(width: int, d2: N, d3: N, tables: Mapping[str, Table], ops: Operations
 
 
 def displacement(gauge: GaugeNumbers, d: Triple[N], ops: Operations[N, Table], table: N | None = None) -> Triple[N]:
-    """Return the displacement u [mm] of the incisal point at the jaw parameters d [mm]; `table` as from `glide`."""
+    """Return the displacement u [mm] of the incisal point at jaw parameters d [mm]; `glide` returns ``table``."""
     d1, d2, d3 = d
     gx, gz = path(gauge, d1, ops)
     surface = drop(gauge, d2, d3, ops)
@@ -194,7 +195,7 @@ class JawFormula(Protocol):
     """The motion of one kind of model.
 
     Attributes:
-        tables: The rows of floats the formula needs; each number type stores them in its own form.
+        tables: Rows of floats that the formula needs; each number type stores them in its own form.
     """
 
     tables: dict[str, Rows]
@@ -225,7 +226,7 @@ class JawFormula(Protocol):
 class AnchoredNumbers(NamedTuple):
     """The scalars of an anchored model (see `AnchoredModel`); `linear` has 3 inputs times 3 outputs [rad].
 
-    `spread` is as from `spread_of`.
+    `spread` is the result of `spread_of`.
     """
 
     gauge: GaugeNumbers

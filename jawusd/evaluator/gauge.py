@@ -1,9 +1,9 @@
 """The gauge: jaw parameters to the displacement of the incisal point and back, with derivatives.
 
-The formulas of `jawusd.evaluator.formula`, differentiated by hand. The functions use only ``+ - * /`` and the functions
-of an `Elementary`, so that they run on floats, arrays and tensors. `jawusd.fast` compiles them unchanged, which is why
-they use tuples instead of lists. A suffix names the variable of a derivative: ``rho_2`` is the derivative of rho with
-respect to d2. `Gauge` applies them to batches.
+The formulas are those of `jawusd.evaluator.formula`, differentiated by hand. The functions use only ``+ - * /`` and the
+functions of an `Elementary`, so that they run on floats, arrays and tensors. `jawusd.fast` compiles them unchanged,
+which is why they use tuples instead of lists. A suffix names the variable of a derivative: ``rho_2`` is the derivative
+of rho with respect to d2. `Gauge` applies them to batches.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def displacement(
 ) -> tuple[Triple[N], tuple[N, N, N, N, N, N]]:
     """Return u [mm] of d [mm], and its derivatives x_1; y_1, y_2, y_3; z_1, z_2.
 
-    The others are constant: ``x_2 = z_3 = 1`` and ``x_3 = 0``.
+    The other derivatives are constant: ``x_2 = z_3 = 1`` and ``x_3 = 0``.
     """
     gx, gz, gx_1, gz_1 = path(gauge, d1, f)
     rho, rho_1, rho_2 = arch(gauge, d1, d2, f)
@@ -183,7 +183,7 @@ def inverse(gauge: GaugeNumbers, u: Triple[float], f: Elementary[float]) -> Trip
 def spline_input(
     gauge: GaugeNumbers, scales: Sequence[float], u: Triple[N], f: Elementary[N]
 ) -> tuple[Triple[N], tuple[N, N]]:
-    """Return the spline's argument q at u [mm], and the derivatives of the path there for `gradient_by_u`."""
+    """Return the spline's argument q at u [mm], and the derivatives of the habitual path for `gradient_by_u`."""
     opening = -u[1]
     gx, gz, gx_1, gz_1 = path(gauge, opening, f)
     return (opening / scales[0], (u[0] - gx) / scales[1], (u[2] - gz) / scales[2]), (gx_1, gz_1)

@@ -25,7 +25,7 @@ _scalar = cast("Callable[[float], Array]", np.float64)  # numpy's stubs do not t
 
 
 def _scalar_or_array(values: Array) -> Array:
-    """Return values, or the number in a 0-dimensional array."""
+    """Return an array unchanged, and a 0-dimensional one as a number."""
     return values[()]
 
 
@@ -59,7 +59,7 @@ class RigJudging(RigClearance, RigArrays):
         d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
-            if abs(d1) + abs(d2) + abs(d3) < SINGLE_LIMIT_MM:  # comparison is false for NaN
+            if abs(d1) + abs(d2) + abs(d3) < SINGLE_LIMIT_MM:  # comparisons with NaN are false
                 return _scalar(self.kernels.margin(d1, d2, d3))
         rows, batch = rows_of(d, (3,), "d")
         return _scalar_or_array(self.kernels.margins(rows).reshape(batch))
@@ -86,14 +86,14 @@ class RigJudging(RigClearance, RigArrays):
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
-        """Judge measured poses: finite, rigid, on the model, inside the bound or tolerance, no collision, not too fast.
+        """Judge measured poses by rigidity, distance to the model, margin to the bound, collisions and speed.
 
         Args:
             T_skull_mandible: Poses, shape (..., 4, 4).
             residual_limit_mm: Largest landmark distance to the model; default: the rig's own limit.
             tolerance_mm: How far outside the bound a measured pose may lie; default: the rig's own tolerance. With 0
                 the poses are judged as authored: teeth may then penetrate less deeply than in measured poses.
-            bound: Which bound; see `margin`.
+            bound: "slices" or "polygons"; see `margin`.
             times_s: Times of the poses along the last batch axis, shape (F,); required with a speed limit.
             speed_limit_mm_s: Largest speed of a landmark since the last valid pose; None disables the check.
 
@@ -204,7 +204,7 @@ class VerdictStream:
         self._time_s, self._positions = -np.inf, np.empty((0, 3))
 
     def __call__(self, T_skull_mandible: ArrayLike, time_s: float) -> Verdicts:
-        """Return the verdict on the next pose (4, 4), taken at a time [s] after that of the previous pose.
+        """Return the verdict on the next pose (4, 4), taken at a time [s] later than that of the previous pose.
 
         Raises:
             ValueError: a wrong shape, or a time that is not finite or not later.
@@ -213,7 +213,7 @@ class VerdictStream:
         if T.shape != (4, 4):
             raise ValueError(f"T_skull_mandible must have shape (4, 4), got {T.shape}")
         if not self._time_s < time_s < np.inf:
-            raise ValueError(f"time_s must be finite and above {self._time_s}, that of the last pose, got {time_s}")
+            raise ValueError(f"time_s must be finite and later than the last pose, {self._time_s}, got {time_s}")
         verdict = self._judge(T)
         self._time_s = time_s
         if not verdict.measured():

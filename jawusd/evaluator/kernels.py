@@ -1,4 +1,4 @@
-"""The kernels of a rig: the functions that evaluate rows.
+"""The kernels of a rig: the functions that evaluate rows of parameters or poses.
 
 Rows are float64 arrays; rows with a value that is not finite, or above 1e9, give NaN.
 """
@@ -21,7 +21,7 @@ from jawusd.evaluator.solver import Residual, minimise
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
 from jawusd.geometry.se3 import rigidity_defect, transform_points
 
-_FEW_ROWS = 3  # maximum number of rows for which one search per row, in floats, is faster
+_FEW_ROWS = 3  # maximum number of rows that are searched one by one in floats, which is faster for few rows
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class NumpyKernels:
         return judge(finite, np.ones_like(finite), np.where(finite, 0.0, np.nan), self.margins(d), d, limits)
 
     def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
-        """Search inside the bound for the points nearest to given ones.
+        """Search inside the bound for the parameters nearest to given ones.
 
         Args:
             wanted: Given d [mm], shape (n, 3).
@@ -135,8 +135,8 @@ class NumpyKernels:
         """Search inside the bound for the motions that move handles nearest to their targets.
 
         Args:
-            handles: Points of the mandible, m of them.
-            targets: Their target positions, anatomical frame [mm], scaled likewise, shape (n, 3, m).
+            handles: The m points of the mandible.
+            targets: Their target positions, anatomical frame [mm], scaled by the weights of the handles, (n, 3, m).
             start: Initial d [mm] inside the bound, shape (n, 3).
 
         Returns:

@@ -1,6 +1,6 @@
-"""The two forms of the jaw model: parameters d [mm] to a rigid motion of the mandible, with exact derivatives.
+"""The two forms of the jaw model, which maps parameters d [mm] to a rigid motion, with exact derivatives.
 
-Everything here is in the anatomical frame (x left, y up, z anterior, mm, origin at the upper incisal point): a model
+All quantities are in the anatomical frame (x left, y up, z anterior, mm, origin at the upper incisal point): a model
 returns the motion ``M(d)`` away from the closed bite, ``M(0) = I``. `jawusd.evaluator.rig` maps it to the skull frame.
 All functions take rows: d has shape (n, 3); a row with a NaN gives NaN.
 
@@ -80,15 +80,15 @@ class JawModelForm(Protocol):
         ...
 
     def chart_motion(self, x: Array) -> tuple[Array, Array]:
-        """Return rotation and translation [mm] at x."""
+        """Return rotation and translation [mm] at chart coordinates x (n, 3) [mm]."""
         ...
 
     def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) with respect to x."""
+        """Return rotation, translation [mm] and the derivative S (n, 6, 3) at chart coordinates x (n, 3) [mm]."""
         ...
 
     def chart_parameters(self, x: Array) -> Array:
-        """Return the d (n, 3) [mm] of x."""
+        """Return the d (n, 3) [mm] of chart coordinates x (n, 3) [mm]."""
         ...
 
 
@@ -255,7 +255,7 @@ class AdditiveModel:
         incisor: The incisal point at rest [mm], shape (3,).
         d_range: Box of valid d [mm], shape (3, 2).
         single: The model for one row, in floats.
-        starts: Starting points of searches, spread over that box.
+        starts: Starting points of searches, spread over the box `d_range`.
     """
 
     kind: ClassVar[str] = ADDITIVE
@@ -319,15 +319,15 @@ class AdditiveModel:
         return self.starts.nearest(R @ self.incisor + t - self.incisor)
 
     def chart_motion(self, x: Array) -> tuple[Array, Array]:
-        """Return rotation and translation [mm] at x, which is d."""
+        """Return rotation and translation [mm] at chart coordinates x, which are d."""
         return self.decode(x)
 
     def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) with respect to x, which is d."""
+        """Return rotation, translation [mm] and the derivative S (n, 6, 3) at chart coordinates x, which are d."""
         return self.decode_derivative(x)
 
     def chart_parameters(self, x: Array) -> Array:
-        """Return x, which is d."""
+        """Return the chart coordinates x unchanged: they are d."""
         return x
 
 

@@ -1,8 +1,8 @@
-"""Rigid motions of the mandible: for batches, for one pose in plain floats, and their frames.
+"""Rigid motions of the mandible, for batches and for one pose in plain floats, and the frames of a rig.
 
 Evaluating one pose with the array functions spends nearly all its time on the call overhead of numpy. DCC callbacks and
-face solvers evaluate single poses, so the models of `jawusd.evaluator.models` have a second form in floats; tests
-compare the two.
+face solvers evaluate single poses, so the models of `jawusd.evaluator.models` have a second implementation in floats;
+tests compare the two.
 
 A motion (R, t) in floats consists of twelve numbers: the rows of ``R - I``, then the displacement [mm] of a point p,
 the anchor: ``u = R p + t - p``.
@@ -50,7 +50,7 @@ def anchored_motions(omega: Array, moved: Array, anchor: Array) -> Array:
 
 
 def _with_rotation(omega: Triple[Array], a: Array, b: Array) -> Array:
-    """Return transforms (n, 4, 4) with the rotations of `turning`, without translation."""
+    """Return transforms (n, 4, 4) with the rotations ``I + a W + b W W``, W the skew matrix of omega."""
     M = np.zeros((len(a), 4, 4))
     for i, row in enumerate(turning(omega, a, b)):
         M[:, i, 0], M[:, i, 1], M[:, i, 2] = row
@@ -73,7 +73,7 @@ class SingleForm(Protocol):
 
 
 class SingleAnchored:
-    """`models.AnchoredModel` for one finite d or u; the anchor is the incisal point.
+    """A `models.AnchoredModel` for one finite d or u; the anchor is the incisal point.
 
     Args:
         gauge: Map between d and u.
@@ -154,7 +154,7 @@ class SingleAnchored:
 
 
 class SingleAdditive:
-    """`models.AdditiveModel` for one finite d; the anchor is the origin of the anatomical frame."""
+    """A `models.AdditiveModel` for one finite d; the anchor is the origin of the anatomical frame."""
 
     anchor: Vector = (0.0, 0.0, 0.0)
 
@@ -168,7 +168,7 @@ class SingleAdditive:
 
 
 class _SingleCurve:
-    """`HermiteCurve.value` at one parameter."""
+    """A `HermiteCurve` evaluated at one parameter."""
 
     def __init__(self, curve: HermiteCurve) -> None:
         self._knots = curve.knots.tolist()
@@ -204,7 +204,9 @@ def _motion(omega: Vector, u: Vector) -> Motion:
 
 
 class RigFrames:
-    """The frames of a rig: ``T_skull_mandible = T_skull_anatomical M T_anatomical_mandible_rest``, with the motion M.
+    """The coordinate frames of a rig: for a motion M, ``T_skull_mandible = A^-1 M T_anatomical_mandible_rest``.
+
+    Here A is T_anatomical_skull.
 
     Attributes:
         T_anatomical_skull: Shape (4, 4).
@@ -215,7 +217,7 @@ class RigFrames:
     """
 
     def __init__(self, T_anatomical_skull: Array, T_rest: Array, anchor: Vector) -> None:
-        """Precompute the products; ``anchor`` [mm] is the anchor of the motions in floats, anatomical frame."""
+        """Precompute the matrix products; ``anchor`` [mm] is the anchor of the motions in floats, anatomical frame."""
         self.T_anatomical_skull = T_anatomical_skull
         self.T_skull_anatomical = se3_inverse(T_anatomical_skull)
         self.T_anatomical_mandible_rest = T_anatomical_skull @ T_rest

@@ -26,9 +26,10 @@ MIN_DAMPING = 1e-9
 INSIDE_MM = 1e-10  # depth below the surface of a point that was moved back onto it
 MAX_STEP_MM = 1.0  # maximum step length within a bound; a longer step may end in another basin
 PULL_BACKS = 12  # maximum number of iterations that move a point back onto the surface
-PULL = 1.01  # overshoot factor of these iterations, so that one usually suffices; its error vanishes as steps shrink
+PULL = 1.01  # overshoot factor of the iterations that move a point back onto the surface, so that one usually suffices
 MIN_STIFFNESS = 1e-12  # minimum stiffness; keeps steps finite where the cost does not depend on a parameter
-MIN_SLOPE = 1e-6  # minimum squared gradient of the bound; keeps the pull-back iterations finite where the bound is flat
+# minimum squared gradient of the bound; keeps steps back onto the surface finite where the bound is flat
+MIN_SLOPE = 1e-6
 TOUCHING_MM = 1e-3  # maximum depth at which a start counts as lying on the bound
 
 Vector = Triple[float]
@@ -61,7 +62,7 @@ class Place(NamedTuple):
     Attributes:
         distance: Signed distance [mm], negative inside.
         gradient: Its derivative.
-        rounding: The Hessian's part from the rounding, positive semidefinite.
+        rounding: The part of the Hessian that comes from the rounding, positive semidefinite.
         bend: The curvature of the supports along d1, to be subtracted from the Hessian's first entry.
     """
 
@@ -112,9 +113,9 @@ def lowest_in_valley(
 
     Args:
         bound: The bound.
-        pull: The cost and its model at a point.
+        pull: Function that returns the cost and its quadratic model at a point.
         start: The start; if it or its cost is not finite, the result is NaN.
-        exact: Whether the model is exact, so that steps benefit from the full Hessian of the bound.
+        exact: Whether the quadratic model is exact, so that steps benefit from the full Hessian of the bound.
     """
     if not math.isfinite(sum(start)):
         return _UNKNOWN
@@ -180,7 +181,8 @@ def _inverse(matrix: Symmetric) -> tuple[Vector, Vector, Vector]:
     """Return the rows of the inverse of a definite symmetric matrix, by cofactors."""
     a, p, q, c, s, f = matrix
     x, y, z = c * f - s * s, q * s - p * f, p * s - q * c
-    scale = 1.0 / ((a * x + p * y + q * z) or 1.0)  # finite even for a singular matrix; damping corrects the step
+    # keeps the result finite for a singular matrix; damping corrects the step
+    scale = 1.0 / ((a * x + p * y + q * z) or 1.0)
     x, y, z = x * scale, y * scale, z * scale
     v, w = (p * q - a * s) * scale, (a * c - p * p) * scale
     return (x, y, z), (y, (a * f - q * q) * scale, v), (z, v, w)

@@ -1,7 +1,7 @@
 """The operations that formulas need beyond arithmetic, and their implementation for Python floats.
 
-A table is rows of floats, stored in a form that depends on the number type. A column of a table is a sequence of
-numbers, or of one number that is itself an array, such as a tensor. This file imports only the standard library and
+A table consists of rows of floats, stored in a form that depends on the number type. A column of a table is a sequence
+of numbers, or of one number that is itself an array, such as a tensor. This file imports only the standard library and
 `jawusd.geometry.rodrigues`: it is copied into the single-file reader.
 """
 
@@ -16,7 +16,7 @@ from typing import Protocol, TypeVar
 from jawusd.geometry.rodrigues import N, Triple, angle_coefficients
 
 Rows = list[list[float]]
-Table = TypeVar("Table", contravariant=True)  # the form in which a number type stores rows of floats
+Table = TypeVar("Table", contravariant=True)  # type in which a number type stores rows of floats
 
 
 def polynomial(coefficients: Sequence[N | float], x: N) -> N:
@@ -140,7 +140,7 @@ class FloatOperations:
 
     @staticmethod
     def split(row: Sequence[float], width: int) -> Sequence[float]:
-        """Return the row unchanged: it already is separate numbers."""
+        """Return the row unchanged: it already consists of separate numbers."""
         return row
 
 

@@ -98,7 +98,7 @@ class JawRig(RigJudging, RigAuthoring):
         d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
-            if abs(d1) + abs(d2) + abs(d3) < SINGLE_LIMIT_MM:  # comparison is false for NaN
+            if abs(d1) + abs(d2) + abs(d3) < SINGLE_LIMIT_MM:  # comparisons with NaN are false
                 return self.kernels.pose(d1, d2, d3)
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.poses(rows).reshape(*batch, 4, 4)
@@ -114,9 +114,10 @@ class JawRig(RigJudging, RigAuthoring):
         return self.kernels.jacobians(rows).reshape(*batch, 6, 3)
 
     def spatial_jacobian(self, d: ArrayLike) -> Array:
-        """Return the spatial velocity (omega [rad/mm], v [mm/mm]) per unit of each d, skull frame, (..., 6, 3).
+        """Return the spatial velocities (omega [rad/mm], v [mm/mm]) per unit of d1, d2, d3, skull frame, (..., 6, 3).
 
-        The left twists from the poses of d (..., 3) [mm] to those of adjacent parameters (Barfoot 2017, section 7.1.5).
+        They are the left twists from the poses of d (..., 3) [mm] to those of adjacent parameters (Barfoot 2017,
+        section 7.1.5).
         """
         rows, batch = as_rows(d, (3,), "d")
         spatial = in_chunks(lambda d: self._frames.adjoint @ self.model.decode_derivative(d)[2], rows)
@@ -145,8 +146,8 @@ class JawRig(RigJudging, RigAuthoring):
     def pose_covariance(self, T_skull_mandible: ArrayLike) -> Array:
         """Return the covariance (..., 6, 6) of the rig's own error at poses (..., 4, 4).
 
-        It is that of xi, (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``, and reproduces
-        `landmark_sigma_mm`; 0 where the rig does not state these.
+        The error is xi = (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``. Its covariance
+        reproduces `landmark_sigma_mm`; it is 0 if the rig does not state these.
         """
         rows, batch = as_rows(T_skull_mandible, (4, 4), "T_skull_mandible")
         points = transform_points(rows, self.landmarks[None])
@@ -155,7 +156,7 @@ class JawRig(RigJudging, RigAuthoring):
     def parameter_covariance(self, d: ArrayLike) -> Array:
         """Return the covariance (..., 3, 3) [mm^2] of d (..., 3) [mm] that follows from the rig's own error.
 
-        It is 0 where the rig does not state its error.
+        It is 0 if the rig does not state its error.
         """
         rows, batch = as_rows(d, (3,), "d")
         if not self.landmark_sigma_mm.all():
@@ -184,9 +185,9 @@ class JawRig(RigJudging, RigAuthoring):
             T_skull_mandible: Poses, shape (..., 4, 4). If a matrix is slightly non-rigid, the landmark positions it
                 yields are matched; matrices that are not rigid to 1e-3 give NaN.
             inside: Search only inside the bound.
-            covariance: If given, return the most likely instead of the nearest parameters of noisy poses, and their
-                covariance, which disregards the bound. Covariance of xi, (omega [rad], v [mm]) in the skull frame,
-                with ``T_true = exp(xi) T``, shape (..., 6, 6) or (6, 6).
+            covariance: Covariance of the noise of the poses, shape (..., 6, 6) or (6, 6); the noise is xi = (omega
+                [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``. If given, the result is the most likely
+                instead of the nearest parameters, with their covariance, which disregards the bound.
 
         Raises:
             ValueError: wrong shapes, or a covariance that is not positive definite.
@@ -256,7 +257,8 @@ class JawRig(RigJudging, RigAuthoring):
             p_mandible: One handle (3,) or several (H, 3) [mm], mandible frame.
             p_skull: Targets [mm], skull frame, shape (..., 3) for one handle, (..., H, 3) for several.
             start: Initial d [mm], shape (..., 3). While dragging, pass the last result, so that the jaw moves without
-                jumps. A start outside the bound is first projected. Default: the best of a scan of the valid volume.
+                jumps. A start outside the bound is first projected. Default: the best of many points spread over the
+                valid volume.
             weights: Weights of the handles, shape (H,), >= 0 and not all zero; default: equal.
             sight: Directions along which distances do not count, skull frame, of the shape of p_mandible; 0 for handles
                 whose whole distance counts. Along the sight the jaw follows the habitual path: in a frontal view d3
@@ -304,7 +306,7 @@ def load(path: str | os.PathLike[str]) -> JawRig:
 
     Raises:
         FormatError: another kind of file, a corrupt file, or arrays missing, of a wrong shape or not finite.
-        VersionError: written by a newer jawusd.
+        VersionError: written by a newer version of jawusd.
         UnitsError: lengths, angles or twists in another convention.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)

@@ -17,7 +17,7 @@ class ArraySpec(NamedTuple):
         attribute: USD attribute, with the values in row-major order; None for `d_range` (see `D_RANGE_ATTRIBUTES`).
         shape: Axis lengths; axes of the same name have the same length.
         kind: The only model kind with this array; None for both.
-        integer: Integers in USD; in memory all arrays are float64.
+        integer: Whether the values are integers in USD; in memory all arrays are float64.
     """
 
     attribute: str | None
@@ -72,7 +72,7 @@ ARRAYS: dict[str, ArraySpec] = {
 }
 
 
-#: Arrays of anchored models with a glide surface measured on scans, all or none; see `jawusd.evaluator.curves`.
+#: Arrays of anchored models with a glide surface measured on scans, all present or none; see `jawusd.evaluator.curves`.
 GLIDE_ARRAYS: dict[str, ArraySpec] = {
     "glide_d2": ArraySpec("jaw:model:glideD2", ("glide knots of d2",), ANCHORED),
     "glide_d2_factors": ArraySpec("jaw:model:glideD2Factors", ("glide knots of d2", "glide factors"), ANCHORED),
@@ -80,7 +80,7 @@ GLIDE_ARRAYS: dict[str, ArraySpec] = {
     "glide_d3_factors": ArraySpec("jaw:model:glideD3Factors", ("glide knots of d3", "glide factors"), ANCHORED),
 }
 
-#: Clearance of the teeth, all or none; see `jawusd.evaluator.contact`.
+#: Arrays of the clearance of the teeth, all present or none; see `jawusd.evaluator.contact`.
 CONTACT_ARRAYS: dict[str, ArraySpec] = {
     "contact_first_mm": ArraySpec("jaw:contact:first", (3,)),
     "contact_step_mm": ArraySpec("jaw:contact:step", (3,)),
@@ -92,7 +92,7 @@ CONTACT_ARRAYS: dict[str, ArraySpec] = {
 }
 
 
-#: Clearance of condyles and skull, for rigs with scanned bones, all or none.
+#: Arrays of the clearance between condyles and skull, for rigs with scanned bones, all present or none.
 JOINT_ARRAYS: dict[str, ArraySpec] = {
     "joint_first_mm": ArraySpec("jaw:joints:first", (3,)),
     "joint_step_mm": ArraySpec("jaw:joints:step", (3,)),
@@ -103,13 +103,14 @@ JOINT_ARRAYS: dict[str, ArraySpec] = {
     "joint_limit_mm": ArraySpec("jaw:joints:limit"),
 }
 
-#: Speeds of a take with a frame rate, both or none; see `jawusd.evaluator.speeds`.
+#: Arrays of the speeds in a take with a known frame rate, both present or none; see `jawusd.evaluator.speeds`.
 SPEED_ARRAYS: dict[str, ArraySpec] = {
     "velocity_covariance": ArraySpec("jaw:motion:velocityCovariance", (3, 3)),
     "acceleration_covariance": ArraySpec("jaw:motion:accelerationCovariance", (3, 3)),
 }
 
-#: How far frames lie outside a bound built without them, both or none; see `jawusd.evaluator.arrays.HeldOut`.
+#: Distances of frames from a bound built without them, both arrays present or none; see
+#: `jawusd.evaluator.arrays.HeldOut`.
 HELD_OUT_ARRAYS: dict[str, ArraySpec] = {
     "held_out_share": ArraySpec("jaw:thresholds:heldOutShare"),
     "held_out_p95_mm": ArraySpec("jaw:thresholds:heldOutP95"),

@@ -1,4 +1,4 @@
-"""Searches inside the bound: the nearest valid parameters, and inverse kinematics of the mandible's points."""
+"""Searches inside the bound: for the nearest valid parameters, and inverse kinematics of points of the mandible."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ class BoundedSearch:
         """Return the valid d (n, 3) [mm] that move the handles nearest to the targets (n, 3, m).
 
         Args:
-            handles: Points of the mandible, m of them.
-            target: Their target positions, anatomical frame [mm], scaled likewise.
+            handles: The m points of the mandible.
+            target: Their target positions, anatomical frame [mm], scaled by the weights of the handles.
 
         Raises:
             EvaluatorError: the valid volume is empty.
@@ -81,10 +81,10 @@ class BoundedSearch:
         return self._multistart(handles, target)[0]
 
     def solve_ik(self, handles: Handles, target: Array, start: Array) -> Array:
-        """Return the local minimum in whose basin start (n, 3) [mm] lies.
+        """Return the local minima in whose basins the starts (n, 3) [mm] lie.
 
         Short steps keep the search in that basin, which makes dragging continuous. A result far from its start is not
-        part of a drag; the result of `solve_ik_multistart` replaces it if that is better.
+        part of a drag; the result of `solve_ik_multistart` replaces it if that one is better.
         """
         found, left = self._kernels.solve_ik(handles, target, start)
         far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _MAX_DRAG_MM)

@@ -49,7 +49,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "familiar_count": (),
     "familiar_limit": (2,),
 }
-MOST_FRAMES = 2000  # maximum M; a matrix (M, M) is inverted when a file is read
+MOST_FRAMES = 2000  # maximum number M of training frames; a matrix (M, M) is inverted when a file is read
 _LARGEST = 1e12  # maximum magnitude of the values in a file
 
 
@@ -110,7 +110,7 @@ class Skin:
             X: The columns with which the map was learned, shape (..., K), or points [mm], shape (..., N, 3).
 
         Raises:
-            ValueError: another number of columns.
+            ValueError: the number of columns is not K.
         """
         X = as_floats(X, "X")
         if self.points and X.ndim > 1 and X.shape[-2:] == (self.columns // 3, 3):
@@ -142,7 +142,8 @@ class Skin:
         d = self._d_mean + k @ self._weights
         prior = kernel[1] + kernel[2] * ((f * f).sum(axis=1) + left_out) + kernel[3]
         variance = np.maximum(prior - ((k @ self._precision) * k).sum(axis=1), kernel[3])
-        moved = self._gradient(f, smooth) @ self.arrays["head_error"].T  # mm per standard deviation, (n, 3, R)
+        # change of d [mm] per standard deviation, shape (n, 3, R)
+        moved = self._gradient(f, smooth) @ self.arrays["head_error"].T
         covariance = variance[:, None, None] * self.arrays["spread"] + moved @ np.swapaxes(moved, 1, 2)
         outside = left_out + (f[:, self._inside :] ** 2).sum(axis=1)
         return np.column_stack([d, covariance.reshape(-1, 9), variance, outside])
@@ -170,7 +171,7 @@ def load_skin(path: str | os.PathLike[str]) -> Skin:
 
     Raises:
         FormatError: another kind of file, a corrupt file, or arrays missing, of a wrong shape or out of range.
-        VersionError: written by a newer jawusd.
+        VersionError: written by a newer version of jawusd.
         UnitsError: other units or twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
@@ -190,14 +191,14 @@ def _checked(arrays: Mapping[str, Array]) -> dict[str, Array]:
         sizes.update((axis, n) for axis, n in zip(shape, value.shape) if isinstance(axis, str) and axis not in sizes)
         wanted = tuple(axis if isinstance(axis, int) else sizes.get(axis, -1) for axis in shape)
         if value.shape != wanted or (not value.size and name != "head_error"):
-            raise EvaluatorError(f'"{name}" has shape {value.shape}, expected {shape} with at least one value.')
+            raise EvaluatorError(f'"{name}" has shape {value.shape}; expected {shape} with at least one value.')
         if not (np.abs(value) <= _LARGEST).all():
-            raise EvaluatorError(f'"{name}" has values that are not finite or larger than {_LARGEST:g}.')
+            raise EvaluatorError(f'"{name}" has values that are not finite or are larger than {_LARGEST:g}.')
         value.flags.writeable = False
         found[name] = value
     for name in ("scale", "noise", "kernel", "familiar_limit"):
         if not (found[name] > 0).all():
-            raise EvaluatorError(f'"{name}" must be positive, found {found[name].min():g}.')
+            raise EvaluatorError(f'"{name}" must be positive; found {found[name].min():g}.')
     if sizes["M"] > MOST_FRAMES:
         raise EvaluatorError(f'"features" has {sizes["M"]} frames; at most {MOST_FRAMES} are allowed.')
     most = len(found["basis"])

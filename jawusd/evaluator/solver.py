@@ -1,8 +1,8 @@
 """Damped Gauss-Newton over many small problems at once, unconstrained or inside a bound.
 
 Each row is a problem in three unknowns [mm] with its own damping (Levenberg 1944, Marquardt 1963). Within a bound every
-iterate is feasible: the step solves the quadratic model under the linearised bound in closed form, is pulled back onto
-the surface, and is accepted only if the cost does not rise.
+iterate is feasible: the step solves the quadratic model under the linearised bound in closed form, is moved back onto
+the surface of the bound, and is accepted only if the cost does not increase.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def minimise(
         if bound is None:
             x[rows] += np.where(
                 moving[:, None], 0.0, step
-            )  # the last step costs nothing more and doubles the correct digits
+            )  # the last step needs no further evaluation and doubles the number of correct digits
         rows = rows[moving]
         r, J, damping, multiplier, step = _picked(moving, r, J, damping, multiplier, step)
         if not rows.size:
@@ -130,7 +130,8 @@ def solve_symmetric(A: Array, b: Array) -> Array:
     c00, c01, c02 = c * f - s * s, q * s - p * f, p * s - q * c
     c11, c12, c22 = a * f - q * q, p * q - a * s, a * c - p * p
     determinant = a * c00 + p * c01 + q * c02
-    scale = 1.0 / (determinant + (determinant == 0))  # finite even for a singular row; damping corrects the step
+    # keeps the result finite for a singular matrix; damping corrects the step
+    scale = 1.0 / (determinant + (determinant == 0))
     solution = (c00 * x + c01 * y + c02 * z, c01 * x + c11 * y + c12 * z, c02 * x + c12 * y + c22 * z)
     return (np.array(solution) * scale).T.reshape(len(A), 3)
 

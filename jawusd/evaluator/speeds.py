@@ -1,4 +1,4 @@
-"""How fast a jaw moves: covariances of the velocity and acceleration of d, estimated from a take."""
+"""Covariances of the velocity and acceleration of d, estimated from a take."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
 
 _MIN_FRAMES = 30  # minimum number of fourth differences for an estimate
-# Sums of the squared coefficients of first, second and fourth differences: the factor by which differencing multiplies
+# Sums of the squared coefficients of first, second and fourth differences: the factors by which differencing multiplies
 # the variance of white noise.
 _NOISE_IN = {1: 2.0, 2: 6.0, 4: 70.0}
 _SIGMA_OF_MEDIAN = 1.4826  # ratio of standard deviation to median absolute value of a normal distribution

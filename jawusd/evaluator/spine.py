@@ -16,7 +16,7 @@ from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull, largest_share
 
-INSET_MM = 0.01  # depth at which points moved inside end, so that lines between samples stay inside
+INSET_MM = 0.01  # depth to which points are moved inside, so that lines between samples stay inside
 
 _SLICES = 97
 _CAP_MM = 0.3  # depth of the spine's ends below the surface; openings beyond the ends are clamped
@@ -27,7 +27,7 @@ _ENTRY_TOLERANCE_MM = 1e-10
 
 @dataclass(frozen=True)
 class Spine:
-    """A line inside a bound, one point (d2, d3) for every opening.
+    """A line inside a bound, with one point (d2, d3) for every opening.
 
     Attributes:
         d1: Increasing openings, shape (n,) [mm].
@@ -54,7 +54,7 @@ class Spine:
         return cls(d1, _moved_inside(bound, d1, centres, np.zeros_like(centres), 0.5 * depth))
 
     def towards(self, bound: SliceHull, low: Array, high: Array) -> Spine:
-        """Return the spine moved into a box of (d2, d3) [mm], (2,) each, as far as it stays deep inside.
+        """Return the spine moved into a box of (d2, d3) [mm] as far as it stays deep inside the bound.
 
         Paths from points in the box to this spine stay in the box.
         """

@@ -43,7 +43,7 @@ class SampledTable:
             raise ValueError(f"twists must have shape {(*counts, 6)} and T_rest (4, 4), got {twists.shape}")
         if len(counts) != 3 or any(len(axis) < 2 or (np.diff(axis) <= 0).any() for axis in self.grid_axes):
             raise ValueError("grid_axes must be three increasing arrays of at least two positions")
-        # neighbours along d3 are stored side by side: half as many memory accesses
+        # stores neighbours along d3 side by side, for half as many memory accesses
         self._pairs = np.concatenate([twists[:, :, :-1], twists[:, :, 1:]], axis=3)
         self._flat = self._pairs.reshape(-1, 12)
         self._positions = tuple(axis.tolist() for axis in self.grid_axes)
@@ -58,7 +58,7 @@ class SampledTable:
         d = np.asarray(d, dtype=np.float64)
         if d.shape == (3,):
             x, y, z = d.tolist()
-            if abs(x) + abs(y) + abs(z) < _SINGLE_LIMIT_MM:  # comparison is false for NaN and infinities
+            if abs(x) + abs(y) + abs(z) < _SINGLE_LIMIT_MM:  # false for NaN and infinities
                 return motion_matrix(motion_of_twist(*self._single_twist(x, y, z))).dot(self.T_rest)
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(self._poses, rows).reshape(*batch, 4, 4)

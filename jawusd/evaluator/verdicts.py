@@ -52,13 +52,13 @@ class Verdicts(NamedTuple):
     """Result of `JawRig.validate`, one entry per pose.
 
     Attributes:
-        valid: Whether no `Reason` applies to the pose, bool, shape (...). Measured poses are also valid within the
-            tolerance outside the bound.
+        valid: Whether no `Reason` applies to the pose, bool, shape (...). Measured poses are also valid outside the
+            bound within the tolerance.
         reason: `Reason` flags, uint8, shape (...); ``Reason(int(code))`` names them, `words` spells them out.
         residual_mm: RMS landmark distance to the nearest pose of the model, (...); NaN if not finite or not rigid.
         margin_mm: Signed distance of d to the bound, > 0 inside, shape (...); NaN if not finite or not rigid.
         d: Nearest jaw parameters [mm], shape (..., 3); NaN if not finite or not rigid.
-        tolerance_mm: How far outside the bound a pose may lie and still be valid.
+        tolerance_mm: Maximum distance of a valid pose outside the bound.
     """
 
     valid: Mask
@@ -80,7 +80,7 @@ class Verdicts(NamedTuple):
 
     def with_collisions(self, collide: Mask) -> Verdicts:
         """Return the verdicts with the poses in ``collide`` (n,) marked as colliding."""
-        if not np.count_nonzero(collide):  # takes a tenth of the time of `any`
+        if not np.count_nonzero(collide):  # ten times as fast as `any`
             return self
         reason = self.reason | np.where(collide, Reason.TEETH_COLLIDE.value, 0).astype(np.uint8)
         return self._replace(valid=reason == 0, reason=reason)
@@ -103,7 +103,7 @@ class Verdicts(NamedTuple):
     def words(self) -> list[str]:
         """Return the verdicts in words, one per pose in row-major order.
 
-        A valid pose is "inside", or "within tolerance 0.83 of 1.00 mm"; for the others, the reasons.
+        A valid pose is "inside" or "within tolerance 0.83 of 1.00 mm"; an invalid one is described by its reasons.
         """
         pairs = zip(self.reason.ravel().tolist(), self.margin_mm.ravel().tolist())
         return [Reason(code).words if code else place(margin, self.tolerance_mm) for code, margin in pairs]
@@ -119,7 +119,7 @@ def place(margin_mm: float, tolerance_mm: float = 0.0) -> str:
 
     Args:
         margin_mm: Their margin.
-        tolerance_mm: How far outside measured parameters may lie; 0 for authored ones.
+        tolerance_mm: Maximum distance of valid parameters outside the bound; 0 for authored ones.
     """
     if is_inside(margin_mm):
         return INSIDE
@@ -134,8 +134,8 @@ class Limits:
 
     Attributes:
         residual_mm: Largest landmark distance to the model.
-        tolerance_mm: How far outside the bound a pose may lie: 0 for authored poses, the rig's tolerance for measured
-            ones.
+        tolerance_mm: Maximum distance of a valid pose outside the bound: 0 for authored poses, the rig's tolerance for
+            measured ones.
         speed_mm_s: Largest speed of any landmark since the last valid pose; None disables the check.
     """
 
@@ -201,7 +201,7 @@ def too_fast(positions: Array, valid: Mask, times_s: ArrayLike | None, limit_mm_
         limit_mm_s: Largest speed [mm/s].
 
     Returns:
-        Shape (..., F). Frames before the first good one, and that one itself, are never too fast.
+        Mask, shape (..., F). Frames up to and including the first good one are never too fast.
 
     Raises:
         ValueError: there is no frame axis, or the times do not match it or do not increase.
