@@ -89,7 +89,7 @@ def test_the_search_for_a_mistake_is_bounded_and_reports_what_was_tried(monkeypa
     assert searches.count == 6  # of three cameras each
     assert (
         "any of 6 possible mistakes" in words
-        and "14 more were not tried, since at most 20 pictures are searched" in words
+        and "14 more were not tried, since at most 20 images are searched" in words
     )
 
 

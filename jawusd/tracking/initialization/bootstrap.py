@@ -1,4 +1,4 @@
-"""Initial poses from picked vertices: triangulation, consensus of rigid fits, refinement on the pixels."""
+"""Initial poses from picked vertices: triangulation, consensus of rigid fits, refinement of the reprojection error."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _FEWEST = 3
 TOLERANCE_MM = 1.1
 _CLICK_MM = TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
 _GAP_MM = 0.8  # maximum distance between the lines of sight of a careless pick
-# Minimum relative error of the scan size, estimated from the picks, for it to explain contradictions: clicks 0.4 mm off
-# on picks 40 mm apart cause 0.01.
+# Minimum relative error of the scan size, estimated from the picks, for it to explain their misfit [-]: clicks 0.4 mm
+# off, on vertices 40 mm apart, cause an error of 0.01.
 _SIZE_SHARE = 0.03
-_MOST_TRIPLES = 500  # maximum number of triples tried: more do not improve the consensus
+_MOST_TRIPLES = 500  # maximum number of pick triples tried: more do not improve the consensus
 
 
 @dataclass(frozen=True, eq=False)
 class _Sighting:
-    """A pick prepared for fitting: the scan point and its undistorted pixels."""
+    """A pick prepared for fitting: the scan point and its undistorted pixel in each view."""
 
     number: int
     point: Array
@@ -92,7 +92,7 @@ def pose_from_picks(
             if (cause := _wrong_sight(picks, vertices, cameras, arch, places, sightings)) is not None:
                 raise TrackingError(
                     f"bootstrap: the picks on the {arch} teeth contradict one another: {cause}",
-                    hint="Check the calibration and the picks' camera names, and that their views show the same frame.",
+                    hint="Check the calibration and the picks' camera names, and that all views show the same frame.",
                 )
             misses = ", ".join(f"pick {s.number}: {_miss_mm(s, best):.1f} mm" for s in sightings)
             raise TrackingError(
@@ -105,7 +105,7 @@ def pose_from_picks(
 
 
 def _other_size(sightings: Sequence[_Sighting], places: Array) -> float | None:
-    """Return the factor by which the scan is too large if that explains the contradictions, otherwise None.
+    """Return the factor by which the scan is too large if that explains the misfit of the picks, otherwise None.
 
     `places` are the triangulated picks in world coordinates [mm], shape (P, 3).
     """
@@ -127,7 +127,7 @@ def _wrong_sight(
     places: Array,
     sightings: Sequence[_Sighting],
 ) -> str | None:
-    """Describe swapped cameras that explain the contradictions, or lines of sight that do not meet; otherwise None.
+    """Describe swapped cameras that explain the misfit of the picks, or lines of sight that miss; otherwise None.
 
     `places` are the triangulated picks in world coordinates [mm], shape (P, 3).
     """
@@ -145,7 +145,7 @@ def _wrong_sight(
         pose = rigid_fit(points, meets)
         if all(_miss_mm(s, pose) < TOLERANCE_MM for s in seen):
             return f"cameras {a} and {b} are exchanged, in the picks or in the calibration"
-    # If different points at the same height were picked, lines of sight of neighbouring cameras may meet all the same.
+    # Lines of sight of neighbouring cameras may meet even if different points at the same height were picked.
     gaps = [_miss_mm(replace(s, point=place), np.eye(4)) for s, place in zip(sightings, places, strict=True)]
     if float(np.median(gaps)) < _GAP_MM:
         return None
@@ -156,7 +156,7 @@ def _wrong_sight(
 
 
 def _than(ratio: float) -> str:
-    """Format a size ratio."""
+    """Format a size ratio as "2.0% larger" or "2.0% smaller"."""
     return f"{abs(ratio - 1.0):.1%} {'larger' if ratio > 1.0 else 'smaller'}"
 
 
@@ -167,7 +167,7 @@ def picked_sigma_mm(
     pose: Array,
     probes: Array,
 ) -> float:
-    """Return the rms position uncertainty of the crowns, assuming careless clicks [mm].
+    """Return the rms position uncertainty of the crowns [mm], assuming careless clicks.
 
     `picks` are those from which the pose T_world_scan, shape (4, 4), was computed; `probes` are points spread over the
     crowns, scan coordinates [mm], shape (N, 3).
@@ -194,7 +194,7 @@ def picks_miss_mm(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, 
 def picked_size(
     picks: Sequence[Sequence[Pick]], vertices: Sequence[Array], cameras: Mapping[str, Camera]
 ) -> tuple[float, float]:
-    """Return the size ratio of scans to triangulated picks, and its sigma, assuming careless clicks [-].
+    """Return the size ratio of scans to triangulated picks, and its standard deviation for careless clicks [-].
 
     `picks` and `vertices` are those of the upper and the lower scan.
 
@@ -241,7 +241,7 @@ def _sighting(number: int, pick: Pick, vertices: Array, cameras: Mapping[str, Ca
 
 
 def _residuals_px(s: _Sighting, pose: Array) -> tuple[Array, Array, Array]:
-    """Return projection minus pixel (C, 2), depths (C,) and derivatives with respect to the world point (C, 2, 3)."""
+    """Return reprojection errors (C, 2), depths (C,), and error derivatives with respect to the point (C, 2, 3)."""
     h = s.matrices @ np.append(transform_point(pose, s.point), 1.0)
     projected = h[:, :2] / h[:, 2:]
     slope = (s.matrices[:, :2, :3] - projected[:, :, None] * s.matrices[:, 2:, :3]) / h[:, 2, None, None]
@@ -249,7 +249,7 @@ def _residuals_px(s: _Sighting, pose: Array) -> tuple[Array, Array, Array]:
 
 
 def _miss_mm(s: _Sighting, pose: Array) -> float:
-    """Return the largest distance between a pick's vertex and its pixel, measured at the vertex [mm]."""
+    """Return the largest reprojection error of a pick over its views, measured at the vertex [mm]."""
     residual, depth, slope = _residuals_px(s, pose)
     if (depth <= 0).any():
         return np.inf
@@ -258,7 +258,7 @@ def _miss_mm(s: _Sighting, pose: Array) -> float:
 
 
 def _refined(sightings: Sequence[_Sighting], pose: Array) -> Array:
-    """Minimise the pixel error of the picks by Gauss-Newton from a nearby pose."""
+    """Minimise the reprojection error of the picks by Gauss-Newton, starting from a nearby pose."""
     for _ in range(10):
         H, g = np.zeros((6, 6)), np.zeros(6)
         centre = transform_point(pose, np.mean([s.point for s in sightings], axis=0))

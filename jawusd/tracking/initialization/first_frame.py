@@ -19,8 +19,8 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.magnification import magnified, measure_magnification
 
-# Minimum `arch_fit` of a first frame [-]: wrong poses fit worse; correct ones fit better, even with most lower teeth
-# hidden.
+# Minimum `arch_fit` of a first frame [-]: wrong poses stay below it; correct poses exceed it, even with most lower
+# teeth hidden.
 _LEAST_FIT = 0.03
 # Minimum `arch_fit` [-] of a first frame that fits only without one of the cameras: an unambiguous fit, as in
 # `start_causes.CLEAR_FIT`.
@@ -75,7 +75,7 @@ def first_record(
 
 @dataclass(frozen=True, eq=False)
 class _Aligned:
-    """An alignment, the masks that it uses, and its quality."""
+    """An alignment of both arches, the masks used for it, and its quality."""
 
     solution: Solution
     use: Mask  # masks used, shape (2, C)
@@ -84,7 +84,7 @@ class _Aligned:
 
 
 def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View], use: Mask) -> _Aligned:
-    """Align with narrow and with wide gates, then without uncovered masks."""
+    """Align both arches with narrow and with wide residual gates, then exclude masks that they do not cover."""
     whole = use
     best = solver.solve(start, views, config.gates_from(0.0), use)
     wide = solver.solve(start, views, config.wide_gates_px, use)
@@ -92,7 +92,7 @@ def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views:
         poses = np.where(better[:, None, None], wide.poses, best.poses)
         best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
-    for _ in range(2):  # excludes uncovered masks, and includes previously excluded ones that are now covered
+    for _ in range(2):  # exclude uncovered masks, and include previously excluded ones that are now covered
         kept = _without_spoiled(whole, coverage, config.lost_coverage)
         if (kept == use).all():
             break
@@ -103,7 +103,7 @@ def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views:
 
 
 def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
-    """Describe why an alignment is rejected; None if it is accepted."""
+    """Return the reason for which an alignment is rejected; None if it is accepted."""
     for r in ARCHES:
         share = score_px(first.solution)[r].sum() / max(first.solution.visible_px[r].sum(), 1.0)
         uncovered = np.nanmedian(first.coverage[r, first.use[r]])
@@ -118,7 +118,7 @@ def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
 
 
 def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View]) -> str | None:
-    """Describe a camera whose magnification explains a failed alignment; None if there is none."""
+    """Return a message about a camera whose magnification explains a failed alignment; None without such a camera."""
     use = present_masks(views)
     poses = solver.solve(start, views, config.wide_gates_px, use).poses
     scales = np.zeros(len(views))
@@ -142,16 +142,17 @@ def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, vie
 
 
 def _without_camera(use: Mask, camera: int) -> Mask:
-    """Exclude a camera from arches that have enough masks without it, shape (2, C)."""
+    """Exclude the masks of a camera for each arch that has enough masks without it; return the masks kept (2, C)."""
     kept = use.copy()
     kept[:, camera] = False
     return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)
 
 
 def _without_spoiled(use: Mask, coverage: Array, limit: float) -> Mask:
-    """Exclude uncovered masks of arches with at least two covered ones, shape (2, C).
+    """Exclude uncovered masks of arches that have at least two covered ones; return the masks kept (2, C).
 
-    The limit is that for lost arches, so with an excluded mask, the arch would have been lost in every frame.
+    The limit of the uncovered fraction is that for lost arches: an arch aligned with an excluded mask would be lost in
+    every frame.
     """
     kept = use & ~(coverage > limit)
     return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)

@@ -17,15 +17,15 @@ from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
-_BESIDE = 2  # number of surveyed frames on either side of a chosen frame that are redundant
-_WIDTH_PX = 320  # width of the surveyed images: mask centres are accurate to a tenth of a millimetre
+_BESIDE = 2  # number of surveyed frames, on either side of a chosen one, that are redundant
+_WIDTH_PX = 320  # width of the surveyed mask images: enough for mask centres accurate to 0.1 mm
 
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """The masks to be tracked: cameras with masks, and the range of frames (end exclusive), or None for all.
+    """The masks to be tracked: cameras with masks, and the range of frames (end exclusive; None for all frames).
 
-    `offsets` are reference frame minus own frame number, by camera name.
+    `offsets` are time offsets by camera name: the reference frame number minus the camera's own frame number.
     """
 
     sources: Sequence[CameraSource]
@@ -39,7 +39,7 @@ class Footage:
         return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count, self.fewest)
 
     def views(self, centre: Array, px_per_mm: float) -> MaskViews:
-        """Open the masks at a given resolution at the teeth, which are near a world point `centre` (3,) [mm]."""
+        """Open the masks, scaled to a given resolution at the teeth, which are near world point `centre` (3,) [mm]."""
         return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm, self.fewest)
 
     def has_masks(self, frame: int) -> bool:
@@ -53,15 +53,15 @@ class Footage:
 
 @dataclass(frozen=True, eq=False)
 class MaskSurvey:
-    """Centres and areas of the masks of some frames."""
+    """Centres and areas of the masks of the surveyed frames."""
 
-    frames: NDArray[np.int64]  # reference camera frames, shape (F,)
+    frames: NDArray[np.int64]  # frame numbers of the reference camera, shape (F,)
     # mean position (x, y) of every mask in its undistorted survey image [px], NaN without a mask, shape (F, 2, C, 2);
     # rows are upper, lower
     middles: Array
     areas_px: Array  # area of every mask, shape (F, 2, C); 0 without a mask
     matrices: Array  # world [mm] to homogeneous px of the survey images, shape (C, 3, 4)
-    eyes: Array  # camera centres in the world [mm], shape (C, 3)
+    eyes: Array  # camera centres in world coordinates [mm], shape (C, 3)
     fewest: int = FEWEST_CAMERAS  # minimum number of cameras with masks of both arches
 
     def places(self) -> Array:

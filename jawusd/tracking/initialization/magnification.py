@@ -1,7 +1,7 @@
 """Magnification of the masks relative to calibration and scans: wrong focal lengths, lenses and scan sizes.
 
 Poses cannot compensate for an image that is magnified about its principal point: over a take, distances between
-projected contours and mask edges then grow with the distance from that point. Magnification and its change with the
+projected contours and mask edges grow with the distance from that point. Magnification and its change with the
 radius are estimated per camera, with poses, camera motions and outline biases eliminated.
 """
 
@@ -20,7 +20,7 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z, 
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import Drawn, View
 
-# Search distance about contours [px]: an error of 5 % in focal length shifts molars by 9 px at 7 px/mm.
+# Search distance around contours [px]: an error of 5 % in focal length shifts molars by 9 px at 7 px/mm.
 _REACH_PX = 16.0
 # Distance from the optical axis at which distortion is reported [mm]: the distance of the outermost visible teeth.
 _RADIUS_MM = 25.0
@@ -29,7 +29,7 @@ _RADIUS_MM = 25.0
 _PRIORS = (0.1, 0.1, *(0.01,) * 3, *(2.0,) * 3, 1.0, 1.0)
 _UNKNOWNS = len(_PRIORS)
 _ROUNDS = 5
-_LENGTH_FACTOR = 1.5  # factor on the correlation length, for losses by the Tukey weight and the fit
+_LENGTH_FACTOR = 1.5  # factor on the correlation length: offsets the effects of the Tukey weight and of the fit
 _LEAST_SPREAD_PX = 0.3
 
 
@@ -61,22 +61,22 @@ class Magnification:
 
     @property
     def common(self) -> float:
-        """The magnification error common to all cameras, their median [-]."""
+        """The magnification error common to all cameras [-]: the median over the cameras."""
         return float(np.median(self.scale))
 
 
-#: A frame: T_world_upper and T_world_lower (2, 4, 4), its views, and the masks used (2, C).
+#: A video frame: T_world_upper and T_world_lower (2, 4, 4), its views, and the masks used (2, C).
 Instant = tuple[Array, Sequence[View], Mask]
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Linearised distances of one arch in one frame: d = J x + C theta with pose x and shared unknowns theta."""
+    """Linearised contour distances of an arch in a video frame: d = J x + C theta, pose x, shared unknowns theta."""
 
     distance: Array  # signed distances to the edges [px], shape (n,)
     length: Array  # contour length [px], shape (n,)
     pose: Array  # derivatives with respect to the twist of the arch, shape (n, 6)
-    camera: Array  # index of each row's camera, shape (n,)
+    camera: Array  # camera index of each row, shape (n,)
     shared: Array  # derivatives with respect to the unknowns of the row's camera, shape (n, _UNKNOWNS)
 
 
@@ -135,10 +135,10 @@ def _rows(
 
 
 def _matched(scans: Sequence[Scan], r: int, view: View, poses: Array, config: TrackingConfig) -> tuple[Array, Array]:
-    """Return the contour samples of an arch in reach of an edge (n, COLUMNS), and their distances to it (n,) [px]."""
+    """Return the contour samples of an arch near a mask edge (n, COLUMNS), and their distances to it (n,) [px]."""
     labels = np.zeros((2, *view.masks.shape[1:]), np.uint8)
     depth = np.zeros(labels.shape, np.float32)
-    # the other arch need not be drawn, as masks already separate the arches
+    # the other arch need not be rendered, since the masks already separate the arches
     drawn = [r] if view.edges is None else ARCHES
     for arch in drawn:
         scans[arch].draw(view.matrix @ view.T_delay[arch] @ poses[arch], depth[arch], labels[arch])
@@ -169,7 +169,7 @@ def _joined(parts: Sequence[_Rows]) -> _Rows:
 
 
 def _solved(blocks: Sequence[_Rows], cameras: int, config: TrackingConfig) -> Magnification:
-    """Solve by iterative reweighting (Tukey), with poses eliminated block by block."""
+    """Solve for the shared unknowns by iterative reweighting (Tukey), with poses eliminated block by block."""
     size = _UNKNOWNS * cameras
     prior = np.diag(np.tile(np.array(_PRIORS) ** -2.0, cameras))
     left = [block.distance for block in blocks]

@@ -12,7 +12,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal
 from jawusd.tracking.contour.scan import Scan
 
-_SAMPLES = 8000  # number of surface samples per arch: about half a millimetre apart
+_SAMPLES = 8000  # number of surface samples per arch; they are about half a millimetre apart
 _SHARE = 0.002  # fraction of the crown surface that is ignored as outliers, such as spikes of the mesh
 _DEEPEST_MM = 5.0  # maximum depth of a point inside a crown: deeper points lie beyond an open border
 _DEEP_MM = 1.0
@@ -21,8 +21,8 @@ _BESIDE_MM = 4.0  # maximum distance in the bite plane between opposed crown poi
 _CELL_MM = 1.0
 _THROUGH_MM = 2.0  # minimum vertical overlap of arches that passed through one another; cusps overlap less
 _SLAB_MM = 3.0
-_FEWEST = 50  # minimum number of surface samples on a side of an arch
-# minimum distance from the midline of points on the left or right side: nearer points may be on the central incisors
+_FEWEST = 50  # minimum number of surface samples for a side of an arch to be measured
+# minimum distance from the midline for a point to count as left or right: nearer ones may be on the central incisors
 _ASIDE_MM = 6.0
 _OPEN = 0.08  # minimum ratio of directed area to area for a surface to count as open
 # For the gum to indicate the orientation of a scan: minimum area relative to the crowns, and minimum vertical distance
@@ -32,7 +32,7 @@ _GUM_SHARE, _GUM_BELOW_MM = 0.3, 2.0
 
 @dataclass(frozen=True)
 class Occlusion:
-    """How two arches meet; lengths in mm, NaN if not measurable."""
+    """Measurements of how two arches meet; lengths in mm, NaN if not measurable."""
 
     gap_mm: float  # minimum distance between the crowns, 0 if they touch
     side_gaps_mm: tuple[float, float]  # gaps left and right of the midline, negative if crowns overlap
@@ -42,14 +42,14 @@ class Occlusion:
     # the upper ones
     through: float
     same: float  # fraction of the lower surface that coincides with the upper one
-    # fraction of crown points with crowns of the other arch above or below them, of the arch in which it is larger
+    # fraction of crown points directly above or below crowns of the other arch; the larger value of both arches
     opposite: float
     aside_mm: float  # distance between the centres of the arches along the bite plane
     turn_rad: float  # angle in the bite plane between the forward directions of both arches
     # per arch, whether its gum lies between its crowns and the other arch; None if unknown
     turned_over: tuple[bool | None, bool | None]
     opens_towards: tuple[bool, bool]  # per arch, whether the open side of its crowns faces the other arch
-    midlines_mm: float  # lateral distance of the midlines, where both arches have teeth left and right
+    midlines_mm: float  # lateral distance between the midlines, where both arches have teeth left and right
     width_ratio: float  # ratio of the upper to the lower width, measured in the same transverse slabs
     widths_mm: tuple[float, float]  # maximum extent of each arch in its own plane
     lower_ahead_mm: float  # distance by which the lower front teeth lie in front of the upper ones
@@ -66,7 +66,7 @@ class CrownSurface:
 
 
 def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlusion:
-    """Measure how two scans in one frame meet; `T_anatomical_scan` maps that frame to (left, up, front) axes."""
+    """Measure how two scans in one scan frame meet; `T_anatomical_scan` maps it to (left, up, front) axes."""
     surfaces = [crown_surface(scan) for scan in scans]
     crowns = [scan.crown_vertices(_SAMPLES) for scan in scans]
     normal = bite_normal(*crowns)
@@ -151,7 +151,7 @@ def _beside(these: Array, others: Array) -> Array:
 
 
 def _side_gap(signed: Sequence[Array], surfaces: Sequence[CrownSurface], aside: Array, middle: float) -> float:
-    """Return the gap between the crowns on the side that `aside` points to [mm]; NaN if an arch has no teeth there."""
+    """Return the gap between the crowns on one side, in direction `aside` [mm]; NaN if an arch has no teeth there."""
     gaps = []
     for distance, surface in zip(signed, surfaces, strict=True):
         there = surface.points @ aside - middle > _ASIDE_MM
@@ -162,7 +162,7 @@ def _side_gap(signed: Sequence[Array], surfaces: Sequence[CrownSurface], aside: 
 
 
 def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
-    """Return the lateral distance of the midlines [mm], and the ratio of the widths; NaN if unknown.
+    """Return the lateral distance between the midlines [mm], and the ratio of the arch widths; NaN if unknown.
 
     They are measured in transverse slabs in which both arches have teeth on both sides.
     """

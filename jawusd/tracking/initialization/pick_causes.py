@@ -1,6 +1,6 @@
 """Mistakes in scans, calibration, masks or picks that can make picks and masks contradict one another.
 
-Each mistake is yielded with the inputs after undoing it, so that `pick_checks` can test whether these agree.
+Each mistake is yielded with the corrected inputs, so that `pick_checks` can test whether they agree.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ _SIZE_SHARE = 0.02
 _SHIFT, _FOCAL, _CLICK_MM = 0.05, 0.1, 0.3
 # bound on the log of the focal-length factor, which random clicks would otherwise make overflow
 _MOST_ZOOM = np.log(2.0)
-_STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # scale of the pose unknowns, about their usual error [rad, mm]
+_STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # scale of the pose unknowns [rad, mm]: about their usual error
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """All inputs that determine the projections of the scans, as given or with a mistake undone.
+    """All inputs that determine the projections of the scans, as given or with a mistake corrected.
 
     Attributes:
-        picks: those on the upper and on the lower arch.
+        picks: picks on the upper and on the lower arch.
         vertices: vertices of both scans, as indexed by the picks [mm].
         crowns: some points of both scans' crowns [mm].
-        cameras: by name.
-        sources: the camera whose masks are used for each camera; by default its own.
+        cameras: calibrated cameras by name.
+        sources: for each camera name, the name of the camera whose masks it uses; by default, its own.
         exchanged: cameras for which the masks of the two arches are swapped.
     """
 
@@ -51,7 +51,7 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Mistake:
-    """A possible mistake, and the setting with it undone."""
+    """A possible mistake, and the setting after correcting it."""
 
     kind: str
     message: str
@@ -62,7 +62,7 @@ class Mistake:
 
 
 def possible_mistakes(given: Setting) -> Iterator[Mistake]:
-    """Yield every mistake that can be undone; those of single cameras, which take longest, come last."""
+    """Yield every mistake that can be corrected; those of single cameras take longest and come last."""
     yield Mistake(
         "scans_mirrored",
         "the scans are mirrored: left and right are exchanged",
@@ -159,7 +159,7 @@ def _with_views(given: Setting, renamed: Callable[[list[str]], list[str]]) -> tu
 
 
 def _wrong_lenses(given: Setting) -> Iterator[Mistake]:
-    """Yield cameras whose images may be shifted or scaled relative to their calibration."""
+    """Yield mistakes of cameras whose images may be shifted or scaled relative to their calibration."""
     for name, camera in given.cameras.items():
         for zooms in (False, True):
             fitted = fitted_camera(given.picks, given.vertices, given.cameras, name, zooms)
@@ -179,7 +179,7 @@ def _wrong_lenses(given: Setting) -> Iterator[Mistake]:
 
 
 def shifted(camera: Camera, shift_px: Array) -> Camera:
-    """Return a camera with its principal point moved by some pixels, shape (2,)."""
+    """Return a camera with its principal point moved by `shift_px` (2,)."""
     K = camera.K.copy()
     K[:2, 2] += shift_px
     return replace(camera, K=K)
@@ -199,10 +199,10 @@ def fitted_camera(
     name: str,
     zooms: bool,
 ) -> Camera | None:
-    """Return a camera with the principal point, or focal length, that fits the picks best.
+    """Return a camera whose principal point or focal length is adjusted to fit the picks best.
 
-    None if no pick has a pixel in that camera, or the picks of an arch lie on a line. `picks` and `vertices` are those
-    of the upper and the lower scan. The poses of the scans are fitted as well.
+    Return None if no pick has a pixel in that camera, or if the picks of an arch lie on a line. `picks` and `vertices`
+    are those of the upper and the lower scan. The poses of the scans are fitted as well.
     """
     if all(view.camera != name for own in picks for pick in own for view in pick.views):
         return None
@@ -256,7 +256,7 @@ def _sights(picks: Sequence[Pick], vertices: Array) -> tuple[Array, Array, list[
 
 
 def _placed(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera]) -> Array | None:
-    """Return T_world_scan (4, 4) from the triangulated picks; None if they lie on a line."""
+    """Return T_world_scan (4, 4) from the triangulated picks; None if the picks lie on a line."""
     places = [
         triangulate(
             np.stack([cameras[view.camera].projection_matrix() for view in pick.views]),

@@ -1,7 +1,7 @@
-"""Check that picks agree with one another and with the masks; if not, find the mistake that explains it.
+"""Check that picks agree with one another and with the masks; if not, find the mistake that explains the misfit.
 
-Each possible mistake is undone in turn. A mistake is reported if, once it is undone, all picks agree and the masks
-coincide with the scans at the poses from the picks.
+Each possible mistake is corrected in turn. A mistake is reported if, once it is corrected, all picks agree and the
+masks coincide with the scans at the poses from the picks.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from jawusd.tracking.initialization.bootstrap import TOLERANCE_MM, picks_miss_mm
 from jawusd.tracking.initialization.pick_causes import Mistake, Setting, possible_mistakes
 
 _CLOSE_MM = 1.0  # maximum distance of a covered mask pixel from a projected crown point
-_ON = 0.85  # minimum fraction of a camera's mask pixels on the scans for its masks to be consistent with the picks
-# Misfit of the given inputs above which mistakes are tested [-]; exceeded by 1 of 60 valid subjects.
+_ON = 0.85  # minimum fraction of a camera's mask pixels on the scans for its masks to agree with the picks
+# Misfit of the given inputs above which mistakes are tested [-]; exceeded by 1 in 60 valid subjects.
 _SUSPECT_MISFIT = 1.7
-# Maximum ratio of the misfit after undoing a mistake to that of the given inputs, for the mistake to be reported: in
-# general, and for mistakes that make rejected picks fit and that tracking corrects, which are only warnings.
+# Maximum ratio of the misfit after correcting a mistake to that of the given inputs for the mistake to be reported [-]:
+# in general; and if tracking corrects the mistake itself and rejected picks then fit, which is only a warning.
 _PROOF, _PROOF_BY_PICKS = 0.5, 0.75
 # fraction of mask pixels off the scans that adds 1 to the misfit, and rms pick error that adds 1
 _OFF, _MISS_MM = 0.05, 0.3
-# fraction of mask pixels off the scans assumed for a camera without masks in this frame, as these might contradict the
-# picks
+# fraction of mask pixels off the scans that is assumed for a camera without masks in this frame, since its masks might
+# contradict the picks
 _UNSEEN = 0.25
 _SURE = 1.0  # misfit below which swapped inputs are reported without testing mistakes of single cameras
-_ALIKE = 0.15  # maximum excess of another mistake's misfit over the smallest one for it to be reported as well
-# maximum number of mistakes tested: all those of 15 cameras; the 6,000 of 64 cameras would take most of an hour
+_ALIKE = 0.15  # maximum difference of another mistake's misfit from the smallest one for it to be reported too
+# maximum number of mistakes tested: covers 15 cameras; the 6,000 mistakes of 64 cameras would take most of an hour
 _MOST_TRIED = 400
 _FEWEST = 3  # minimum number of picks on an arch
 
-#: Returns the mask pixels of both arches in the frame of the picks, shape (N, 2) each, N = 0 without a mask. Arguments:
-#: names of the camera whose masks are read, and of the camera whose frame numbers are used.
+#: Function that returns the mask pixels of both arches in the frame of the picks, shape (N, 2) each, N = 0 without a mask.
+#: Arguments: name of the camera whose masks are read, and name of the camera whose frame numbers are used.
 Seen = Callable[[str, str], tuple[Array, Array]]
 
 
@@ -52,7 +52,7 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
         given: the inputs as in the capture.
         seen: readers of the masks, one per candidate set of time offsets.
         masked: cameras that have masks.
-        frame: frame of the picks, for the findings.
+        frame: frame number of the picks, for the findings.
 
     Raises:
         TrackingError: the picks contradict one another, and no single mistake explains it.
@@ -92,7 +92,7 @@ class _Evidence:
 
     @property
     def misfit(self) -> float:
-        """The total disagreement [-]: 0.2 to 1.5 for correct inputs."""
+        """The total misfit of picks and masks [-]: 0.2 to 1.5 for correct inputs."""
         off = np.array([1.0 - on for on in self.on.values()] + [_UNSEEN] * self.unseen)
         return float(off.mean() if self.on else 0.0) / _OFF + self.miss_mm / _MISS_MM
 
@@ -156,15 +156,15 @@ def _covered(setting: Setting, poses: Sequence[Array], seen: Sequence[Seen], mas
 def _explanation(
     given: Setting, found: _Evidence | None, seen: Sequence[Seen], masked: Sequence[str]
 ) -> tuple[Mistake, _Evidence] | None:
-    """Return the mistake that best explains the misfit, and the evidence with it undone; None if no mistake does.
+    """Return the mistake that best explains the misfit, and the evidence after correcting it; otherwise None.
 
-    `found` is the evidence for the inputs as given, None if the picks contradict one another.
+    `found` is the evidence for the inputs as given; None if the picks contradict one another.
     """
     allowed = 0 if found is None else found.rejected
     tried: list[tuple[Mistake, _Evidence]] = []
     for mistake in islice(possible_mistakes(given), _MOST_TRIED):
         if mistake.camera is not None and any(not m.correctable and e.misfit < _SURE for m, e in tried):
-            break  # mistakes of single cameras follow, which take longest to test
+            break  # only mistakes of single cameras follow, which take longest to test
         try:
             undone = _evidence(mistake.setting, seen, masked)
         except TrackingError:

@@ -1,6 +1,6 @@
 """Brute-force search for the pose of one arch: orientations one by one, all translations at once.
 
-For one orientation, a small translation mostly shifts the image of the arch. Its fit to the mask as a function of the
+For one orientation, a small translation mostly shifts the image of the arch. The fit to the mask as a function of that
 shift is a correlation, which the fast Fourier transform computes for all shifts together. The objective of a
 translation is the sum of the correlations of all cameras.
 """
@@ -30,7 +30,7 @@ _UNCOVERED_PRICE = 1.0
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of poses about a guess.
+    """A grid of poses around a guess.
 
     Attributes:
         yaw_rad, pitch_rad, roll_rad: rotations about the up, left and front axes of the arch.
@@ -45,7 +45,7 @@ class Grid:
     step_mm: float = 1.5
 
     def turns(self) -> Iterator[Array]:
-        """Yield the rotations, all roll angles of one yaw and pitch together, shape (N, 3, 3)."""
+        """Yield the rotations in batches (N, 3, 3): all roll angles of one yaw and pitch."""
         rolls = so3_exp(self.roll_rad[:, None] * [0.0, 0.0, 1.0])
         for yaw in self.yaw_rad:
             for pitch in self.pitch_rad:
@@ -81,7 +81,7 @@ class ShiftCorrelation:
 
     def __init__(self, view: View, arch: int, px_per_mm: float, shifts: Array, at: Array) -> None:
         """Prepare the correlation for world translations `shifts` (N, 3) of a world point `at` (3,) [mm]."""
-        # Shifts are rounded, since blurred outlines are insensitive to fractions of a pixel.
+        # Shifts are rounded to whole pixels, since blurred outlines are insensitive to fractions of a pixel.
         pixels = np.rint(shifts @ _slope(view.matrix, at).T).astype(np.int64)
         picture = _template(view.masks[arch], view.masks[1 - arch], px_per_mm)
         some = np.abs(picture) > 1e-3
@@ -124,13 +124,13 @@ def search_arch(
     """Return the best translation of every orientation of a grid, the best orientations first.
 
     Args:
-        scan: the arch, coarse.
+        scan: coarse scan of the arch.
         arch: 0 upper, 1 lower.
         views: views of one frame; those without a mask of the arch are ignored.
         px_per_mm: resolution of the views at the teeth.
         base: guessed T_world_axes of (left, up, front) axes of the arch with origin at the centre of rotation, shape
             (4, 4).
-        hinge: T_axes_scan to the same axes, shape (4, 4).
+        hinge: T_axes_scan, from the scan frame to the same axes, shape (4, 4).
         map_: distributes the orientations among threads.
     """
     shifts = grid.shifts() @ base[:3, :3].T
@@ -157,7 +157,7 @@ def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: floa
     straight edge. Moving both derivatives to the mask turns it into -div(w grad m), with w = 0 where the outline is
     that of the other arch.
     """
-    sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # blur of both outlines combined [px]
+    sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # combined blur of both outlines [px]
     inside = mask / 255.0
     own = 1.0 - ndimage.binary_dilation(other > 127, iterations=max(1, round(px_per_mm)))
     smooth = ndimage.gaussian_filter(inside, sigma)
@@ -167,7 +167,7 @@ def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: floa
 
 
 def _slope(matrix: Array, point: Array) -> Array:
-    """Return the derivative of the pixel with respect to the world point, shape (2, 3)."""
+    """Return the derivative of the projected pixel with respect to the world point, shape (2, 3)."""
     h = matrix @ np.append(point, 1.0)
     return (matrix[:2, :3] - (h[:2] / h[2])[:, None] * matrix[2, :3]) / h[2]
 
@@ -186,13 +186,13 @@ def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
 
 
 def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], use: Mask) -> Array:
-    """Return the translation across the line of sight that aligns the centres of crowns and masks [mm].
+    """Return the translation perpendicular to the line of sight that aligns the centres of crowns and masks [mm].
 
-    It moves teeth that were out of view close to their masks. Lips hide different teeth in every view, so a depth
-    estimate would be off by a centimetre or two; depth is therefore not changed. Perpendicular to the line of sight,
-    the result is accurate to a few millimetres, enough to start a search.
+    The translation moves teeth that were out of view close to their masks. Lips hide different teeth in every view, so
+    a depth estimate would be off by a centimetre or two; depth is therefore not changed. Perpendicular to the line of
+    sight, the result is accurate to a few millimetres, enough to start a search.
 
-    `pose` is T_world_scan, `use` the masks to use, shape (2, C). Zero without masks.
+    `pose` is T_world_scan, `use` the masks to use, shape (2, C). Without masks, the translation is zero.
     """
     centre = np.append(transform_point(pose, scan.centre), 1.0)
     H, g, sight = np.zeros((3, 3)), np.zeros(3), np.zeros(3)

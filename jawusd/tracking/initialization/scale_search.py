@@ -1,7 +1,7 @@
 """Search for the world scale at which masks and scans agree best.
 
-Images of a calibration board do not reveal the size of its squares. A wrong size scales the whole world, and then no
-pose of the teeth fits their masks in several views.
+Images of a calibration board do not reveal the size of its squares. A wrong square size scales the whole world, and
+then no pose of the teeth fits their masks in several views.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ def seen_size(
     meshes: Sequence[Mesh],
     map_: Mapper = map,
 ) -> float:
-    """Return the size of the teeth in the calibrated world relative to the scans, accurate to half a per cent.
+    """Return the size of the teeth in the calibrated world relative to the scans, accurate to 0.5 %.
 
     Args:
         capture: provides masks, frame range and anatomical axes.
         cameras: calibrated up to the scale of the world.
         offsets: reference frame minus own frame number, by camera name.
-        meshes: upper and lower teeth scans in one frame, in occlusion [mm].
+        meshes: upper and lower teeth scans in one coordinate frame, in occlusion [mm].
         map_: distributes the search among threads.
 
     Raises:
@@ -69,7 +69,7 @@ def seen_size(
                 continue
             size, fit = sizes.climb(frame, start, poses)
             if fit >= _CLEAR_FIT:
-                return 1.0 / size  # the world is too small by the factor by which the teeth appear too small
+                return 1.0 / size  # teeth that appear too small indicate a world that is too small by the same factor
             best_fit = max(best_fit, fit)
     raise TrackingError(
         f"the scans do not fit the masks of frames {', '.join(map(str, frames))} at any size from {_SMALLEST:g} to "
@@ -97,7 +97,7 @@ class _Sizes:
         return Footage(sources, cameras, self._offsets, self._capture.frames)
 
     def climb(self, frame: int, size: float, poses: Array) -> tuple[float, float]:
-        """Return the size with the best fit, by hill climbing from given poses, and the fit of the worse arch.
+        """Return the size with the best fit, found by hill climbing from given poses, and the fit of the worse arch.
 
         The fit is -inf if the climb has not ended after `_MOST_SIZES` evaluations.
         """
@@ -126,7 +126,7 @@ class _Sizes:
         return size, fit
 
     def _fitted(self, frame: int, size: float, poses: Array, size_of_poses: float) -> tuple[float, float, Array]:
-        """Return objective, fit of the worse arch, and poses, aligned from poses at another size."""
+        """Align at one size, from poses at another; return objective, fit of the worse arch, and poses."""
         scans, config = self._solver.scans, self._solver.config
         start = poses.copy()
         start[:, :3, 3] *= size / size_of_poses

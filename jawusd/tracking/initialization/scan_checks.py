@@ -24,7 +24,8 @@ _BESIDE_SHARE = 0.35
 _FACING_BACK_RAD = np.pi / 2
 _WIDEST_MM, _NARROWEST_MM = 100.0, 20.0
 # Limits of usual bites: gap, overlap, difference between the gaps of both sides, distance of the midlines, maximum and
-# minimum width, range of width ratios, lower front teeth in front of the upper ones, tilt of the given axes.
+# minimum width, range of width ratios, distance of the lower front teeth in front of the upper ones, tilt of the given
+# axes.
 _LOOSE_MM = 0.8
 _TIGHT_MM = 1.3
 _ONE_SIDED_MM = 1.0
@@ -40,13 +41,13 @@ _LOOK = "View both scans together, and correct them if this is not the subject's
 
 
 def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
-    """Check that both arches are in one frame, in occlusion; return T_anatomical_scan (4, 4) and warnings.
+    """Check that both scans share a coordinate frame and are in occlusion; return T_anatomical_scan and warnings.
 
-    `T_anatomical_scan` maps the scan frame to (left, up, front) axes; None derives it from the scans.
+    `T_anatomical_scan` (4, 4) maps the scan frame to (left, up, front) axes; None derives it from the scans.
 
     Raises:
-        TrackingError: the scans cannot form a bite: apart, beside or inside one another, upside down, identical, or not
-            of the size of teeth.
+        TrackingError: the scans cannot form a bite: they are apart, beside or inside one another, upside down,
+            identical, or not of the size of teeth.
     """
     T, findings = occlusion_findings(scans, T_anatomical_scan)
     for finding in findings:
@@ -56,9 +57,9 @@ def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) 
 
 
 def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
-    """Return T_anatomical_scan (4, 4), given or derived, and findings about two scans in one frame.
+    """Return T_anatomical_scan (4, 4), given or derived, and findings about two scans in one scan frame.
 
-    Only impossible bites are errors. Warnings are then omitted, since they would be consequences.
+    Only impossible bites are errors; with an error, warnings are omitted, since they would be its consequences.
     """
     given = T_anatomical_scan is not None
     derived = anatomical_frame(*(scan.crown_vertices(6000) for scan in scans))

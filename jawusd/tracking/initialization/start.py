@@ -32,7 +32,7 @@ from jawusd.tracking.initialization.start_causes import (
 )
 from jawusd.tracking.initialization.start_search import SearchResult, StartSearch
 
-#: Number of frames surveyed: takes two seconds, and covers every exercise of a usual take.
+#: Number of frames surveyed: the survey takes two seconds, and covers every jaw exercise of a usual take.
 SURVEYED = 24
 #: Maximum number of frames on which the teeth are searched for.
 FRAMES_TRIED = 5
@@ -52,13 +52,13 @@ class Start:
 def search_start(search: StartSearch, footage: Footage, suspects: Collection[str] = (), explain: bool = True) -> Start:
     """Find a frame on which both arches can be aligned, and their poses.
 
-    Uses the first frame with a clear fit, or else the one with the best fit. If neither arch fits acceptably in the
-    latter, but both fit clearly with a mistake undone, that mistake is an error.
+    Uses the first frame with a clear fit, or else the one with the best fit. If neither arch fits acceptably on the
+    frame with the best fit, but both fit clearly once a mistake is corrected, that mistake is reported as an error.
 
     Args:
-        search: search for the scans.
+        search: search for the poses of the scans.
         footage: the masks.
-        suspects: hints of the mistakes that the scans suggest, which identify them.
+        suspects: hints of the mistakes that the scans suggest; a mistake is identified by its hint.
         explain: whether to look for a mistake if no frame fits, which takes several times as long.
 
     Raises:
@@ -75,8 +75,8 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
         try:
             found = search.at(footage, frame)
             fits[frame] = found.fits
-            # If most masks are correct, so are the poses, which then reveal the wrong masks. Poor poses are no
-            # evidence.
+            # If most masks are correct, so are the poses, which then reveal the wrong masks. Poor poses are no evidence
+            # against masks.
             exchange = likely_exchange(footage, search.solver, found.poses, frame)
             if exchange is None:
                 found = replace(found, poses=aligned(search, footage, found.poses, frame))
@@ -128,9 +128,9 @@ def search_near(search: StartSearch, footage: Footage, frame: int, poses: Array)
 def fit_without_a_camera(
     search: StartSearch, footage: Footage, frame: int, poses: Array, found: SearchResult
 ) -> tuple[str, SearchResult] | None:
-    """Return a camera whose masks contradict the others', and the poses found without it; None if there is none.
+    """Return a camera whose masks contradict the other cameras, and the poses found without it; otherwise None.
 
-    A camera is excluded only if the others then fit clearly.
+    A camera is excluded only if the masks of the others then fit clearly.
     """
     if len(footage.sources) < 3:
         return None
@@ -184,9 +184,10 @@ def find_start(
 
     Args:
         capture: provides masks, picks and frame range.
-        cameras, offsets: by camera name; an offset is reference minus own frame number.
-        meshes: upper and lower teeth scans in one frame, in occlusion [mm].
-        solver: solver with the same scans, prepared.
+        cameras, offsets: calibrations and time offsets by camera name; an offset is the reference frame number minus
+            the camera's own.
+        meshes: upper and lower teeth scans in one coordinate frame, in occlusion [mm].
+        solver: solver prepared with the same scans.
         map_: distributes the search among threads.
 
     Raises:
@@ -208,10 +209,10 @@ def find_start(
 
 @contextlib.contextmanager
 def quote_findings(findings: Sequence[Finding]) -> Iterator[None]:
-    """Append findings to the hint of a TrackingError raised inside the context, since they may be its cause.
+    """Append findings, which may be the cause, to the hint of a TrackingError raised inside the context.
 
     Raises:
-        TrackingError: as raised inside, with the findings.
+        TrackingError: the error raised inside, with the findings in its hint.
     """
     try:
         yield
@@ -262,7 +263,7 @@ def _picked(
 
 
 def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mapping[str, float]) -> tuple[Finding, ...]:
-    """Return warnings for arches that the search found far from their picks, although these are accurate."""
+    """Return warnings for arches that the search found far from their picks, although the picks are accurate."""
     out = []
     for scan, picked, found in zip(search.solver.scans, start.poses, poses, strict=True):
         off = float(np.linalg.norm(transform_point(found, scan.centre) - transform_point(picked, scan.centre)))
@@ -282,7 +283,7 @@ def _elsewhere(
 ) -> Start:
     """Return a start on another frame that fits, since lips may hide the teeth on the picked frame.
 
-    If there is none, return the start unchanged; it then fails with its own error.
+    Without such a frame, return the start unchanged; it then fails with its own error.
     """
     other = _near_on_another_frame(search, footage, start)
     if other is None:
@@ -298,7 +299,7 @@ def _elsewhere(
 
 
 def _near_on_another_frame(search: StartSearch, footage: Footage, start: Start) -> Start | None:
-    """Return the first frame with a clear fit near the picked poses, since heads and jaws move little."""
+    """Return the start on the first frame that fits clearly near the picked poses, since heads and jaws move little."""
     try:
         frames = footage.survey(None, SURVEYED).promising(FRAMES_TRIED).tolist()
     except TrackingError:
@@ -314,7 +315,7 @@ def _near_on_another_frame(search: StartSearch, footage: Footage, start: Start) 
 
 
 def _fits(search: StartSearch, footage: Footage, start: Start) -> bool:
-    """Return whether a start passes the checks of a first frame; hidden teeth may cause wrong local minima near it."""
+    """Return whether a start passes the checks of a first frame; with hidden teeth, it may be a wrong local minimum."""
     try:
         aligned(search, footage, start.poses, start.frame)
     except TrackingError:

@@ -1,4 +1,4 @@
-"""Causes of a failed start: swapped masks, and other mistakes in scans or calibration, each tested by undoing it."""
+"""Causes of a failed start: swapped masks, and other mistakes in scans or calibration, each tested by correcting it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_search import StartSearch
 
-# Maximum ratio of the uncovered mask fraction after undoing a swap to that before, for the swap to be reported.
+# Maximum ratio of the uncovered mask fraction after correcting a swap to that before for the swap to be reported [-].
 _PROOF = 0.5
 # Minimum uncovered fraction of a camera's masks for a swap to be suspected: good poses leave 0.01, and swapped masks of
 # similar cameras as little as 0.1.
@@ -30,8 +30,8 @@ class MaskExchange:
     """A possible swap of masks."""
 
     finding: str  # description of the swap
-    hint: str  # instruction for undoing the swap
-    sources: tuple[CameraSource, ...]  # sources of the cameras' masks, with the swap undone
+    hint: str  # instruction for correcting the swap
+    sources: tuple[CameraSource, ...]  # sources of the cameras' masks, with the swap corrected
 
     def error(self, frame: int) -> TrackingError:
         """Return the error that reports the swap."""
@@ -72,7 +72,7 @@ def possible_exchanges(sources: Sequence[CameraSource]) -> list[MaskExchange]:
 
 
 def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> MaskExchange | None:
-    """Return the swap that best explains why masks lie off their scans, with its evidence; None if none does.
+    """Return the swap that best explains why masks lie off their scans, with its evidence; None if no swap does.
 
     `poses` are T_world_upper and T_world_lower of the frame, accurate to about 1 mm, shape (2, 4, 4).
     """
@@ -108,7 +108,7 @@ def _uncovered_shares(footage: Footage, solver: ContourSolver, poses: Array, fra
 
 
 def _masks(source: CameraSource) -> Masks:
-    """Return the masks of a camera that was chosen by `masked_sources`."""
+    """Return the masks of a camera, which has masks because `masked_sources` chose it."""
     if source.masks is None:
         raise TrackingError("there are no masks", camera=source.name)
     return source.masks
@@ -128,7 +128,7 @@ def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
 #: Minimum of a clear fit [-]: correct poses exceed it unless lips are nearly closed; wrong poses stay below 0.1 in one
 #: arch.
 CLEAR_FIT = 0.3
-#: Minimum acceptable fit with a mistake undone [-]: wrong poses do not reach it.
+#: Minimum acceptable fit with a mistake corrected [-]: wrong poses do not reach it.
 EXPLAINS = 0.1
 _MOST_CAMERAS = 4  # maximum number of cameras for which swaps are tried, since each swap costs a search
 #: Maximum number of images searched, separately for the start and for mistakes; each takes 2 to 3 s of CPU time. The
@@ -155,7 +155,7 @@ def aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> 
     """Return the poses aligned by the solver, if they pass the checks of a first frame, shape (2, 4, 4).
 
     Raises:
-        TrackingError: they do not pass.
+        TrackingError: the poses do not pass the checks.
     """
     solver = search.solver
     with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm) as masks:
@@ -170,13 +170,13 @@ def raise_cause(
     suspected: set[str],
     only_clear: bool = False,
 ) -> str:
-    """Raise an error for a mistake if undoing it makes the search succeed on one of some frames.
+    """Raise an error for a mistake if correcting it makes the search succeed on one of the given frames.
 
     Suspected swaps are tried before others, and suspected sizes before everything else. Mistakes of single cameras, and
     sizes that are not suspected, come last, since many poses fit once contradictions are excluded. At most
-    `MOST_PICTURES` images are searched; in a group of mistakes that was not fully tried, only a clear fit counts. Next,
-    a scan that fits none of its masks is reported; then other frames are tried within the same budget, since the search
-    can miss the teeth on a frame.
+    `MOST_PICTURES` images are searched; in a group of mistakes of which some were not tried, only a clear fit counts.
+    Next, a scan that fits none of its masks is reported; then other frames are tried within the same budget, since the
+    search can miss the teeth on a frame.
 
     Args:
         search, footage: the search that failed, and its footage.
@@ -186,10 +186,10 @@ def raise_cause(
         only_clear: whether only a clear fit counts.
 
     Returns:
-        A sentence that describes what was tried, if no mistake explains the failure.
+        A sentence about what was tried; returned only if no mistake explains the failure.
 
     Raises:
-        TrackingError: names the mistake.
+        TrackingError: a mistake explains the failure; the message describes it.
     """
     exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in suspected)
     sizes = [*_sizes(search, footage)]
@@ -206,11 +206,11 @@ def raise_cause(
     sentence = f"Correcting any of {tried} possible mistakes in masks, scans and calibration does not help on {where}"
     if tried == count:
         return f"{sentence}."
-    return f"{sentence}; {count - tried} more were not tried, since at most {MOST_PICTURES} pictures are searched."
+    return f"{sentence}; {count - tried} more were not tried, since at most {MOST_PICTURES} images are searched."
 
 
 def _raise_cause_on(frame: int, groups: Sequence[Sequence[_Cause]], only_clear: bool) -> int:
-    """Raise an error for a mistake if undoing it makes the search succeed on a frame; return how many were tried."""
+    """Raise an error for a mistake if correcting it makes the search succeed; return the number of mistakes tried."""
     tried, pictures = 0, 0
     for causes in groups:
         explained: list[tuple[float, _Cause]] = []
@@ -235,7 +235,7 @@ def raise_for_unmatched_arch(fits: Mapping[int, Array]) -> None:
         fits: `arch_fit` of both arches by frame, as found by a failed search [-], shape (2,).
 
     Raises:
-        TrackingError: names the scan.
+        TrackingError: there is such a scan; the message names it.
     """
     clear = {frame: fit for frame, fit in fits.items() if fit.max() >= CLEAR_FIT}
     arches = {int(fit.argmax()) for fit in clear.values()}
@@ -255,7 +255,7 @@ def raise_for_unmatched_arch(fits: Mapping[int, Array]) -> None:
 
 
 def _fit(cause: _Cause, frame: int) -> float:
-    """Return the fit of the teeth with a mistake undone [-]; zero if they are not found."""
+    """Return the fit of the teeth with a mistake corrected [-]; zero if the teeth are not found."""
     try:
         found = cause.search.at(cause.footage, frame)
         if found.fit < EXPLAINS:
@@ -282,7 +282,7 @@ def _exchanges(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
     for exchange in possible_exchanges(footage.sources):
         yield _Cause(exchange.finding, exchange.hint, search, replace(footage, sources=exchange.sources))
     for a, b in combinations([source.name for source in footage.sources], 2):
-        if footage.offsets[a] != footage.offsets[b]:  # would otherwise be identical to a swap of masks
+        if footage.offsets[a] != footage.offsets[b]:  # with equal offsets, this is identical to a swap of masks
             cameras = {**footage.cameras, a: footage.cameras[b], b: footage.cameras[a]}
             message = f"the calibrations of cameras {a} and {b} are exchanged"
             hint = f"Exchange the names {a} and {b} in the calibration."

@@ -24,7 +24,7 @@ from jawusd.tracking.initialization.pose_search import Candidate, Grid, coarse_s
 _PX_PER_MM = 2.0
 _FINALISTS = 5  # number of poses per arch that are refined
 _DISTINCT_MM = 2.0  # minimum distance of distinct poses: closer ones converge to the same local minimum
-# Rotations and translations about a guess in which the teeth face the cameras with the upper arch above the lower one.
+# Rotations and translations around a guess in which the teeth face the cameras with the upper arch above the lower one.
 # Lateral movements and lips bias mostly the roll of the guess. With retracted lips, the centre of the masks lies up to
 # 20 mm behind the front teeth.
 _GRID = Grid(
@@ -33,7 +33,7 @@ _GRID = Grid(
     roll_rad=np.radians(np.arange(-50, 51, 10.0)),
     reach_mm=(13.0, 9.0, 22.5),
 )
-# Rotations and translations about picked poses: possible errors after four careless clicks close together.
+# Rotations and translations around picked poses: possible errors after four careless clicks close together.
 _NEAR_GRID = Grid(
     yaw_rad=np.radians(np.arange(-20, 21, 10.0)),
     pitch_rad=np.radians(np.arange(-20, 21, 10.0)),
@@ -74,7 +74,7 @@ class StartSearch:
         """Prepare coarse scans.
 
         Args:
-            meshes: upper and lower teeth scans in one frame, in occlusion [mm].
+            meshes: upper and lower teeth scans in one coordinate frame, in occlusion [mm].
             solver: solver with the same scans.
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
             map_: distributes the search among threads.
@@ -121,7 +121,7 @@ class StartSearch:
         return self._settled(finalists, views, footage, frame)
 
     def near(self, footage: Footage, frame: int, poses: Array) -> SearchResult:
-        """Return the best poses on a frame near given ones, T_world_upper and T_world_lower, shape (2, 4, 4).
+        """Return the best poses on a frame near given poses T_world_upper and T_world_lower, shape (2, 4, 4).
 
         Raises:
             TrackingError: no anatomically possible pair of poses.
@@ -135,7 +135,7 @@ class StartSearch:
         return self._settled(finalists, views, footage, frame)
 
     def _searched(self, r: int, views: Sequence[View], base: Array, grid: Grid) -> list[Array]:
-        """Return the best distinct poses of an arch."""
+        """Return the best poses of an arch that are distinct from one another."""
         found = search_arch(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
         return self._distinct(found, r)
 
@@ -224,7 +224,7 @@ def guessed_axes(places: Array, eyes: Array) -> Array:
     """Return a guess of the left, up and front axes of the teeth in the world, shape (3, 3), axes in columns.
 
     Args:
-        places: centres of the upper and the lower masks [mm], shape (2, 3).
+        places: centres of the upper and the lower masks in world coordinates [mm], shape (2, 3).
         eyes: camera centres [mm], shape (C, 3).
     """
     rays = eyes - places.mean(0)

@@ -49,7 +49,7 @@ class GuidedTracker:
         """Prepare the scans.
 
         Args:
-            upper, lower: teeth scans in one frame, in occlusion [mm].
+            upper, lower: teeth scans in one coordinate frame, in occlusion [mm].
             see: makes the masks of a frame; masks made around a wrong pose tend to confirm it.
             rounds: number of times that masks and poses of a frame are updated in turn.
 

@@ -62,7 +62,7 @@ def track_capture(
         capture: provides masks, frame range and bootstrap picks; without picks, the first pose is searched for.
         cameras: calibrated; world lengths in mm.
         offsets: reference frame minus own frame number, per camera name.
-        upper, lower: teeth scans in one frame, in occlusion [mm].
+        upper, lower: teeth scans in one coordinate frame, in occlusion [mm].
         landmarks: points whose uncertainty is reported, mandible (= scan) coordinates [mm], shape (5, 3).
         threads: number of worker threads; the result does not depend on it.
         progress: called once per frame with the number of frames done, and their total.
