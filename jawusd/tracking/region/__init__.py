@@ -1,5 +1,5 @@
-"""Tracking by image colours, without masks: of independent arches (`tracker`, `take`) and of a rig (`rig_tracker`).
+"""Tracking of independent arches (`tracker`, `take`) or of a rig (`rig_tracker`) by image colours, without masks.
 
-Read in order: colours, edges, creases, view, appearance, jaw_priors, search, tracker, take; then rig_tracker, live.
-May import the other parts of `tracking`, which must not import this one.
+Reading order: colours, edges, creases, view, appearance, jaw_priors, search, tracker, take; then rig_tracker, live.
+This package may import the other parts of `tracking`; they must not import it.
 """

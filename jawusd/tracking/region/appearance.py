@@ -19,8 +19,8 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.colours import PATCHES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.view import Counts, RegionView
 
-# Distances that define the training areas of the initial colours [px]: minimum inside crowns, minimum and maximum
-# outside them, and minimum from all teeth for the background.
+# Distances that define the training areas of the initial colours [px]: minimum distance inside crowns, minimum and
+# maximum distance outside them, and minimum distance of the background from all teeth.
 _INSIDE_PX, _OUTSIDE_PX, _RING_PX, _BEYOND_PX = 2.0, 3.0, 30.0, 4.0
 
 #: Learning rates of tooth and background colours [-], in general and in the first frame.
@@ -37,13 +37,13 @@ class Picture(NamedTuple):
     rgb: NDArray[np.uint8]  # 8-bit pixels, shape (h, w, 3)
 
 
-#: Returns the images of a frame, one per camera or None, cropped around T_world_upper and T_world_lower, shape (2, 4,
-#: 4).
+#: Function that returns the images of a frame, one per camera (None without image), cropped around the teeth at
+#: T_world_upper and T_world_lower, shape (2, 4, 4).
 Cut = Callable[[Array], Sequence[Picture | None]]
 
 
 def first_colours(picture: Picture, poses: Array, scans: Sequence[Scan]) -> CameraColours:
-    """Learn the colours of an image with known poses T_world_upper and T_world_lower, shape (2, 4, 4)."""
+    """Learn tooth colours from an image with known poses T_world_upper and T_world_lower, shape (2, 4, 4)."""
     shape = picture.rgb.shape[:2]
     labels = np.zeros((2, *shape), np.uint8)
     for r in ARCHES:
@@ -64,7 +64,7 @@ class LearnedColours:
         """Start without statistics.
 
         Args:
-            scans: upper and lower, in one frame.
+            scans: upper and lower scan, in one coordinate frame.
             cameras: cameras in the order of the images.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
         """
@@ -76,17 +76,17 @@ class LearnedColours:
         self._gum_px = np.zeros((2, len(cameras)))
 
     def copy(self) -> LearnedColours:
-        """Return a copy that learns independently."""
+        """Return a copy whose colours are learned independently."""
         out = copy(self)
         out._colours, out._gum_px = deepcopy(self._colours), self._gum_px.copy()
         return out
 
     def begin(self, pictures: Sequence[Picture | None], poses: Array) -> None:
-        """Initialise the colours in a frame with poses T_world_upper and T_world_lower, shape (2, 4, 4)."""
+        """Initialise the colours from a frame with poses T_world_upper and T_world_lower, shape (2, 4, 4)."""
         self._colours = [None if p is None else first_colours(p, poses, self._scans) for p in pictures]
 
     def views(self, pictures: Sequence[Picture | None], before: Array) -> list[View]:
-        """Return the views of a frame.
+        """Return the views of a video frame.
 
         Args:
             pictures: one image per camera.
@@ -112,7 +112,7 @@ class LearnedColours:
         return out
 
     def counting(self, views: Sequence[View]) -> list[View]:
-        """Return the views with counters that collect the colours on both sides of borders, for `learn`."""
+        """Return the views with empty counts, which collect the colours on both sides of borders for `learn`."""
         return [
             replace(view, edges=replace(view.edges, counts=Counts.zeros()))
             if isinstance(view.edges, RegionView)
@@ -126,8 +126,8 @@ class LearnedColours:
         """Update the colour models from both sides of matched borders, and the offset of the gum line.
 
         Args:
-            views: views of the images, with the counts of one alignment.
-            pictures, poses: images and poses of the frame.
+            views: views of the images, with the colour counts of one alignment.
+            pictures, poses: images and poses of the same frame.
             rates: learning rates of tooth and background colours, 0 .. 1.
         """
         for c, view in enumerate(views):

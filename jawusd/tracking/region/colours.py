@@ -1,4 +1,4 @@
-"""Colour model of teeth and surroundings in one camera: histograms, global and by patch of an arch."""
+"""Colour model of teeth and surroundings in one camera: histograms of the whole image and of patches of each arch."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from scipy.ndimage import gaussian_filter1d
 from jawusd.base.arrays import Array, Mask
 
 PATCHES = 8  # number of patches per arch
-KINDS = 2  # number of kinds of borders: free edges and gum line
+KINDS = 2  # number of border kinds: free edge and gum line
 TABLES = PATCHES * KINDS  # number of colour tables per arch; table = KINDS * patch + kind
-_BITS = 4  # bits per channel; with more, most bins would stay empty
+_BITS = 4  # bits per colour channel; with more bits, most bins would stay empty
 BINS = 1 << (3 * _BITS)
 
 _BLUR = 0.7  # standard deviation of the blur kernel [bins]
@@ -22,7 +22,7 @@ _REACH = 2  # radius of the blur kernel [bins]
 # Matrix that blurs along one axis of the colour cube; values are replicated at its border.
 _SPREAD = gaussian_filter1d(np.eye(1 << _BITS), _BLUR, axis=0, mode="nearest", radius=_REACH)
 _LOCAL = 0.5  # weight of a patch's own histogram in its colour model
-_MOST = 3.0  # maximum magnitude of the log ratios, as no colour is conclusive
+_MOST = 3.0  # maximum magnitude of the log ratios, since no colour is conclusive
 _LIPS = 0.2  # weight of skin and lips in the background model
 _EMPTY = 2e-5  # probability assigned to unseen colours
 _ENOUGH = 200.0  # minimum number of counts for a new histogram to have full weight
@@ -62,8 +62,8 @@ class CameraColours:
     def __init__(self, bins: NDArray[np.uint16], areas: Areas) -> None:
         """Train on a first image, given as colour bins of shape (h, w).
 
-        Lips may hide the projected crowns, and other teeth may lie beside these; repeated classification removes the
-        pixels of both.
+        Lips may hide the projected crowns, and other teeth may lie beside the crowns; repeated classification removes
+        the pixels of lips and other teeth.
         """
 
         def count(where: Mask) -> Array:
@@ -100,7 +100,7 @@ class CameraColours:
     def _ratio(self) -> NDArray[np.float32]:
         """Return the log ratio of tooth to background by arch, table and bin, shape (2, TABLES, BINS)."""
         out = np.empty((2 * TABLES, BINS), np.float32)
-        beside = np.stack([self._outside, 0.5 * (self._gum + self._outside)])  # by kind of border
+        beside = np.stack([self._outside, 0.5 * (self._gum + self._outside)])  # background histograms by kind of border
         inside, outside = self._local_tooth.reshape(-1, BINS), self._local_outside.reshape(-1, BINS)
         _write_ratios(inside, outside, self._tooth, beside, self._lips, out)
         return out.reshape(2, TABLES, BINS)
@@ -110,10 +110,10 @@ class CameraColours:
 def _write_ratios(
     local_tooth: Array, local_outside: Array, tooth: Array, outside: Array, lips: Array, out: NDArray[np.float32]
 ) -> None:
-    """Write the log ratios of tables (T, B), mixing local and global histograms and lips.
+    """Write the log ratios of colour tables (T, B) from a mixture of local, global and lip histograms.
 
     Args:
-        local_tooth, local_outside: histograms by table, empty where nothing was learned, shape (T, B).
+        local_tooth, local_outside: histograms by table, shape (T, B); all zero where nothing was learned.
         tooth: histogram of all teeth, shape (B,).
         outside: histogram of the background next to borders of each kind, shape (KINDS, B).
         lips: histogram of skin and lips, shape (B,).
@@ -131,7 +131,7 @@ def _write_ratios(
 
 @numba.njit(nogil=True, cache=True)
 def _blend(known: Array, counts: Array, rate: float) -> None:
-    """Blend blurred counts (T, B) into histograms (T, K, B), the same for all K, weighted by the number of counts."""
+    """Blend blurred counts (T, B), weighted by their number, into histograms (T, K, B); all K are updated alike."""
     blurred = np.empty(BINS)
     for t in range(len(known)):
         total = counts[t].sum()
@@ -161,7 +161,7 @@ def _blur(histogram: Array, out: Array) -> None:
 
 
 def _blended(known: Array, counts: Array, rate: float) -> Array:
-    """Return a histogram (BINS,) with new counts blended in, unchanged if they are too few."""
+    """Return a histogram (BINS,) with new counts blended in; unchanged if the counts are too few."""
     total = counts.sum()
     return known if total < 2 * _ENOUGH else (1 - rate) * known + rate * _smooth(counts / total)
 

@@ -2,9 +2,9 @@
 
 The covariances of frames with implausible condylar motion are inflated first.
 
-Masks generated around a wrong pose confirm it, and colours may favour it, but such poses rarely fit the condylar motion
-of this jaw. While a take is tracked, the condylar prior has a low weight, as few frames have trained it. Once all
-frames are known, each pose is fused with the prediction at full weight.
+Masks generated around a wrong pose confirm that pose, and colours may favour it, but wrong poses rarely fit the
+condylar motion of the subject's jaw. While a take is tracked, the condylar prior has a low weight, since it was trained
+on few frames. Once all frames are known, each pose is fused with the prediction at full weight.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from jawusd.tracking.contour.quality import landmark_sigmas
 from jawusd.tracking.region.jaw_priors import CondyleMotion
 
 _STRAINED = 2.0  # squared Mahalanobis distance of the condyles, per coordinate, above which a frame is implausible
-# Quantile of the take's squared distances that counts as usual, and lower bound of the usual squared distance.
+# Quantile of a take's squared condyle distances that counts as usual, and lower bound of the usual squared distance.
 _USUAL, _LEAST = 0.9, 0.25
 
 
 def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) -> Array:
-    """Train a condylar motion with all frames; return factors on the covariances (F,), 1 for plausible frames.
+    """Train a condylar motion on all frames; return factors on their covariances (F,), 1 for plausible frames.
 
-    The factor is the squared distance of the condyles from their prediction, relative to the usual one (Birge 1932).
+    The factor is the squared distance of the condyles from their prediction, relative to its usual value (Birge 1932).
 
     Args:
-        motion: untrained.
+        motion: untrained condylar motion, which is trained in place.
         relative: T_upper_lower, shape (F, 4, 4).
-        covariance: covariance of their left twists about the skull origin, shape (F, 6, 6).
+        covariance: covariance of the left twists of T_upper_lower about the skull origin, shape (F, 6, 6).
     """
     for pose, spread in zip(relative, covariance, strict=True):
         motion.learn(pose, spread)
@@ -42,7 +42,7 @@ def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) ->
 
 
 def widen_strained(tracks: Tracks, landmarks: Array, axes: Array) -> Tracks:
-    """Return tracks with inflated covariances of implausible frames; see `strain_factors`.
+    """Return tracks in which the covariances of implausible frames are inflated; see `strain_factors`.
 
     Args:
         landmarks, axes: as in `CondyleMotion`.
@@ -65,7 +65,7 @@ def widen_strained(tracks: Tracks, landmarks: Array, axes: Array) -> Tracks:
 
 @dataclass(frozen=True, eq=False)
 class CondyleFusion:
-    """Fuses all poses of a take with its own condylar motion; see `results.Fusion`.
+    """Fuses all poses of a take with the condylar motion learned from them; see `results.Fusion`.
 
     Attributes:
         landmarks, axes: as in `CondyleMotion`.
@@ -103,7 +103,7 @@ class CondyleFusion:
 def _fused(motion: CondyleMotion, relative: Array, covariance: Array) -> tuple[Array, Array]:
     """Return the left twist (6,) from a measured to the fused T_upper_lower, and its covariance.
 
-    A single step suffices, as the prediction is nearly linear within the range of pose errors.
+    A single step suffices, since the prediction is nearly linear within the range of pose errors.
     """
     residual, slope, variance = motion.residual(relative)
     pull = slope.T / variance
@@ -121,7 +121,7 @@ def _shared(poses: Array, covariance: Array, twist: Array, gained: Array) -> tup
         gained: reduction of the covariance of T_upper_lower's left twist by the fusion, shape (6, 6).
     """
     to_world = se3_adjoint(poses[0])
-    gains = covariance @ np.linalg.inv(covariance.sum(0))  # the twist adds to x_lower - x_upper
+    gains = covariance @ np.linalg.inv(covariance.sum(0))  # the fusion adds `twist` to x_lower - x_upper
     moves = gains @ to_world @ twist * np.array([[-1.0], [1.0]])
     less = gains @ (to_world @ gained @ to_world.T) @ np.swapaxes(gains, 1, 2)
     return orthonormalise(se3_exp(moves) @ poses), covariance - less

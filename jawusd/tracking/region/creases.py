@@ -14,7 +14,7 @@ from jawusd.tracking.contour.samples import NX, NY, U, V, pixel_of
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.region.edges import colour_at
 
-# Search range of dark lines about a sample, and of edges about a dark line [px]; number of half-pixel steps to either
+# Search range of dark lines around a sample, and of edges around a dark line [px]; number of half-pixel steps to either
 # side from which a gradient is computed.
 _CREASE_PX, _BESIDE_PX, _CREASE_ARM = 6.0, 3.0, 3
 
@@ -31,9 +31,9 @@ def search_creases(
     out: Array,
     clearness: Array,
 ) -> None:
-    """Find crown edges in front of the other arch: the steepest brightness change beside the dark line between both.
+    """Find crown edges in front of the other arch: the steepest brightness change beside the dark line between crowns.
 
-    Shading may darken both crowns towards the line, but gradually, whereas the edge is sharp except for lens blur.
+    Shading may darken both crowns towards the line, but gradually; the edge is sharp except for lens blur.
 
     Args:
         contrast: minimum difference between the brighter tooth and the line [8-bit steps].
@@ -56,7 +56,7 @@ def search_creases(
             line[k] = _light(rgb, u + t * nx, v + t * ny)
         low, at = np.inf, n
         for k in range(n - int(2 * reach), n + int(2 * reach) + 1):
-            p = line[k] + 0.25 * abs(k - n)  # prefers the nearer of two lines
+            p = line[k] + 0.25 * abs(k - n)  # prefer the nearer of two dark lines
             if p < low:
                 low, at = p, k
         least = line[at]
@@ -71,7 +71,7 @@ def search_creases(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _sharpest(line: Array, at: int, steps: int) -> float:
-    """Return the interpolated index of the steepest change near index `at` of a line; NaN without a local maximum."""
+    """Return the interpolated index of the steepest change near index `at` of a profile; NaN without local maximum."""
     best, place = 0.0, np.nan
     before, slope = np.nan, np.nan
     first = max(at - steps, _CREASE_ARM)

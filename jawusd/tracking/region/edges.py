@@ -1,7 +1,7 @@
 """Tooth edges in a colour image: the most likely border along every contour normal.
 
-Pixels inside the border should have tooth colours, pixels outside background colours. The log ratios of both sides sum
-to the log likelihood of every border position (as in Stoiber et al. 2022). No mask is computed.
+Pixels inside the border should have tooth colours, pixels outside background colours. The sum of the log ratios on both
+sides is the log likelihood of a border position (as in Stoiber et al. 2022). No mask is computed.
 
 All compiled functions release the GIL and are stateless.
 """
@@ -20,20 +20,20 @@ _MOST_STEPS = 10  # maximum number of search steps to either side of a sample
 _LEAST_CLEAR = 0.15  # fraction of `clear_ratio` below which an edge is rejected
 # minimum and maximum motion blur that is compensated; gamma of the images
 _LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2
-_SMOOTH_PX = 1.0  # half the width over which gradients are computed
+_SMOOTH_PX = 1.0  # half the width over which image gradients are computed
 _PER_CODE = 8  # entries of the linearisation table per 8-bit step
 _LIGHT = (np.arange(255 * _PER_CODE + 1) / (255 * _PER_CODE)) ** _GAMMA
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _within(bins: NDArray[np.uint16], x: float, y: float) -> bool:
-    """Return whether a position can be interpolated bilinearly."""
+    """Return whether an image position can be interpolated bilinearly."""
     return x >= 0 and y >= 0 and x < bins.shape[1] - 1 and y < bins.shape[0] - 1
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _ratio_at(bins: NDArray[np.uint16], table: NDArray[np.float32], x: float, y: float) -> float:
-    """Interpolate the log ratio of a table bilinearly; 0, which is neutral, outside the image."""
+    """Interpolate the log ratio of a table bilinearly; outside the image, return the neutral value 0."""
     if not _within(bins, x, y):
         return 0.0
     # Unsigned indices avoid numba's check for negative indices.
@@ -72,9 +72,9 @@ def search_borders(
         ratio: bounded log likelihood ratio of tooth to background by colour bin [-], shape (T, B).
         own_labels, other_labels: rendered labels of this and of the other arch: CROWN, GUM or 0, shape (h, w).
         other_inverse_depth: rendered inverse depth of the other arch's scan [1/mm], 0 = empty, shape (h, w).
-        reach_px: search distance on either side.
+        reach_px: search distance on either side of the sample.
         tolerance_mm: minimum depth difference between the arches for occlusion.
-        cos_limit: minimum cosine between the sample's normal and the direction in which the ratio falls.
+        cos_limit: minimum cosine between the sample's normal and the direction in which the log ratio falls.
         clear_ratio: minimum mean log ratio on both sides for full weight of a border [-].
         out: result, shape (n,): distance, positive outwards; NaN where the sample is hidden or no border is found.
         clearness: result, shape (n,): weight, 0 .. 1; NaN where the other arch hides the sample.
@@ -103,7 +103,7 @@ def search_borders(
         gx = _ratio_at(bins, table, ex + e, ey) - _ratio_at(bins, table, ex - e, ey)
         gy = _ratio_at(bins, table, ex, ey + e) - _ratio_at(bins, table, ex, ey - e)
         if -(gx * nx + gy * ny) < cos_limit * np.sqrt(gx * gx + gy * gy):
-            continue  # this border crosses the contour: a lip or a neighbouring tooth
+            continue  # a border that crosses the contour belongs to a lip or a neighbouring tooth
         out[s] = d
         clearness[s] = min(1.0, clear)
 
@@ -129,7 +129,7 @@ def _read_line(
     own_labels: NDArray[np.uint8],
     other_labels: NDArray[np.uint8],
 ) -> None:
-    """Read the log ratios along a normal; 0 inside beyond the sample's own crown, and outside beyond the next one."""
+    """Read the log ratios along a contour normal; they are 0 inwards of the sample's crown and beyond the next one."""
     x, y, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
     r[:] = 0.0
     for i in range(n, 2 * n + 1):
@@ -151,7 +151,7 @@ def _read_line(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _likeliest(r: Array, n: int, step: float, reach_px: float) -> int:
-    """Return the index of the most likely border; -1 if it lies at an end of the line."""
+    """Return the index of the most likely border along a normal; -1 if it lies near an end of the search range."""
     total = 0.0
     best = -np.inf
     at = -1
@@ -167,7 +167,7 @@ def _likeliest(r: Array, n: int, step: float, reach_px: float) -> int:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _zero_crossing(r: Array, n: int, step: float, k: int) -> float:
-    """Return the position where the ratio falls below 0 near index k, or that of k if there is none [px]."""
+    """Return the position at which the log ratio falls below 0 near index k [px]; without one, the position of k."""
     d = (k - n) * step
     near = np.inf
     for m in range(k - 2, k + 2):
@@ -223,7 +223,8 @@ def sharpen(
         contrast: minimum difference of both sides' mean colours [8-bit steps].
         reach_px: maximum distance by which a border is moved.
         blur_px: motion along the normals during the exposure, which is the width of a blurred edge, shape (n,).
-        out, clearness: as written by `search_borders`; the weight of borders without a steepest point is reduced.
+        out, clearness: results of `search_borders`, updated in place; borders without a steepest point get a lower
+            weight.
     """
     inner = np.empty(3)
     outer = np.empty(3)
@@ -272,12 +273,12 @@ def sharpen(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _steepest(line: Array, steps: int, arm: int) -> float:
-    """Return the position of the steepest descent of a line, in samples from its middle; NaN without a local maximum.
+    """Return the position of the steepest descent of a profile [samples from its middle]; NaN without local maximum.
 
     Args:
-        line: 2 (steps + arm) + 1 samples.
+        line: profile of 2 (steps + arm) + 1 samples.
         steps: search steps to either side.
-        arm: number of samples to either side whose linearly weighted difference is the gradient.
+        arm: number of samples on either side from whose linearly weighted difference the gradient is computed.
     """
     before, slope = np.nan, np.nan
     best, place = 0.0, np.nan
@@ -310,7 +311,7 @@ def count_colours(
     """Count the colours on both sides of borders found within 2 px.
 
     Args:
-        near_px, far_px: minimum and maximum distance of counted pixels from the contour.
+        near_px, far_px: minimum and maximum distance from the contour of the pixels counted.
         tooth, outside: counts to update, shape (T, B).
     """
     for s in range(len(samples)):

@@ -9,23 +9,23 @@ _Gates = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Effort:
-    """Steps of an alignment, conditions for searches, and their sizes.
+    """Steps of an alignment, conditions for starting searches, and sizes of searches.
 
     Attributes:
-        gates_px: residual gates of the steps from a prediction.
-        next_px: gates after one dropped frame.
-        far_px: gates after several dropped frames.
-        wide_px: gates from other starts and at the end of a search; None to use those from the prediction.
+        gates_px: residual gates of the steps of an alignment that starts from the prediction.
+        next_px: residual gates after one dropped frame.
+        far_px: residual gates after several dropped frames.
+        wide_px: residual gates for other starts and at the end of a search; None to use the gates for the prediction.
         uncertain, searched: fractions of the usual matched contour below which other starts are tried, and below which
             a search starts, provided that hardly any frames were dropped.
         jaws, finalists, heads: numbers of jaw poses tried by a search, of jaw poses aligned fully, and of head poses
             tried.
-        search_every: number of failed frames from one search to the next.
+        search_every: interval between searches, in failed frames.
         searches: number of failed frames after which teeth count as not visible.
         later_every: like `search_every`, once teeth count as not visible.
         in_turn: whether jaw and head are searched in different frames once teeth count as not visible, to limit the
             time per frame.
-        learn_every: number of frames from one update of the colours to the next.
+        learn_every: interval between updates of the colours, in frames.
     """
 
     gates_px: _Gates
@@ -61,7 +61,8 @@ THOROUGH = Effort(
     in_turn=False,
     learn_every=1,
 )
-#: Effort for live images. Frames are dropped during a search, so searches are less frequent.
+#: Effort for live images. Since frames are dropped during a search, searches are less frequent than for recorded
+#: images.
 FAST = Effort(
     gates_px=(8.0, 3.0, 2.0),
     next_px=(16.0, 6.0, 2.5, 2.0),

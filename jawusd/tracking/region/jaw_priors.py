@@ -1,8 +1,8 @@
-"""Priors on the jaw: condyles that follow the incisal point, and teeth that do not interpenetrate.
+"""Priors on the jaw pose: condyles that follow the incisal point, and teeth that do not interpenetrate.
 
 When the teeth touch, or lips hide most of them, the contour hardly constrains rotations of the jaw that raise the front
-teeth and lower the condyles. In any one jaw, the position of the incisal point nearly determines those of both
-condyles, as mandibles have about three degrees of freedom (Zoss et al. 2018). The relation is learned from earlier
+teeth and lower the condyles. For a given jaw, the position of the incisal point nearly determines the positions of both
+condyles, since a mandible has about three degrees of freedom (Zoss et al. 2018). This relation is learned from earlier
 frames.
 """
 
@@ -17,9 +17,9 @@ from jawusd.geometry import hat, relative_pose, rigid_fit, se3_adjoint, se3_inve
 from jawusd.tracking.contour.equations import NormalEquations, Solution, translation
 from jawusd.tracking.contour.quality import landmark_sigmas
 
-_UNIT_MM = (5.0, 20.0, 5.0)  # scale of the incisal point's motion to the left, up and forwards
-# Mean motion of the left condyle to the left, up and forwards [mm] as coefficients of 1, x, y, z, xx, xy, xz, yy, yz,
-# zz, over 60 joints of `jawusd.synthetic.person`, whose ranges come from the literature. The motion of the right
+_UNIT_MM = (5.0, 20.0, 5.0)  # scale of the incisal point's motion to the left, upwards and forwards
+# Mean motion of the left condyle to the left, upwards and forwards [mm]: coefficients of 1, x, y, z, xx, xy, xz, yy,
+# yz, zz, over 60 joints of `jawusd.synthetic.person`, whose ranges come from the literature. The motion of the right
 # condyle is the mirror image.
 _USUAL_MM = np.array(
     [
@@ -29,32 +29,34 @@ _USUAL_MM = np.array(
     ]
 )
 _ODD = np.array([False, True, False, False, False, True, True, False, False, False])  # whether each term is odd in x
-# Standard deviations of a subject's coefficients to the side, up and forwards [mm], factor on these for the quadratic
-# terms, and standard deviation of the constant term, which is an error of the bite registration of the scans [mm].
+# Standard deviations of a subject's polynomial coefficients, sideways, upwards and forwards [mm]; factor on these for
+# the quadratic terms; and standard deviation of the constant term, which is an error of the bite registration of the
+# scans [mm].
 _SPREAD_MM, _PRODUCTS, _CONSTANT_MM = (0.4, 1.5, 1.5), 0.5, 1.0
-# Standard deviations of the condyles about the polynomials of their own jaw, to the side, up and forwards [mm].
+# Standard deviations of the condyles from the polynomials of their own jaw, sideways, upwards and forwards [mm].
 _OFF_MM = (0.3, 0.8, 0.5)
-_NEWS = 0.1  # weight of a frame in the regression: below 1, as neighbouring frames are correlated
-# backward motion of the incisal point per mm of opening and per mm^2 of its square: mean over the joints of `_USUAL_MM`
+_NEWS = 0.1  # weight of a frame in the regression: below 1, since neighbouring frames are correlated
+# backward motion of the incisal point per mm of opening and per mm^2 of squared opening: mean over the joints of
+# `_USUAL_MM`
 _BACK = 0.25, 0.005
-# squared Mahalanobis distance per coordinate at which the weight of a frame is halved, as its pose may be wrong [-]
+# squared Mahalanobis distance per coordinate at which the weight of a frame is halved, since its pose may be wrong [-]
 _HALVING = 4.0
 
 # Standard deviation of the height of lower teeth above their position in the occlusion of the scans [mm], due to errors
-# of the bite registration; and the squared height in standard deviations [-] at which the penalty's weight is halved,
-# as the bite of the scans may be wrong instead of the pose.
+# of the bite registration; and the squared height in standard deviations [-] at which the weight of the penalty is
+# halved, since the bite of the scans may be wrong instead of the pose.
 _ABOVE_MM, _BITE_HALVING = 0.2, 4.0
 
 
 class CondyleMotion:
-    """Learned map from the position of the incisal point to those of both condyles.
+    """Learned map from the position of the incisal point to the positions of both condyles.
 
-    Bayesian linear regression (Bishop 2006, section 3.3) of the motion of both condyles on the incisal point's, all
-    within the skull, by polynomials of the second degree.
+    Bayesian linear regression (Bishop 2006, section 3.3) of the motion of both condyles on that of the incisal point,
+    all relative to the skull, by polynomials of the second degree.
     """
 
     def __init__(self, landmarks: Array, axes: Array) -> None:
-        """Start from the prior, which is the same for all jaws.
+        """Start from the population prior, which is the same for all subjects.
 
         Args:
             landmarks: as in `geometry.LANDMARKS`, in scan coordinates [mm], shape (5, 3).
@@ -86,7 +88,8 @@ class CondyleMotion:
     def expected(self, incisor: Array) -> tuple[Array, Array, Array]:
         """Predict the condyles' motion from that of the incisal point: mean (6,), derivative (6, 3), variance (6,).
 
-        In anatomical axes [mm], left condyle first; `incisor` has shape (3,).
+        Motions are in anatomical axes [mm], left condyle first; `incisor`, the motion of the incisal point, has shape
+        (3,).
         """
         features, slopes = _features(incisor)
         means = np.linalg.solve(self._precision, self._sums[..., None])[..., 0]
@@ -110,12 +113,12 @@ class CondyleMotion:
         return rigid_fit(self._points, self._points + moves @ self.axes)
 
     def _shifts(self, relative: Array) -> tuple[Array, Array]:
-        """Return displacements of incisal point (3,) and condyles (6,) from occlusion, anatomical axes [mm]."""
+        """Return displacements of incisal point (3,) and condyles (6,) from occlusion, in anatomical axes [mm]."""
         moved = (transform_point(relative, self._points) - self._points) @ self.axes.T
         return moved[0], moved[1:].ravel()
 
     def residual(self, relative: Array) -> tuple[Array, Array, Array]:
-        """Return the residuals of the condyles [mm], derivatives, and variances [mm^2]; shapes (6,), (6, 6), (6,).
+        """Return the residuals of the condyles [mm], their derivatives and variances [mm^2]; shapes (6,), (6, 6), (6,).
 
         `relative` is T_upper_lower (4, 4); the derivatives are with respect to its left twist about the skull origin.
         """
@@ -128,13 +131,13 @@ class CondyleMotion:
 
 @dataclass(frozen=True, eq=False)
 class CondyleTerm:
-    """Penalises distances of both condyles from their predicted positions."""
+    """Penalises the distances of both condyles from their predicted positions."""
 
     motion: CondyleMotion
     noise_px3: float  # border variance times correlation length
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the squared distances at the solution's poses, in units of the outline sums."""
+        """Add the squared condyle distances at the solution's poses, in units of the outline's sum of squares."""
         residual, slope, variance = self.motion.residual(relative_pose(state.poses[0], state.poses[1]))
         to_skull = se3_adjoint(se3_inverse(state.poses[0]))
         upper, lower = (slope @ to_skull @ se3_adjoint(translation(centre)) for centre in state.centres)
@@ -144,7 +147,7 @@ class CondyleTerm:
 
 
 def _features(incisor: Array) -> tuple[Array, Array]:
-    """Return the monomials (K,) of a point up to degree two, and their derivatives with respect to it (K, 3)."""
+    """Return the monomials (K,) of a point up to degree two, and their derivatives with respect to the point (K, 3)."""
     x, unit = incisor / _UNIT_MM, np.diag(1.0 / np.array(_UNIT_MM))
     i, j = np.triu_indices(3)
     products = x[i, None] * unit[j] + x[j, None] * unit[i]
@@ -153,7 +156,7 @@ def _features(incisor: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class BiteTerm:
-    """Penalises lower teeth above their position in the occlusion of the scans.
+    """Penalises lower teeth that lie above their position in the occlusion of the scans.
 
     Attributes:
         points: points on the lower teeth, in scan coordinates [mm], shape (N, 3).
@@ -166,7 +169,7 @@ class BiteTerm:
     noise_px3: float
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the squared heights above occlusion at the solution's poses, in units of the outline sums."""
+        """Add the squared heights above occlusion at the solution's poses, in units of the outline's sum of squares."""
         skull = state.poses[0]
         up = skull[:3, :3] @ self.up
         for point in self.points:
@@ -174,7 +177,7 @@ class BiteTerm:
             height = float(up @ (here - closed))
             if height <= 0:
                 continue
-            # The point moves with the lower arch, and its upper limit with the upper arch.
+            # The point on the lower teeth moves with the lower arch, and its upper limit with the upper arch.
             moves = [up @ np.hstack([-hat(here - centre), np.eye(3)]) for centre in state.centres]
             slope = np.concatenate([-moves[0], moves[1]])
             trust = _BITE_HALVING / (_BITE_HALVING + (height / _ABOVE_MM) ** 2)

@@ -25,13 +25,13 @@ from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import fitting_share
 
 _FACES = 3_000
-# Settings are coarser than for recorded images, since dropped frames reduce accuracy more than coarse settings.
+# The settings are coarser than for recorded images, since dropped frames reduce accuracy more than coarse settings.
 _SETTINGS = replace(TrackingConfig(), sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
-_WIDER = 1.5  # ratio of true to computed standard deviation, as in the smoother
+_WIDER = 1.5  # ratio of true to computed standard deviation of d, as in the smoother
 
 
 class LiveTake:
-    """Live tracker of head and jaw; `coordinates` convert its poses."""
+    """Live tracker of head and jaw of a subject with a known rig; `coordinates` convert its poses."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class LiveTake:
         fixed_head: bool = False,
         executor: Executor | None = None,
     ) -> None:
-        """Prepare the scans.
+        """Prepare the scans for tracking.
 
         Args:
             jaw: the subject's rig.
@@ -51,7 +51,7 @@ class LiveTake:
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
             cameras: cameras in the order of the images.
             fixed_head: whether the cameras are head-mounted, so that the head hardly moves relative to them.
-            executor: thread pool that matches the contours of all cameras in parallel.
+            executor: thread pool in which the contours of all cameras are matched in parallel.
         """
         self._scans, self._axes, self._cameras = [thinned(scan, _FACES) for scan in scans], axes, cameras
         self._head = STEADY if fixed_head else 1.0
@@ -79,7 +79,7 @@ class LiveTake:
         return self._tracker.step(cut, frames)
 
     def sigma_d(self, fit: FrameFit) -> Array:
-        """Return the standard deviations of d of the last step [mm], including the rig's own error, shape (3,).
+        """Return the standard deviations of the jaw parameters d in the last step [mm], including the rig error (3,).
 
         Raises:
             ValueError: `begin` was not called.

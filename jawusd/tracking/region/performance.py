@@ -30,25 +30,25 @@ from jawusd.tracking.region.recovery import both_ways, contradicts, nearest_foun
 from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import fitting_share
 
-#: Returns the cropped images of a range of frames. Arguments: cameras, possibly with changed focal lengths; a world
-#: point near the teeth, which determines the resolution [mm], shape (3,); and the frames.
+#: Function that returns the cropped images of a range of frames. Arguments: cameras, possibly with changed focal
+#: lengths; a world point near the teeth, which determines the resolution [mm], shape (3,); and the frames.
 Cuts = Callable[[Sequence[Camera], Array, range], Iterator[Cut]]
-#: Searches for the teeth in some frames; returns a frame and the pose there. The second argument is the up direction of
-#: the head in the world, shape (3,). Raises TrackingError.
+#: Function that searches for the teeth in some frames; returns a frame and the pose in it. The second argument is the
+#: up direction of the head in the world, shape (3,). Raises TrackingError.
 Find = Callable[[range, Array], tuple[int, Pose]]
 Progress = Callable[[int, int], None]
 
-# Number of crown faces before and in the last step; spacing of contour samples, and motion that triggers a redraw [px];
-# pose update below which intermediate gates are skipped [mm].
+# Number of crown faces before the last step, and in it; spacing of contour samples [px]; image motion after which scans
+# are rendered again [px]; pose update below which intermediate gates are skipped [mm].
 _ROUGH_FACES, _FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 6_000, 20_000, 2.0, 2.0, 0.08
 # Number of frames from which a fixed head pose and unknown focal lengths are estimated in advance, and number of rounds
 # for focal lengths.
 _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
-# Prior on the offsets between colour borders and tooth edges in a take, and correlation length of the residuals along
+# Prior on the offsets between colour borders and tooth edges in a take; and correlation length of the residuals along
 # an outline [px]. Teeth darken towards their free edges, where borders lie up to half a pixel inside; gum-line offsets
 # are learned while tracking.
 _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
-_ALONE = 2.0  # factor on the variance if there is a single camera, as no other view reveals shifted borders [-]
+_ALONE = 2.0  # factor on the variance for a single camera [-], since no other view reveals shifted borders
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
 _SAME_MM = 0.15  # maximum difference of jaw parameters of equal poses
 
@@ -58,8 +58,8 @@ class PictureShot:
     """Input of a solve.
 
     Attributes:
-        cuts: source of the cropped images.
-        find: search for the teeth.
+        cuts: function that returns the cropped images.
+        find: function that searches for the teeth.
         cameras: cameras in the order of the images.
         frames: frame numbers of the reference camera.
         fps: frames per second.
@@ -146,7 +146,7 @@ class PictureTake:
         return performance_of(self._jaw, pivot, shot.frames, smoothed, names, shot.fps, free_focal=shot.free_focal)
 
     def _known_before(self, at: int, start: Pose, progress: Progress) -> tuple[Sequence[Camera], Pose, Array]:
-        """Return cameras, start pose, and focal-length factors (C,), estimated from some frames if unknown."""
+        """Return cameras, start pose, and focal-length factors (C,); unknown ones are estimated from some frames."""
         shot = self._shot
         cameras, factors = shot.cameras, np.ones(len(shot.cameras))
         rounds = _FOCAL_ROUNDS if shot.free_focal else int(shot.fixed_head)
@@ -194,7 +194,7 @@ class PictureTake:
     def _followed_from(
         self, lost: range, cameras: Sequence[Camera], head: float, known: Mapping[int, FrameFit]
     ) -> dict[int, FrameFit] | None:
-        """Return all fits after a search in lost frames, or None if it fails or contradicts the known fits."""
+        """Return all fits after a search in lost frames; None if the search fails or contradicts the known fits."""
         head_pose = self.coordinates.arches(nearest_found(known, lost).pose)[0]
         try:
             frame, pose = self._shot.find(lost, head_pose[:3, :3] @ self._axes[1])
@@ -238,7 +238,7 @@ class PictureTake:
 
 
 def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, range], Iterator[FrameFit]]) -> None:
-    """Track backwards into frames in which the teeth were not found or the fit is uncertain; keep the better fits.
+    """Track backwards into frames in which teeth were not found or the fit is uncertain; keep the better fits.
 
     Teeth may be visible for some frames before a search finds them, and a wrong pose is often corrected only some
     frames later.
@@ -266,12 +266,12 @@ def _same(fit: FrameFit, old: FrameFit) -> bool:
 
 
 def _better(fit: FrameFit, old: FrameFit) -> bool:
-    """Return whether a fit may replace another: one that is not trusted, or that matches clearly less contour."""
+    """Return whether a fit may replace another, which must be untrusted or match clearly less contour."""
     return _trust(old) < 2 or _fitting_px(fit) >= _CLEARLY * _fitting_px(old)
 
 
 def _trust(fit: FrameFit) -> int:
-    """Return the trust in a fit: 0 if the teeth were not found, 1 if it is uncertain, 2 otherwise."""
+    """Return the trust in a fit: 0 if the teeth were not found, 1 if the fit is uncertain, 2 otherwise."""
     return int(fit.found.all()) * (1 if fit.uncertain else 2)
 
 
@@ -280,7 +280,7 @@ def _fitting_px(fit: FrameFit) -> float:
 
 
 def _zoomed(camera: Camera, factor: float) -> Camera:
-    """Return a camera with its focal length scaled."""
+    """Return a camera with its focal length multiplied by a factor."""
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= factor
     return replace(camera, K=K)

@@ -1,4 +1,4 @@
-"""The start of tracking by colour: from picks, or by search in rough masks of the arches found by colour."""
+"""Start of tracking by colour: from picks, or by a search in rough masks of the arches, which are found by colour."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from jawusd.tracking.performance.single_start import SingleStart
 
 
 class ArchStart:
-    """Search for both arches in a frame of two or more cameras.
+    """Search for both arches in one video frame of two or more cameras.
 
     Rough masks are sufficient, since the fit of the poses is verified with colour borders.
 
@@ -45,9 +45,10 @@ class ArchStart:
         """Prepare the search.
 
         Args:
-            meshes, scans: upper and lower teeth in one frame, in occlusion [mm], before and after `prepare_scan`.
+            meshes, scans: upper and lower teeth in one coordinate frame, in occlusion [mm], before and after
+                `prepare_scan`.
             T_anatomical_skull: scan frame to (left, up, front) axes, shape (4, 4); None if unknown.
-            map_: map function that may run orientations in parallel.
+            map_: map function that may process orientations in parallel.
 
         Raises:
             TrackingError: the scans are not in occlusion.
@@ -87,7 +88,7 @@ class ArchStart:
 
 
 class PictureStart:
-    """Search for head and jaw of a subject with a known rig in a frame of one or more cameras.
+    """Search for head and jaw of a subject with a known rig in one video frame of one or more cameras.
 
     Attributes:
         findings: findings about the scans.

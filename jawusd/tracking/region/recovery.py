@@ -1,4 +1,4 @@
-"""Search for teeth that stay lost, and follow them forwards and backwards until known poses are met."""
+"""Search for teeth that stay lost, and track them forwards and backwards until their poses agree with known ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Located(Protocol):
 
     @property
     def found(self) -> Mask:
-        """Arches found, shape (2,)."""
+        """Whether each arch was found, shape (2,)."""
 
 
 P = TypeVar("P", bound=Located)
@@ -29,7 +29,7 @@ def recover(known: dict[int, P], frames: range, again: Callable[[range], Mapping
     Args:
         known: poses by frame, updated in place.
         frames: all frames.
-        again: searches in lost frames; returns the poses of all frames, or None if it found nothing.
+        again: function that searches in lost frames; returns the poses of all frames, or None if nothing was found.
     """
     if not any(pose.found.all() for pose in known.values()):
         return
@@ -50,12 +50,12 @@ def lost_stretches(known: Mapping[int, P], frames: range) -> list[range]:
 
 
 def nearest_found(known: Mapping[int, P], lost: range) -> P:
-    """Return the poses of the frame nearest to a lost run among those with both arches found."""
+    """Return the poses of the frame nearest to a run of lost frames, among the frames with both arches found."""
     return known[min((frame for frame in known if known[frame].found.all()), key=lambda frame: abs(frame - lost.start))]
 
 
 def both_ways(frame: int, frames: range) -> tuple[range, range]:
-    """Return the frames after and before a frame, in the order in which they are followed."""
+    """Return the frames after and before a frame, each in the order in which they are tracked."""
     return range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)
 
 
@@ -66,19 +66,19 @@ def replace_poses(
     same: Callable[[P, P], bool],
     better: Callable[[P, P], bool],
 ) -> bool | None:
-    """Replace poses by others of the same frames, as long as the two differ and the latter are better.
+    """Replace known poses by newly tracked ones, frame by frame, while the new ones differ and are better.
 
-    Where a tracker recovers or loses the teeth, its poses were wrong before, although each is plausible by itself.
+    Before a tracker recovers or loses the teeth, its poses may be wrong although each is plausible by itself.
 
     Args:
         way: frames in tracking order.
-        followed: other poses of these frames.
+        followed: newly tracked poses of these frames.
         known: poses by frame, updated in place.
-        same, better: compare another pose with a known one.
+        same, better: functions that compare a new pose with a known one.
 
     Returns:
-        True if an equal known pose was met, False if a different one that is not worse, None if the arches were lost
-        or the take ended.
+        True if a known pose agrees with the new one, False if a known pose differs and is not worse, None if the arches
+        were lost or the take ended first.
     """
     for frame, other in zip(way, followed, strict=False):
         if not other.found.all():
@@ -93,5 +93,5 @@ def replace_poses(
 
 
 def contradicts(meetings: list[bool | None]) -> bool:
-    """Return whether poses followed both ways, as by `replace_poses`, contradict known poses and agree with none."""
+    """Return whether the results of `replace_poses` in both directions include a contradiction but no agreement."""
     return False in meetings and True not in meetings

@@ -1,4 +1,4 @@
-"""Tracker of head and jaw of a subject with a known rig by colour, with recovery after losses."""
+"""Colour-based tracker of head and jaw of a subject with a known rig; it recovers lost teeth."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from jawusd.tracking.region.search import fitting_share, head_shifts, rank_by_co
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _LAST_GATES_PX = (2.0,)
-_TRIAL_GATES_PX = (8.0, 6.0)  # gates of the short trial alignments of a search
+_TRIAL_GATES_PX = (8.0, 6.0)  # residual gates of the short trial alignments of a search
 # Longest intervals between steps [frames] that count as no dropped frame, and as one dropped frame.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
 _FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some tenths of a millimetre
 # Fractions of the usual matched contour below which an arch is lost, and below which a lost arch stays lost.
 _LOST, _AGAIN = 0.33, 0.5
-# number of frames since the last step above which an arch must fit as well as a lost one to be accepted
+# number of frames since the last step above which an arch must fit as well as a recovered one
 _UNSURE_FRAMES = 3.0
 _USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
 _LEAST_USUAL = 0.7  # lower bound of the usual matched fraction, relative to the first frame
@@ -45,7 +45,7 @@ class RigTracker:
     """Frame-by-frame tracker of head and jaw of a known subject.
 
     Attributes:
-        expected: prior of the last step.
+        expected: pose prior of the last step.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class RigTracker:
             head: factor on the head's standard deviations; see `Prediction`.
             free_focal: whether to compute derivatives with respect to focal lengths.
             effort: computational effort per frame.
-            whole: solver whose scans have more faces, for the last step; default: none.
+            whole: solver whose scans have more faces, for the last step; None skips that step.
         """
         self._whole = whole
         self._instants, self._coordinates, self._colours = instants, instants.coordinates, colours
@@ -96,7 +96,7 @@ class RigTracker:
         return fit
 
     def reversed_from(self, begin: FrameFit) -> RigTracker:
-        """Return an independent tracker that continues from the first frame with the current statistics."""
+        """Return an independent tracker that starts again from the first frame with the colours learned so far."""
         out = copy(self)
         out._colours, out._usual = self._colours.copy(), self._usual.copy()
         out._motion = Prediction(self._coordinates, begin.pose, begin.found, head=self._head)
@@ -128,7 +128,7 @@ class RigTracker:
         return replace(fit, uncertain=bool((share < THOROUGH.uncertain * usual).any()))
 
     def _remember(self, share: Array) -> None:
-        """Add the matched fractions (2,) to the statistics, except uncertain ones."""
+        """Add the matched fractions of both arches (2,) to the statistics, except uncertain ones."""
         usual = self._usual_share()
         self._usual.append(np.where(share >= THOROUGH.searched * usual, share, usual))
 
@@ -147,14 +147,14 @@ class RigTracker:
     def _best(
         self, expected: Expected, look: _InstantImages, cut: Cut, frames: float, least: Array
     ) -> tuple[Aligned, _InstantImages]:
-        """Align from the prediction; if that may have failed, from other starts, then by search in larger crops.
+        """Align from the prediction; if this may have failed, from other starts, and then by a search in larger crops.
 
         Results of a search are accepted only if the matched fraction reaches `least`, shape (2,).
         """
         effort, usual = self._effort, self._usual_share()
         in_turn, far = effort.in_turn and self._failed > effort.searches, frames > _STEADY_FRAMES
         gates = effort.gates_px if in_turn or frames <= _NEXT_FRAMES else effort.far_px if far else effort.next_px
-        # After dropped frames, partial fits are not trusted, as the motion prior is weak.
+        # After dropped frames, partial fits are not trusted, since the motion prior is weak.
         limits = THOROUGH if far else effort
         found = look.align(expected.pose, expected, gates)
         if not (fitting_share(found.solution) < limits.uncertain * usual).any():
@@ -259,7 +259,7 @@ class _InstantImages:
         self._colours.learn(self._counting, self._pictures, self._instants.coordinates.arches(pose), rates)
 
     def fit(self, found: Aligned, trusted: Mask, free_focal: bool) -> FrameFit:
-        """Return the frame fit, restricted to the trusted arches, shape (2,)."""
+        """Return the fit of the frame; only trusted arches, shape (2,), count as found."""
         use = self.use & trusted[:, None]
         unknown = np.full(use.shape, np.nan)
         if not free_focal or not trusted.any():

@@ -24,11 +24,11 @@ from jawusd.tracking.region.view import RegionView
 from jawusd.tracking.sequence.history import MotionPredictor
 
 _POINTS = 400  # number of scan points at which image colours are read to rank starts
-# Candidate rotations of the jaw about the condyles, in opening and to the side [degrees].
+# Candidate rotations of the jaw about the condyles, up and down and to the side [degrees].
 _OPENED, _ASIDE = (-6.0, -4.5, -3.0, -1.5, 1.5, 3.0, 4.5, 6.0), (-4.0, -2.0, 2.0, 4.0)
-# Candidate positions of the incisal point: left, down, and forward of the path of plain opening [mm]. The solver
-# converges from about 1.7 mm. In a lateral excursion, the jaw rotates about the condyle of that side, so the point
-# moves forward.
+# Candidate positions of the incisal point [mm]: to the left, down, and in front of its path in plain opening. The
+# solver converges from a distance of about 1.7 mm. In a lateral excursion, the jaw rotates about the condyle of that
+# side, so the incisal point moves forward.
 _DOWN = np.arange(0.0, 46.0, 2.5).tolist()
 _LEFT = (-12.0, -9.0, -6.0, -3.0, 3.0, 6.0, 9.0, 12.0)
 _PLACES_MM = [
@@ -44,8 +44,8 @@ _SHIFTS_MM = [
     *((0.0, far, 0.0) for far in _FAR_MM),
 ]
 
-# Gates of an alignment from the prediction, of one from farther away, of a trial, and of the final step with all faces
-# [px]; spacing of contour samples, and motion that triggers a redraw [px].
+# Residual gates of an alignment from the prediction, from farther away, of a trial, and of the final step with all
+# faces [px]; spacing of contour samples [px]; and image motion after which scans are rendered again [px].
 _NEAR_GATES_PX, _FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _TRIAL_GATES_PX, _LAST_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
 _FACES = 6_000  # number of crown faces of the scans before the final step
@@ -54,22 +54,22 @@ _FACES = 6_000  # number of crown faces of the scans before the final step
 _LOOSE_PX3, _FIRM_PX3 = 3.0, 15.0
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX  # border variance times correlation length, as estimated from residuals
 # Penalty per unit of the condyles' squared Mahalanobis distance, as length of matched contour [px]: Tukey's loss of a
-# sample beyond the gate is 4.685^2 / 6, and samples are correlated over `CORRELATION_PX`.
+# sample beyond the gate is 4.685^2 / 6, and neighbouring samples are correlated over `CORRELATION_PX`.
 _STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
 _FAST_MM = 1.0  # predicted motion per frame above which other starts are tried
-# Number of starts that a search tries near the last poses, number that it tries anywhere in the human range, and number
-# that it aligns fully. Colours rank the correct start among the first 22 of 57.
+# Number of starts that a search tries near the last poses, number of starts that it tries anywhere in the human range
+# of motion, and number of starts that it aligns fully. Colours rank the correct start among the first 22 of 57.
 _HOPEFUL_NEAR, _HOPEFUL, _FINALISTS = 12, 24, 3
 
 
 def head_shifts(T_world_head: Array, axes: Array) -> Array:
-    """Return motions of the head in the world, shape (N, 4, 4); `axes` rotate from scan to left, up, front (3, 3)."""
+    """Return candidate head motions in the world, shape (N, 4, 4); `axes` (3, 3) map scan axes to left, up, front."""
     to_world = T_world_head[:3, :3] @ axes.T
     return np.stack([translation(to_world @ shift) for shift in np.array(_SHIFTS_MM)])
 
 
 def turned_starts(condyles: CondyleMotion, bases: Sequence[Array]) -> list[Array]:
-    """Return poses T_upper_lower (4, 4) rotated about the condyles from each base pose."""
+    """Return poses T_upper_lower (4, 4): each base pose rotated about the condyles by candidate angles."""
     hinge, axes = condyles.hinge, condyles.axes
     turns = [np.deg2rad(a) * axes[0] for a in _OPENED] + [np.deg2rad(a) * axes[1] for a in _ASIDE]
     about = [translation(hinge) @ se3_exp(np.append(turn, np.zeros(3))) @ translation(-hinge) for turn in turns]
@@ -87,7 +87,7 @@ def rank_by_colour(
     """Return the indices of poses T_world_arch (4, 4), ranked by the tooth likelihood of the pixels at their crowns.
 
     Args:
-        places: the poses.
+        places: the poses to be ranked.
         taken: for each view, the pixels (h, w) of the other arch, which are ignored; empty if unknown.
     """
     points = scans[arch].crown_vertices(_POINTS)
@@ -107,14 +107,14 @@ def rank_by_colour(
 
 
 class InstantViews(NamedTuple):
-    """Views of a frame, and the rendering shared by its alignments."""
+    """Views of a video frame, and the rendering shared by all alignments of that frame."""
 
     views: Sequence[View]
     rendering: Rendering
 
 
 class PoseSearch:
-    """Alignment of both arches in the views of a frame."""
+    """Alignment of both arches in the views of a video frame."""
 
     def __init__(
         self,
@@ -124,7 +124,7 @@ class PoseSearch:
         config: TrackingConfig | None,
         executor: Executor | None,
     ) -> None:
-        """Prepare the scans; see `RegionTracker`."""
+        """Prepare the scans; for the arguments, see `RegionTracker`."""
         self.config = replace(
             config or TrackingConfig(),
             sample_step_px=_SAMPLE_STEP_PX,
@@ -159,7 +159,7 @@ class PoseSearch:
         return solution
 
     def from_farther(self, solution: Solution, start: Array, last: Array, look: InstantViews) -> Solution:
-        """Align from a start with wide gates, and from the poses of the previous frame; return the best solution."""
+        """Align from a start with wide residual gates, and from the previous poses; return the better solution."""
         solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
         return self._better(solution, self._align(last, look, _NEAR_GATES_PX))
 
@@ -172,7 +172,7 @@ class PoseSearch:
         motion: MotionPredictor,
         everywhere: bool,
     ) -> Solution:
-        """Try earlier and rotated jaw poses and, if `everywhere`, the whole human range; the head is not changed."""
+        """Try earlier and rotated jaw poses and, if `everywhere`, all humanly possible ones; keep the head pose."""
         near = [se3_inverse(poses[0]) @ poses[1] for poses in (last, *motion.pose_history())]
         near += turned_starts(self.condyles, (se3_inverse(predicted[0]) @ predicted[1], near[0]))
         anywhere = starts_everywhere(self.condyles) if everywhere else []
@@ -187,12 +187,12 @@ class PoseSearch:
         return solution
 
     def with_head_alone(self, solution: Solution, start: Array, look: InstantViews) -> Solution:
-        """Align the head alone if that improves its fit: a wrong jaw pose biases it through the condylar prior."""
+        """Align the head alone if that improves its fit: a wrong jaw pose biases the head by the condylar prior."""
         alone = self._align(start, look, _FAR_GATES_PX, use=_upper_alone(look.views))
         return max((solution, alone), key=lambda trial: float(fitting_share(trial)[0]))
 
     def with_head_searched(self, solution: Solution, predicted: Array, look: InstantViews, alone: bool) -> Solution:
-        """Try shifted head poses with an unchanged jaw pose; `alone` ignores the contour of the jaw."""
+        """Try shifted head poses with an unchanged jaw pose; with `alone`, the contour of the jaw is ignored."""
         shifts, use = head_shifts(predicted[0], self._axes), _upper_alone(look.views) if alone else None
         order = rank_by_colour(list(shifts @ predicted[0]), look.views, self._thin.scans, 0)[: _HOPEFUL // 2]
         brief = [self._align(shifts[k] @ predicted, look, _TRIAL_GATES_PX, True, use) for k in order]

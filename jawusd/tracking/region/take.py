@@ -1,4 +1,4 @@
-"""Tracks of a take tracked by colour, and checks of its cameras, scans and footage."""
+"""Tracks of a take from colour images, and checks of its cameras, scans and footage."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings, mirr
 from jawusd.tracking.sequence.time_checks import time_findings
 
 _LEAST_SHARE = 0.3  # matched fraction of a camera's contour, relative to the best camera, below which it is reported
-# Standard deviation of the lower teeth above which a frame is uninformative [mm], and the fractions of such frames
-# above which a take is partly unreliable, and above which it is unusable.
+# Standard deviation of the position of the lower teeth above which a frame is uninformative [mm]; and fractions of such
+# frames above which a take is partly unreliable, and above which it is unusable.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 _MOST = 0.6  # minimum length of a run of good frames, as a fraction of the take, for suggesting to trim the take's ends
 
-#: Prior on the offsets between colour borders and tooth edges. Borders lie up to half a pixel inside, as teeth darken
-#: towards their edges; gum-line offsets are learned while tracking.
+#: Prior on the offsets between colour borders and tooth edges. Borders lie up to half a pixel inside the edges, since
+#: teeth darken towards them; gum-line offsets are learned while tracking.
 BORDERS = AnnotatorPrior(edge_px=0.3, gum_px=0.08, gum_mm=0.02, arch_px=0.25, arch_mm=0.01, camera_px=0.08, frames=5.0)
 FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)
 
 
 def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list[Finding]:
-    """Return a warning for each camera whose images fit the teeth far worse than those of the others.
+    """Return a warning for each camera whose images fit the teeth far worse than those of the other cameras.
 
-    Kind: "camera_rarely_used", with the matched fraction of the visible contour.
+    The finding's kind is "camera_rarely_used", its value the matched fraction of the visible contour.
     """
     shares = []
     for solution in solutions:
@@ -106,9 +106,9 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def footage_findings(tracks: Tracks) -> list[Finding]:
-    """Return a warning if the jaw is lost, or uncertain by more than a millimetre, in too many frames.
+    """Return a warning if in too many frames the jaw is lost, or its position uncertain by more than a millimetre.
 
-    Kind: "footage_doubtful" [%].
+    The finding's kind is "footage_doubtful".
     """
     sigma_mm = tracks.sigma_mm[:, :3].mean(1)
     bad = ~(sigma_mm <= _UNKNOWN_MM)  # also true for NaN, where an arch is lost
@@ -135,9 +135,9 @@ class TakeFacts:
     """Everything that describes a take except its frames.
 
     Attributes:
-        cameras: in view order.
-        scans: upper and lower.
-        landmarks: mandible coordinates [mm], shape (5, 3).
+        cameras: cameras in the order of the views.
+        scans: upper and lower scan.
+        landmarks: landmarks in mandible coordinates [mm], shape (5, 3).
         axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
         rest_frame: frame with closed teeth, as specified in the capture, or None.
         registers: whether to register the lower scan by the frames with closed teeth.
@@ -154,13 +154,13 @@ class TakeFacts:
 def tracks_of(
     followed: Mapping[int, RegionPose], take: TakeFacts, looks: Sequence[tuple[Array, Sequence[View]]] = ()
 ) -> Tracks:
-    """Return the tracks of frames; delays between cameras and border offsets are estimated jointly.
+    """Return the tracks of the given frames; delays between cameras and border offsets are estimated as well.
 
     Args:
         looks: poses and views of some frames, for estimating scale and focal lengths.
 
     Raises:
-        TrackingError: the registration of the scans is to be corrected, but the mouth was never closed.
+        TrackingError: the registration of the scans is to be corrected, but the teeth are never closed.
     """
     config = FOR_COLOURS
     solved = [(frame, found, found.solution) for frame, found in followed.items() if found.solution is not None]

@@ -22,13 +22,13 @@ from jawusd.tracking.region.search import InstantViews, PoseSearch, fitting_shar
 from jawusd.tracking.sequence.history import MotionPredictor
 
 _FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some tenths of a millimetre
-# Fractions of the usual matched contour below which wider gates are tried, the jaw is searched for, a lost arch stays
-# lost, and an arch is lost. The usual matched contour is the median over the last frames, but at least `_LEAST_USUAL`
-# times that of the first frame, so that slowly closing lips do not redefine it.
+# Fractions of the usual matched contour below which wider residual gates are tried, the jaw is searched for, a lost
+# arch stays lost, and an arch is lost. The usual matched contour is the median over recent frames, but at least
+# `_LEAST_USUAL` times its value in the first frame, so that slowly closing lips do not redefine it.
 _UNCERTAIN, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = THOROUGH.uncertain, THOROUGH.searched, 0.5, 0.25, 0.7
 _USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
-_EAGER, _OFTEN = 6, 4  # a lost arch is searched in the first frames, then in every n-th one; see `_is_due`
-# number of frames in which wide gates are not tried again after they have failed, since lips stay closed for a while
+_EAGER, _OFTEN = 6, 4  # a lost arch is searched for in each of the first frames, then in every n-th one; see `_is_due`
+# number of frames in which wide residual gates are not tried again after a failure: lips stay closed for a while
 _RESTING = 4
 _WIDE_MM = 40.0  # maximum expected opening of a jaw that was not visible
 
@@ -38,8 +38,8 @@ class RegionPose:
     """Poses of both arches in one video frame."""
 
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4); predictions for arches not found
-    found: Mask  # arches found, shape (2,)
-    covariance: Array  # covariance of their left twists about the world origin, NaN if not found, shape (2, 6, 6)
+    found: Mask  # whether each arch was found, shape (2,)
+    covariance: Array  # covariance of the poses' left twists about the world origin, NaN if not found, shape (2, 6, 6)
     objective_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
     solution: Solution | None = None  # the alignment; None for poses read from a file
     # matched fraction of the contour relative to the usual one, shape (2,)
@@ -63,7 +63,7 @@ class RegionTracker:
         """Prepare the scans.
 
         Args:
-            scans: upper and lower, in one frame, in occlusion.
+            scans: upper and lower scan, in one coordinate frame, in occlusion.
             cameras: cameras in the order of the images.
             landmarks, axes: as in `CondyleMotion`.
         """
@@ -72,7 +72,7 @@ class RegionTracker:
         self._first_share = np.zeros(2)
 
     def begin(self, cut: Cut, poses: Array) -> RegionPose:
-        """Learn the colours of a first frame from poses accurate to some tenths of a millimetre, and refine them."""
+        """Learn the colours of a first frame at poses accurate to some tenths of a millimetre, and refine the poses."""
         self._colours.begin(cut(poses), poses)
         for _ in range(_FIRST_ROUNDS):
             pictures = cut(poses)
@@ -96,13 +96,13 @@ class RegionTracker:
 
     @property
     def first_fit(self) -> float:
-        """Matched fraction of the visible contour in the first frame, of the worse arch, 0 .. 1."""
+        """Matched fraction of the visible contour in the first frame, 0 .. 1; the smaller value of both arches."""
         return float(self._first_share.min())
 
     def follow(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:
-        """Yield the poses of consecutive frames in either direction from the first one, whose poses are given.
+        """Yield the poses of consecutive frames, forwards or backwards from a first frame with given poses.
 
-        Every call starts from the statistics after `begin`.
+        Every call starts from the colours learned in `begin`.
         """
         known, self._colours = self._colours, self._colours.copy()
         try:
@@ -131,7 +131,7 @@ class _Instant:
 
 
 class _DirectionTracker:
-    """Tracker in one temporal direction."""
+    """Tracker that follows the teeth in one temporal direction."""
 
     def __init__(self, search: PoseSearch, colours: LearnedColours, first_share: Array, poses: Array) -> None:
         self._search, self._colours, self._first_share, self._poses = search, colours, first_share, poses
@@ -177,7 +177,7 @@ class _DirectionTracker:
         return solution, searched
 
     def _least(self) -> Array:
-        """Return the fraction of the usual matched contour below which an arch counts as not found, shape (2,)."""
+        """Return the fraction of the usual matched contour below which each arch counts as not found, shape (2,)."""
         return np.where(self._found, _LOST, _AGAIN)
 
     def _taken(self, instant: _Instant, rough: Solution, searched: bool, usual: Array, seen: bool) -> RegionPose:
@@ -207,6 +207,6 @@ def _is_due(count: int, found: bool) -> bool:
 
 
 def _covariance(solution: Solution) -> Array:
-    """Return the covariance of both arches' left world twists, shape (2, 6, 6)."""
+    """Return the covariances of the left twists of both arches about the world origin, shape (2, 6, 6)."""
     sigma = residual_px(solution)
     return np.stack([twist_covariance(solution, r, float(sigma[r]), CORRELATION_PX) for r in ARCHES])

@@ -22,13 +22,13 @@ from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
 _AHEAD_PX = 2.0  # distance outside a crown's silhouette at which the rendered label is tested for gum
 
 _SHUTTER = 0.5  # assumed exposure as a fraction of the frame time, as is typical of film
-# Motion during the exposure at which the weight of a border is halved [px]: the variance of an edge grows with the
-# square of its blur. Applied only in the final alignment: in earlier ones, the matched fraction of the contour
-# determines whether teeth are lost.
+# Motion during the exposure at which the weight of a border is halved [px]: the variance of an edge position grows with
+# the square of its blur. The weight is applied only in the final alignment: in earlier ones, the matched fraction of
+# the contour determines whether teeth are lost.
 _BLURRED_PX = 10.0
 _LEARNED_PX = (2, 7)  # minimum and maximum distance from the contour of pixels whose colours are learned
-# For estimating the gum-line offset: minimum weight of a border [-], maximum distance of a border from its sample [px],
-# and number of samples that must be exceeded.
+# Limits for estimating the gum-line offset: minimum weight of a border [-], maximum distance of a border from its
+# sample [px], and number of samples that must be exceeded.
 _SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
 _CLEAR_RATIO = 1.0  # minimum mean log ratio on both sides for full weight of a border [-]
 _SHARPEN_PX = 5.0  # maximum search range for which borders are refined by colour
@@ -40,11 +40,11 @@ _CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
 def choose_tables(
     samples: Array, count: int, labels: NDArray[np.uint8], axes: Array, patches: Array, out: NDArray[np.int64]
 ) -> None:
-    """Write the index of the log-ratio table of each sample: nearest patch, and free edge or gum line.
+    """Write the index of the log-ratio table of each contour sample: nearest patch, and free edge or gum line.
 
     Args:
-        samples: shape (n, COLUMNS); the first `count` are silhouette.
-        labels: rendered labels of the arch: CROWN, GUM or 0, shape (h, w).
+        samples: shape (n, COLUMNS); the first `count` are on the silhouette.
+        labels: rendered labels of the arch (CROWN, GUM or 0), shape (h, w).
         axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
         patches: centres of the arch's patches, left and front [mm], shape (PATCHES, 2).
         out: result, shape (n,).
@@ -69,11 +69,11 @@ def choose_tables(
 
 @numba.njit(nogil=True, cache=True)
 def measure_blur(samples: Array, before: Array, shutter: float, out: Array) -> None:
-    """Write the motion of the samples along their normals during the exposure [px], shape (n,).
+    """Write the motion of contour samples along their normals during the exposure [px], shape (n,).
 
     Args:
         samples: shape (n, COLUMNS).
-        before: projection of the arch to this image in the previous frame, shape (3, 4).
+        before: projection of the arch into this camera's image in the previous frame, shape (3, 4).
         shutter: exposure as a fraction of the frame time [-].
         out: result, shape (n,).
     """
@@ -96,7 +96,7 @@ class Counts:
 
     @classmethod
     def zeros(cls) -> Counts:
-        """Return empty counts."""
+        """Return statistics without any counts."""
         return cls(np.zeros((2, TABLES, BINS)), np.zeros((2, TABLES, BINS)), np.full(2, np.nan))
 
 
@@ -109,7 +109,7 @@ class RegionView:
     ratio: NDArray[np.float32]  # log ratios of tooth to background, shape (2, TABLES, BINS)
     patches: Array  # centres of the patches of both arches, left and front [mm], shape (2, PATCHES, 2)
     axes: Array  # rotation from scan to anatomical axes, shape (3, 3)
-    before: Array  # projections of both arches to this image in the previous frame, shape (2, 3, 4)
+    before: Array  # projections of both arches into this camera's image in the previous frame, shape (2, 3, 4)
     counts: Counts | None = None  # statistics to collect in the final alignment of a frame
 
     def likeness(self, arch: int) -> NDArray[np.float32]:
@@ -119,7 +119,7 @@ class RegionView:
     def search(
         self, samples: Array, count: int, arch: int, drawn: Drawn, limits: tuple[float, float, float]
     ) -> tuple[Array, Array]:
-        """Return distances and weights; see `EdgeSearch`."""
+        """Return border distances and weights; see `EdgeSearch`."""
         tables, blur_px = np.empty(len(samples), np.int64), np.empty(len(samples))
         distances, clearness = np.empty(len(samples)), np.empty(len(samples))
         choose_tables(samples, count, drawn.own, self.axes, self.patches[arch], tables)
