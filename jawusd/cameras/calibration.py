@@ -1,7 +1,7 @@
-"""Camera calibration: aniposelib TOML, lengths in mm; Pose2Sim and Caliscope use the same keys, in metres.
+"""Camera calibration as TOML of aniposelib (lengths in mm), or of Pose2Sim and Caliscope (same keys, in metres).
 
 Each table `[cam_0]`, `[cam_1]`, ... has name, size, matrix, distortions, rotation (Rodrigues vector) and translation;
-the last two map world to camera coordinates. Pose2Sim names the tables after its cameras, Caliscope nests them in
+the last two map world to camera coordinates. Pose2Sim names the tables after its cameras; Caliscope nests them in
 `[cameras]`, by port.
 """
 
@@ -20,7 +20,7 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import read_toml
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp, so3_log
 
-# Maximum entry of R R^T - I; rotations written with 6 digits stay below it.
+# Maximum entry of R R^T - I for a rotation to be accepted; rotations written with 6 digits stay below it.
 _ROTATION_TOLERANCE = 1e-4
 _CAMERA_TABLE = re.compile(r"^cam_\d+$")
 
@@ -30,14 +30,14 @@ def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
 
     Raises:
         CalibrationError: a value is missing, has the wrong shape, is not finite, or a rotation is invalid.
-        FormatError: not TOML.
+        FormatError: the file is not TOML.
     """
     path = Path(path)
     data = read_toml(path)
     tables = sorted((k for k in data if _CAMERA_TABLE.match(k)), key=lambda k: int(k[4:]))
     if not tables:
         below = data.get("cameras")
-        if isinstance(below, dict):  # written by Caliscope
+        if isinstance(below, dict):  # Caliscope nests the camera tables in [cameras]
             data = {f"cam_{port}": table for port, table in below.items()}
         tables = [key for key, table in data.items() if isinstance(table, dict) and "matrix" in table]
     if not tables:
@@ -45,7 +45,7 @@ def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
     cameras = [_camera(path, table, data[table]) for table in tables]
     names = [camera.name for camera in cameras]
     if len(set(names)) != len(names):
-        raise CalibrationError(f"has a duplicate camera name: {', '.join(names)}.", path=path)
+        raise CalibrationError(f"has cameras with the same name; the names are {', '.join(names)}.", path=path)
     return cameras
 
 
@@ -58,7 +58,7 @@ def _numbers(path: Path, table: str, values: dict[str, object], key: str, shapes
         raise CalibrationError(f'[{table}] "{key}" is not an array of numbers.', path=path) from error
     if array.shape not in shapes:
         allowed = " or ".join(str(s) for s in shapes)
-        raise CalibrationError(f'[{table}] "{key}" has shape {array.shape}; it must be {allowed}.', path=path)
+        raise CalibrationError(f'[{table}] "{key}" has shape {array.shape}; expected {allowed}.', path=path)
     if not np.isfinite(array).all():
         raise CalibrationError(f'[{table}] "{key}" has a value that is not finite.', path=path)
     return array
@@ -75,7 +75,7 @@ def _camera(path: Path, table: str, values: object) -> Camera:
     check_lens_model(path, f"[{table}]", values)
     if (size < 16).any() or (size != np.round(size)).any():
         raise CalibrationError(
-            f"[{table}] size is {size.tolist()} px; it must be two whole numbers of at least 16.", path=path
+            f"[{table}] size is {size.tolist()} px; expected two whole numbers of at least 16 px.", path=path
         )
     if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 0 or K[2, 2] != 1:
         raise CalibrationError(
@@ -86,11 +86,12 @@ def _camera(path: Path, table: str, values: object) -> Camera:
     defect = float(rigidity_defect(make_transform(rotation, np.zeros(3))))
     if defect > _ROTATION_TOLERANCE:
         raise CalibrationError(
-            f"[{table}] rotation is not orthonormal (R R^T - I up to {defect:.2g}, allowed {_ROTATION_TOLERANCE:g}).",
+            f"[{table}] rotation is not orthonormal: R R^T - I is up to {defect:.2g}; at most "
+            f"{_ROTATION_TOLERANCE:g} is allowed.",
             path=path,
             hint="Write the Rodrigues vector of a proper rotation, world to camera.",
         )
-    # Orthonormalise a rotation written with few digits.
+    # A rotation written with few digits is only approximately orthonormal.
     rotation = so3_exp(so3_log(rotation))
     name = str(values.get("name", table))
     return Camera(name, (int(size[0]), int(size[1])), K, distortion, make_transform(rotation, translation))

@@ -1,8 +1,8 @@
-"""Cameras of COLMAP: text models (https://colmap.github.io/format.html), read and written.
+"""Read and write the cameras of COLMAP text models (https://colmap.github.io/format.html).
 
-`cameras.txt` contains the intrinsics, `images.txt` two lines per image: rotation (w, x, y, z) and translation, world to
-camera; and the image's points, which may be omitted. The centre of the top-left pixel is at (0.5, 0.5); in OpenCV it is
-at (0, 0).
+`cameras.txt` contains the intrinsics. `images.txt` contains two lines per image: the rotation (w, x, y, z) and
+translation from world to camera, and the image's points, which may be omitted. The centre of the top-left pixel is at
+(0.5, 0.5); in OpenCV it is at (0, 0).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, wxyz_from_matrix
 
 _FILES = ("cameras.txt", "images.txt")
-# Focal length parameters of each camera model (f: shared by x and y), and number of OpenCV's distortion coefficients
-# that follow the principal point.
+# For each camera model: its focal length parameters (f is shared by x and y), and the number of distortion
+# coefficients, in OpenCV's order, after the principal point.
 _MODELS = {
     "SIMPLE_PINHOLE": ("f", 0),
     "PINHOLE": ("fxfy", 0),
@@ -71,14 +71,14 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
 
 
 def _image_rows(path: Path) -> Iterator[list[str]]:
-    """Yield the words of each image line; an optional line of points, three numbers each, may follow it.
+    """Yield the words of each image line; a line of points, three numbers per point, may follow an image line.
 
     Raises:
         CalibrationError: a line is neither an image nor points.
     """
     after_image = False
     for row in _rows(path):
-        # the third number of a point is the ID of a 3D point
+        # a point is (x, y, ID of the 3D point)
         if not row or (after_image and _POINTS.fullmatch(" ".join(row))):
             after_image = False
             continue
@@ -100,7 +100,7 @@ def _is_number(word: str) -> bool:
 
 
 def _rows(path: Path) -> list[list[str]]:
-    """Return the words of every line except comments."""
+    """Return the words of each line, without comment lines."""
     try:
         text = read_text(path, MOST_BYTES)
     except FormatError as error:
@@ -138,11 +138,11 @@ def _lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Array]:
     values = _floats(path, row[2:])
     expected = 2 + (3 if focal == "f" else 4) + terms
     if len(values) != expected:
-        raise CalibrationError(f"camera {row[0]} has {len(values)} values; {row[1]} needs {expected}.", path=path)
+        raise CalibrationError(f"camera {row[0]} has {len(values)} values; model {row[1]} has {expected}.", path=path)
     size = (int(values[0]), int(values[1]))
     fx, fy, cx, cy = (values[2], *values[2:5]) if focal == "f" else values[2:6]
     distortion = values[expected - terms :]
-    if 0 < terms < 4:  # the model has only radial terms
+    if 0 < terms < 4:  # pad a model that has only radial terms
         distortion = np.concatenate([distortion, np.zeros(4 - terms)])
     return size, corner_matrix(path, f"camera {row[0]}", fx, fy, cx, cy), distortion
 
@@ -170,7 +170,8 @@ def save_colmap(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
         if abs(skew) > _LARGEST_SKEW * fx:
             raise CalibrationError(f"camera {camera.name} has pixel skew, which COLMAP does not support.")
         lens = np.pad(camera.distortion, (0, 8 - camera.distortion.size))
-        values = np.concatenate([[fx, fy, cx + 0.5, cy + 0.5], lens])  # COLMAP's origin is the corner of a pixel
+        # COLMAP's image origin is the corner of the top-left pixel.
+        values = np.concatenate([[fx, fy, cx + 0.5, cy + 0.5], lens])
         shown = " ".join(repr(float(value)) for value in values)
         lenses.append(f"{number} FULL_OPENCV {camera.size_px[0]} {camera.size_px[1]} {shown}")
         T = camera.T_cam_world

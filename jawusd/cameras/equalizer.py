@@ -1,11 +1,12 @@
-"""Cameras of 3DEqualizer: its Nuke export (.nk), with lens files beside it (see `equalizer_lens`).
+"""Read the cameras of 3DEqualizer from its Nuke export (.nk) and the lens files beside it (see `equalizer_lens`).
 
-Poses, focal length and film back come from the `Camera` nodes of "Export Project, Nuke" (see a studio's version of that
-script: NyanNyanGringo/match-move-exporter on GitHub): camera axes x right, y up, z backward; `rotate` in
-degrees, z applied first, then x, then y (`rot_order ZXY`); `translate` in the units of the project, mostly cm; `focal`,
-`haperture` and `vaperture` in mm; `win_translate` is -2 times the lens centre offset over the film back. A parent
-`Axis` has the scene transform and scale. The optical axis meets the film back at its centre plus that offset, x right,
-y up; the film back spans the outer edges of the pixels. The image size is not in the file.
+Poses, focal length and film back are read from the `Camera` nodes that "Export Project, Nuke" writes (for a version of
+that export script, see NyanNyanGringo/match-move-exporter on GitHub). The camera axes are x right, y up, z backward.
+`rotate` is in degrees, applied about z first, then x, then y (`rot_order ZXY`). `translate` is in the project's unit,
+mostly cm. `focal`, `haperture` and `vaperture` are in mm. `win_translate` is -2 times the lens centre offset, divided
+by the film back size. A parent `Axis` node contains the scene's transform and scale. The optical axis meets the film
+back at its centre plus the lens centre offset (x right, y up). The film back extends to the outer edges of the pixels.
+The image size is not in the file.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def load_3de(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read the cameras of 3DEqualizer's Nuke export, sorted by name, with lenses beside it, in the project's unit.
+    """Read the cameras of 3DEqualizer's Nuke export, sorted by name, in the project's unit.
 
-    A camera uses the lens of the same name (of its node, of its file, or stated in the file), or the only lens.
-    Without lenses, cameras are pinholes, for undistorted footage.
+    A camera uses the lens whose node, file or stated name is the camera's name; if there is only one lens, all cameras
+    use it. Without lenses, cameras are pinholes, for undistorted footage.
 
     Args:
-        path: the script or its folder.
+        path: the Nuke script or its folder.
         sizes: (width, height) [px] of the images by camera.
 
     Raises:
-        CalibrationError: no camera, a camera that moves or zooms, an unknown size or distortion model, or a lens that
-            is ambiguous or cannot be approximated by OpenCV's coefficients.
+        CalibrationError: there is no camera, a camera moves or zooms, an image size or distortion model is unknown,
+            or a lens is ambiguous or cannot be approximated by OpenCV's coefficients.
         FormatError: a file cannot be read.
     """
     scripts = [path] if path.is_file() else sorted(path.glob("*.nk"))
@@ -79,14 +80,16 @@ def _camera(path: Path, node: NukeNode, lenses: list[FoundLens], sizes: Mapping[
     )
     if not (focal_mm > 0 and min(back) > 0):
         raise CalibrationError(
-            f"camera {name} has focal length {focal_mm:g} mm and film back {back[0]:g} x {back[1]:g} mm; all must be "
-            "above 0.",
+            f"camera {name} has focal length {focal_mm:g} mm and film back {back[0]:g} x {back[1]:g} mm; "
+            "all three must be greater than 0 mm.",
             path=path,
         )
     if (steady_values(path, node, "win_scale", (1.0, 1.0)) != 1).any() or steady_values(path, node, "winroll", (0.0,))[
         0
     ] != 0:
-        raise CalibrationError(f"camera {name} has win_scale or winroll set; they must be 1 1 and 0.", path=path)
+        raise CalibrationError(
+            f"camera {name} has win_scale or winroll set; expected win_scale 1 1 and winroll 0.", path=path
+        )
     shift = steady_values(path, node, "win_translate", (0.0, 0.0))
     offset = (-float(shift[0]) * back[0] / 2, -float(shift[1]) * back[1] / 2)
     lens = _lens_of(path, name, lenses)
@@ -108,7 +111,7 @@ def _camera(path: Path, node: NukeNode, lenses: list[FoundLens], sizes: Mapping[
 
 
 def _world_to_camera(path: Path, node: NukeNode) -> Array:
-    """Return T_cam_world of a camera, including its parent axes."""
+    """Return T_cam_world of a camera node, including its parent nodes."""
     R, t = _placed(path, node)
     above = node.parent
     while above is not None and re.fullmatch(r"(Axis|Camera)\d?", above.kind):
@@ -118,7 +121,8 @@ def _world_to_camera(path: Path, node: NukeNode) -> Array:
         )
         if np.ptp(scale) > 1e-9 or scale[0] <= 0:
             raise CalibrationError(
-                f"{above.name}, parent of camera {node.name}, has scale {scale.tolist()}; it must be uniform and > 0.",
+                f"{above.name}, parent of camera {node.name}, has scale {scale.tolist()}; expected a "
+                "uniform scale > 0.",
                 path=path,
             )
         R, t = turn @ R, turn @ (scale[0] * t) + shift
@@ -127,7 +131,7 @@ def _world_to_camera(path: Path, node: NukeNode) -> Array:
 
 
 def _placed(path: Path, node: NukeNode) -> tuple[Array, Array]:
-    """Return the rotation (3, 3) and translation (3,) of a static node."""
+    """Return the rotation (3, 3) and translation (3,) of a static Axis or Camera node."""
     for knob in ("useMatrix", "pivot", "skew"):
         if set(re.findall(r"[\w.]+", node.knobs.get(knob, "0"))) - {"0", "false", "0.0"}:
             raise CalibrationError(f"node {node.name} has {knob} set, which is not supported.", path=path)

@@ -1,12 +1,12 @@
-"""Lenses of 3DEqualizer, from text files and Nuke nodes, converted to OpenCV's coefficients.
+"""Read lenses of 3DEqualizer from text files and Nuke nodes, and convert them to OpenCV's coefficients.
 
-A text file (File, Export, Lens) has: name; film back width and height, focal length, film aspect, lens centre offset x
-and y, all in cm, pixel aspect; 0, 1 or DISTORTION_...; the model; per parameter its name, value, number of curve keys,
-and a line per key; <end_of_file>. `LD_...` nodes (File, Export, Nuke LD_3DE4 Lens Distortion Node) have the same data
-as knobs.
+A text file (File, Export, Lens) has these lines: name; film back width and height [cm], focal length [cm], film aspect,
+lens centre offset x and y [cm], pixel aspect; 0, 1 or DISTORTION_...; the model; for each parameter its name, value,
+number of curve keys, and one line per key; <end_of_file>. `LD_...` nodes (File, Export, Nuke LD_3DE4 Lens Distortion
+Node) have the same data as knobs.
 
 The models (Science-D-Visions, "The Standard Models for Lens Distortion in 3DE4", and its Lens Distortion Plugin Kit)
-map recorded to undistorted points, relative to the lens centre, y up, in units of half the film back diagonal. OpenCV
+map distorted to undistorted points, relative to the lens centre, y up, in units of half the film back diagonal. OpenCV
 maps in the other direction: its coefficients are fitted to the model over the image, and lenses with residuals above
 0.05 px are rejected. Only "OpenCV Radial Degree 6, Decentered Degree 2" uses OpenCV's own coefficients.
 """
@@ -32,7 +32,7 @@ Size = tuple[int, int]
 _MOST_BYTES = 4 << 20
 _CLASSIC, _RADIAL = "3DE Classic LD Model", "3DE4 Radial - Standard, Degree 4"
 _BROWN, _OPENCV = "3DE4 Brown-Conrady, Degree 6/2", "OpenCV Radial Degree 6, Decentered Degree 2"
-# Parameters of each model, with their defaults, which Nuke omits.
+# Parameters of each distortion model, with their default values; Nuke omits parameters that have the default value.
 _PARAMETERS: dict[str, dict[str, float]] = {
     _CLASSIC: {
         "Distortion": 0.0,
@@ -70,7 +70,8 @@ _STATIC = ("0", "DISTORTION_STATIC")
 _FOV = {"xa": 0.0, "xb": 1.0, "ya": 0.0, "yb": 1.0}
 _LARGEST_ERROR_PX = 0.05
 _MM_PER_CM = 10.0
-_GRID, _BEYOND = 33, 0.03  # fitting points per side of the image, and margin around it as a fraction of the side
+# Number of fitted points per side of the image, and margin around the image as a fraction of its side.
+_GRID, _BEYOND = 33, 0.03
 
 
 @dataclass(frozen=True)
@@ -80,14 +81,14 @@ class Lens:
     name: str
     path: Path
     filmback_mm: tuple[float, float] | None
-    offset_mm: tuple[float, float]  # offset of the lens centre, x right, y up
+    offset_mm: tuple[float, float]  # position of the lens centre relative to the film back centre, x right, y up
     model: str
     values: Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class FoundLens:
-    """A lens in a file, with the function that reads it."""
+    """A lens found in a file, and the function that reads it."""
 
     name: str
     path: Path
@@ -110,7 +111,7 @@ def find_lenses(folder: Path, scripts: Mapping[Path, list[NukeNode]]) -> list[Fo
 
 
 def _node_lens(path: Path, node: NukeNode, name: str) -> Lens:
-    """Return the lens of an LD node, whose class and knobs are named like the model and its parameters."""
+    """Return the lens of a Nuke LD node; its class names the distortion model, its knobs the parameters."""
     models = {_nuke_name(model): model for model in _PARAMETERS}
     model = models.get(node.kind.removeprefix("LD").lstrip("_"))
     if model is None:
@@ -122,10 +123,10 @@ def _node_lens(path: Path, node: NukeNode, name: str) -> Lens:
     for side, whole in _FOV.items():
         if abs(value(f"field_of_view_{side}_unit", whole) - whole) > 1e-6:
             raise CalibrationError(
-                f"lens {node.name} has a field of view other than the whole picture (field_of_view_{side}_unit), "
-                "which must be 0, 1, 0, 1 (xa, xb, ya, yb).",
+                f"lens {node.name} has a field of view smaller or larger than the image (field_of_view_{side}_unit); "
+                "expected xa = 0, xb = 1, ya = 0, yb = 1.",
                 path=path,
-                hint="Set the camera's field of view to the whole picture in 3DEqualizer.",
+                hint="Set the camera's field of view to the whole image in 3DEqualizer.",
             )
     sides = [f"tde4_filmback_{side}_cm" for side in ("width", "height")]
     stated = all(side in node.knobs for side in sides)
@@ -150,7 +151,7 @@ def _lens_lines(path: Path) -> list[str] | None:
     """Return the lines of a lens file; None for other text files.
 
     Raises:
-        CalibrationError: it ends like a lens file but has an invalid beginning.
+        CalibrationError: the file ends like a lens file but has an invalid beginning.
     """
     try:
         lines = [line.strip() for line in read_text(path, _MOST_BYTES).splitlines()]
@@ -164,7 +165,7 @@ def _lens_lines(path: Path) -> list[str] | None:
         pass
     if "<end_of_file>" in lines:
         raise CalibrationError(
-            "is a lens file, but its first four lines are not name, seven numbers, type of distortion and model.",
+            "is a lens file, but does not begin with four lines: name, seven numbers, type of distortion, and model.",
             path=path,
             hint="Export the lens again, or remove the file.",
         )
@@ -178,9 +179,9 @@ def _text_lens(path: Path, lines: list[str]) -> Lens:
         raise _unread(path, model)
     if mode not in _STATIC:
         raise CalibrationError(
-            f'lens {lines[0]} has an animated distortion ("{mode}"); it must be {" or ".join(_STATIC)}.',
+            f'lens {lines[0]} has the type of distortion "{mode}"; expected a static lens ({" or ".join(_STATIC)}).',
             path=path,
-            hint="Make the lens static in 3DEqualizer, and export it again.",
+            hint="Make the lens static in 3DEqualizer and export it again.",
         )
     values = dict(_PARAMETERS[model])
     at = 4
@@ -190,7 +191,8 @@ def _text_lens(path: Path, lines: list[str]) -> Lens:
             at += 3 + int(lines[at + 2])
     except (ValueError, IndexError) as error:
         raise CalibrationError(
-            f'line {at + 1}: "{lines[at]:.60}" must be followed by a number and the keys of its curve.', path=path
+            f'line {at + 1}: "{lines[at]:.60}" must be followed by its value, the number of curve keys, and the keys.',
+            path=path,
         ) from error
     unknown = sorted(set(values) - set(_PARAMETERS[model]))
     if unknown or not np.isfinite(list(values.values())).all():
@@ -215,17 +217,17 @@ def _unread(path: Path, model: str) -> CalibrationError:
 def opencv_of(
     lens: Lens, K: Array, size: Size, back_mm: tuple[float, float], focal_mm: float
 ) -> tuple[Array, Array, Array]:
-    """Return K (3, 3), OpenCV's coefficients, and a rotation vector (3,) [rad] to apply to camera points first.
+    """Return K (3, 3), OpenCV's coefficients, and a rotation vector (3,) [rad], applied to points before projection.
 
     Args:
         lens: the lens.
         K: the camera's pinhole matrix [px].
-        size: width and height of its image [px].
-        back_mm: width and height of its film back.
-        focal_mm: its focal length.
+        size: width and height of the camera's image [px].
+        back_mm: width and height of the camera's film back.
+        focal_mm: the camera's focal length.
 
     Raises:
-        CalibrationError: the residual is above 0.05 px.
+        CalibrationError: OpenCV's coefficients approximate the lens with a residual above 0.05 px.
     """
     values = list(lens.values.values())
     if values == list(_PARAMETERS[lens.model].values()):
@@ -241,8 +243,8 @@ def opencv_of(
     fitted, distortion, turn, off = opencv_lens(K, recorded, ideal)
     if off > _LARGEST_ERROR_PX:
         raise CalibrationError(
-            f'lens {lens.name} ("{lens.model}") cannot be approximated by OpenCV\'s coefficients (error {off:.2f} px, '
-            f"allowed {_LARGEST_ERROR_PX:g} px).",
+            f'lens {lens.name} ("{lens.model}") cannot be approximated by OpenCV\'s coefficients (error {off:.2f} px; '
+            f"at most {_LARGEST_ERROR_PX:g} px is allowed).",
             path=lens.path,
             hint="Solve without decentering and bending, or undistort the footage in 3DEqualizer or Nuke and remove "
             "the lens file.",
@@ -253,7 +255,7 @@ def opencv_of(
 def _undistorted(model: str, values: list[float], x: Array, y: Array) -> tuple[Array, Array]:
     """Undistort points given relative to the lens centre, y up, in units of half the film back diagonal.
 
-    The Standard Models for Lens Distortion in 3DE4; Lens Distortion Plugin Kit 2.12.
+    References: "The Standard Models for Lens Distortion in 3DE4"; Lens Distortion Plugin Kit 2.12.
     """
     xx, yy, xy = x * x, y * y, x * y
     r2 = xx + yy

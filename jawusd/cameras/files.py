@@ -1,7 +1,7 @@
-"""Load calibrations of any supported program, recognised by file name: a registry of the modules in this folder.
+"""Load calibrations of all supported programs; the format is recognised by file name or content.
 
-A module that defines a CameraFormat named FORMAT (see `parts`) is registered. All other files are read as TOML of
-aniposelib, Pose2Sim or Caliscope by `calibration`.
+Every module of this package that defines a CameraFormat named FORMAT (see `parts`) is registered as a format. Files of
+no registered format are read as TOML of aniposelib, Pose2Sim or Caliscope by `calibration`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _format_of(path: Path) -> CameraFormat:
 def load_cameras_file(
     path: str | os.PathLike[str], unit_mm: float = 1.0, sizes: Mapping[str, Size] | None = None
 ) -> list[Camera]:
-    """Read cameras from any supported calibration, in file order; lengths in mm, OpenCV axes and pixels.
+    """Read cameras from a calibration in any supported format, in file order; lengths in mm, OpenCV axes and pixels.
 
     Args:
         path: TOML of aniposelib, Pose2Sim or Caliscope; a COLMAP text model (its folder or one of its files);
@@ -82,7 +82,7 @@ def load_cameras_file(
 
 
 def calibration_files(path: Path) -> list[Path]:
-    """Return the files of a calibration."""
+    """Return all files that belong to a calibration."""
     return _format_of(path).files(path)
 
 

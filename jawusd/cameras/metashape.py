@@ -1,8 +1,8 @@
-"""Cameras of Agisoft Metashape: XML (File, Export, Export Cameras, "Agisoft XML").
+"""Read the cameras of Agisoft Metashape from XML (File, Export, Export Cameras, "Agisoft XML").
 
-Metashape User Manual, appendix "Camera models", frame camera: `transform` of a camera maps camera to chunk, x right, y
-down, z forward; the transform of the chunk or component maps to the world, with a scale. With undistorted x, y over the
-focal length, and r their norm,
+The conventions are those of a frame camera in the Metashape User Manual, appendix "Camera models": `transform` of a
+camera maps camera coordinates (x right, y down, z forward) to its chunk; the transform of the chunk or component maps
+to the world and includes a scale. With the undistorted normalised image point x, y (focal length 1) and its norm r,
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y,
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p2 (r^2 + 2 y^2) + 2 p1 x y,
     u = width / 2 + cx + x' f + x' b1 + y' b2,  v = height / 2 + cy + y' f,
@@ -38,8 +38,8 @@ def load_metashape(path: Path) -> list[Camera]:
     """Read the aligned cameras of a Metashape XML, named by their labels, in the file's unit.
 
     Raises:
-        CalibrationError: no cameras are aligned, two have the same label, or a sensor is not a frame camera or has no
-            calibration.
+        CalibrationError: no camera is aligned, two cameras have the same label, or a sensor is no frame camera or has
+            no calibration.
         FormatError: the file is damaged.
     """
     root = parsed_xml(path)
@@ -47,7 +47,8 @@ def load_metashape(path: Path) -> list[Camera]:
         (chunk, node)
         for chunk in root.findall("chunk") or [root]
         for node in chunk.iter("camera")
-        if (node.findtext("transform") or "").strip()  # cameras without a transform are not aligned
+        # Metashape writes no transform for cameras that it could not align.
+        if (node.findtext("transform") or "").strip()
     ]
     if not nodes:
         raise CalibrationError("has no aligned cameras.", path=path, hint="Align the photos, then export the cameras.")
@@ -80,7 +81,9 @@ def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
     kind = node.get("type", sensor.get("type", "frame"))
     if kind != "frame":
         raise CalibrationError(
-            f'sensor {label} is a "{kind}" camera; only "frame" cameras are supported.', path=path, hint=UNDISTORT
+            f'sensor {label} has the type "{kind}"; only sensors of type "frame" are supported.',
+            path=path,
+            hint=UNDISTORT,
         )
     values = {child.tag: child.text or "" for child in node}
 
@@ -99,7 +102,7 @@ def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
     cx = value("cx") + (0.0 if old else size[0] / 2) - _HALF_PX
     cy = value("cy") + (0.0 if old else size[1] / 2) - _HALF_PX
     K = np.array([[wide, value("b2"), cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    for key in ("p3", "p4"):  # tangential coefficients of older versions
+    for key in ("p3", "p4"):  # former names of the tangential coefficients
         if value(key):
             raise CalibrationError(
                 f"sensor {label} has {key} = {value(key):g}; it must be 0.", path=path, hint=UNDISTORT

@@ -1,7 +1,7 @@
-"""Cameras of nerfstudio: `transforms.json` (https://docs.nerf.studio/quickstart/data_conventions.html).
+"""Read nerfstudio's `transforms.json` (https://docs.nerf.studio/quickstart/data_conventions.html).
 
-Camera-to-world with OpenGL axes (x right, y up, z backward); the centre of the top-left pixel is at (0.5, 0.5),
-OpenCV's at (0, 0).
+Its matrices map camera to world with OpenGL axes (x right, y up, z backward). The centre of the top-left pixel is at
+(0.5, 0.5); in OpenCV it is at (0, 0).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
-    """Read nerfstudio's transforms.json; return the cameras sorted by name, in units before its `applied_scale`.
+    """Read nerfstudio's transforms.json; return the cameras sorted by name, in the unit before `applied_scale`.
 
     Raises:
         CalibrationError: a value is missing or wrong, or the camera model is not supported.
@@ -49,7 +49,7 @@ def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
             raise CalibrationError(f'{where} has no "transform_matrix" of 4 x 4 numbers.', path=path) from error
         T_world_gl = np.vstack([T_world_gl, [0, 0, 0, 1]]) if T_world_gl.shape == (3, 4) else T_world_gl
         if T_world_gl.shape != (4, 4) or not np.isfinite(T_world_gl).all() or rigidity_defect(T_world_gl) > 1e-4:
-            raise CalibrationError(f"{where} transform_matrix is not a rigid 4 x 4 matrix.", path=path)
+            raise CalibrationError(f"{where} has a transform_matrix that is not a rigid motion.", path=path)
         T_world_gl[:3, 3] /= scale
         T_cam_world = se3_inverse(T_world_gl @ _OPENGL)
         images.append((frame["file_path"], Camera(frame["file_path"], size, K, distortion, T_cam_world)))
@@ -68,7 +68,7 @@ def _lens(path: Path, values: dict[str, object], where: str) -> tuple[tuple[int,
     for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4"):
         value = values.get(key, values.get("fl_x") if key == "fl_y" else 0.0 if key[0] in "kp" else None)
         if not isinstance(value, int | float) or not abs(value) < _MOST_VALUE:
-            raise CalibrationError(f'{where} has no number "{key}".', path=path)
+            raise CalibrationError(f'{where} has no "{key}", or its value is not a number.', path=path)
         found[key] = float(value)
     if found["k4"] != 0:
         # nerfstudio's k4 multiplies r^8; OpenCV's fourth coefficient is in a denominator.

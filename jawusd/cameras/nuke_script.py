@@ -1,8 +1,9 @@
 """Read the nodes of a Nuke script, with their knobs and connections.
 
 A script is a list of nodes: `Class {`, one knob per line, `}`. A node pops its inputs from a stack (one unless `inputs`
-is given) and pushes itself; `set` and `push` name nodes and push them again. Knobs with default values are omitted. The
-value of an animated knob is a curve, `{curve x1001 0.5 x1002 0.6}`: frame numbers have the prefix x.
+is given) and pushes itself; `set` names a node, and `push` pushes a named node again. Knobs with default values are
+omitted. The value of an animated knob is a curve such as `{curve x1001 0.5 x1002 0.6}`, where frame numbers have the
+prefix x.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.formats.text import read_text
 
-SAME = 1e-3  # tolerance for equal values: relative for lengths, [rad] for rotations
+SAME = 1e-3  # tolerance for equal values: relative for lengths, in rad for rotations
 
 _MOST_BYTES = 64 << 20
 _MOST_LEVELS = 4  # maximum nesting of braces in a knob
@@ -29,15 +30,15 @@ _BRACE = re.compile(r"(?<!\\)[{}]")
 
 @dataclass(frozen=True)
 class NukeNode:
-    """A node of a script."""
+    """A node of a Nuke script."""
 
-    kind: str  # class, such as "Camera2"
-    knobs: Mapping[str, str]  # values by knob, as written in the script
-    parent: NukeNode | None  # the node connected to its first input
+    kind: str  # node class, such as "Camera2"
+    knobs: Mapping[str, str]  # knob values by knob name, as written in the script
+    parent: NukeNode | None  # the node connected to the first input
 
     @property
     def name(self) -> str:
-        """The node's name."""
+        """Name of the node, or its class if it has no name."""
         return self.knobs.get("name", self.kind).strip().strip('"')
 
 
@@ -93,7 +94,7 @@ def knob_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...
     """Return the values of a knob at its key frames, shape (F, C), where C is the length of the default.
 
     Raises:
-        CalibrationError: it has an expression or another value that is not a number.
+        CalibrationError: the knob has an expression or another value that is not a number.
     """
     text = node.knobs.get(knob)
     if text is None:
@@ -103,16 +104,14 @@ def knob_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...
         values = [[float(word) for word in words if not _is_sign(word)] for words in channels]
     except ValueError as error:
         raise CalibrationError(
-            f'node {node.name}: {knob} is "{text:.60}"; it must be a number.',
+            f'node {node.name}: {knob} is "{text:.60}"; expected numbers.',
             path=path,
             hint="Bake expressions, or export again from the tracking program.",
         ) from error
     frames = max((len(column) for column in values), default=0)
     filled = [column * frames if len(column) == 1 else column for column in values]
     if len(filled) != len(default) or any(len(column) != frames for column in filled) or not frames:
-        raise CalibrationError(
-            f'node {node.name}: {knob} is "{text:.60}"; {len(default)} numbers are needed.', path=path
-        )
+        raise CalibrationError(f'node {node.name}: {knob} is "{text:.60}"; expected {len(default)} numbers.', path=path)
     table = np.array(filled).T
     if not np.isfinite(table).all():
         raise CalibrationError(f"node {node.name}: {knob} has a value that is not finite.", path=path)
@@ -130,7 +129,7 @@ def steady_values(path: Path, node: NukeNode, knob: str, default: tuple[float, .
         raise CalibrationError(
             f"node {node.name}: {knob} is animated; it must be constant.",
             path=path,
-            hint="Lenses of a capture are fixed: solve with a fixed focal length, and export again.",
+            hint="The lenses of a capture do not change: solve with a fixed focal length, and export again.",
         )
     return np.asarray(table[0], np.float64)
 
@@ -162,5 +161,5 @@ def _unwrapped(items: list[object]) -> list[object]:
 
 
 def _is_sign(word: str) -> bool:
-    """Tell whether a word of a curve is the keyword, a frame, an interpolation type or a slope rather than a value."""
+    """Return whether a word of a curve is not a value but the keyword, a frame, an interpolation type or a slope."""
     return word == "curve" or bool(re.fullmatch(r"[A-Za-z]|[a-z]-?[\d.]+(?:e[-+]?\d+)?", word))

@@ -1,10 +1,10 @@
-"""Cameras in OpenCV's storage: YAML, XML and JSON.
+"""Read cameras from files of OpenCV's `cv::FileStorage`: YAML, XML and JSON.
 
-`cv::FileStorage` (https://docs.opencv.org/4.x/d4/da4/group__core__xml.html), with matrices as written by OpenCV's
-samples, ROS `camera_info` and EasyMocap: camera_matrix, cameraMatrix, K or M with distortion coefficients, and R (3 x 3
-or Rodrigues vector) and T, world to camera. Names may have the camera as suffix, `K_left`, `R_left`. For a stereo pair,
-M1, D1, M2, D2, R and T, the world frame is that of the first camera. Pixels and axes are OpenCV's. Other values are
-ignored.
+The format is described at https://docs.opencv.org/4.x/d4/da4/group__core__xml.html. Matrices have the names that
+OpenCV's samples, ROS `camera_info` and EasyMocap use: camera_matrix, cameraMatrix, K or M with distortion coefficients,
+and R (3 x 3 or Rodrigues vector) and T, which map world to camera. Names may have the camera as suffix, such as
+`K_left` and `R_left`. For a stereo pair with M1, D1, M2, D2, R and T, the world frame is that of the first camera.
+Pixels and axes are OpenCV's. Other values are ignored.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ _MOST_PX = 1e6
 
 
 def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read cameras from OpenCV's storage: one file per camera, named after it, or files with several cameras.
+    """Read cameras from OpenCV's storage: one file per camera, named after the camera, or files with several cameras.
 
     Args:
-        paths: the files; values of a camera are merged over all files. If any camera has a pose, those without one are
-            ignored.
-        sizes: (width, height) [px] of the images by camera, if not in the files.
+        paths: the files; values of a camera are merged over all files. If any camera has a pose, cameras without one
+            are ignored.
+        sizes: (width, height) [px] of the images by camera, used if the files do not state them.
 
     Raises:
         CalibrationError: a camera lacks intrinsics, pose or size, or a value is wrong.
@@ -62,13 +62,14 @@ def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
             twice = [role for role in parts if role in own and not np.array_equal(parts[role], own[role])]
             if twice:
                 raise CalibrationError(
-                    f"has another {twice[0]} for camera {name or path.stem} than another file in the folder.",
+                    f"and another file in the folder have different values of {twice[0]} for camera "
+                    f"{name or path.stem}.",
                     path=path,
                     hint="Give each camera its own file and name.",
                 )
             own.update(parts)
     shared = found.pop("", {}) if any("K" in parts for name, parts in found.items() if name) else {}
-    if set(found) == {"1", "2"} and {"R", "T"} <= set(shared):  # a stereo pair: the first camera is the world
+    if set(found) == {"1", "2"} and {"R", "T"} <= set(shared):  # a stereo pair: the world frame is the first camera's
         found["1"] |= {"R": np.eye(3), "T": np.zeros(3)}
         found["2"] |= {"R": shared["R"], "T": shared["T"]}
     whole = {name: shared | parts for name, parts in found.items()}
@@ -81,7 +82,7 @@ def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
 
 
 def _parts_of(path: Path) -> dict[str, dict[str, Array]]:
-    """Return the matrices and numbers of a file, by camera and role; "" is the unnamed camera."""
+    """Return the matrices and numbers of a file, by camera name ("" if unnamed) and role."""
     out: dict[str, dict[str, Array]] = {}
     seen: set[str] = set()
     for key, shape, words in _values(path):
@@ -105,7 +106,8 @@ def _parts_of(path: Path) -> dict[str, dict[str, Array]]:
 
 
 def _array(path: Path, key: str, shape: tuple[int, ...], words: list[str]) -> Array:
-    plain = [re.sub(r"^([-+]?)\.(?=nan|inf)", r"\1", word.lower()) for word in words]  # OpenCV writes .Nan and -.Inf
+    # OpenCV writes .Nan and -.Inf, which float() rejects
+    plain = [re.sub(r"^([-+]?)\.(?=nan|inf)", r"\1", word.lower()) for word in words]
     try:
         data = np.array([float(word) for word in plain]).reshape(shape)
     except ValueError as error:
@@ -174,7 +176,7 @@ def _camera(path: Path, name: str, parts: Mapping[str, Array], sizes: Mapping[st
         sides = np.array([parts["width"], parts["height"]], np.float64).ravel()
         if sides.size != 2 or not ((sides >= 1) & (sides <= _MOST_PX)).all():
             raise CalibrationError(
-                f"camera {name} has image size {sides.tolist()} px; both must be 1 to 1e6 px.", path=path
+                f"camera {name} has image size {sides.tolist()} px; width and height must be 1 to 1e6 px.", path=path
             )
         size = (int(sides[0]), int(sides[1]))
     elif name in sizes or plain_name(name) in sizes:

@@ -1,4 +1,4 @@
-"""Helpers for the camera readers: the registry entry of a format, names, sizes, lens models, XML, numbers."""
+"""Helpers for the readers of camera formats: registry entry, names, sizes, lens models, XML and numbers."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ Size = tuple[int, int]
 MOST_BYTES = 64 << 20
 UNDISTORT = "Undistort the footage first, or calibrate with OpenCV's standard model."
 _LARGEST_DEFECT = 1e-3
-# Maximum differences between a static camera's poses in different images: rotation [rad], and position as a fraction of
-# the distance from the origin.
+# Maximum differences between the poses of a static camera in different images: rotation [rad], and position as a
+# fraction of the camera's distance from the origin.
 _MOVED_RAD, _MOVED_SHARE = 1e-3, 1e-3
-_LARGEST_ERROR_PX = 0.05  # maximum error of a lens model converted to OpenCV's
+_LARGEST_ERROR_PX = 0.05  # maximum error of a lens model converted to OpenCV's model
 _MODEL_KEYS = ("distortion_model", "distortion_type", "lens_model", "camera_model", "model_type", "projection_model")
-_FLAG_KEYS = ("fisheye", "fisheye_model", "is_fisheye", "use_fisheye", "xi")  # xi: omnidirectional
-# Names of OpenCV's radial-tangential model with up to eight coefficients, in ROS, Kalibr, camodocal and others.
+# Keys that mark another lens model; `xi` is a parameter of omnidirectional cameras.
+_FLAG_KEYS = ("fisheye", "fisheye_model", "is_fisheye", "use_fisheye", "xi")
+# Names that ROS, Kalibr, camodocal and others use for OpenCV's radial-tangential model with up to 8 coefficients.
 _READ_MODELS = {"plumb_bob", "rational_polynomial", "radtan", "radial_tangential", "brown", "brown_conrady", "opencv"}
 _READ_MODELS |= {"pinhole", "perspective", "standard", "none", "no_distortion", "frame", "full_opencv", ""}
 _OTHER_MODELS = re.compile(
@@ -38,28 +39,28 @@ _OTHER_MODELS = re.compile(
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """A camera format. To add one, define it as FORMAT in a module of this folder."""
+    """Registry entry of a camera format; a module of this package registers its format as FORMAT."""
 
-    # returns 1 if a path has this format by its name, 2 if by its content, 0 if not
+    # Returns 1 if a path has this format judged by its name, 2 if judged by its content, 0 if not.
     reads: Callable[[Path], int]
-    # returns the cameras in the file's order and unit, given (width, height) [px] of the images by camera
+    # Returns the cameras in the file's order and unit, given (width, height) [px] of the images by camera.
     load: Callable[[Path, Mapping[str, Size]], list[Camera]]
-    files: Callable[[Path], list[Path]] = lambda path: [path]  # returns all files of a calibration
-    lacks_sizes: bool = False  # image sizes may be missing from the file
+    files: Callable[[Path], list[Path]] = lambda path: [path]  # returns all files that belong to a calibration
+    lacks_sizes: bool = False  # whether image sizes may be missing from the file
 
 
 def files_in(path: Path, *suffixes: str) -> list[Path]:
-    """Return the files of a folder with one of the suffixes; empty if it is not a folder."""
+    """Return the files of a folder that have one of the suffixes; none if the path is not a folder."""
     return sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes) if path.is_dir() else []
 
 
 def plain_name(name: str) -> str:
-    """Return a name with only the characters allowed in camera names of a capture."""
+    """Return a name in which characters not allowed in camera names of a capture are replaced by underscores."""
     return re.sub(r"[^A-Za-z0-9_\-]+", "_", name)
 
 
 def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
-    """Return a unique name for each image label; folder and suffix are dropped unless needed.
+    """Return a unique name for each image label, without folder and suffix where it is unique without them.
 
     Raises:
         CalibrationError: two labels are equal.
@@ -78,7 +79,7 @@ def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
         raise CalibrationError(
             f"has {times} cameras with the same label: {alike}. Labels must be unique.",
             path=path,
-            hint="Rename the pictures (such as left_0001.jpg) or cameras, and export again.",
+            hint="Rename the images (such as left_0001.jpg) or cameras, and export again.",
         )
     return names
 
@@ -93,24 +94,24 @@ def known_size(path: Path, name: str, sizes: Mapping[str, Size]) -> Size:
         if known in sizes:
             return sizes[known]
     raise CalibrationError(
-        f"camera {name}: the image size is not in the file, and there is no footage with that name "
+        f"camera {name}: the image size is not in the file, and no footage has that name "
         f"(available: {', '.join(sizes) or 'none'}).",
         path=path,
-        hint="Use the [[camera]] names as picture names, or give --size.",
+        hint="Name the images after the [[camera]] tables, or set --size.",
     )
 
 
 def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> None:
-    """Check that a file's lens model, if stated under a key of a common program, is OpenCV's standard model.
+    """Check that a file's lens model, if stated under a key that common programs use, is OpenCV's standard model.
 
     Raises:
-        CalibrationError: it is another model.
+        CalibrationError: the file states another lens model.
     """
     for key, value in values.items():
         said = re.sub(r"[\s-]+", "_", str(value).strip().lower())
         flag = key.lower() in _FLAG_KEYS and said not in ("0", "false", "no", "none", "")
         named = key.lower() in _MODEL_KEYS and said not in _READ_MODELS
-        # "camera_model" may be a product name
+        # "camera_model" may be a product name, so that only known names of other models are rejected
         if flag or (named and (key.lower().startswith("distortion") or _OTHER_MODELS.search(said))):
             raise CalibrationError(
                 f"{where} has {key} = {value}, a lens model that is not supported; use OpenCV's "
@@ -121,17 +122,17 @@ def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> No
 
 
 def numbers(path: Path, text: str, count: int, what: str) -> Array:
-    """Return a text of `count` numbers as an array, shape (count,).
+    """Convert a text of `count` numbers to an array, shape (count,).
 
     Raises:
-        CalibrationError: the text has other content.
+        CalibrationError: the text is not a list of `count` finite numbers.
     """
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError as error:
         raise CalibrationError(f'{what}: "{text:.60}" is not a list of numbers.', path=path) from error
     if len(values) != count or not np.isfinite(values).all():
-        raise CalibrationError(f"{what} has {len(values)} values; {count} finite numbers are needed.", path=path)
+        raise CalibrationError(f"{what} has {len(values)} values; expected {count} finite numbers.", path=path)
     return values
 
 
@@ -139,11 +140,11 @@ def parsed_xml(path: Path) -> ElementTree.Element:
     """Return the root of an XML file.
 
     Raises:
-        CalibrationError: it is not XML, or declares a document type.
-        FormatError: it cannot be read.
+        CalibrationError: the file is not XML, or declares a document type.
+        FormatError: the file cannot be read.
     """
     text = read_text(path, MOST_BYTES)
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can refer to other files and expand without limit
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities may read other files and expand without limit
         raise CalibrationError("declares a document type, which is not allowed.", path=path)
     try:
         return ElementTree.fromstring(text)
@@ -173,8 +174,8 @@ def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tan
     k, error_px = opencv_radial(K, size, radial)
     if error_px > _LARGEST_ERROR_PX:
         raise CalibrationError(
-            f"camera {name}: its lens cannot be approximated by OpenCV's coefficients (error {error_px:.2f} px, "
-            f"allowed {_LARGEST_ERROR_PX:g} px).",
+            f"camera {name}: its lens cannot be approximated by OpenCV's coefficients (error {error_px:.2f} px; "
+            f"at most {_LARGEST_ERROR_PX:g} px is allowed).",
             path=path,
             hint="Calibrate without k4, or undistort the footage first.",
         )
@@ -183,7 +184,7 @@ def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tan
 
 
 def corner_matrix(path: Path, where: str, fx: float, fy: float, cx: float, cy: float) -> Array:
-    """Return K (3, 3) from intrinsics for which the centre of the first pixel is at (0.5, 0.5).
+    """Return K (3, 3) in OpenCV's pixels from intrinsics in which the centre of the first pixel is at (0.5, 0.5).
 
     Raises:
         CalibrationError: a focal length is not positive.
@@ -194,7 +195,7 @@ def corner_matrix(path: Path, where: str, fx: float, fy: float, cx: float, cy: f
 
 
 def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[Camera]:
-    """Return the cameras of images (file, camera), sorted by name.
+    """Return one camera per physical camera, given (file, camera) of each image, sorted by name.
 
     The camera's name is the image's folder (`cam0/0001.png` is cam0) or, without one, the file name (`cam0.png`).
 
@@ -218,9 +219,10 @@ def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[
             what = "has different lenses"
         if what:
             raise CalibrationError(
-                f"camera {name} {what} in its images.",
+                f"camera {name} {what} in different images.",
                 path=path,
-                hint="Name images after their cameras, one per camera (cam0.png) or one folder each (cam0/0001.png), "
+                hint="Name images after their cameras, with one image (cam0.png) or one folder (cam0/0001.png) per "
+                "camera, "
                 "and use one lens for all images of a camera.",
             )
     return [cameras[name] for name in sorted(cameras)]

@@ -1,15 +1,15 @@
-"""Cameras of RealityScan (RealityCapture): XMP beside the images, and CSV.
+"""Read the cameras of RealityScan (RealityCapture) from XMP files beside the images, or from CSV.
 
-XMP, `IMAGE.xmp` ("Camera Geometry in RealityScan", dev.epicgames.com, and "RealityCapture XMP Camera Math",
-support.capturingreality.com): Rotation (row-major) maps world to camera axes, x right, y down, z forward; Position is
-the camera's centre. FocalLength35mm refers to 36 mm along the longer side; PrincipalPointU and V are relative to the
-image centre, in units of that side. Distortion models "brown3" and "brown4" ("t2": with tangential terms) equal
-OpenCV's in normalised coordinates: k1 k2 k3 k4 t1 t2, where t1, t2 are OpenCV's p1, p2. The image size is not in the
-file.
+In XMP files (`IMAGE.xmp`), Rotation (row-major) maps world to camera axes (x right, y down, z forward), and Position is
+the camera's centre. FocalLength35mm assumes that the longer side measures 36 mm; PrincipalPointU and V are relative to
+the image centre, in units of the longer side. Distortion models "brown3" and "brown4" (with the suffix "t2": with
+tangential terms) equal OpenCV's in normalised coordinates: k1 k2 k3 k4 t1 t2, where t1, t2 are OpenCV's p1, p2. The
+image size is not in the file. References: "Camera Geometry in RealityScan", dev.epicgames.com; "RealityCapture XMP
+Camera Math", support.capturingreality.com.
 
-CSV ("Internal/External camera parameters"; columns are found by name): x, y, alt is the camera's centre; the camera's
-axes in the world, x right, y up, z backward, are Rz(-heading) Rx(pitch) Ry(roll) in degrees, as in nerfstudio and
-brush; f, px, py, k1 .. k4, t1, t2 as in XMP.
+In CSV files ("Internal/External camera parameters"; columns are found by name), (x, y, alt) is the camera's centre. The
+camera's axes in the world (x right, y up, z backward) are Rz(-heading) Rx(pitch) Ry(roll) with angles in degrees, as in
+nerfstudio and brush. f, px, py, k1 to k4, t1 and t2 are as in XMP.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
     """Read the XMP files of a folder; return cameras named after the files, in the files' unit.
 
     Args:
-        folder: the folder of the files.
+        folder: the folder that contains the XMP files.
         sizes: (width, height) [px] of the images by camera.
 
     Raises:
@@ -70,7 +70,7 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
         model = values.get("DistortionModel", "perspective").lower()
         if not model.startswith(("brown", "perspective")):
             raise CalibrationError(
-                f'has the distortion model "{model}"; "brown3" and "brown4" are supported.',
+                f'has the distortion model "{model}"; expected "brown3" or "brown4".',
                 path=path,
                 hint="Choose Brown3 or Brown4 with tangential distortion, and align again.",
             )
@@ -93,7 +93,7 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
     """Read cameras from RealityScan's camera parameters, named after the images, in the file's unit.
 
     Args:
-        path: the CSV.
+        path: the CSV file.
         sizes: (width, height) [px] of the images by camera.
 
     Raises:
@@ -104,7 +104,7 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
     header = [word.lstrip("#").strip().lower() for word in table.header]
     lacking = [key for key in _NEEDED if key not in header]
     if lacking:
-        raise CalibrationError(f"has no column {lacking[0]}; required: {', '.join(_NEEDED)}.", path=path)
+        raise CalibrationError(f"has no column {lacking[0]}; expected the columns {', '.join(_NEEDED)}.", path=path)
     columns = [k for k, key in enumerate(header) if key in (*_NEEDED[1:], *_LENS)]
     column = header.index("name")
     names = names_of_labels(path, [row[column] for row in table.rows])
@@ -129,7 +129,7 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
 def _lens(
     path: Path, name: str, size: Size, f35_mm: float, principal: tuple[float, float], terms: Array
 ) -> tuple[Array, Array]:
-    """Return K (3, 3) and OpenCV's coefficients from RealityScan's values; terms are k1 k2 k3 k4 t1 t2.
+    """Return K (3, 3) and OpenCV's coefficients from RealityScan's values; `terms` are k1 k2 k3 k4 t1 t2.
 
     Raises:
         CalibrationError: the focal length is not positive, or OpenCV's coefficients cannot approximate the lens.

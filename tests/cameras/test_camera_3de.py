@@ -216,7 +216,7 @@ def test_a_damaged_lens_is_not_taken_for_a_remark(tmp_path):
     second = whole.splitlines()[1]
     for damaged in (whole.replace(second, " ".join(second.split()[:6])), "\n".join(whole.splitlines()[1:]) + "\n"):
         (tmp_path / "lens.txt").write_text(damaged)
-        with pytest.raises(CalibrationError, match=r"lens\.txt: is a lens file, but its first four lines"):
+        with pytest.raises(CalibrationError, match=r"lens\.txt: is a lens file, but does not begin with four lines"):
             away_px(tmp_path)
 
 
@@ -270,9 +270,9 @@ GOOD = lens_text(RADIAL, (0.04, 0, 0, 0.01, 0, 0, 0, 0))
     [
         (camera_node(rotate="{" + curve(1.0) + " {curve i x1 0 x2 1 x3 2} 0}"), None, "camera left moves between"),
         (camera_node(focal="{{curve i x1 35 x2 40}}"), None, "focal is animated"),
-        (camera_node(focal=0), None, "has focal length 0 mm and film back 36 x 20.25 mm; all must be"),
-        (camera_node(focal="{{parent.focal}}"), None, "focal is .*it must be a number"),
-        (camera_node(translate="{1 2}"), None, "3 numbers are needed"),
+        (camera_node(focal=0), None, "has focal length 0 mm and film back 36 x 20.25 mm; all three must be"),
+        (camera_node(focal="{{parent.focal}}"), None, "focal is .*expected numbers"),
+        (camera_node(translate="{1 2}"), None, "expected 3 numbers"),
         (camera_node(translate="{1 2 nan}"), None, "not finite"),
         (camera_node(win_scale="{1 2}"), None, "win_scale or winroll"),
         (camera_node(useMatrix="true"), None, "has useMatrix"),
@@ -285,9 +285,9 @@ GOOD = lens_text(RADIAL, (0.04, 0, 0, 0.01, 0, 0, 0, 0))
             lens_text("3DE4 Anamorphic - Standard, Degree 4", np.zeros(8)),
             "Anamorphic - Standard, Degree",
         ),
-        (camera_node(), lens_text(RADIAL, np.zeros(8), mode="DISTORTION_DYNAMIC_FOCUS_DISTANCE"), "animated"),
+        (camera_node(), lens_text(RADIAL, np.zeros(8), mode="DISTORTION_DYNAMIC_FOCUS_DISTANCE"), "type of distortion"),
         (camera_node(), lens_text(RADIAL, (0.05, 0.02, 0, 0, 0.01, 0, 0, 0)), "cannot be approximated .*0.05"),
-        (camera_node(), GOOD.replace("0.04\n", "much\n"), "must be followed by a number"),
+        (camera_node(), GOOD.replace("0.04\n", "much\n"), "must be followed by its value"),
         (camera_node(), GOOD.replace("0.04\n", "inf\n"), "not finite"),
         (camera_node(), GOOD.replace("U - Degree 2", "U - Degree 3"), 'no parameter "U - Degree 3"; its param'),
         (camera_node(haperture=24.0), GOOD, r"film back 24 x 20.25 .*its lens lens in left\.txt has 36 x 20.25"),
@@ -295,7 +295,7 @@ GOOD = lens_text(RADIAL, (0.04, 0, 0, 0.01, 0, 0, 0, 0))
         (
             camera_node() + lens_node("LD_3DE_Classic_LD_Model", {"field_of_view_xa_unit": 0.1}),
             None,
-            "other than the whole picture",
+            "smaller or larger than the image",
         ),
     ],
 )
@@ -309,7 +309,7 @@ def test_files_that_are_wrong_are_refused(tmp_path, script, lens, words):
 
 def test_sizes_are_needed_and_other_files_named(tmp_path):
     (tmp_path / "shot.nk").write_text(SCRIPT + camera_node())
-    with pytest.raises(CalibrationError, match=r"camera left: .*no footage with that name \(available: none\)"):
+    with pytest.raises(CalibrationError, match=r"camera left: .*no footage has that name \(available: none\)"):
         load_cameras_file(tmp_path)
     (tmp_path / "shot.3de").write_text("")
     with pytest.raises(CalibrationError, match=r"3DEqualizer's project; this format is not supported.*\.nk"):

@@ -78,7 +78,7 @@ def change(path, old, new):
     ("file", "old", "new", "words"),
     [
         ("cameras.txt", "PINHOLE", "OPENCV_FISHEYE", "model OPENCV_FISHEYE; it must be one of SIMPLE_PINHOLE"),
-        ("cameras.txt", "900.0 910.0", "900.0", "camera 1 has 5 values; PINHOLE needs 6"),
+        ("cameras.txt", "900.0 910.0", "900.0", "camera 1 has 5 values; model PINHOLE has 6"),
         ("cameras.txt", "900.0", "many", "is not a list of numbers"),
         ("cameras.txt", "900.0", "-900.0", "focal lengths -900"),
         ("images.txt", "0.9 0.1 -0.3 0.2", "0 0 0 0", "zero quaternion"),
@@ -161,7 +161,7 @@ def test_nerfstudio_scale_is_undone_and_frames_may_have_their_own_lens(tmp_path,
     [
         ({"camera_model": "OPENCV_FISHEYE"}, "only perspective models"),
         ({"k4": 0.1}, "k4 = 0.1; it must be 0"),
-        ({"fl_x": None}, 'has no number "fl_x"'),
+        ({"fl_x": None}, 'has no "fl_x"'),
         ({"fl_x": 0}, "focal lengths 0"),
         ({"frames": []}, 'has no "frames"'),
         ({"frames": [{"file_path": "a.png"}]}, "frames.0. has no .transform_matrix"),

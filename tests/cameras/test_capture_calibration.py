@@ -159,7 +159,7 @@ def test_calibration_round_trip(folder, tmp_path):
         ("[2870.0, 0.0, 968.3]", "[-2870.0, 0.0, 968.3]", "fx, fy > 0"),
         ("size = [1920, 1080]", "size = [1920.5, 1080]", "whole numbers"),
         ("distortions = [-0.03, 0.012, 0.0003, -0.0004, 0.0]", 'distortions = ["a"]', "not an array of numbers"),
-        ('name = "right"', 'name = "left"', "duplicate"),
+        ('name = "right"', 'name = "left"', "same name"),
         ("[cam_0]\nname", "[cam_0]\nfisheye = true\nname", "fisheye"),
     ],
 )
