@@ -1,5 +1,5 @@
-"""The HTML reports of builds and solves, with their verdicts and figures.
+"""HTML reports on builds and solves, with verdicts and figures.
 
-Its inputs are `formats` and `evaluator` objects. It imports no other stage, and drawing code only in `style` and
-`figures`.
+The inputs are objects of `formats` and `evaluator`. This package imports no other stage; only `style` and `figures`
+import drawing code.
 """

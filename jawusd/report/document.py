@@ -27,7 +27,7 @@ from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
 from jawusd.report.verdicts import MARKS, WORDS, judge, summary
 
-_LISTED = 60  # maximum number of frame ranges listed
+_LISTED = 60  # maximum number of frame ranges in a list
 _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
 
 
@@ -37,8 +37,8 @@ def write_document(
     """Write the report to an HTML file; return its summary.
 
     Args:
-        figures: plots by their slot on the page; by default those of `draw_figures`. Plots of the experiments are made
-            by `paper.figures.inline_figures`.
+        figures: plots by their slot on the page; default: those of `draw_figures`. The plots of the experiments come
+            from `paper.figures.inline_figures`.
 
     Raises:
         OutputError: the file cannot be written.
@@ -48,7 +48,7 @@ def write_document(
 
 
 def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> str:
-    """Return the report as HTML (see `write_document`); text from files is escaped."""
+    """Return the report as HTML, with text from files escaped; see `write_document`."""
     verdicts = judge(data)
     verdict = summary(verdicts)
     return (
@@ -95,8 +95,8 @@ def page_environment() -> jinja2.Environment:
 
 
 def worded(text: str) -> Markup:
-    """Return a sentence as HTML, with text in backticks as code."""
-    parts = re.split(r"`([^`]*)`", shown(text))  # elements at odd indices were in backticks
+    """Return a sentence as HTML, with text in backticks marked as code."""
+    parts = re.split(r"`([^`]*)`", shown(text))  # parts at odd indices were in backticks
     return Markup().join(Markup("<code>{}</code>").format(p) if k % 2 else escape(p) for k, p in enumerate(parts))
 
 
@@ -111,7 +111,7 @@ def package_file(name: str) -> Markup:
 
 
 def draw_figures(data: ReportData) -> dict[str, Markup]:
-    """Return the plots of tracks and model by their slot on the page."""
+    """Return the plots of the tracks and the model by their slot on the page."""
     return {
         "tracking": inline_svg(tracking_figure(data.tracks), "tracking", "Tracking state and errors of every frame."),
         "model": inline_svg(model_figure(data.model), "model", "Parameters, model error and margin of every frame."),
@@ -119,7 +119,7 @@ def draw_figures(data: ReportData) -> dict[str, Markup]:
 
 
 def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict[str, float]]]]]:
-    """Return the error tables, each with short name, description, and rows of (place, figures)."""
+    """Return the error tables, each with a short name, a description, and rows of (place, errors by statistic)."""
     names = {
         "train": ("fit", "poses the model was fitted to"),
         "holdout": ("held out", "poses of parts of the take that were held out of the fit, one part at a time"),
@@ -150,7 +150,7 @@ def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
 
 
 def _spans(frames: NDArray[np.int64]) -> str:
-    """Return frame numbers as ranges: 3-7, 9."""
+    """Return frame numbers as text with ranges, such as "3-7, 9"."""
     if not len(frames):
         return ""
     frames = np.unique(frames)
@@ -167,7 +167,7 @@ def _findings(data: ReportData) -> list[str]:
 
 
 def _start(data: ReportData) -> str:
-    """Return how tracking was initialised."""
+    """Return a phrase that describes how tracking was initialised."""
     start = data.tracks.meta.get("start", {})
     if not start:
         return "not recorded"
@@ -216,7 +216,7 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
 
 
 def _drawn(meta: TracksMeta, camera: str) -> str:
-    """Return the offset of the mask outlines from the teeth in a camera, upper and lower arch."""
+    """Return a text with the offsets of a camera's mask outlines from the teeth, upper and lower arch."""
     edges, gum = meta.get("outline_bias_px", {}).get(camera), meta.get("gum_bias_px", {}).get(camera)
     if edges is None or gum is None:
         return ""
@@ -224,7 +224,7 @@ def _drawn(meta: TracksMeta, camera: str) -> str:
 
 
 def _bite(data: ReportData) -> str:
-    """Return sentences on the annotated gum line and the occlusion as estimated from the take."""
+    """Return sentences on the gum line of the masks and the occlusion, as estimated from the take."""
     meta, said = data.tracks.meta, []
     if "gum_line_mm" in meta:
         upper, lower = meta["gum_line_mm"]

@@ -36,17 +36,17 @@ from jawusd.report.style import (
 )
 from jawusd.report.verdicts import GOOD, LOOK
 
-_COLUMNS = 1200  # maximum number of points per curve; longer takes are reduced to the extreme of every few frames
+_COLUMNS = 1200  # maximum number of points per curve; in longer takes, groups of frames are reduced to their extremes
 _LANES = ("tracked", "recovered", "without a camera", "lost", "regularised")
 _LANE_COLORS = (GREEN, SKY, ORANGE, VERMILION, BLUE)
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, BLACK, GREY)
 _AROUND_FRAMES = 12  # number of frames drawn before and after a flash
-_APART_FRAMES = 48  # maximum distance between successive light steps of one flash
+_APART_FRAMES = 48  # maximum number of frames between two light steps of the same flash
 _QUANTILE = 99.5  # percentile taken as the end of a range of motion, robust to single outliers
 _NEAR_CLOSED_MM = 5.0  # maximum opening at which protrusion is measured, as in clinical practice
 
 
-RANGES = "ranges"  # file name of the figure of several actors
+RANGES = "ranges"  # file name of the figure that compares several actors
 
 _PARAMETERS = {
     "opening": ("opening d1", BLUE),
@@ -54,11 +54,11 @@ _PARAMETERS = {
     "protrusion": ("protrusion d3, + forward", SKY),
 }
 _ROW_IN, _MARGINS_IN = 0.22, 0.9
-_MOST_ROWS = 400  # maximum number of actors drawn; common programs cannot open taller images
+_MOST_ROWS = 400  # maximum number of actors in the figure; common programs cannot open taller images
 
 
 def tracking_figure(tracks: Tracks) -> Figure:
-    """Plot state, outline distance, uncovered mask and expected error of every frame."""
+    """Plot the state, outline distance, uncovered mask fraction and expected error of every frame."""
     figure, axes = new_figure(11.0, 7.4, 4, 1, sharex=True, height_ratios=[1.15, 1, 1, 1])
     _draw_state(axes[0], tracks)
     residual = np.where(tracks.status == LOST, np.nan, tracks.residual_px)
@@ -81,7 +81,7 @@ def tracking_figure(tracks: Tracks) -> Figure:
 
 
 def model_figure(model: JawModel) -> Figure:
-    """Plot the parameters of every frame, their distances to the model and their margins."""
+    """Plot the jaw parameters of every frame, the distances of the poses to the model, and the margins to the bound."""
     rig = JawRig(model.arrays, model.meta)
     known = np.all(np.isfinite(model.d), axis=1)
     margin = np.full(len(model.d), np.nan)
@@ -108,7 +108,7 @@ def model_figure(model: JawModel) -> Figure:
 
 
 def _draw_state(axis: Axes, tracks: Tracks) -> None:
-    """Draw a lane per state, with the upper teeth above the lower, so that it is legible without colour."""
+    """Draw a lane per frame state, upper teeth above lower teeth, so that the plot is legible without colour."""
     states = [tracks.status == value for value in (TRACKED, RECOVERED, PARTIAL, LOST)]
     states.append(np.repeat(tracks.prior_aided[:, None], 2, axis=1))
     for lane, (has, color) in enumerate(zip(states, _LANE_COLORS, strict=True)):
@@ -123,7 +123,7 @@ def _draw_state(axis: Axes, tracks: Tracks) -> None:
 
 
 def runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
-    """Return the ranges (start, width) of consecutive frames with a property."""
+    """Return the ranges (start, width) of consecutive frames for which a mask is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], has, [False]]).astype(np.int8)))
     spans = zip(edges[::2], edges[1::2], strict=True)
     return [(float(frames[a]) - 0.5, float(frames[b - 1] - frames[a]) + 1.0) for a, b in spans]
@@ -136,12 +136,12 @@ def _mean_of_known(values: Array, axis: int) -> Array:
 
 
 def larger_magnitude(a: Array, b: Array) -> Array:
-    """Return the value with the larger magnitude, ignoring NaN."""
+    """Return the elementwise value with the larger magnitude, ignoring NaN."""
     return np.where(np.isnan(a) | (np.abs(b) > np.abs(a)), b, a)
 
 
 def thinned(frames: NDArray[np.int64], values: Array, keep: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
-    """Return at most `_COLUMNS` points (frames, values), with each group of frames reduced by `keep`."""
+    """Return at most `_COLUMNS` points (frames, values); `keep` reduces each group of frames to one."""
     step = -(-len(frames) // _COLUMNS)
     if step <= 1:
         return frames.astype(np.float64), values
@@ -175,7 +175,7 @@ def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | Non
 
 
 def sync_figure(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str) -> Figure:
-    """Return the figure of `draw_sync`: one row as recorded and, with offsets, one row aligned."""
+    """Return the figure of `draw_sync`: one row of plots as recorded and, if offsets are given, one row aligned."""
     rows: list[tuple[str, str, Mapping[str, int]]] = [("as recorded", "frame of each camera", dict.fromkeys(curves, 0))]
     if offsets is not None:
         rows.append(("aligned", "frame of the reference camera", offsets))
@@ -200,7 +200,7 @@ def sync_figure(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | N
 
 
 def _draw_curves(axis: Axes, curves: Mapping[str, LightCurve], shifts: Mapping[str, int], close: bool) -> None:
-    """Draw one line per camera, with markers where the light went off or on."""
+    """Draw the brightness of each camera as a curve, with markers where the light went off or on."""
     for k, (name, curve) in enumerate(curves.items()):
         colour = _COLOURS[k % len(_COLOURS)]
         frames = curve.frames + shifts[name]
@@ -226,7 +226,7 @@ def _flashes(curves: Mapping[str, LightCurve], shifts: Mapping[str, int]) -> lis
 
 @dataclass(frozen=True)
 class RangeRow:
-    """Range of one movement, compared with the range of about 95 % of people; the grade is "good" or "look"."""
+    """Range of one jaw movement, compared with that of about 95 % of people; the grade is "good" or "look"."""
 
     name: str
     found: str
@@ -236,7 +236,7 @@ class RangeRow:
     grade: str
 
 
-# Usual minimum and maximum: mean -+ 2 SD, or the extremes over both sexes where they were published separately.
+# Usual minimum and maximum: mean -+ 2 SD, or the extremes over both sexes if they were published separately.
 _REFERENCE = {
     "opening at the incisors": (
         36.0,
@@ -254,7 +254,7 @@ _REFERENCE = {
 
 
 def human_ranges(tracks: Tracks, model: JawModel) -> list[RangeRow]:
-    """Return the ranges of the poses that the model was fitted to, one row per movement; none without poses."""
+    """Return the ranges of motion in the poses used for the fit, one row per movement; empty without poses."""
     T = tracks.raw_T_upper_lower
     used = np.isin(tracks.frames, model.frames[model.trained]) & np.all(np.isfinite(T), axis=(1, 2))
     if not used.any():
@@ -294,7 +294,7 @@ def draw_ranges(people: Sequence[tuple[str, dict[str, list[float]]]], folder: Pa
 
 
 def ranges_figure(people: Sequence[tuple[str, dict[str, list[float]]]]) -> Figure:
-    """Draw the ranges of actors as bars, one row per actor, one column per parameter.
+    """Draw the ranges of motion of actors as bars, one row per actor and one column per parameter.
 
     Args:
         people: name of each actor, and lowest and highest value [mm] by "opening", "laterotrusion", "protrusion"; only

@@ -14,14 +14,14 @@ from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import transform_points
 
-#: Names of the states of a frame.
+#: Names of the frame states.
 STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "regularised by the model")
 _MOST_FRAMES = 6000  # maximum number of frames; longer takes are subsampled
 _DEFAULT_FPS = 24.0
 
 
 def replay_data(data: ReportData) -> dict[str, object] | None:
-    """Return the input of replay.js for JSON; None without meshes or frames.
+    """Return the input of replay.js, ready for JSON encoding; None without meshes or frames.
 
     Poses are motions relative to occlusion in the anatomical frame, as row-major 3 x 4 matrices. Mesh
     vertices are quantised to 16 bits over the bounding box.
@@ -35,7 +35,7 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
     fitted = np.full((len(rows), 4, 4), np.nan)
     known = np.all(np.isfinite(d), axis=1)
     fitted[known] = JawRig(model.arrays, model.meta).pose(d[known])
-    # The camera frames the jaw, without the skull.
+    # The virtual camera is aimed at the jaw; the skull is ignored.
     jaw = [part.mesh.vertices for part in data.parts if part.name != "skull"] or [data.parts[0].mesh.vertices]
     low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
     A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]
@@ -56,7 +56,7 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
 
 
 def _parameters_at(frames: NDArray[np.int64], data: ReportData) -> Array:
-    """Return the parameters of frames [mm], shape (F, 3); NaN where the model has none."""
+    """Return the jaw parameters of frames [mm], shape (F, 3); NaN where the model has no parameters."""
     rows = {int(frame): row for row, frame in enumerate(data.model.frames)}
     missing = np.full(3, np.nan)
     return np.array([data.model.d[rows[int(f)]] if int(f) in rows else missing for f in frames])

@@ -1,4 +1,4 @@
-"""The report of a solved performance as one self-contained HTML file, with its figures."""
+"""Write the report on a solved performance as one self-contained HTML file with figures."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from jawusd.report.document import package_file, page_environment
 from jawusd.report.figures import larger_magnitude, legend_beside, runs, thinned
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, VERMILION, inline_svg, new_figure
 
-#: Colours of the states: close to those in the images, but legible on light and dark pages.
+#: Colours of the solve states: close to those of the outlines in the images, but legible on light and dark pages.
 STATE_INKS = {SolveState.SOLVED: GREEN, SolveState.CARRIED: ORANGE, SolveState.LOST: MAGENTA}
 _NAMES = ("d1 opening", "d2 laterotrusion,\nleft is positive", "d3 protrusion,\nforward is positive")
 _INKS = (BLACK, BLUE, VERMILION)
 _STYLES = ("-", "--", ":")
-_BAND = 2.0  # half width of the band [sigma]: 95 % of normally distributed errors
+_BAND = 2.0  # half width of the error band [sigma]; it contains 95 % of normally distributed errors
 _UNOBSERVED = (SolveState.CARRIED, SolveState.LOST)
-_LISTED = 60  # maximum number of runs listed
+_LISTED = 60  # maximum number of runs in the table
 
 
 def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
-    """Plot d with a band of two sigma, its sigma and the margin of every frame, with unobserved frames shaded."""
+    """Plot d with a band of two sigma, sigma itself, and the margin to the bound, with unobserved frames shaded."""
     frames = tracks.frames
     figure, axes = new_figure(11.0, 9.6, 5, 1, sharex=True, height_ratios=[1.4, 1, 1, 0.8, 1])
     for axis, name, ink, value, sigma in zip(axes, _NAMES, _INKS, solved.d.T, solved.sigma_mm.T, strict=False):
@@ -110,7 +110,7 @@ def _name_lanes(axis: Axes, names: list[str]) -> None:
 
 
 def _label_frames(top: Axes, bottom: Axes, fps: float) -> None:
-    """Label frames below and seconds above."""
+    """Label a time axis: frames below the plots, seconds above."""
     bottom.set_xlabel("frame of the reference camera")
     seconds = top.secondary_xaxis("top", functions=(partial(_scaled, factor=1 / fps), partial(_scaled, factor=fps)))
     seconds.set_xlabel("time [s]")
@@ -121,7 +121,7 @@ def _scaled(value: ArrayLike, factor: float) -> Array:
 
 
 class UnobservedRun(NamedTuple):
-    """A run of frames in which an arch was not found."""
+    """A run of consecutive frames in which an arch was not found."""
 
     first: int
     last: int
@@ -142,7 +142,7 @@ def write_solve_page(path: str | os.PathLike[str], data: SolveReportData) -> Non
 
 
 def solve_page(data: SolveReportData) -> str:
-    """Return the report as HTML; text from files is escaped.
+    """Return the report as HTML, with text from files escaped.
 
     Raises:
         FormatError: the tracks do not come from a solve.
@@ -172,7 +172,7 @@ def solve_page(data: SolveReportData) -> str:
 
 
 def unobserved_runs(data: SolveReportData, solved: SolvedJaw) -> list[UnobservedRun]:
-    """Return the runs of frames in which an arch was not found, each with a single state."""
+    """Return the runs of consecutive frames in which an arch was not found; a run has a single state."""
     frames, found = data.tracks.frames, []
     breaks = np.flatnonzero((np.diff(solved.state) != 0) | (np.diff(frames) != 1)) + 1
     for rows in np.split(np.arange(len(frames)), breaks):
@@ -225,7 +225,7 @@ def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
 
 
 def _sentence(solved: SolvedJaw, has_findings: bool) -> str:
-    """Return a sentence on what to inspect, based on existing verdicts only."""
+    """Return a sentence on what to inspect, based only on the verdicts in the tracks."""
     said = []
     if (solved.state == SolveState.LOST).any():
         said.append("some frames are lost: inspect their masks")
@@ -244,7 +244,7 @@ def _sentence(solved: SolvedJaw, has_findings: bool) -> str:
 
 
 def _jaw_rows(solved: SolvedJaw) -> list[tuple[str, str, str, str, str]]:
-    """Return (parameter, minimum, maximum, median sigma, maximum sigma) in mm; the median is over solved frames."""
+    """Return rows of (parameter, minimum, maximum, median sigma over solved frames, maximum sigma) in mm."""
     names = ("d1 opening", "d2 laterotrusion (left is positive)", "d3 protrusion (forward is positive)")
     seen = solved.state == SolveState.SOLVED
     rows = []

@@ -30,11 +30,11 @@ SETTINGS: dict[RcKeyType, object] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "svg.fonttype": "none",
-    "svg.hashsalt": "jawusd",  # for reproducible files
+    "svg.hashsalt": "jawusd",  # makes the ids in SVG files reproducible
 }
 DPI, _INLINE_DPI = 150, 110
 _PX_PER_PT = 4 / 3
-# Colours that are replaced by variables of the page's style sheet; white is the background behind text.
+# Colours that are replaced by variables of the page's style sheet; white is the background of text.
 _THEMED = {
     BLACK: "ink",
     "#ffffff": "paper",
@@ -58,7 +58,7 @@ def new_figure(
     sharey: bool = False,
     height_ratios: list[float] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure without a GUI backend, and its axes in row-major order; options as in `Figure.subplots`."""
+    """Return a figure that needs no GUI, and its axes in row-major order; options as in `Figure.subplots`."""
     with matplotlib.rc_context(SETTINGS):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey, height_ratios=height_ratios)
@@ -81,7 +81,7 @@ def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = Fal
     """Return a figure encoded as a file type, without dates and versions, so that equal figures give equal bytes."""
     drawn = io.BytesIO()
     metadata = {"Software": None} if kind == "png" else {"Date": None}
-    for text in figure.findobj(Text):  # draw names literally: drop control characters, and do not parse $ as math
+    for text in figure.findobj(Text):  # draw names literally: remove control characters, and do not parse $ as math
         text.set_text("\n".join(map(shown, text.get_text().split("\n"))))
         text.set_parse_math("$" not in text.get_text())
     with matplotlib.rc_context(SETTINGS):
@@ -92,11 +92,11 @@ def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = Fal
 def inline_svg(figure: Figure, key: str, words: str) -> Markup:
     """Return a figure as an inline SVG element in the page's colours, with alternative text.
 
-    The key is the prefix of all ids of this figure and must be unique in the page.
+    The key becomes the prefix of all ids in the figure; it must be unique in the page.
     """
     text = figure_bytes(figure, "svg", _INLINE_DPI, transparent=True).decode()
     text = text[text.index("<svg") :]
-    # Remove elements that a page does not need; the style would also apply outside the figure.
+    # Remove the metadata and the style element; the style would also apply outside the figure.
     text = re.sub(r"<metadata>.*?</metadata>|<style[^>]*>.*?</style>", "", text, flags=re.DOTALL)
     head, body = text.split(">", 1)
     width = float(head.split('width="', 1)[1].split('pt"', 1)[0])

@@ -18,17 +18,17 @@ GOOD, LOOK, BAD, OPEN = "good", "look", "bad", "open"
 WORDS = {GOOD: "good", LOOK: "needs review", BAD: "poor", OPEN: "not judged"}
 MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
 
-# Yang et al. (2019): mean uncovered mask, and mean and largest reconstruction error in their Fig. 12.
+# Results of Yang et al. (2019): mean uncovered mask fraction; mean and largest reconstruction error (their Fig. 12).
 _PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
 _UNKNOWN = "not known"
 _EXERCISES = "full opening, slides to both sides and protrusion, closed and half open"
-# Kinds of findings in tracks.
+# Kinds of findings in tracks that mean an unused camera or wrong scans.
 _UNUSED = {"camera_without_masks", "masks_black", "camera_not_used", "camera_rarely_used"}
 _WRONG_SCANS = {"scan_misfit", "scans_mirrored"}
 _LACKING = {"take_lacks", "not_shown"}  # fit warnings about movements that are missing or too small
 _MISTAKES = {"scan_units", "pose_units", "front_back_flip", "left_right_flip", "upside_down", "swapped_jaws"}
 _RECORD = "Re-record: "
-_MASKS = "Check masks and calibration in the frames to inspect."
+_MASKS = "Check the masks and the calibration in the frames to inspect."
 _OFFSETS = "Give the frame offsets in [sync], or record a flash or a clap with all cameras."
 _VIEWS = "Film closer, or from more directions."
 _WORST = "Check the masks in the frames with the largest error."
@@ -63,18 +63,18 @@ _SENTENCES = {
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one check: the value with unit, the limits for good and acceptable, and a grade of `WORDS`."""
+    """Result of one check: value with unit, limits for "good" and "acceptable", and grade (one of `WORDS`)."""
 
     name: str
     found: str
     limit: str
     grade: str
-    todo: str = ""  # sentence on what to do, unless the grade is good
+    todo: str = ""  # sentence on what to do; not shown if the grade is good
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on one stage: a sentence and the worst grade of its checks, ignoring those not judged."""
+    """Verdict on one stage: a sentence, and the worst grade of its checks, ignoring checks that were not judged."""
 
     stage: str
     sentence: str
@@ -83,20 +83,20 @@ class Verdict:
 
 
 def judge(data: ReportData) -> list[Verdict]:
-    """Return the verdicts on sync, track, fit, bounds and rig."""
+    """Return the verdicts on the stages sync, track, fit, bounds and rig."""
     return [_sync(data), _track(data.tracks), _fit(data), _bounds(data), _rig(data)]
 
 
 def overall(verdicts: Iterable[Verdict]) -> str:
-    """Return the worst grade of verdicts."""
+    """Return the worst grade of several verdicts."""
     return _worst([verdict.grade for verdict in verdicts])
 
 
 def summary(verdicts: Iterable[Verdict]) -> BuildVerdict:
-    """Return the worst grade, what to do, and the checks with that grade and their limits.
+    """Return the worst grade, advice on what to do, and the checks with that grade and their limits.
 
-    What to do is ordered by grade, then by stage, as a fault affects the stages after it. All movements to record are
-    one sentence.
+    The advice is ordered by grade, then by stage, since a fault affects the stages after it. All movements to record
+    are joined in one sentence.
     """
     verdicts = list(verdicts)
     grade = overall(verdicts)
@@ -118,7 +118,7 @@ def _worst(grades: list[str]) -> str:
 
 
 def _below(name: str, value: float, good: float, fair: float, unit: str, todo: str, digits: int = 2) -> Check:
-    """Check a value that should be small."""
+    """Grade a value that should be small."""
     limit = f"good up to {good:g} {unit}, acceptable up to {fair:g} {unit}"
     if not np.isfinite(value):
         return Check(name, _UNKNOWN, limit, OPEN)
@@ -127,7 +127,7 @@ def _below(name: str, value: float, good: float, fair: float, unit: str, todo: s
 
 
 def _share(name: str, share: float, good: float, fair: float, todo: str) -> Check:
-    """Check a fraction, 0 .. 1, that should be large."""
+    """Grade a fraction, 0 .. 1, that should be large."""
     limit = f"good from {100 * good:g} %, acceptable from {100 * fair:g} %"
     if not np.isfinite(share):
         return Check(name, _UNKNOWN, limit, OPEN)
@@ -136,13 +136,13 @@ def _share(name: str, share: float, good: float, fair: float, todo: str) -> Chec
 
 
 def _movement(sentence: str) -> str:
-    """Return what to record, from a sentence of `fitting.checks` that ends in ": record" and a movement."""
+    """Return advice on what to record, given a sentence of `fitting.checks` that ends in ": record" and a movement."""
     _, found, movement = sentence.rpartition(": record ")
     return _RECORD + (movement if found else sentence)
 
 
 def _mean(has: Mask) -> float:
-    """Return the mean of a mask (F,), NaN if it is empty."""
+    """Return the fraction of true elements in a mask (F,), NaN if it is empty."""
     return float(has.mean()) if has.size else np.nan
 
 
@@ -196,7 +196,7 @@ def _track(tracks: Tracks) -> Verdict:
     found = [Finding.from_json(one) for one in tracks.meta.get("findings", [])]
     for one in found:
         if one.kind in _UNUSED:
-            todo = f"Check masks and calibration of camera {one.camera}."
+            todo = f"Check the masks and the calibration of camera {one.camera}."
             checks.append(Check("unused camera", f"{one.camera}: {one.message}", "", LOOK, todo))
         elif one.kind in _WRONG_SCANS:
             todo = "Check that the scans are of this subject, complete, in mm and not mirrored."
@@ -280,7 +280,7 @@ def _bounds(data: ReportData) -> Verdict:
         ratio = float(np.median(drawn.values_mm) / max(np.median(known.values_mm), 1e-9))
         checks.append(
             _below(
-                "distance of random valid poses to the take, over that of held-out poses",
+                "distance of random valid poses to the take, relative to that of held-out poses",
                 ratio,
                 3.0,
                 6.0,

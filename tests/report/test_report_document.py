@@ -218,7 +218,7 @@ def test_how_masks_were_drawn_and_the_closed_bite_are_told(words_alone):
 
 def test_without_experiments_pictures_and_meshes_the_page_says_so():
     text = " ".join(Page(document(report_data(experiments=None, overlays=(), parts=(), cameras=()))).text)
-    assert "The experiments were not run" in text and "There are no pictures" in text
+    assert "The experiments were not run" in text and "There are no images" in text
     assert "There is nothing to show" in text
 
 
