@@ -1,4 +1,4 @@
-"""Write the rig of a fitted model, the take beside it, and the table of joint deltas for ARKit shapes."""
+"""Write the rig of a fitted model, the captured take beside it, and the table of joint deltas for ARKit shapes."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import BONES, Subject, registered_subject
 
 DEFAULT_FPS = 24.0
-_PROXY_FACES = 1500  # number of faces of a proxy mesh, without those along borders; see `proxy_of`
-_TEETH_APART_MM = 15.0  # maximum; molar landmarks may be picked by hand or detected
+_PROXY_FACES = 1500  # number of faces of a proxy mesh, not counting those along borders; see `proxy_of`
+_TEETH_APART_MM = 15.0  # maximum distance of tooth landmarks; large because they may be picked by hand or detected
 
 
 def check_same_jaw(subject: Subject, model: JawModel) -> None:
-    """Check that a model and a subject's scans share one coordinate frame, by their tooth landmarks.
+    """Check that a model and a subject's scans have the same coordinate frame, by comparing their tooth landmarks.
 
     Raises:
         RigError: the landmarks are too far apart.
@@ -50,7 +50,7 @@ def bake_subject(
     table_size: int = 33,
     prim_name: str | None = None,
 ) -> list[Path]:
-    """Write the rig of a subject with meshes, and the captured motion if there is any; return the files.
+    """Write the rig of a subject with meshes and, if there is any, the captured motion; return the files written.
 
     Args:
         fps: frame rate if the subject has none.
@@ -98,7 +98,7 @@ def bake_subject(
 
 @explain_missing_packages()
 def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
-    """Write the cameras and the captured head motion beside the rig; return the files.
+    """Write the cameras and the captured head motion to the rig's folder; return the files written.
 
     Raises:
         CalibrationError: a camera of the capture has no calibration.
@@ -118,17 +118,17 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
 
 
 SHAPES = ("JawOpen", "JawLeft", "JawRight", "JawForward")
-_WEIGHTS = (0.5, 1.0)  # weights in the table; several, because the joint does not move linearly with the weight
+_WEIGHTS = (0.5, 1.0)  # shape weights in the table; two, because the joint does not move linearly with the weight
 
 
 def joint_deltas(rig: JawRig, mapping: ArkitMapping | None = None) -> list[JointDelta]:
     """Return the offset of the jaw joint, midway between the condyles, for each shape at half and full weight.
 
-    The other weights are neutral. d is projected into the bound, as by `jawusd animate`.
+    All weights of other shapes are zero. d is projected into the bound, as by `jawusd animate`.
 
     Args:
-        mapping: the subject's mapping; None: weights are fractions of the ranges, and the teeth of the neutral face are
-            closed.
+        mapping: the subject's mapping from ARKit weights to d; None: weights are fractions of the ranges of motion, and
+            the teeth are closed in the neutral face.
     """
     from jawusd.rig.skel import joint_poses
 

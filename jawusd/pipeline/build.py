@@ -1,4 +1,4 @@
-"""From a capture to a rig: the stages in order, each reused if none of its inputs has changed."""
+"""Build a rig from a capture, stage by stage; a stage is reused if none of its inputs has changed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
 from jawusd.pipeline.workspace import DryWorkspace, Stage, StageMissing, Workspace, check_folder, opened
 
-OLD_MASKS = "masks"  # folder to which version 0.1 wrote masks if the capture named none
+OLD_MASKS = "masks"  # folder to which version 0.1 wrote masks if the capture named no mask folder
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class BuildOptions:
         model: "anchored", "additive", "paper" or "pca".
         solver: "contour" or "paper".
         backend: renderer of the paper's solver, "cpu" or "gl".
-        jobs: threads of the tracker; the result does not depend on it.
+        jobs: number of threads of the tracker; the result does not depend on it.
         resume: continue an earlier build in the folder.
         fresh: delete an earlier build in the folder first.
         allow_outside: allow paths in the capture that point outside its folder.
@@ -71,10 +71,10 @@ class BuildSummary(TypedDict):
 
     Attributes:
         files: names of all files written, relative to the folder.
-        seconds: duration by stage; of a reused stage, that of its last run.
+        seconds: duration of each stage [s]; for a reused stage, the duration of its last run.
         reused: stages reused from an earlier build.
-        findings: `Finding.as_json` of the check before the first stage.
-        calibrate: None if the capture names a calibration.
+        findings: the findings of the check before the first stage, as `Finding.as_json`.
+        calibrate: summary of the calibration; None if the capture names a calibration file.
         track: summary of the final tracks.
     """
 
@@ -119,8 +119,9 @@ def build(
         tell: called with every finding of the capture's check, before any work.
 
     Raises:
-        CaptureError: the check found errors, which the message lists; or inputs changed while a stage ran.
-        JawusdError: one of its subclasses; finished stages stay valid for `resume`.
+        CaptureError: the check found errors (all are listed in the message), or inputs changed while a stage ran.
+        JawusdError: a stage failed, with the subclass that describes the failure; finished stages stay valid for
+            `resume`.
     """
 
     def read() -> Capture:
@@ -136,8 +137,8 @@ def build(
 def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], None] | None) -> BuildSummary:
     """Run the stages of a build in order, or reuse them.
 
-    Each stage is declared with the parts of the capture and the settings that it depends on. Contents are hashed, not
-    paths, so that a capture may be moved.
+    Each stage is declared with the parts of the capture and the settings that it depends on. File contents are hashed,
+    but not paths, so that a capture may be moved.
     """
     capture, videos = run.capture, run.hashes(["videos"])
     names = [camera.name for camera in capture.cameras]
@@ -215,7 +216,7 @@ def _calibrated(run: Workspace) -> StageRecord[CalibrationSummary]:
 
 
 def _check(run: Workspace) -> tuple[list[Path], CheckResult]:
-    """Check the capture before any work; raise one error with all problems."""
+    """Check the capture before the first stage; raise one error that lists all problems."""
     findings = check_capture(run.capture, run.folder, progress=run.progress)
     refuse_errors(findings, run.capture)
     return [], {"findings": [finding.as_json() for finding in findings]}
@@ -271,8 +272,8 @@ class PlannedStage:
     """A stage of a planned build."""
 
     name: str
-    keeps: bool  # whether its record is reused
-    seconds: float  # recorded duration, or an estimate for stages without a record
+    keeps: bool  # whether the recorded result of the stage is reused
+    seconds: float  # recorded duration [s], or an estimate if the stage has no record
 
 
 @explain_missing_packages()
@@ -307,7 +308,7 @@ def _stages(capture: Capture) -> list[Stage[Mapping[str, object]]]:
 
 
 def _pictures(capture: Capture) -> int:
-    """Return the total number of images that are processed, over all cameras."""
+    """Return the total number of images to process, over all cameras."""
     from jawusd.media.footage import open_clip
 
     counts = [open_clip(camera.clip).count for camera in capture.cameras if camera.clip is not None]

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 PLOT_SUFFIXES = (".png", ".svg")
 
-_SIZE_SIGMA = 0.005  # standard deviation of the scale estimated from masks, as a fraction
+_SIZE_SIGMA = 0.005  # standard deviation of the scale factor estimated from masks
 
 
 class CameraReport(TypedDict):
-    """Calibration quality of one camera; `blurred` and `missed` list image numbers."""
+    """Quality of the calibration of one camera; `blurred` and `missed` list image numbers."""
 
     views: int
     rms_px: float
@@ -55,7 +55,7 @@ class CalibrationSummary(TypedDict):
 
 
 class SyncResult(TypedDict):
-    """Offset of every camera to the reference camera [frames], with figures that depend on the method."""
+    """Offset of every camera to the reference camera [frames], with quality figures of the method that found it."""
 
     offsets: dict[str, Frames]
     method: str
@@ -86,13 +86,13 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> Calibra
             lambda cameras, by_picks: _scale_by_masks(capture, meshes, cameras, by_picks, progress),
         )
     save_calibration(out, cameras)
-    return cast(CalibrationSummary, asdict(report))  # the return type of asdict has no fields
+    return cast(CalibrationSummary, asdict(report))  # asdict returns an untyped dict
 
 
 def _scale_by_masks(
     capture: Capture, meshes: Mapping[str, Mesh], cameras: list[Camera], by_picks: ScaleCheck, progress: Progress
 ) -> ScaleCheck:
-    """Return the scale of the teeth estimated from the masks, as a check of the board's stated size.
+    """Return the scale of the teeth estimated from the masks, to verify the stated size of the calibration board.
 
     Raises:
         CalibrationError: the scale contradicts the scans.
@@ -139,11 +139,11 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
 
 @explain_missing_packages()
 def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progress: Progress) -> SyncResult:
-    """Return the frame offset of every clip to the reference, as `sync_cameras` does for a capture.
+    """Return the frame offset of every clip to the reference clip, as `sync_cameras` does for a capture.
 
     Args:
         videos: clips by the names of their cameras.
-        reference: the camera to which the others are aligned.
+        reference: the camera to which the other cameras are aligned.
 
     Raises:
         SyncError, CaptureError: see `capture.sync.align_videos`.
@@ -169,7 +169,7 @@ def _sync_result(alignment: Alignment) -> SyncResult:
 
 @explain_missing_packages()
 def light_curves(videos: Mapping[str, Path | ClipSource], progress: Progress) -> dict[str, LightCurve]:
-    """Return the brightness of every image of every video, by camera; decodes all of them.
+    """Return the mean brightness of every image by camera; all videos are decoded.
 
     Raises:
         CaptureError: a video cannot be read.
@@ -202,7 +202,7 @@ def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: SyncRe
     """Draw the brightness of all clips before and after alignment, as .png or .svg.
 
     Args:
-        result: None if the cameras could not be aligned.
+        result: offsets found; None if the cameras could not be aligned.
 
     Raises:
         OutputError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Cameras and footage of a capture: calibrations from any program, scaled to the recorded size, and the clips."""
+"""Cameras and footage of a capture: calibrations from any program, scaled to the recorded image size, and clips."""
 
 from __future__ import annotations
 
@@ -28,15 +28,16 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".abc")
 
 
 def read_calibration(path: Path, unit_mm: float, sizes: Callable[[], Mapping[str, Size]]) -> list[Camera]:
-    """Read cameras from any supported file, including OpenUSD stages; lengths in mm.
+    """Read cameras from any supported file, including OpenUSD stages; the returned lengths are in mm.
 
     Args:
         path: the file or folder.
-        unit_mm: the file's unit of length [mm]; ignored for stages, which state theirs.
-        sizes: callback that returns (width, height) [px] of the images by camera; used if the file does not state them.
+        unit_mm: the file's unit of length [mm]; ignored for stages, which state their own unit.
+        sizes: callback that returns the image size (width, height) [px] of each camera; used if the file does not state
+            it.
 
     Raises:
-        CalibrationError, FormatError, RigError: the file contains no usable cameras.
+        CalibrationError, FormatError, RigError: the file contains no valid cameras.
     """
     if path.suffix.lower() in USD_SUFFIXES:
         from jawusd.rig.cameras import read_cameras
@@ -46,7 +47,7 @@ def read_calibration(path: Path, unit_mm: float, sizes: Callable[[], Mapping[str
 
 
 class SameSize(dict[str, Size]):
-    """A mapping that returns one image size for every camera name."""
+    """A mapping that returns the same image size for every camera name."""
 
     def __init__(self, size: Size | None) -> None:
         super().__init__()
@@ -62,18 +63,18 @@ class SameSize(dict[str, Size]):
 
 
 def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) -> tuple[list[Camera], list[Path]]:
-    """Read cameras and write them in mm: .toml for aniposelib, .usda for OpenUSD, a folder for COLMAP.
+    """Read cameras and write them in mm, to .toml (aniposelib), .usda (OpenUSD) or a folder (COLMAP).
 
     Args:
-        source: see `cameras.files.load_cameras_file`; or a stage.
+        source: a camera file as for `cameras.files.load_cameras_file`, or a stage.
         out: file or folder to write.
         unit_mm: the source's unit of length [mm].
         size: (width, height) [px] of the images, for formats that do not state it.
 
     Raises:
-        CalibrationError, FormatError, RigError: the source contains no usable cameras, or the output format cannot
+        CalibrationError, FormatError, RigError: the source contains no valid cameras, or the output format cannot
             represent them.
-        OutputError: the file cannot be written, or has another suffix.
+        OutputError: the file cannot be written, or has an unsupported suffix.
     """
     cameras = read_calibration(source, unit_mm, lambda: SameSize(size))
     suffix = out.suffix.lower()
@@ -95,20 +96,20 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
 
 @explain_missing_packages()
 def load_cameras(capture: Capture) -> list[Camera]:
-    """Return the calibrated cameras in the capture's order, scaled to the recorded size.
+    """Return the calibrated cameras in the capture's order, scaled to the recorded image size.
 
-    A calibration at another size of the same aspect ratio is scaled; see `rescaled_cameras`.
+    A calibration at a different image size of the same aspect ratio is scaled; see `rescaled_cameras`.
 
     Raises:
-        CalibrationError: there is no calibration, it lacks a camera of the capture, or the aspect ratio of the
-            images differs.
+        CalibrationError: there is no calibration, it lacks a camera of the capture, or its aspect ratio differs from
+            that of the images.
         CaptureError: a video or mask cannot be read.
     """
     return [_at_recorded_size(camera, capture, source) for camera, source in _calibrated(capture)]
 
 
 def rescaled_cameras(capture: Capture) -> dict[str, tuple[Size, Size]]:
-    """Return calibrated and recorded size (width, height) [px] of the cameras for which these differ, by name.
+    """Return, by camera name, the calibrated and the recorded size (width, height) [px] where they differ.
 
     Raises:
         CalibrationError, CaptureError: see `load_cameras`.
@@ -126,14 +127,14 @@ def _size(camera: Camera) -> Size:
 
 
 def tracked_cameras(cameras: Sequence[Camera], tracks: Tracks) -> list[Camera]:
-    """Return the calibrated cameras with the corrections estimated in tracking; the poses refer to these cameras."""
+    """Return the calibrated cameras with the corrections estimated in tracking; tracked poses refer to them."""
     from jawusd.tracking.sequence.extrinsics import corrected_cameras
 
     return corrected_cameras(cameras, tracks.meta)
 
 
 def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
-    """Return the cameras as calibrated, each with its source."""
+    """Return the cameras as calibrated, each with its entry in the capture."""
     if capture.calibration is None:
         raise CalibrationError(
             'has no "calibration".',
@@ -141,7 +142,7 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
             hint="Name a calibration file there; `jawusd calibrate` makes one from [boards].",
         )
     found = read_calibration(capture.calibration, capture.calibration_unit_mm, lambda: _recorded_sizes(capture))
-    # Camera names of other programs may contain dots, which names in a capture cannot.
+    # Camera names of other programs may contain dots; names in a capture must not.
     plain = {plain_name(camera.name): camera for camera in found}
     known = (plain if len(plain) == len(found) else {}) | {camera.name: camera for camera in found}
     missing = [source.name for source in capture.cameras if source.name not in known]
@@ -179,11 +180,11 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     # displayed (DV: wider), and may be calibrated as stored or as displayed.
     if min(abs(recorded[0] * share * height / width - recorded[1]) for share in (1.0, aspect)) > 1.0:
         raise CalibrationError(
-            f"calibrated for pictures of {width} x {height} px, but {path.name} has "
+            f"calibrated for images of {width} x {height} px, but {path.name} has "
             f"{recorded[0]} x {recorded[1]} px: the aspect ratios differ.",
             camera=camera.name,
             path=capture.calibration,
-            hint="Calibrate in the recording mode of the take: sizes alone do not tell how pictures are cropped.",
+            hint="Calibrate in the recording mode of the take: their sizes alone do not show how images are cropped.",
         )
     return camera.scaled(recorded)
 
@@ -208,7 +209,7 @@ def open_videos(capture: Capture) -> dict[str, Clip]:
 
 
 def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[str, Camera], dict[str, Clip]]:
-    """Return the calibrated cameras of a capture, and the videos of those that have one, by name.
+    """Return the calibrated cameras of a capture, and the videos of cameras that have one, by camera name.
 
     Args:
         tracks: apply the camera corrections of these tracks.
@@ -224,7 +225,7 @@ def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[s
 
 @explain_missing_packages()
 def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Backdrop]:
-    """Return the backdrops for drawn scans by camera: footage or, without footage, masks.
+    """Return, by camera, the images over which scans are drawn: footage or, without footage, masks.
 
     Args:
         offsets: frame offset by camera.
@@ -245,7 +246,7 @@ def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Ba
 
 
 def check_same_cameras(capture: Capture, tracks: Tracks) -> None:
-    """Check that a capture has all cameras of tracks; it may have others.
+    """Check that a capture has all cameras that the tracks use; additional cameras are allowed.
 
     Raises:
         FormatError: the capture lacks a camera.
@@ -258,7 +259,7 @@ def check_same_cameras(capture: Capture, tracks: Tracks) -> None:
 
 
 def tracked_scans(capture: Capture, tracks: Tracks) -> tuple[Mesh, Mesh]:
-    """Return the teeth scans, upper and lower, with the registration that the poses of tracks refer to [mm].
+    """Return the upper and the lower scan [mm] in the registration to which the poses of the tracks refer.
 
     Raises:
         CaptureError, FormatError: see `load_meshes`.

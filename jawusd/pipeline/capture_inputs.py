@@ -1,4 +1,4 @@
-"""Open a capture, and list and hash its input files by part."""
+"""Open a capture, and list and hash the input files of each of its parts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def open_capture(capture: Capture | str | os.PathLike[str], *, allow_outside: bo
 
 
 def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]:
-    """Return the input files of a capture by part, for hashing.
+    """Return the input files of each part of a capture, for hashing.
 
     Args:
         names: any of "teeth", "mandible", "skull", "boards", "calibration", "masks", "videos".
@@ -55,10 +55,10 @@ def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]
 def input_hashes(
     capture: Capture, names: Iterable[str], hashed: Callable[[list[Path]], str] = hash_files
 ) -> dict[str, str]:
-    """Return the content hashes of parts of a capture; see `input_files`.
+    """Return the content hash of each part of a capture; see `input_files`.
 
     Args:
-        hashed: function that returns the hash of files.
+        hashed: function that returns one hash of a list of files.
 
     Raises:
         CaptureError: a file cannot be read.
@@ -68,7 +68,7 @@ def input_hashes(
         found = {part: hashed(files) for part, files in input_files(capture, names).items()}
     except OSError as error:
         raise CaptureError(f"cannot be read: {error.strerror}.", path=error.filename) from error
-    if "videos" in names:  # settings that change how footage is decoded are hashed too
+    if "videos" in names:  # settings that affect the decoding of footage are hashed too
         keys = {"timecode", "start_frame", "fps", "colour_space", "pixel_aspect"}
         found["footage as read"] = hash_value([camera.model_dump(include=keys) for camera in capture.cameras])
         if capture.colour_config is not None:
@@ -77,21 +77,21 @@ def input_hashes(
 
 
 class InputWatch:
-    """Hash inputs and detect later changes; files with unchanged size and times are not read again."""
+    """Hash inputs and detect later changes; files whose size and timestamps are unchanged are not read again."""
 
     def __init__(self) -> None:
         self._hashed: list[tuple[Capture, list[str], dict[str, str]]] = []
         self._known: dict[tuple[object, ...], str] = {}
 
     def hashes(self, capture: Capture, names: Iterable[str]) -> dict[str, str]:
-        """Return `input_hashes` and remember them; raises CaptureError."""
+        """Return the hashes of `input_hashes` and store them for `changed`; raises CaptureError."""
         names = list(names)
         found = input_hashes(capture, names, self._hash)
         self._hashed.append((capture, names, found))
         return found
 
     def changed(self) -> list[str]:
-        """Return the parts that changed since they were hashed, by the names of `input_files`."""
+        """Return the names, as in `input_files`, of the parts that changed since they were hashed."""
         parts: set[str] = set()
         for capture, names, before in self._hashed:
             now = input_hashes(capture, names, self._hash)
@@ -112,5 +112,5 @@ def _sequence_files(path: Path) -> list[Path]:
         return [path]
     try:
         return list(numbered_files(path).values())
-    except CaptureError:  # the reader of the clip reports the error
+    except CaptureError:  # the error is reported when the clip is opened
         return []

@@ -1,4 +1,4 @@
-"""Check a capture in seconds, before any work: with a few images of each file, and without tracking."""
+"""Check a capture within seconds before a build: a few images of each file are decoded, and nothing is tracked."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from jawusd.pipeline.check_files import Parts, boards, bone_findings, calibratio
 from jawusd.pipeline.check_views import frames, masks, picks, synchronisation, views
 from jawusd.pipeline.state import Progress, no_progress
 
-# Packages that the stages need, and packages that only the report needs.
+# Packages required by the stages, and packages required only by the report.
 _NEEDED = ("av", "cv2", "numba", "scipy", "torch", "onnx", "shapely", "trimesh", "pyfqmr", "PIL")
 _FOR_REPORT = ("matplotlib", "jinja2")
-# Disk space of rig, tracks and report, and minimum free space to start a build [MB].
+# Typical disk space of rig, tracks and report, and minimum free space to start a build [MB].
 _RIG_MB, _LEAST_MB = 200.0, 20.0
 
 
 class CheckSummary(TypedDict):
-    """Result of a check; findings are `Finding.as_json`."""
+    """Result of a check; its findings are in the form of `Finding.as_json`."""
 
     capture: str
     findings: list[dict[str, str | float | int]]
@@ -35,7 +35,7 @@ class CheckSummary(TypedDict):
 
 @dataclass(frozen=True)
 class _Check:
-    """One check: what it checks, the parts it needs, and the function."""
+    """One check: what it checks, the loaded parts it needs, and its function."""
 
     what: str
     needs: tuple[str, ...]
@@ -92,7 +92,7 @@ def check_capture(
 
     Args:
         capture: the capture, its capture.toml or the folder of that file.
-        out: future folder of the rig, for the check of disk space; the capture's folder by default.
+        out: folder in which the rig will be built, for the check of disk space; default: the capture's folder.
         allow_outside: allow paths in the capture that point outside its folder.
         progress: called with (stage, done, total) as work proceeds.
     """
@@ -105,13 +105,13 @@ def check_capture(
         loaded, problems = read_capture(capture, allow_outside=allow_outside)
         findings += [found_error("capture", problem) for problem in problems]
     folder = loaded.folder if loaded is not None else Path(str(capture))
-    # The paths of a loaded capture have been checked already.
+    # If the caller passed a loaded capture, its paths have been checked already.
     with Parts(loaded, Path(out or folder).resolve(), allow_outside or isinstance(capture, Capture)) as parts:
         for done, check in enumerate(_CHECKS):
             progress("check", done, len(_CHECKS))
             findings += _run(check, parts)
     progress("check", len(_CHECKS), len(_CHECKS))
-    if loaded is None:  # one note for all checks
+    if loaded is None:  # one note instead of one per check
         findings = [finding for finding in findings if finding.kind != "not_checked"]
         findings.append(Finding("not_checked", "note", "nothing else was checked, because the capture cannot be read"))
     order = {"error": 0, "warning": 1, "note": 2}
@@ -121,7 +121,7 @@ def check_capture(
 def _run(check: _Check, parts: Parts) -> list[Finding]:
     lacking, capture = [name for name in check.needs if not getattr(parts, name)], parts.capture
     if "samples" in lacking and capture is not None and not any(c.masks for c in capture.cameras):
-        return []  # without masks there is nothing to check
+        return []  # this check applies only to captures with masks
     if lacking:
         boards = capture is not None and capture.calibration is None and capture.boards is not None
         later = boards and lacking == ["cameras"]
@@ -141,7 +141,7 @@ def _run(check: _Check, parts: Parts) -> list[Finding]:
 
 
 def _without_duplicates(findings: Sequence[Finding]) -> list[Finding]:
-    """Return findings without duplicates: same message, same file or camera."""
+    """Return findings without duplicates, which have the same message and the same file or camera."""
     unique: dict[tuple[str, str | None, str | None], Finding] = {}
     for finding in findings:
         key = (finding.message, finding.path, None if finding.path else finding.camera)
@@ -150,10 +150,10 @@ def _without_duplicates(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def refuse_errors(findings: Sequence[Finding], capture: Capture) -> None:
-    """Raise one error that lists all errors among findings.
+    """Raise one exception that lists all findings that are errors.
 
     Raises:
-        CaptureError: there are errors.
+        CaptureError: at least one finding is an error.
     """
     errors = [finding for finding in findings if finding.severity == "error"]
     if not errors:
@@ -167,7 +167,7 @@ def refuse_errors(findings: Sequence[Finding], capture: Capture) -> None:
 
 
 def check_summary(name: str, findings: Sequence[Finding]) -> CheckSummary:
-    """Return findings as plain data, with counts."""
+    """Return findings as plain data, with the numbers of errors and warnings."""
     return {
         "capture": name,
         "findings": [finding.as_json() for finding in findings],

@@ -1,4 +1,4 @@
-"""Checks of individual files of a capture: scans, bones, clips, calibration, boards."""
+"""Checks of individual files of a capture: scans, bones, clips, calibration, board clips."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Size = tuple[int, int]
 
 @dataclass
 class Parts:
-    """The parts of a capture that the checks have loaded; empty if unreadable. A context manager that closes masks."""
+    """Parts of a capture loaded by the checks, empty if unreadable; as a context manager, it closes the masks."""
 
     capture: Capture | None
     out: Path  # future folder of the rig
@@ -72,11 +72,11 @@ class Parts:
             return False
 
     def clip_read(self, camera: CameraSource) -> bool:
-        """Return whether the clip of a camera could be opened; true if it has no clip."""
+        """Return whether the clip of a camera could be opened; true if the camera has no clip."""
         return camera.video is None or camera.name in self.videos
 
     def offsets(self) -> Mapping[str, int] | None:
-        """Return the frame offsets if they are known without the clips, otherwise None."""
+        """Return the frame offsets of the cameras if they are known without decoding clips, otherwise None."""
         capture = self.given
         if capture.sync.offsets is not None:
             return capture.sync.offsets
@@ -85,7 +85,7 @@ class Parts:
         return None
 
     def offset_guesses(self) -> list[Mapping[str, int]]:
-        """Return the offsets; if unknown, two guesses: zero, and offsets that align the first masks of all cameras."""
+        """Return the frame offsets; if unknown, two guesses: zero, and offsets that align the cameras' first masks."""
         if (known := self.offsets()) is not None:
             return [known]
         capture = self.given
@@ -112,13 +112,13 @@ def found_error(kind: str, error: JawusdError, severity: Literal["error", "warni
     )
 
 
-# Maximum median distance of crown vertices from their bone [mm]; larger distances indicate another coordinate frame.
+# Maximum median distance of crown vertices from their bone [mm]; larger distances indicate different coordinate frames.
 _TEETH_TO_BONE_MM = 20.0
-_CONDYLES_MM = (75.0, 140.0)  # smallest and largest plausible distance of the condyle centres; about 100 in adults
+_CONDYLES_MM = (75.0, 140.0)  # plausible range of the distance between the condyle centres; about 100 mm in adults
 
 
 def scans(parts: Parts) -> Iterator[Finding]:
-    """Read every mesh, label the scans and prepare them."""
+    """Read every mesh; label and prepare the scans."""
     from jawusd.meshes.meshio import load_mesh
     from jawusd.tracking.contour.scan import ARCH_NAMES, prepare_scan
 
@@ -153,7 +153,7 @@ def occlusion(parts: Parts) -> Iterator[Finding]:
 
 
 def bone_findings(parts: Parts) -> Iterator[Finding]:
-    """Check the position of bones and landmarks against the teeth."""
+    """Check the positions of bones and landmarks relative to the teeth."""
     for bone, arch in zip(BONES, ("lower", "upper"), strict=True):
         if bone not in parts.meshes:
             continue
@@ -185,7 +185,7 @@ def bone_findings(parts: Parts) -> Iterator[Finding]:
 
 
 def clips(parts: Parts) -> Iterator[Finding]:
-    """Open every clip and decode it; long clips are decoded only in parts."""
+    """Open and decode every clip; long clips are decoded only in parts."""
     from jawusd.media.clip_checks import decoded_findings, rate_findings
     from jawusd.media.footage import open_clip
 
@@ -206,7 +206,7 @@ def clips(parts: Parts) -> Iterator[Finding]:
 
 
 def _copies(clips: Mapping[str, Path]) -> Iterator[Finding]:
-    """Find clips with identical contents, a mistake because two cameras never record the same bytes."""
+    """Report clips with identical contents: two cameras never record the same bytes, so one clip is a copy."""
     for one, other in combinations(clips, 2):
         paths = clips[one], clips[other]
         if not all(path.is_file() for path in paths) or not filecmp.cmp(*paths, shallow=False):
@@ -228,7 +228,7 @@ def calibration(parts: Parts) -> Iterator[Finding]:
             yield Finding("no_calibration", "error", message, path=parts.description, hint=hint)
         return
     if not parts.usable(capture.calibration) or not all(parts.clip_read(camera) for camera in capture.cameras):
-        return  # without its clip, the recorded size of a camera is unknown
+        return  # the recorded size of a camera is unknown if its clip was not read
     if len(capture.cameras) < 2:
         message = "has one camera; tracking in 3-D needs at least two"
         yield Finding("one_camera", "error", message, 1, 2, path=parts.description)
@@ -238,11 +238,11 @@ def calibration(parts: Parts) -> Iterator[Finding]:
 
 
 def _rescaled(parts: Parts) -> Iterator[Finding]:
-    """Report calibrations for another image size; if only some cameras differ, it is probably a mistake."""
+    """Report calibrations for an image size other than the recorded one; probably a mistake if only some differ."""
     found = rescaled_cameras(parts.given)
     for name, (was, now) in found.items():
         every = len(found) == len(parts.cameras)
-        message = f"calibrated at {was[0]} x {was[1]} px, but its pictures or masks have {now[0]} x {now[1]} "
+        message = f"calibrated at {was[0]} x {was[1]} px, but its images or masks have {now[0]} x {now[1]} "
         message += "px; assumed to be scaled, not cropped" + ("" if every else "; the sizes of the other cameras match")
         hint = "Check that its masks were not drawn at a reduced size; picks refer to the pixels of the calibration."
         severity: Severity = "note" if every else "warning"
@@ -250,7 +250,7 @@ def _rescaled(parts: Parts) -> Iterator[Finding]:
 
 
 def boards(parts: Parts) -> Iterator[Finding]:
-    """Open the board clips if a calibration must be made from them."""
+    """Open the board clips if the cameras must be calibrated from them."""
     from jawusd.media.clip_checks import decoded_findings
     from jawusd.media.footage import open_clip
 

@@ -1,4 +1,4 @@
-"""Checks of masks, frames, views and picks of a capture against one another."""
+"""Checks that masks, frame numbers, camera views and picks of a capture are consistent with one another."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from jawusd.formats.finding import Finding, Severity
 from jawusd.geometry import Camera
 from jawusd.pipeline.check_files import Parts, found_error
 
-_INSTANTS = 5  # number of frames at which the views are compared
+_INSTANTS = 5  # number of video frames in which the views are compared
 _CROWN_POINTS = 6000
 
 
 def masks(parts: Parts) -> Iterator[Finding]:
-    """Check samples of the masks of every camera."""
+    """Check a sample of the masks of every camera."""
     from jawusd.media.mask_survey import sample_masks, survey_masks
     from jawusd.media.masks import mask_size_px
 
@@ -74,7 +74,7 @@ def synchronisation(parts: Parts) -> Iterator[Finding]:
 
 
 def frames(parts: Parts) -> Iterator[Finding]:
-    """Check that the frames named in the capture exist."""
+    """Check that the frame numbers given in the capture exist."""
     from jawusd.capture.mask_checks import swapped_cameras
 
     capture = parts.given
@@ -94,7 +94,7 @@ def frames(parts: Parts) -> Iterator[Finding]:
     end = max([count, *(own + offsets[name] for name, own in known.items() if own is not None)])
     if stop > end:
         message = f"frames end at {stop - 1}, but the last frame of any camera is {end - 1}"
-        yield Finding("frames_missing", "error", message, stop, end, path=parts.description, hint="Correct frames.")
+        yield Finding("frames_missing", "error", message, stop, end, path=parts.description, hint="Correct `frames`.")
     if capture.bootstrap is not None and not first <= capture.bootstrap.frame < stop:
         yield out_of("bootstrap_frame", "bootstrap.frame", capture.bootstrap.frame, "error")
     rest = capture.motion.rest_frame
@@ -136,7 +136,7 @@ def _mask_ranges(parts: Parts, first: int, stop: int) -> Iterator[Finding]:
 
 
 def views(parts: Parts) -> Iterator[Finding]:
-    """Check that the views agree on the position and size of the teeth."""
+    """Check that the views of all cameras agree on the position and size of the teeth."""
     from jawusd.capture.mask_checks import centre_findings, width_findings
 
     reference = parts.samples.get(parts.given.reference)
@@ -155,7 +155,7 @@ def views(parts: Parts) -> Iterator[Finding]:
 
 
 def _teeth(parts: Parts, cameras: Mapping[str, Camera], instant: int, offsets: Mapping[str, int]) -> dict[str, Array]:
-    """Return mask pixels of both arches at a frame of the reference camera, for cameras with masks of both arches."""
+    """Return, for cameras with masks of both arches, the mask pixels at a frame of the reference camera."""
     out = {}
     for name in cameras:
         if name not in offsets:
@@ -207,7 +207,7 @@ def _pixels(
     source: str,
     camera: str,
 ) -> tuple[Array, Array]:
-    """Return the mask pixels of a source by arch, attributed to a camera, at a frame of the reference camera.
+    """Return the mask pixels of a source by arch, as if they were a camera's, at a frame of the reference camera.
 
     `numbered` is 0 if the masks are numbered by the camera's frames, and 1 if they are numbered by the source's frames.
     """

@@ -1,4 +1,4 @@
-"""Contact of teeth and condyles in a jaw model: clearances measured on the meshes, and images of the contacts."""
+"""Contact of teeth and condyles in a jaw model: clearances measured on the meshes, and rendered contact images."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ _QUALITY = 88  # JPEG quality of the images
 
 
 class ContactSummary(TypedDict, total=False):
-    """Contact of the teeth, or of the condyles."""
+    """Summary of the contact of the teeth, or of the condyles."""
 
     missing: str  # reason why contact was not measured
-    closed_mm: float  # penetration of the scans with the teeth closed
+    closed_mm: float  # penetration depth of the scans with the teeth closed
     error_mm: float  # maximum error of the clearances
-    limit_mm: float  # smallest clearance of captured poses; poses below it count as collisions
+    limit_mm: float  # smallest clearance of captured poses; poses with less clearance count as collisions
 
 
 def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture, ...]:
-    """Draw the contacts with the teeth closed, and halfway through protrusion and both laterotrusions.
+    """Draw the tooth contacts with the teeth closed, and halfway through protrusion and both laterotrusions.
 
     Args:
-        subject: the subject; its scans must have the registration of the model's poses.
+        subject: the subject; its scans must be in the registration to which the model's poses refer.
 
     Raises:
         RigError: the scans do not show contacts.
@@ -70,7 +70,7 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
     """Return both arches as solids, from meshes in the skull and mandible frames.
 
     Raises:
-        RigError: the rig has no clearances, or the meshes do not show how the teeth meet.
+        RigError: the rig has no clearances, or tooth contact cannot be computed from the meshes.
     """
     from jawusd.meshes.contact import NoContact, find_teeth
 
@@ -81,14 +81,14 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
     try:
         return find_teeth(upper, lower, rig.T_anatomical_skull, rig.T_rest)
     except NoContact as reason:
-        raise RigError(f"does not show how the teeth meet: {reason}.") from reason
+        raise RigError(f"gives no contact of the teeth: {reason}.") from reason
 
 
 def tooth_solids(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: Array) -> Teeth | str:
-    """Return both arches as solids, or the reason for failure; axes and rest pose as in `Subject`.
+    """Return both arches as solids, or the reason why that failed; axes and rest pose are as in `Subject`.
 
     Args:
-        meshes: scans and bones, with the registration of the poses.
+        meshes: scans and bones, in the registration to which the poses refer.
     """
     from jawusd.meshes.contact import NoContact, find_teeth
 
@@ -103,7 +103,7 @@ def tooth_solids(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: 
 def condyle_solids(
     meshes: Mapping[str, Mesh], T_anatomical_skull: Array, landmarks: Array, T_rest: Array
 ) -> Joints | str:
-    """Return condyles and skull as solids, or the reason for failure; see `tooth_solids`."""
+    """Return condyles and skull as solids, or the reason why that failed; see `tooth_solids`."""
     from jawusd.meshes.contact import NoContact
     from jawusd.meshes.joints import find_joints
 
@@ -118,11 +118,11 @@ def condyle_solids(
 def with_tooth_contact(
     model: JawModel, teeth: Teeth | str, progress: Progress = no_progress, *, regauge: bool = True
 ) -> JawModel:
-    """Return a model with the clearances of the teeth, summarised in ``meta["contact"]``.
+    """Return the model with tooth clearances added; ``meta["contact"]`` summarises them.
 
     Args:
         teeth: result of `tooth_solids`.
-        regauge: shift d1 so that the teeth touch at d1 = 0, and limit the bound there.
+        regauge: shift d1 so that the teeth touch at d1 = 0, and end the bound there.
     """
     from jawusd.fitting.glide import follow_teeth
     from jawusd.meshes.contact import sample_field
@@ -139,7 +139,7 @@ def with_tooth_contact(
 
 
 def with_condyle_contact(model: JawModel, joints: Joints | str, progress: Progress = no_progress) -> JawModel:
-    """Return a model with the clearances of the condyles, summarised in ``meta["joints"]``.
+    """Return the model with condyle clearances added; ``meta["joints"]`` summarises them.
 
     Args:
         joints: result of `condyle_solids`.

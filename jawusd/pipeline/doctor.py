@@ -1,4 +1,4 @@
-"""Check of the installation: packages, OpenGL, codecs and limits."""
+"""Check the installation: packages, OpenGL, codecs and limits."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Examined(TypedDict):
 
     Attributes:
         versions: version of each package; "" if not installed.
-        extras: missing packages of each extra.
+        extras: missing packages by pip extra.
         graphics: OpenGL version, or the reason why OpenGL is not available.
-        codecs: whether each codec can be decoded.
-        memory_limit_gb: memory limit of a command, 0 for none.
+        codecs: for each codec, whether it can be decoded.
+        memory_limit_gb: memory limit of a command [GB]; 0: no limit.
         problems: reasons why a build would fail.
     """
 
@@ -47,7 +47,7 @@ class Examined(TypedDict):
 
 
 def examine() -> Examined:
-    """Check versions, extras, OpenGL, codecs, cores and cache."""
+    """Check package versions, extras, OpenGL, codecs, CPU cores and the cache of compiled code."""
     extras = _extras()
     names = sorted({name for packages in extras.values() for name in packages} | set(_required("")))
     versions = {name: _version(name) for name in names}
@@ -59,10 +59,10 @@ def examine() -> Examined:
     ]
     codecs = _codecs()
     lost = [name for name in _NEEDED_CODECS if codecs.get(name) is False]
-    problems += [f"pictures in {name} cannot be decoded" for name in lost]
+    problems += [f"images in {name} cannot be decoded" for name in lost]
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     if free_gb < _LEAST_FREE_GB:
-        problems.append(f"{free_gb:.1f} GB of disk space are free; a build may need {_LEAST_FREE_GB:g}")
+        problems.append(f"{free_gb:.1f} GB of disk space are free; a build may need {_LEAST_FREE_GB:g} GB")
     return {
         "jawusd": __version__,
         "python": platform.python_version(),

@@ -57,22 +57,22 @@ _MOST_NUMBERS = 16_000_000  # maximum number of array elements: a million 4 x 4 
 
 @dataclass(frozen=True)
 class TrajectoryOptions:
-    """Conventions of a file of poses."""
+    """Conventions of a pose file: names, units and direction of its transforms."""
 
-    # for tables: the file's column names by jawusd's column names; see `formats.poses.read_poses`
+    # for tables, maps jawusd's column names to the file's; see `formats.poses.read_poses`
     columns: Mapping[str, str] = field(default_factory=dict)
     length_unit: str = "mm"  # a key of `LENGTH_UNITS_MM`, for files that do not state their unit
-    invert: bool = False  # whether the poses map skull to mandible
-    # frame with the teeth in occlusion, to which poses are made relative, so that the file may use any mandible frame;
-    # None: in the file, the pose in occlusion is the identity
+    invert: bool = False  # whether the transforms of the file map the skull frame to the mandible frame
+    # video frame with the teeth in occlusion; poses are made relative to it, so that the file may use any coordinate
+    # frame of the mandible; None: the file's pose in occlusion is the identity
     rest_frame: int | None = None
-    group: str | None = None  # trajectory of an HDF5 file; None: the raw trajectory
+    group: str | None = None  # name of the trajectory in an HDF5 file; None: the raw trajectory
     # rigid bodies in a table of markers (see `pipeline.markers.marker_poses`); empty if the file contains poses
     rigid: Mapping[str, str] = field(default_factory=dict)
 
 
 class FitSummary(TypedDict, total=False):
-    """Key figures of a model: errors [mm], ranges and warnings."""
+    """Key figures of a fitted model: errors [mm], ranges of motion and warnings."""
 
     method: str
     kind: str
@@ -96,7 +96,7 @@ def fit_subject(
     """Fit the jaw model of a subject.
 
     Args:
-        fps: frame rate of the poses; None: the subject's frame rate.
+        fps: frame rate of the poses [1/s]; None: the subject's frame rate.
         method: "anchored", "additive", "paper" or "pca".
 
     Raises:
@@ -110,7 +110,7 @@ def fit_subject(
     if registration is not None:
         subject = registered_subject(subject, {"registration": registration})
     axes, rest = subject.T_anatomical_skull, subject.T_rest
-    with ThreadPoolExecutor(1) as pool:  # computing solids needs no model, and mostly releases the GIL
+    with ThreadPoolExecutor(1) as pool:  # solids do not depend on the model; computing them mostly releases the GIL
         teeth = pool.submit(tooth_solids, subject.meshes, axes, rest)
         joints = pool.submit(condyle_solids, subject.meshes, axes, subject.landmarks, rest)
         model = fit_model(
@@ -119,7 +119,7 @@ def fit_subject(
             landmarks=subject.landmarks,
             mandible_vertices=subject.measured_points(),
             T_rest=rest,
-            config=FittingConfig(method=cast("Method", method)),  # checked by FittingConfig
+            config=FittingConfig(method=cast("Method", method)),  # the name is checked by FittingConfig
             actor=subject.name,
             forms=FORMS,
             progress=partial(progress, "fit"),
@@ -137,39 +137,39 @@ def fit_subject(
 
 
 def fit_summary(model: JawModel) -> FitSummary:
-    """Return the key figures of a model."""
+    """Return the key figures of a fitted model."""
     found = {key: model.meta[key] for key in FitSummary.__annotations__ if key in model.meta}
-    return cast(FitSummary, found)  # JSON
+    return cast(FitSummary, found)  # the values of meta are untyped JSON
 
 
 def read_motion(
     path: str | os.PathLike[str], options: TrajectoryOptions | None = None
 ) -> tuple[Tracks | Poses, float | None]:
-    """Read tracks from tracks.npz, or poses with their frame rate from any other file; see `read_trajectory`.
+    """Read tracks from tracks.npz, or poses and their frame rate from any other file; see `read_trajectory`.
 
     Raises:
-        FormatError: the file is invalid, or options are given for tracks.
-        MissingDependencyError: HDF5 without h5py.
+        FormatError: the file is invalid, or it is tracks.npz, for which options do not apply.
+        MissingDependencyError: the file is HDF5, and h5py is not installed.
     """
     if Path(path).suffix != ".npz":
         frames, T, fps = read_trajectory(path, options or TrajectoryOptions())
         return (frames, T), fps
     if options not in (None, TrajectoryOptions()):
-        raise FormatError("contains tracks; columns, units and rest frame are for poses of other programs.", path=path)
+        raise FormatError("contains tracks; columns, units and rest frame apply only to other poses.", path=path)
     return load_tracks(path), None
 
 
 def read_trajectory(
     path: str | os.PathLike[str], options: TrajectoryOptions
 ) -> tuple[NDArray[np.int64], Array, float | None]:
-    """Read poses from a CSV or JSON table, a table of markers, or HDF5 (.h5, .hdf5) of jaw-tracking-system.
+    """Read poses from a CSV or JSON table, a table of markers, or an HDF5 file (.h5, .hdf5) of jaw-tracking-system.
 
-    Returns frame numbers (F,), T_skull_mandible [mm] (F, 4, 4), NaN where there is no pose, and frames per second,
-    None if the file does not state them.
+    Returns frame numbers, shape (F,); T_skull_mandible [mm], shape (F, 4, 4), NaN where there is no pose; and the frame
+    rate, None if the file does not state it.
 
     Raises:
         FormatError: the file is invalid, an option does not apply to it, or the rest frame is missing or has no pose.
-        MissingDependencyError: HDF5 without h5py.
+        MissingDependencyError: the file is HDF5, and h5py is not installed.
     """
     path, fps = Path(path), None
     if options.rigid:
@@ -182,7 +182,7 @@ def read_trajectory(
             raise FormatError(
                 "its poses are those of landmarks on the mandible, not of a scan.",
                 path=path,
-                hint="Name a frame (counted from 0) with the teeth in occlusion with --rest-frame.",
+                hint="Use --rest-frame to name a frame (counted from 0) with the teeth in occlusion.",
             )
         frames, T = read_hdf5(path, options.group)
     else:
@@ -208,10 +208,10 @@ def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int, path: Path) -> Ar
 
 @explain_missing_packages()
 def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
-    """Read a trajectory of jaw-tracking-system: the landmark frame in the model frame, frames numbered from 0.
+    """Read a trajectory of jaw-tracking-system: poses of the landmark frame in the model frame, numbered from 0.
 
     Args:
-        group: name of the trajectory; None: the raw trajectory, or the only one.
+        group: name of the trajectory's HDF5 group; None: the raw trajectory, or the only one in the file.
 
     Raises:
         FormatError: the file is invalid, lacks the group, has data sets of wrong shapes, or poses that are not rigid.
@@ -248,7 +248,9 @@ def _chosen(groups: list[str], wanted: str | None, path: Path) -> str:
         if len(groups) == 1:
             return groups[0]
         raise FormatError(
-            f"has the trajectories: {known}.", path=path, hint="Name one of them with --group." if groups else None
+            f"no trajectory is chosen; available trajectories: {known}.",
+            path=path,
+            hint="Name one of them with --group." if groups else None,
         )
     if wanted not in groups:
         raise FormatError(f'has no trajectory "{wanted}"; it has {known}.', path=path)
@@ -268,7 +270,7 @@ def _data(group: h5py.Group, key: str, name: str, path: Path) -> Array | None:
 
 
 def _poses(held: dict[str, Array | None], name: str, path: Path) -> Array:
-    """Return the poses (F, 4, 4) from the data sets, translations in the file's unit."""
+    """Return the poses (F, 4, 4) from the data sets of a trajectory; translations are in the file's unit."""
     whole, t, rotations = held["transformations"], held["translations"], held["rotations"]
     if whole is not None:
         if whole.ndim != 3 or whole.shape[1:] != (4, 4):

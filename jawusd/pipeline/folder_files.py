@@ -13,7 +13,7 @@ from jawusd.formats.capture_template import CameraSketch
 from jawusd.formats.file_names import MESHES, PICTURES, VIDEOS, groups
 
 _CALIBRATIONS = (".toml", ".json", ".xml", ".csv", ".yaml", ".yml", ".txt", ".usda", ".usdc", ".usd", ".nk")
-_FEWEST_PICTURES = 5  # minimum number of images of a sequence
+_FEWEST_PICTURES = 5  # minimum number of numbered images that count as a sequence
 _DEPTH = 4
 
 _BOARD = {"board", "boards", "calib", "calibration", "calibrate", "checker", "checkerboard", "chess", "chessboard"}
@@ -22,8 +22,8 @@ _MASK = {"mask", "masks", "matte", "mattes", "roto", "segmentation", "seg"}
 _UPPER = {"upper", "maxilla", "maxillary", "maxillar", "maxillaire", "maxilar", "oberkiefer", "oben", "superior"}
 _UPPER |= {"superiore", "superieur"}
 _LOWER = {"lower", "mandibular", "mandibulaire", "unterkiefer", "unten", "inferior", "inferiore", "inferieur"}
-# Ambiguous words for upper and lower, accepted only if two names are otherwise equal: "u" may also mean "unten", German
-# for lower.
+# Pairs of ambiguous words for upper and lower, accepted only if two file names are otherwise equal: "u" may also mean
+# "unten", German for lower.
 _PAIRS = [("u", "l"), ("o", "u"), ("ok", "uk"), ("uj", "lj"), ("max", "mand"), ("mx", "md"), ("sup", "inf")]
 _PAIRS += [("top", "bottom"), ("haut", "bas")]
 _MANDIBLE = {"mandible", "mandibula", "jawbone"}
@@ -43,8 +43,8 @@ class FoundFiles:
 
     clips: list[PurePath] = field(default_factory=list)
     boards: list[PurePath] = field(default_factory=list)
-    masks: dict[PurePath, str] = field(default_factory=dict)  # arch by path of the mask file
-    scans: dict[str, list[PurePath]] = field(default_factory=lambda: defaultdict(list))  # keys of [scans], or ""
+    masks: dict[PurePath, str] = field(default_factory=dict)  # arch of each mask file
+    scans: dict[str, list[PurePath]] = field(default_factory=lambda: defaultdict(list))  # by key of [scans], or ""
     calibrations: list[PurePath] = field(default_factory=list)
 
 
@@ -117,7 +117,7 @@ def _arch(own_words: set[str]) -> str:
 
 
 def _paired(paths: Sequence[PurePath]) -> dict[PurePath, str]:
-    """Return the arch of each file whose name differs from another only in a pair of ambiguous words."""
+    """Return the arch of each file whose name differs from another file's only in one pair of ambiguous words."""
     spelt = {tuple(_split_words(path)): path for path in paths}
     pairs = [
         (path, spelt[other])
@@ -132,11 +132,11 @@ def _paired(paths: Sequence[PurePath]) -> dict[PurePath, str]:
 
 
 def _part(path: PurePath, paired: str) -> str:
-    """Return the key of [scans] for a mesh, "" if unknown; the file name takes precedence over folders.
+    """Return the key of [scans] for a mesh, "" if unknown; words of the file name take precedence over folder names.
 
     Args:
         path: the mesh.
-        paired: its arch according to an ambiguous word (see `_paired`); "" if unknown.
+        paired: arch of the mesh according to an ambiguous word (see `_paired`); "" if unknown.
     """
     own, all_words = set(_split_words(PurePath(path.name))), set(_split_words(path))
     for own_words, arch in ((own, ""), (all_words, ""), (all_words, paired)):
@@ -157,7 +157,7 @@ def _part(path: PurePath, paired: str) -> str:
 
 
 def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
-    """Return a unique name for each clip, made of the words in which its path differs from the others."""
+    """Return a unique name for each clip, made of the words in which its path differs from the other paths."""
     own_words = {path: [word for word in words(path)] for path in paths}
     shared = set.intersection(*(set(own) for own in own_words.values())) if len(own_words) > 1 else set()
     out: dict[PurePath, str] = {}
@@ -170,16 +170,16 @@ def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
     if len(set(out.values())) < len(paths) or any(len(name) > 40 for name in out.values()):
         out = {path: f"{name or 'cam'}_{number}" for number, (path, name) in enumerate(zip(paths, plain))}
     elif all(sorted(words(PurePath(name))) == sorted(words(PurePath(out[path]))) for path, name in zip(paths, plain)):
-        out = dict(zip(paths, plain))  # keeps the spelling of the file name if it has the same words
+        out = dict(zip(paths, plain))  # same words: keep the spelling of the file name
     return out
 
 
 def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dict[PurePath, PurePath], bool]:
-    """Match other files with clips; the flag is true if they were matched by name, false if by order.
+    """Match files, such as masks, to clips; the flag returned is true if matched by name, false if by order.
 
     Args:
         names: camera names by clip.
-        others: files, each of which belongs to one camera.
+        others: files to match, each of which belongs to one camera.
     """
     found: dict[PurePath, PurePath] = {}
     for clip, name in names.items():
@@ -195,7 +195,7 @@ def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dic
 
 
 def with_masks(cameras: Sequence[CameraSketch], masks: Mapping[PurePath, str]) -> list[CameraSketch]:
-    """Return cameras with the masks whose paths contain the words of their names."""
+    """Return each camera with the masks whose paths contain the words of its name."""
     out = []
     for camera in cameras:
         telling = set(words(PurePath(camera.name)))

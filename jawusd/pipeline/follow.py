@@ -1,4 +1,4 @@
-"""Follow the teeth through footage by their colours, from a start to both ends and again where they were lost."""
+"""Follow the teeth through footage by colour, from a start frame to both ends, and again where they were lost."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 
-_WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # working resolution at the teeth, and margin of the crop around the teeth
+_WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # resolution at the teeth, and margin around them, in cropped images
 
 
 class Cutter:
-    """Crop the images of all cameras to the teeth."""
+    """Crops the images of all cameras to the teeth."""
 
     def __init__(
         self, cameras: Mapping[str, Camera], scans: Sequence[Scan], centre: Array, executor: Executor | None = None
@@ -36,8 +36,8 @@ class Cutter:
         """Choose the working resolution of every camera.
 
         Args:
-            cameras: calibrated, by name.
-            scans: upper and lower.
+            cameras: calibrated cameras by name.
+            scans: upper and lower scan.
             centre: approximate position of the teeth in the world [mm], shape (3,).
             executor: threads for the images of all cameras.
         """
@@ -50,7 +50,7 @@ class Cutter:
         self._probes = [scan.probes for scan in scans]
 
     def cut(self, pictures: Pictures) -> Cut:
-        """Return a function that crops the images of one frame around given poses."""
+        """Return a function that crops the images of one video frame around given poses."""
 
         def cut(poses: Array) -> list[Picture | None]:
             around = np.concatenate([transform_points(T, own) for T, own in zip(poses, self._probes, strict=True)])
@@ -59,7 +59,7 @@ class Cutter:
         return cut
 
     def walk(self, footage: ColourFootage, frames: range) -> Iterator[Cut]:
-        """Yield the function of `cut` for each frame.
+        """Yield the function returned by `cut` for each frame.
 
         Raises:
             CaptureError: an image cannot be decoded.
@@ -74,23 +74,24 @@ class Cutter:
         return None if window is None else Picture(window.camera, window.rgb)
 
 
-# Threshold of the second difference of the jaw's motion [mm], above which the preceding frames are tracked again
-# backwards, and distance [mm] below which two poses count as equal. Speech and chewing reach second differences of 1 mm
+# Threshold of the second difference of the jaw's position [mm], above which the preceding frames are tracked again
+# backwards; and distance [mm] below which two poses count as equal. Speech and chewing reach second differences of 1 mm
 # at 24 fps; a false positive costs the time of one frame.
 _JUMP_MM, _SAME_MM = 0.8, 0.15
-_SAMPLED_VIEWS = 10  # maximum number of frames whose views are kept: a few MB
+_SAMPLED_VIEWS = 10  # maximum number of frames whose views are kept, a few MB in all
 STAGE = "follow"
 
-#: Function that searches for the teeth in some frames, passes what it finds to `Follower.start_at`, and returns it.
-#: Its second argument is the up direction of the head in the world, shape (3,). It raises TrackingError.
+#: Function that searches for the teeth in a range of frames, passes the pose found to `Follower.start_at`, and returns
+#: the start. Its second argument is the up direction of the head in the world, shape (3,). It raises TrackingError if
+#: the teeth are not found.
 Find: TypeAlias = Callable[[range, Array], Start[Array]]
 
 
 class Follower:
-    """Follow both arches from one frame to both ends of a take.
+    """Tracker of both arches from a start frame to both ends of a take.
 
     Attributes:
-        cameras: calibrated, those that have a video, by name.
+        cameras: the calibrated cameras that have a video, by name.
         sampled_views: poses and views of evenly sampled frames of the last run.
     """
 
@@ -102,11 +103,11 @@ class Follower:
         subject: Subject,
         pool: Executor | None = None,
     ) -> None:
-        """Prepare to follow.
+        """Prepare the tracker.
 
         Args:
-            footage, cameras: images, and the calibrated cameras by name.
-            scans: upper and lower, prepared.
+            footage, cameras: the images, and the calibrated cameras by name.
+            scans: upper and lower scan, prepared for tracking.
             subject: provides axes and condyles.
             pool: threads for the cameras.
         """
@@ -116,7 +117,7 @@ class Follower:
         self.sampled_views: list[tuple[Array, list[View]]] = []
 
     def start_at(self, frame: int, poses: Array) -> tuple[RegionPose, float]:
-        """Refine T_world_upper, T_world_lower (2, 4, 4) on a frame, from which `run` then starts; return pose and fit.
+        """Refine T_world_upper, T_world_lower (2, 4, 4) in the frame from which `run` will start; return pose and fit.
 
         The fit is the fraction of the visible contour that matches the colours, 0 .. 1, for the worse arch.
 
@@ -165,7 +166,7 @@ class Follower:
     def _followed_from(
         self, lost: range, frames: range, find: Find, known: Mapping[int, RegionPose]
     ) -> dict[int, RegionPose] | None:
-        """Return all poses after a search in lost frames, or None if it fails or contradicts the known poses."""
+        """Return all poses after a search in lost frames; None if the search fails or contradicts the known poses."""
         from jawusd.tracking.region.recovery import both_ways, contradicts, nearest_found
 
         up_world = nearest_found(known, lost).poses[0, :3, :3] @ self._subject.T_anatomical_skull[1, :3]
@@ -183,7 +184,7 @@ class Follower:
 
 
 class _Latest(Iterator["Cut"]):
-    """An iterator that stores only its last item; `itertools.tee` would store up to 57."""
+    """An iterator that stores only its last item; `itertools.tee` would keep up to 57 items in memory."""
 
     def __init__(self, cuts: Iterator[Cut]) -> None:
         self._cuts = cuts
@@ -194,12 +195,12 @@ class _Latest(Iterator["Cut"]):
 
 
 def _places(found: RegionPose, points: Array) -> Array:
-    """Return points of the lower teeth (N, 3) in the frame of the upper teeth [mm], shape (N, 3)."""
+    """Return points (N, 3) of the lower teeth in the coordinate frame of the upper teeth [mm], shape (N, 3)."""
     return transform_points(relative_pose(found.poses[0], found.poses[1]), points)
 
 
 def _jumps(way: range, known: Mapping[int, RegionPose], points: Array) -> list[int]:
-    """Return the frames at which the jaw accelerates implausibly."""
+    """Return the video frames at which the jaw accelerates implausibly."""
     if len(way) < 3:
         return []
     places = np.stack([_places(known[frame], points) for frame in way])
@@ -208,7 +209,7 @@ def _jumps(way: range, known: Mapping[int, RegionPose], points: Array) -> list[i
 
 
 def _replace(way: range, again: Iterator[RegionPose], known: dict[int, RegionPose], points: Array) -> bool | None:
-    """Replace poses as in `replace_poses`; `points` (N, 3) of the lower teeth [mm] tell them apart."""
+    """Replace poses as `replace_poses` does; two poses are compared at `points` (N, 3) of the lower teeth [mm]."""
     from jawusd.tracking.region.recovery import replace_poses
 
     def same(other: RegionPose, before: RegionPose) -> bool:

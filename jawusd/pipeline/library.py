@@ -26,20 +26,20 @@ from jawusd.pipeline.fit import fit_summary
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_landmarks
 
-# Minimum step of a retargeted motion, relative to the source's step times the ratio of the ranges.
+# Minimum step of a retargeted motion between samples, relative to the source's step times the ratio of the ranges.
 _SLOWEST = 0.1
-_ROUNDS = 400  # maximum number of iterations of timing and projection into the bound; most motions need fewer than 40
+_ROUNDS = 400  # maximum number of alternations of timing and projection into the bound; most motions need fewer than 40
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 @explain_missing_packages()
 def load_any_rig(path: Path) -> JawRig:
-    """Read a rig from `model.npz` with numpy alone, or from any USD layer that contains it.
+    """Read a rig from `model.npz`, which needs only numpy, or from any USD layer that contains it.
 
     Raises:
         JawusdError: the file is not a rig.
-        MissingDependencyError: USD without OpenUSD.
+        MissingDependencyError: the file is USD, and OpenUSD is not installed.
     """
     if path.suffix == ".npz":
         return load(path)
@@ -49,7 +49,7 @@ def load_any_rig(path: Path) -> JawRig:
 
 
 def open_library(folder: str | os.PathLike[str]) -> Library:
-    """Scan a folder with a subfolder per subject and update its index; see `library.index.scan_library`."""
+    """Scan a folder with one subfolder per subject, and update its index; see `library.index.scan_library`."""
     return scan_library(folder, load_any_rig)
 
 
@@ -57,12 +57,12 @@ def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, forc
     """Copy a rig into a library, as the model file `NAME/model.npz`, and return that file.
 
     Args:
-        name: name of the subject and the subfolder; None: the name in the rig.
+        name: name of the subject and of its subfolder; None: the name in the rig.
         force: overwrite a subject of the same name.
 
     Raises:
-        FormatError: not a rig, or the name is not a valid folder name.
-        OutputError: there is such a subject already, or the file cannot be written.
+        FormatError: the file is not a rig, or the name is not a valid folder name.
+        OutputError: the library already has a subject of this name, or the file cannot be written.
     """
     rig = load_any_rig(source)
     called = name or str(rig.meta.get("actor") or "")
@@ -95,7 +95,7 @@ def _as_model(rig: JawRig, source: Path, name: str) -> JawModel:
 
 @explain_missing_packages()
 def plot_ranges(entries: Sequence[Entry], folder: Path, force: bool) -> list[Path]:
-    """Draw the ranges of subjects of a library side by side, as PNG and SVG, and return the files.
+    """Plot the ranges of motion of a library's subjects side by side, as PNG and SVG; return the files.
 
     Raises:
         MissingDependencyError: matplotlib is not installed.
@@ -119,18 +119,18 @@ class PersonalRig:
 
 
 def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str, progress: Progress) -> PersonalRig:
-    """Make a rig for a subject without a capture, from landmarks and a library.
+    """Make a rig for a subject without a capture, from the subject's landmarks and a library.
 
     The motion of the library's subjects is transferred to the landmarks and averaged (see `library.personal`), and the
-    anchored model is fitted to it. Its header states the expected error, from leave-one-out over the library; the
-    residual limit of measured poses allows for that error.
+    anchored model is fitted to it. The model's header states the expected error, estimated by leave-one-out over the
+    library; the residual limit of measured poses allows for that error.
 
     Args:
         landmarks: file of format jawusd-landmarks/1.
         closest: use the motion of the subject with the most similar landmarks instead of the average.
 
     Raises:
-        FormatError: the file is not of that format.
+        FormatError: the landmarks file is not of that format.
         FittingError: the library has no usable subject, or the landmarks are not those of a jaw.
     """
     subject = subject_of_landmarks(landmarks, name)
@@ -142,12 +142,12 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
     left_out = tuple(entry.path for entry in library.entries if entry.not_shown)
     return PersonalRig(
         model, motion, left_out, cast("Mapping[str, object]", model.meta["personal"])
-    )  # set by fit_personal
+    )  # `fit_personal` sets this entry
 
 
 @explain_missing_packages()
 def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
-    """Fit the anchored model to motion transferred to a subject, and state the expected error in its header.
+    """Fit the anchored model to motion transferred to a subject, and store the expected error in the model's header.
 
     Raises:
         FittingError: see `fitting.fit_model`.
@@ -199,24 +199,24 @@ def _finite(value: float | None) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
-    """A retargeted motion, and the changes that were made to it."""
+    """A retargeted motion, and the changes made to keep it inside the bound."""
 
     frames: Array  # frame numbers, shape (G,)
-    d: Array  # parameters of the target [mm], inside its bound, NaN where the motion is lost, shape (G, 3)
-    outside: Mask  # samples at which equal fractions of the ranges would leave the bound, shape (G,)
-    moved_mm: Array  # distance in d of each sample from equal fractions of the ranges, NaN where lost, shape (G,)
+    d: Array  # jaw parameters of the target [mm], inside its bound, NaN in lost frames, shape (G, 3)
+    outside: Mask  # samples at which equal fractions of the ranges of motion would lie outside the bound, shape (G,)
+    moved_mm: Array  # distance in d [mm] of each sample from equal fractions of the ranges, NaN if lost, shape (G,)
 
 
 def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retargeted:
-    """Retarget a motion to another subject: equal fractions of both subjects' ranges, same timing, inside the bound.
+    """Retarget a motion to another subject: equal fractions of both ranges of motion, same timing, inside the bound.
 
-    The motion is resampled at all whole frames, because it is linear in d between samples, but not in the fractions
-    of the ranges. Equal fractions alone would shift peaks by some frames and might leave the bound, so the motion is
-    alternately made to rise and fall with the source (see `library.timing`) and projected into the bound.
+    The motion is resampled at all whole frames, because it is linear between samples in d, but not in fractions of the
+    ranges of motion. Equal fractions alone would shift peaks by some frames and might leave the bound, so the motion is
+    alternately adjusted to rise and fall with the source (see `library.timing`) and projected into the bound.
 
     Args:
         frames: increasing frame numbers, shape (F,).
-        d: parameters of the source [mm], NaN where lost, shape (F, 3).
+        d: jaw parameters of the source [mm], NaN in lost frames, shape (F, 3).
 
     Raises:
         EvaluatorError: no frame has parameters.
@@ -239,7 +239,7 @@ def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retarge
 
 
 def _in_time(source: JawRig, target: JawRig, original: Array, carried: Array) -> Array:
-    """Return d (F, 3) [mm] inside the bound and near `carried`, which rises and falls where the original does."""
+    """Return d (F, 3) [mm] inside the bound and near `carried`, rising and falling where `original` does."""
     sizes = [np.ptp(rig.d_range, axis=1) for rig in (source, target)]
     least = _SLOWEST * sizes[1] / np.maximum(sizes[0], SMALLEST_REACH_MM)
     kept = carried.copy()

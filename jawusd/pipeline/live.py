@@ -1,4 +1,4 @@
-"""Track the jaw of a subject with a rig in live video, and send it as OSC: `jawusd live`."""
+"""Track the jaw of a subject with a rig in live video, and send the parameters over OSC: `jawusd live`."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ if TYPE_CHECKING:
     from jawusd.tracking.performance.coordinates import Pose
 
 
-_PATIENCE_S = 2.0  # time without visible teeth after which a new search begins
+_PATIENCE_S = 2.0  # time without visible teeth [s] after which a new search begins
 _WAIT_S = 0.25
-_MOST_BEHIND_S = 0.15  # lag behind the newest images above which frames are dropped
-_BEFORE = 6  # number of frames tracked before playback of a file, to estimate the motion
+_MOST_BEHIND_S = 0.15  # lag behind the newest images [s] above which frames are dropped
+_BEFORE = 6  # number of frames tracked before playback of files begins, to estimate the motion
 
 
 @dataclass(frozen=True, eq=False)
 class LiveFrame:
-    """Result of one frame: images of all sources at one time.
+    """Result of one frame, which consists of the images of all sources at one time.
 
     Attributes:
         time_s: capture time of the images [s] since the start of the sources; for files, since their first images.
         d, sigma: jaw parameters and their standard deviations [mm], shape (3,).
-        margin_mm: signed distance to the rig's bound, > 0 inside.
+        margin_mm: signed distance to the rig's bound [mm], positive inside.
         verdict: the rig's verdict on the pose.
-        state: `SolveState`, solved or carried.
-        latency_ms: time since the images were captured.
+        state: name of the `SolveState`, solved or carried.
+        latency_ms: time from the capture of the images to this result [ms].
         dropped: number of frames dropped since the last result.
     """
 
@@ -64,7 +64,7 @@ class LiveFrame:
     dropped: int
 
     def as_json(self) -> dict[str, object]:
-        """Return the result as plain values, rounded to significant digits."""
+        """Return the result as JSON-serialisable values, rounded to significant digits."""
         return {
             "time_s": round(self.time_s, 4),
             "d": [round(value, 3) for value in self.d.tolist()],
@@ -90,17 +90,17 @@ def live(
     silence_s: float = 10.0,
     allow_outside: bool = False,
 ) -> Iterator[LiveFrame]:
-    """Yield a result per frame; frames are dropped if images arrive too fast.
+    """Yield one result per frame; frames are dropped if images arrive faster than they are tracked.
 
     Args:
         rig: `actor.usda`, another layer of it, or `model.npz`.
-        shot: a capture with the calibration of the cameras and the rig's scans; without sources, its videos are played
+        shot: a capture with the calibrated cameras and the rig's scans; if no sources are given, its videos are played
             in real time.
-        sources: device, address or file by camera name.
+        sources: device, stream address or file of each camera, by camera name.
         prim: path of the rig's prim, if a stage has several.
         fixed_head: the cameras are head-mounted.
         jobs: number of threads.
-        seconds: stop after this time; None: when the sources end.
+        seconds: duration after which tracking stops [s]; None: when the sources end.
         silence_s: maximum time without an image from a device or stream [s].
         allow_outside: allow paths in the capture that point outside its folder.
 
@@ -121,12 +121,12 @@ def live(
 def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:
     """Return the time of the next frame to process; None if a source has no image of that frame yet.
 
-    This is the first frame that is not too old. A search takes as long as several frames; tracking is faster than real
-    time and catches up.
+    It is the oldest frame that is not too old. A search takes as long as several frames; tracking is faster than real
+    time and catches up afterwards.
 
     Args:
         times_s: increasing times of the buffered images of each source.
-        after_s: time that the frame must follow [s].
+        after_s: time after which the frame must lie [s].
     """
     if not all(len(kept) for kept in times_s):
         return None
@@ -136,7 +136,7 @@ def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | 
 
 
 def _with_sources(capture: Capture, sources: Mapping[str, str]) -> tuple[Capture, dict[str, str]]:
-    """Return the capture restricted to cameras with a source, and the sources; files replace the capture's videos."""
+    """Return the capture restricted to cameras with a source, and the sources; source files replace its videos."""
     names = [camera.name for camera in capture.cameras]
     if unknown := sorted(set(sources) - set(names)):
         raise CaptureError(
@@ -195,7 +195,7 @@ class _Follower:
             source.stop()
 
     def run(self, seconds: float | None, silence_s: float) -> Iterator[LiveFrame]:
-        """Yield results until the sources end."""
+        """Yield one result per frame until the sources end."""
         start = self._begin_in_files() if self._files else 0
         for source in self._sources.values():
             source.open(start * self._period_s)
@@ -249,7 +249,7 @@ class _Follower:
         return after.stop
 
     def _learn(self, pictures: Pictures, near: Pose) -> None:
-        """Learn colours from images, given an approximate pose; start following if the teeth fit."""
+        """Learn the colours of the teeth from images, given an approximate pose; start tracking if the teeth fit."""
         from jawusd.tracking.contour.scan import teeth_centre
 
         centre = teeth_centre(self._teeth.scans, self._take.coordinates.arches(near))
@@ -258,7 +258,7 @@ class _Follower:
             self._cutter = cutter
 
     def _begin_in_pictures(self, pictures: Pictures) -> None:
-        """Search for the teeth in images, if the arches are apart in them."""
+        """Search for the teeth in images in which the arches are visibly apart."""
         none = dict.fromkeys(self._cameras, 0)
         for turns in orientations(self._cameras):
             apart = arches_apart(pictures, turns)
@@ -273,7 +273,7 @@ class _Follower:
                 return
 
     def _next(self, last: float, silence_s: float) -> float | None:
-        """Wait for the next frame of which all sources have an image; return its time, or None at the end."""
+        """Wait for the next frame of which all sources have an image; return its time, None once a source has ended."""
         after = last + 0.5 * self._period_s
         while True:
             at = next_instant([source.times_s() for source in self._sources.values()], after)
@@ -284,17 +284,17 @@ class _Follower:
                 source.refuse_silence(silence_s)
 
     def _pictures(self, at: float) -> Pictures:
-        """Return the images of all sources at a time, None for sources without an image near it."""
+        """Return the image of each source at a time; None for sources without an image near that time."""
         found = {name: source.at(at) for name, source in self._sources.items()}
         near = self._period_s
         return {n: None if p is None or abs(p.time_s - at) > near else p.rgb for n, p in found.items()}
 
 
 class OscSender:
-    """Sender of an OSC bundle per frame over UDP.
+    """Sends one OSC bundle per frame over UDP.
 
-    The arguments of /jaw/d and /jaw/sigma are three floats [mm], of /jaw/margin one [mm], of /jaw/time one [s], and of
-    /jaw/state 1 for solved or 2 for carried, as in `SolveState`.
+    Arguments: /jaw/d and /jaw/sigma have three floats [mm], /jaw/margin one [mm], /jaw/time one [s]; /jaw/state has the
+    integer 1 for solved or 2 for carried, as in `SolveState`.
     """
 
     @explain_missing_packages()
@@ -321,7 +321,7 @@ class OscSender:
 
     @explain_missing_packages()
     def send(self, frame: LiveFrame) -> None:
-        """Send one result; a missing receiver is not an error."""
+        """Send one result; it is not an error if nothing receives it."""
         from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
         from pythonosc.osc_message_builder import OscMessageBuilder
 
@@ -342,5 +342,5 @@ class OscSender:
             bundle.add_content(message.build())
         try:
             self._client.send(bundle.build())
-        except OSError:  # the receiver has closed its port, and may open it again
+        except OSError:  # the receiver has closed its port and may open it again
             return

@@ -1,4 +1,4 @@
-"""Build many captures, in worker processes or on a Dask cluster, with one table of outcomes."""
+"""Build many captures in worker processes or on a Dask cluster, and write one table of outcomes."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ from jawusd.pipeline.workspace import check_folder
 SUMMARY_JSON, SUMMARY_CSV = "builds.json", "builds.csv"
 BUILT, KEPT, FAILED, STOPPED = "built", "kept", "failed", "stopped"
 
-#: Callback for events, with one line of text each.
+#: Callback that is called with one line of text per event.
 Notify = Callable[[str], None]
 
 _NOTIFY_SECONDS = 10.0  # minimum interval between two lines about the same stage of a capture
-_STOP_SECONDS = 15.0  # time that running builds have to stop
+_STOP_SECONDS = 15.0  # time within which running builds must stop after a cancellation
 CONNECT_SECONDS = 10
 _LOOPBACK = "127.0.0.1"
 
@@ -64,7 +64,7 @@ class ManyOptions:
     """Options for building many captures.
 
     Attributes:
-        build: options of each build.
+        build: options for every build.
         cluster: address of a Dask scheduler; None: local processes.
         workers: number of local processes; None: one per core, at most one per capture.
         retries: number of retries of a capture after its process died; an existing scheduler uses its own setting.
@@ -85,11 +85,11 @@ class Outcome:
         capture: path of the capture.
         status: "built", "kept" (nothing changed since an earlier build), "failed" or "stopped".
         frames, tracked: number of frames, and number of frames with both arches tracked.
-        model_mm: maximum error over the mandible's vertices, mean over frames.
-        holdout_mm: the same error for held-out frames.
-        sigma_incisor_mm: median standard deviation of the tracked incisal point.
+        model_mm: mean over frames of the maximum error over the mandible's vertices [mm].
+        holdout_mm: the same mean, over held-out frames [mm].
+        sigma_incisor_mm: median standard deviation of the tracked incisal point [mm].
         seconds: total duration of the stages.
-        error: reason of a failure.
+        error: reason for the failure; None if the build did not fail.
     """
 
     name: str
@@ -145,7 +145,7 @@ def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptio
 def _run(
     client: Client, captures: Sequence[ListedCapture], root: Path, options: BuildOptions, notify: Notify
 ) -> Iterator[Outcome]:
-    """Yield outcomes as builds end; on an interrupt, cancel the running builds."""
+    """Yield outcomes as the builds end; on an interrupt, cancel the running builds."""
     run = uuid.uuid4().hex
     # After a worker has died, the retry reuses the stages that the worker finished.
     options = options if options.fresh else replace(options, resume=True)
@@ -167,7 +167,7 @@ def _run(
 
 @contextlib.contextmanager
 def _listening(client: Client, run: str, notify: Notify) -> Iterator[None]:
-    """Forward messages from the workers of a run."""
+    """Forward the messages of a run's workers to the callback."""
     client.subscribe_topic(run, lambda event: notify(event[1]))
     try:
         yield
@@ -243,7 +243,7 @@ def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
 
 
 class _IgnoreInterrupt(WorkerPlugin):
-    """Ignore signals that a terminal or service sends to all processes; the parent handles them.
+    """Ignore signals that a terminal or service sends to all processes; the parent process handles them.
 
     If such a signal ended a worker, its replacement would continue the build.
     """
@@ -256,16 +256,16 @@ class _IgnoreInterrupt(WorkerPlugin):
 
 @contextlib.contextmanager
 def local_cluster(workers: int, retries: int) -> Iterator[Client]:
-    """Start single-threaded worker processes on the loopback interface, and yield their client.
+    """Start single-threaded worker processes on the loopback interface, and yield a client connected to them.
 
-    The processes end with the block.
+    The processes end with the context.
 
     Args:
         retries: number of retries of a task after its worker died.
     """
     settings = {
         "distributed.scheduler.allowed-failures": retries,
-        # Only a dashboard displays the profile, which takes 2 to 3 % of the time.
+        # Profiling takes 2 to 3 % of the time, and only a dashboard shows the profile.
         "distributed.worker.profile.enabled": False,
     }
     with (
@@ -276,7 +276,7 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
             threads_per_worker=1,
             processes=True,
             host=_LOOPBACK,
-            # Any free port: without an address, the server of the dashboard would require its default port.
+            # Port 0 means any free port; without an address, the dashboard server would require its default port.
             dashboard_address=f"{_LOOPBACK}:0",
             scheduler_kwargs={"dashboard": False},
             memory_limit=0,  # no limit per worker
@@ -291,7 +291,7 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
 
 @contextlib.contextmanager
 def existing_cluster(address: str) -> Iterator[Client]:
-    """Connect to a scheduler at an address such as "tcp://host:8786", and yield a client.
+    """Connect to a scheduler at an address such as "tcp://host:8786", and yield the client.
 
     Raises:
         ClusterError: no scheduler answers, or it has no workers.
@@ -314,7 +314,7 @@ def existing_cluster(address: str) -> Iterator[Client]:
 
 
 async def _greet(address: str) -> None:
-    """Do the handshake with a scheduler; a `Client` would wait forever for a server that does not answer."""
+    """Perform the handshake with a scheduler; a `Client` would wait forever for a server that does not answer."""
     arguments = Security().get_connection_args("client")
     async with asyncio.timeout(CONNECT_SECONDS + 1):
         comm = await connect(address, timeout=CONNECT_SECONDS, **arguments)

@@ -18,28 +18,28 @@ from jawusd.geometry import rigid_fits, se3_inverse, transform_points
 
 BODIES = ("head", "jaw")
 LENGTH_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-_MOST_C3D_FRAMES = 65_535  # maximum of C3D's 16-bit frame counter
+_MOST_C3D_FRAMES = 65_535  # maximum value of C3D's 16-bit frame counter
 _BLOCK, _C3D_KEY = 512, 0x50
-#: Byte order, and offset in the header of the byte with the scale's sign, for the processor types Intel, DEC and MIPS.
+#: Byte order, and offset within the header of the byte with the sign of the scale, for Intel, DEC and MIPS processors.
 _BYTE_ORDERS = {b"T": ("<", 15), b"U": ("<", 13), b"V": (">", 12)}
-_LABELS = ("LABELS", *(f"LABELS{k}" for k in range(2, 9)))  # parameters, each with up to 255 labels
+_LABELS = ("LABELS", *(f"LABELS{k}" for k in range(2, 9)))  # C3D parameters that contain up to 255 labels each
 
-# Maximum RMS residual of a rigid body [mm]; above it, a marker jumped or was mislabelled, and the frame has no pose.
-# The largest residual of 6,400 fits to recorded speech and clenching is 0.18 mm. Four markers with 0.3 mm of noise per
-# axis exceed the limit once in 10 million frames (chi squared with six degrees of freedom).
+# Maximum RMS residual of a rigid body [mm]; a larger residual means that a marker jumped or was mislabelled, and the
+# frame gets no pose. The largest residual of 6,400 fits to recorded speech and clenching is 0.18 mm. Four markers with
+# 0.3 mm of noise per axis exceed the limit once in 10 million frames (chi squared with six degrees of freedom).
 _FARTHEST_MM = 1.0
 
 
 def marker_poses(
     path: str | os.PathLike[str], rigid: Mapping[str, str], rest_frame: int | None = None, unit: str = "mm"
 ) -> tuple[Array, float | None]:
-    """Return T_head_jaw (F, 4, 4) [mm] of a table of markers, NaN where a rigid body is occluded, and the frame rate.
+    """Return T_head_jaw (F, 4, 4) [mm] from a table of markers, NaN where a rigid body is occluded, and the frame rate.
 
     Args:
-        path: the table (see `formats.markers.read_markers`), or C3D.
+        path: the table (see `formats.markers.read_markers`) or a C3D file.
         rigid: descriptions of the rigid bodies "head" and "jaw" (see `formats.rigid_bodies.read_body`); without "head",
             the table is in head coordinates.
-        rest_frame: frame that defines the shape of rigid bodies for which only the markers are named.
+        rest_frame: frame that defines the marker positions of rigid bodies for which only marker names are given.
         unit: unit of the rigid bodies, and of tables that do not state a unit; a key of `LENGTH_UNITS_MM`.
 
     Raises:
@@ -71,15 +71,15 @@ def in_head(
     unit: str,
     path: Path,
 ) -> Array:
-    """Return points (F, N, 3) [mm] relative to the head, NaN where it is occluded.
+    """Return points (F, N, 3) [mm] relative to the head, NaN in frames in which the head is occluded.
 
     Args:
         rigid: description of the rigid body "head"; see `formats.rigid_bodies.read_body`.
-        rest_frame: frame that defines the shape of the head, if only its markers are named.
+        rest_frame: frame that defines the marker positions on the head, if only the names of its markers are given.
         unit: unit of the rigid body, a key of `LENGTH_UNITS_MM`.
 
     Raises:
-        FormatError: another rigid body, or one that does not fit the markers.
+        FormatError: a rigid body other than the head is given, or the head does not fit the markers.
     """
     if set(rigid) != {"head"}:
         raise FormatError(f"rigid bodies given: {', '.join(rigid)}; only head is used.", path=path)
@@ -93,7 +93,7 @@ def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
 
     Raises:
         FormatError: the file is not C3D.
-        UnitsError: the unit is not a unit of length.
+        UnitsError: the file's unit is not a unit of length.
         MissingDependencyError: ezc3d is not installed.
     """
     import ezc3d
@@ -110,14 +110,14 @@ def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
         hidden = np.asarray(data["meta_points"]["residuals"])[0].T < 0
         names = [name for key in _LABELS if key in given for name in given[key]["value"]]
         unit, rate = (given[key]["value"] for key in ("UNITS", "RATE"))
-    # ezc3d raises these for invalid, corrupt or truncated files
+    # exceptions that ezc3d raises for invalid, corrupt or truncated files
     except (OSError, RuntimeError, LookupError, ValueError, MemoryError) as error:
         raise FormatError(f"is not a readable C3D file ({error!s:.200}).", path=path) from error
     if not points.size:
         raise FormatError("has no points or no frames.", path=path)
     if len(points) >= _MOST_C3D_FRAMES:
         raise FormatError(
-            f"has {_MOST_C3D_FRAMES} frames or more; C3D files cannot store the number.",
+            f"has {_MOST_C3D_FRAMES} frames or more; C3D files cannot store that number.",
             path=path,
             hint="Export the take as TRC or CSV, or in parts.",
         )
@@ -130,7 +130,7 @@ def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
 
 
 def _check_length(path: Path) -> None:
-    """Check that a C3D file is not truncated: ezc3d would return arbitrary frames, or hang."""
+    """Check that a C3D file is not truncated; for truncated files, ezc3d returns arbitrary frames or hangs."""
     with open(path, "rb") as file:
         head = file.read(_BLOCK)
         file.seek((max(head[0], 1) - 1) * _BLOCK + 3 if head else 0)
@@ -139,7 +139,7 @@ def _check_length(path: Path) -> None:
         raise FormatError("is not a readable C3D file (invalid header).", path=path)
     points, analog, first, last = struct.unpack(f"{order[0]}4H", head[2:10])
     start = struct.unpack(f"{order[0]}H", head[16:18])[0]
-    size = 4 if head[order[1]] & 0x80 else 2  # bytes per coordinate: floating point if the scale is negative
+    size = 4 if head[order[1]] & 0x80 else 2  # bytes per coordinate; a negative scale indicates floating point
     needed = (start - 1) * _BLOCK + (last - first + 1) * (4 * points + analog) * size
     found = path.stat().st_size
     if found < needed:
@@ -184,7 +184,7 @@ def _moved(
     unit_mm: float,
     path: Path,
 ) -> Array:
-    """Return the poses (F, 4, 4) of a rigid body in the table's coordinate frame."""
+    """Return the poses (F, 4, 4) of a rigid body in the coordinate frame of the table."""
     seen = points[:, _columns(body, names, points.shape[1], name, path)]
     shape = _shape_at(rest_frame, seen, body, name, path) if body.points is None else body.points * unit_mm
     T, off_mm = rigid_fits(shape, seen)
@@ -203,7 +203,7 @@ def _moved(
 
 def _shape_at(rest_frame: int | None, seen: Array, body: RigidBody, name: str, path: Path) -> Array:
     """Return the positions of the markers of a rigid body in the rest frame."""
-    hint = "Name a frame (counted from 0) with the teeth in occlusion and all markers visible with --rest-frame."
+    hint = "Use --rest-frame to name a frame (counted from 0) with the teeth in occlusion and all markers visible."
     if rest_frame is None:
         raise FormatError(
             f"the positions of the markers on the rigid body of the {name} are unknown.", path=path, hint=hint

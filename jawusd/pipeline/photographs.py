@@ -1,4 +1,4 @@
-"""Register two scans in occlusion using photographs of the bite, and estimate the pose of each photograph."""
+"""Register two scans in occlusion using photographs of the closed bite, and estimate the camera poses."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from jawusd.photographs import Drawing, PhotoAlignment, align_photographs, read_
 from jawusd.pipeline.state import Progress, no_progress
 
 RESULT = "photos.json"
-_COLOURS = np.array([[60, 220, 60], [60, 160, 255]], np.uint8)  # of the upper and lower crowns, (red, green, blue)
-# Fraction of bright pixels above which a drawing is read as filled areas; lines 4 px wide around 20 teeth cover 4 %.
+_COLOURS = np.array([[60, 220, 60], [60, 160, 255]], np.uint8)  # RGB colours of the upper and lower crowns
+# Fraction of bright pixels above which a drawing is read as filled teeth; outlines 4 px wide of 20 teeth cover 4 %.
 _FILLED = 0.08
 
 
 @dataclass(frozen=True, eq=False)
 class PhotographFiles:
-    """Result and files of an alignment."""
+    """Result of an alignment, and the files written."""
 
     result: AlignedPhotos
     file: Path
@@ -44,13 +44,13 @@ def align_photograph_files(
     force: bool = False,
     progress: Progress = no_progress,
 ) -> PhotographFiles:
-    """Align scans with outlines drawn in photographs, and write poses, lenses, bite and overlays.
+    """Align scans with outlines drawn in photographs, and write camera poses, lenses, scan registration and overlays.
 
     Args:
-        outlines: a drawing per photograph, all of one bite and from one camera: tooth outlines as bright lines on
-            black, or filled teeth, each with its own gray value.
-        upper_teeth, lower_teeth: scans, each in any frame.
-        out: folder of photos.json and an overlay per photograph.
+        outlines: one drawing per photograph, all of the same bite and from one camera: tooth outlines as bright lines
+            on black, or filled teeth, each with its own gray value.
+        upper_teeth, lower_teeth: scans, each in any coordinate frame.
+        out: folder for photos.json and one overlay per photograph.
         force: overwrite existing files.
 
     Raises:
@@ -63,7 +63,7 @@ def align_photograph_files(
     for name in names:
         if names.count(name) > 1:
             raise CaptureError(
-                f'two pictures are called "{name}".', hint="Photographs are identified by their file names."
+                f'two photographs have the name "{name}".', hint="Photographs are identified by their file names."
             )
     refuse_existing(folder / RESULT, force)
     pictures = [_read(path) for path in paths]
@@ -79,7 +79,7 @@ def align_photograph_files(
 
 
 def read_drawing(picture: NDArray[np.uint8], name: str) -> Drawing:
-    """Return the lines of a gray drawing (h, w), or the borders of its areas if teeth are filled.
+    """Return the drawn outlines of a gray drawing (h, w), or the borders of its areas if the teeth are filled.
 
     Raises:
         TrackingError: the drawing has too few outlines.
@@ -110,5 +110,5 @@ def drawn_over(picture: NDArray[np.uint8], found: PhotoAlignment, number: int) -
 def _read(path: Path) -> NDArray[np.uint8]:
     picture = read_gray(path)
     if picture is None:
-        raise CaptureError("is not a readable picture.", path=path, hint="Check the path; save it as 8-bit PNG.")
+        raise CaptureError("is not a readable image.", path=path, hint="Check the path; save it as 8-bit PNG.")
     return picture

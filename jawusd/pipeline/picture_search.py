@@ -1,4 +1,4 @@
-"""Search for the teeth in the frames of footage in which the arches are visibly apart."""
+"""Search for the teeth in video frames in which the arches are visibly apart."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ if TYPE_CHECKING:
     from jawusd.segmentation.picture import ColourFootage, Pictures
     from jawusd.segmentation.rows import Rows
 
-# Frames per part of the take, maximum frame stride of the search, and minimum number of frames searched in long parts.
+# Number of frames per part of the take, maximum stride of the search [frames], and minimum number of frames searched in
+# a long part.
 _PART, _EVERY, _FEWEST = 240, 8, 8
-# Starts tried per part for each of the four orientations of the cameras, the most likely orientation first.
+# Number of starts tried per part of the take for each of the four camera orientations, the most likely one first.
 _TRIED = (4, 1, 1, 1)
-# Maximum number of starts tried, at about ten seconds of CPU time each. If six parts yield no start that fits, scans,
-# cameras or the detection are wrong, and more tries would not help. The limit is a number instead of a time, so that
+# Maximum number of starts tried, each of which takes about ten seconds of CPU time. If no start of six parts fits,
+# scans, cameras or detection are wrong, and more tries would not help. The limit is a number, not a duration, so that
 # results do not depend on the machine.
 _MOST_TRIED = 42
-# Maximum fraction of the line between the arches that may be bridged if the arches are to count as apart. All of 64
-# images of eight mouths with a smaller fraction were separated correctly.
+# Maximum fraction of the dividing line between the arches that may cross teeth for the arches to count as apart. In 64
+# images of eight mouths with smaller fractions, the arches were always separated correctly.
 _MOST_BRIDGED = 0.1
-# Minimum projected length of the unit up vector in the image plane; if shorter, it does not determine the
-# orientation of the image.
+# Minimum length of the head's unit up vector projected to the image plane; a shorter one does not determine how the
+# image is turned.
 _SHORTEST_UP = 0.5
 #: Limits of the fraction of the visible contour that matches the colours. Starts below `LEAST_FIT` are rejected; the 20
 #: starts found in one take, all but one within 0.5 mm, had 0.19 to 0.48, and starts from images turned the wrong way at
@@ -46,7 +47,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Start(Generic[T]):
-    """A start of tracking: frame, pose, fraction of the contour that fits, and how it was found."""
+    """A start of tracking: frame, pose, fraction of the visible contour that fits, and how it was found."""
 
     frame: int
     pose: T
@@ -56,27 +57,27 @@ class Start(Generic[T]):
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """Arches detected in the cameras' images of a frame."""
+    """Arches detected in all cameras' images of one frame."""
 
     frame: int
     rows: Mapping[str, Rows]
 
     @property
     def bridged(self) -> float:
-        """Fraction of the line between the arches along which they are not separated, in the worst camera."""
+        """Fraction of the dividing line between the arches that crosses teeth instead of a gap, in the worst camera."""
         return max(rows.bridged for rows in self.rows.values())
 
 
 @dataclass(frozen=True, eq=False)
 class PictureSearch(Generic[T]):
-    """A search for the teeth.
+    """A search for the teeth in footage, without masks.
 
     Attributes:
-        capture, footage: the capture, and the images of its cameras with a video.
-        cameras: these cameras, by name.
-        near: function that estimates a pose on a frame from cameras with rough masks; returns None if that fails.
-        judged: function that refines a pose on a frame, and returns the fraction of the visible contour that fits, 0 ..
-            1.
+        capture, footage: the capture, and the images of those of its cameras that have a video.
+        cameras: the calibrated cameras that have a video, by name.
+        near: function that estimates the pose in a frame from cameras with rough masks; returns None if that fails.
+        judged: function that refines a pose in a frame; returns the pose and the fraction of the visible contour that
+            fits, 0 .. 1.
     """
 
     capture: Capture
@@ -86,11 +87,11 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
-        """Return the first start with a clear fit, otherwise the best of a part of the take and an orientation.
+        """Return the first start with a clear fit, otherwise the best one of a part of the take and an orientation.
 
-        `up_world` is the up direction of the head, shape (3,), if known from other frames. With it, one orientation is
-        tried, and with several cameras the first start that fits is returned, because it can be compared with those
-        frames. Without it, four orientations are tried.
+        `up_world` is the up direction of the head in the world, shape (3,), if known from other frames. If it is given,
+        one camera orientation is tried and, with several cameras, the first start that fits is returned, because it
+        can be compared with those frames. Otherwise, four orientations are tried.
 
         Raises:
             TrackingError: no start fits.
@@ -120,12 +121,12 @@ class PictureSearch(Generic[T]):
                 break
         raise TrackingError(
             _describe_failure(tried, best, frames[seen:]),
-            hint="Check that scans, or rig, belong to this subject. Show both arches apart for a moment, "
+            hint="Check that the scans or the rig belong to this subject. Film both arches apart for a moment, "
             "pick teeth in two cameras ([bootstrap]), or draw masks.",
         )
 
     def _candidates(self, part: range, turns: Mapping[str, int], progress: Progress) -> list[_Candidate]:
-        """Return the frames of a part of the take on which the arches are apart in enough cameras."""
+        """Return the frames of a part of the take in which the arches are visibly apart in enough cameras."""
         out, chosen = [], part[:: min(_EVERY, max(1, len(part) // _FEWEST))]
         for done, (frame, pictures) in enumerate(self.footage.walk(chosen), start=1):
             apart = arches_apart(pictures, turns)
@@ -146,7 +147,7 @@ class PictureSearch(Generic[T]):
 def upright_turns(cameras: Mapping[str, Camera], up_world: Array) -> dict[str, int]:
     """Return the number of counter-clockwise quarter turns that make each camera's image upright.
 
-    Cameras that look along the up direction of the head in the world, shape (3,), are left out.
+    `up_world` is the up direction of the head in the world, shape (3,). Cameras that look along it are left out.
     """
     turns = {}
     for name, camera in cameras.items():
@@ -159,9 +160,9 @@ def upright_turns(cameras: Mapping[str, Camera], up_world: Array) -> dict[str, i
 def orientations(cameras: Mapping[str, Camera]) -> list[dict[str, int]]:
     """Return four hypotheses of how the cameras are turned about their optical axes, as in `upright_turns`.
 
-    A camera may lie on its side or hang upside down. The calibration gives the orientation of the cameras relative to
-    one another, so that one unknown remains: how the first camera is turned. The hypothesis with most upright cameras
-    is the first.
+    A camera may lie on its side or hang upside down. The calibration gives the orientations of the cameras relative to
+    one another, so that only the turn of the first camera is unknown. The hypothesis with the most upright cameras
+    comes first.
     """
     T_world_first = se3_inverse(next(iter(cameras.values())).T_cam_world)
     ups = [np.array([np.sin(angle), -np.cos(angle), 0.0]) for angle in np.pi / 2 * np.array([0, 1, 3, 2])]
@@ -173,7 +174,7 @@ def arches_apart(pictures: Pictures, turns: Mapping[str, int]) -> dict[str, Rows
     """Return the arches in the images in which they are visibly apart, by camera name.
 
     Args:
-        pictures: image per camera, or None.
+        pictures: image of each camera by name; None if it has none.
         turns: counter-clockwise quarter turns that make the images upright, by camera name.
     """
     from jawusd.segmentation.rows import tooth_rows
@@ -184,9 +185,9 @@ def arches_apart(pictures: Pictures, turns: Mapping[str, int]) -> dict[str, Rows
 
 
 def _describe_failure(tried: Sequence[int], best: Start[T] | None, left: range) -> str:
-    """Describe a failed search: the frames tried, the best fit, and the frames not searched."""
+    """Return a message about a failed search: the frames tried, the best fit, and the frames not searched."""
     frames = sorted(set(tried))
-    found = f"the teeth were not found on {len(frames)} frames that show both arches apart"
+    found = f"the teeth were not found in {len(frames)} frames that show both arches apart"
     if frames:
         found += f" ({', '.join(map(str, frames))})"
     if best is not None:
@@ -199,7 +200,7 @@ def _describe_failure(tried: Sequence[int], best: Start[T] | None, left: range) 
 def masked_cameras(
     capture: Capture, rows: Mapping[str, Rows], numbers: Mapping[str, int], folder: Path
 ) -> list[CameraSource]:
-    """Write detected arches as masks to a folder, numbered by the frames of each camera; return cameras with them.
+    """Write detected arches as masks to a folder, numbered by each camera's own frames; return the cameras with masks.
 
     Raises:
         OutputError: a mask cannot be written.
@@ -218,18 +219,18 @@ def picked_start(picked_frame: int, frames: range, begin: Callable[[], tuple[T, 
     Args:
         picked_frame: frame of the picks.
         frames: range to be tracked.
-        begin: returns the pose there, and the fraction of the visible contour that fits it, 0 .. 1.
-        least_fit: smallest fraction that is accepted.
+        begin: returns the pose estimated from the picks, and the fraction of the visible contour that fits it, 0 .. 1.
+        least_fit: minimum fraction for the start to be accepted.
 
     Raises:
-        TrackingError: the frame is not to be tracked, or the picks do not match the images.
+        TrackingError: the frame is outside the range, or the picks do not match the images.
     """
     if picked_frame not in frames:
         raise picks_outside(picked_frame, frames)
     pose, fit = begin()
     if fit < least_fit:
         raise TrackingError(
-            f"the picks do not match the pictures: {fit:.0%} of the visible contour fits the colours; at least "
+            f"the picks do not match the images: {fit:.0%} of the visible contour fits the colours; at least "
             f"{least_fit:.0%} is needed",
             frame=picked_frame,
             hint="Check the picks, and that scans, rig and calibration belong to this subject and these cameras.",

@@ -1,4 +1,4 @@
-"""Images and videos of a capture with its tracks: overlays, worst frames, plates, the report's 3-D replay."""
+"""Images and videos of a tracked capture: overlays, worst frames, plates, and the meshes of the report's 3-D replay."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from jawusd.media.side_by_side import CameraWall
 
 
-_UNCOVERED, _UNCERTAIN = 3, 2  # number of frames drawn for each reason, in addition to a typical frame
+_UNCOVERED, _UNCERTAIN = 3, 2  # number of frames drawn for each reason; one typical frame is drawn in addition
 _MOST_CAMERAS = 4
 _REPORT_TILE_PX = (400, 225)
 _QUALITY = 82
@@ -62,7 +62,7 @@ def draw_frames(
     backdrops: Mapping[str, Backdrop],
     scans: tuple[Mesh, Mesh],
 ) -> tuple[Overlay, ...]:
-    """Draw the scans over the images of frames; each frame is given by its row in the tracks and the reason to draw it.
+    """Draw the scans over images; each frame is given by its row in the tracks and the reason for drawing it.
 
     Raises:
         CaptureError: an image cannot be decoded.
@@ -79,7 +79,7 @@ def draw_frames(
 
 
 def chosen_frames(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return the rows in the tracks of frames to inspect, each with the reason, worst frames first."""
+    """Return the frames to inspect, as row in the tracks and reason, worst first."""
     tracked = tracks.tracked()
     uncovered = np.where(tracked, np.fmax.reduce(uncovered_percent(tracks), axis=1), np.nan)
     sigma_mm = np.where(tracked, tracks.sigma_mm.max(axis=1), np.nan)
@@ -147,7 +147,7 @@ def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
     """Return decimated meshes of a rig with the teeth closed, in the anatomical frame [mm], for the report.
 
     Raises:
-        RigError: there is no geometry.
+        RigError: the rig has no geometry.
     """
     from jawusd.rig.geo import read_geometry, read_gum
 
@@ -175,12 +175,12 @@ def _small(mesh: Mesh) -> Mesh:
 
 
 SHEET = "contact_sheet.png"
-#: Suffix of the path if one video of all cameras is written.
+#: Suffix of an output path that requests one video of all cameras; any other path is a folder.
 VIDEO = ".mp4"
 _SHEET_FRAMES = 6
-_CRF = 20  # H.264 rate factor of viewing quality; archive quality takes twice the time to encode
+_CRF = 20  # H.264 constant rate factor for viewing; archive quality would take twice the time to encode
 TILE_PX = (640, 480)
-_FILL = 0.12  # opacity of the crowns, low enough for outlines to remain visible
+_FILL = 0.12  # opacity of the crowns; low enough to keep the outlines visible
 
 
 def overlay_files(capture: Capture, path: Path) -> list[Path]:
@@ -228,7 +228,7 @@ def _write_cameras(
     make_folder(folder)
     done, total = 0, len(backdrops) * len(tracks.frames)
     for name, backdrop in backdrops.items():
-        width, height = (side // 2 * 2 for side in backdrop.size_px)  # H.264 needs even sizes
+        width, height = (side // 2 * 2 for side in backdrop.size_px)  # H.264 needs even image sizes
         writer = VideoWriter(folder / f"{name}.mp4", (width, height), capture.fps, quality_crf=_CRF)
         with writer as out:
             for image in _drawn(tracks, backdrop, cameras[name], scans):
@@ -281,7 +281,7 @@ def open_wall(
     scans: tuple[Mesh, Mesh],
     tile_px: tuple[int, int],
 ) -> CameraWall:
-    """Return a renderer of all cameras side by side, each cropped to the teeth.
+    """Return a renderer of the images of all cameras side by side, each cropped to the teeth.
 
     Raises:
         CaptureError, CalibrationError: no camera has video or masks, or one cannot be read.

@@ -57,7 +57,7 @@ class CheckResult(TypedDict):
 
 
 class ReportSummary(TypedDict):
-    """Path of the capture relative to the rig, `Origin`, and the report's file name or the missing packages."""
+    """Path of the capture relative to the rig, origin of the build, and the report's file or the missing packages."""
 
     capture: NotRequired[str]
     origin: NotRequired[dict[str, object]]
@@ -68,10 +68,10 @@ class ReportSummary(TypedDict):
 
 @dataclass(frozen=True)
 class BuildFacts:
-    """A finished build, with its capture if available."""
+    """Facts of a finished build, with its capture if that is available."""
 
     state: BuildState
-    capture: Capture | None  # None if not available
+    capture: Capture | None  # None if the capture is not available
     origin: Origin
     why_not: str = ""  # why the capture is not available
 
@@ -83,14 +83,14 @@ def write_build_report(
     """Write report.html of a finished build; return its path and the verdict.
 
     Args:
-        experiments: complete results; None: run those that take seconds.
+        experiments: results of all experiments; None: run only the experiments that take seconds.
 
     Raises:
         MissingDependencyError: matplotlib or jinja2 is not installed.
         FormatError, RigError: a file of the build is corrupt.
         OutputError: the file cannot be written.
     """
-    # raises an error before any work if packages are missing
+    # imported first, so that missing packages raise an error before any work
     from jawusd.paper.figures import inline_figures
     from jawusd.report.document import draw_figures, write_document
 
@@ -100,7 +100,7 @@ def write_build_report(
     unmet, unseen = list[str](), list[str]()
     # Decoding, drawing and measuring images releases the GIL.
     with ThreadPoolExecutor(1) as pool:
-        drawn = pool.submit(attempt, "pictures of the footage", unseen, lambda: _overlays(facts, tracks))
+        drawn = pool.submit(attempt, "images of the footage", unseen, lambda: _overlays(facts, tracks))
         met = pool.submit(attempt, "contacts of the teeth", unmet, lambda: contact_pictures(model, subject))
         data = _without_pictures(folder, facts, tracks, model, subject, experiments)
         progress("report", 1, 4)
@@ -118,7 +118,7 @@ def write_build_report(
 def _without_pictures(
     folder: Path, facts: BuildFacts, tracks: Tracks, model: JawModel, subject: Subject, experiments: Experiments | None
 ) -> ReportData:
-    """Return the data of a report without the images of footage and teeth."""
+    """Return the data of a report, except for the images of footage and teeth."""
     from jawusd.rig.read import describe
 
     left_out: list[str] = []
@@ -166,9 +166,9 @@ def report_build(
         allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
-        FormatError: not the folder of a build, or its files are corrupt or were modified.
+        FormatError: the path is not the folder of a build, or its files are corrupt or were modified.
         MissingDependencyError, RigError, OutputError: see `write_build_report`.
-        CaptureError: the capture named cannot be read.
+        CaptureError: the given capture cannot be read.
     """
     if not is_build(folder):
         raise FormatError(
@@ -184,7 +184,7 @@ def report_build(
         given = open_capture(capture, allow_outside=allow_outside) if capture is not None else None
         facts = build_facts(folder, state, given, allow_outside=allow_outside)
         path, verdict = write_build_report(folder, facts, progress, experiments)
-        # Record the new file; otherwise the next --resume would write the report again.
+        # Record the hash of the new file; otherwise the next --resume would write the report again.
         known = state.stages.get("report")
         result = dict(known.result if known else {}) | {"file": path.name, "verdict": verdict}
         if facts.capture:
@@ -205,7 +205,7 @@ def fitted_poses(folder: Path) -> Path:
 
 
 def missing_packages() -> str | None:
-    """Return the message about packages missing for a report, None if it can be written."""
+    """Return a message about the packages that a report lacks; None if none is missing."""
     try:
         with explain_missing_packages():
             import jawusd.report.document  # noqa: F401
@@ -236,7 +236,7 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
 
 
 def as_built(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the calibration and the scan labels that the build made."""
+    """Return the capture with the calibration and the scan labels that the build wrote."""
     made = folder / CALIBRATION
     if capture.calibration is None and made.is_file():
         capture = capture.model_copy(update={"calibration": made, "calibration_unit_mm": 1.0})
@@ -244,15 +244,15 @@ def as_built(capture: Capture, folder: Path) -> Capture:
 
 
 def relative_capture_path(capture: Capture, folder: Path) -> str:
-    """Return the path of a capture relative to the rig's folder; absolute on another drive."""
+    """Return the path of a capture relative to the rig's folder, or its absolute path if on another drive."""
     try:
         return os.path.relpath(capture.folder, folder.resolve())
-    except ValueError:  # on another drive
+    except ValueError:  # the paths are on different drives
         return str(capture.folder)
 
 
 def attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
-    """Run a part of the report; on failure, list the part as left out and return None."""
+    """Run a function that makes one part of the report; if it fails, list the part as left out and return None."""
     try:
         with explain_missing_packages():
             return work()
@@ -268,7 +268,7 @@ def _overlays(facts: BuildFacts, tracks: Tracks) -> tuple[Overlay, ...]:
 
 
 def recorded_offsets(state: BuildState) -> dict[str, int]:
-    """Return the frame offset of every camera recorded by a build; empty if it has not been synchronised.
+    """Return the frame offset of every camera recorded by a build; empty if the build did not synchronise them.
 
     Raises:
         FormatError: build.json is corrupt.
@@ -326,7 +326,7 @@ def run_paper_experiments(
     """Run the paper's experiments.
 
     Args:
-        starts: random starts of the paper's networks.
+        starts: number of random starts of the paper's networks.
         quick: skip the networks and the paper's model, which take minutes.
 
     Raises:
@@ -351,7 +351,7 @@ def run_paper_experiments(
 
 @explain_missing_packages()
 def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
-    """Write the figures and the table of the experiments to a folder; return the files.
+    """Write the figures and the table of the experiments to a folder; return the files written.
 
     Raises:
         OutputError: a file cannot be written.

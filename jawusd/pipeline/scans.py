@@ -1,4 +1,4 @@
-"""Label the teeth scans of a capture, store the labels, and draw them for review."""
+"""Label the teeth scans of a capture, store the labels, and draw an image of them for review."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ PICTURE = "scan_labels.png"
 
 
 class ScanSummary(TypedDict):
-    """Figures of one scan."""
+    """Key figures of one scan and its labels."""
 
     arch: str
     scan: str
-    labels_by: str  # "file", "paint" or "shape"
-    labels_file: str | None  # None if none was read or written
+    labels_by: str  # origin of the labels: "file", "paint" or "shape"
+    labels_file: str | None  # None if no label file was read or written
     faces: int
     pieces: int
     merged_vertices: int  # number of vertices that coincide with another vertex
     empty_faces: int
     repeated_faces: int
-    crown_percent: float  # percentage of the vertices
+    crown_percent: float  # percentage of vertices labelled as crown
     weak_border_percent: float | None  # percentage of the crown border without a crease
     findings: list[dict[str, str | float | int]]
 
 
 class ScansSummary(TypedDict):
-    """Both scans, and the image of their labels."""
+    """Summaries of both scans, and the path of the image of their labels."""
 
     picture: str
     scans: list[ScanSummary]
@@ -61,8 +61,8 @@ def label_scans(
     Paint and existing labels are kept.
 
     Args:
-        out: folder of labels and image; None: labels go to the labels folder of the capture or beside the scans, the
-            image to the capture's folder.
+        out: folder of labels and image; None: labels are written to the labels folder of the capture or beside the
+            scans, and the image to the capture's folder.
         force: label again, and overwrite existing labels.
 
     Raises:
@@ -91,9 +91,9 @@ def all_labelled(capture: Capture) -> bool:
 
 
 def store_labels(capture: Capture, folder: Path) -> list[Path]:
-    """Write the labels of both teeth scans to a folder if one is labelled by shape; return the files written.
+    """Write the labels of both teeth scans to a folder if either is labelled by shape; return the files written.
 
-    Labels of an earlier call are deleted.
+    Labels written by an earlier call are deleted.
 
     Raises:
         FormatError, CaptureError: a scan or its labels cannot be read.
@@ -112,7 +112,7 @@ def store_labels(capture: Capture, folder: Path) -> list[Path]:
 
 
 def with_stored_labels(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the labels that `store_labels` wrote to a folder, unless it has its own."""
+    """Return the capture with the labels that `store_labels` wrote to a folder, unless it has its own label files."""
     scans = capture.scans
     teeth = (scans.upper_teeth, scans.lower_teeth)
     own = any(labels_path(path, scans.labels).is_file() for path in teeth)
@@ -122,7 +122,7 @@ def with_stored_labels(capture: Capture, folder: Path) -> Capture:
 
 
 def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: NDArray[np.uint8]) -> Path:
-    """Write reviewed labels (V,) to the label file of the capture; return the file.
+    """Write the reviewed labels (V,) of one scan to its label file; return the file.
 
     Args:
         scans: the scans' paths in the capture.
@@ -137,7 +137,7 @@ def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: N
 
 
 def _stored(scan: LabelledScan, folder: Path | None) -> ScanSummary:
-    """Store labels found by shape, and return the figures of the scan."""
+    """Store labels found by shape, and return the summary of the scan."""
     from jawusd.meshes.scan_surface import ScanSurface
 
     file = labels_path(scan.path, folder)

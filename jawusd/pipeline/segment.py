@@ -1,4 +1,4 @@
-"""Make masks from footage: follow the teeth by their colours, segment around them, and align the masks."""
+"""Make masks from footage: follow the teeth by their colours, and segment the images around them."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ ARCHES = ("upper", "lower")
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    """Options of the segmentation."""
+    """Options for making masks from footage."""
 
     keys: Path | None = None  # folder with masks or strokes drawn by hand for some frames
-    resume: bool = False  # whether to keep finished frames
+    resume: bool = False  # whether to keep the frames finished by an earlier run
     jobs: int = 2  # number of threads
 
 
@@ -57,7 +57,7 @@ def segment_teeth(
     """Write masks of both arches for every frame and camera of a capture.
 
     Args:
-        capture: provides videos, calibration, scans, picks and frame range; its masks are ignored.
+        capture: the capture; its videos, calibration, scans, picks and frame range are used, its masks are ignored.
         offsets: frame offset by camera.
         folder: output folder of masks CAMERA/upper/000123.png, numbered by the camera's own frames.
 
@@ -75,14 +75,14 @@ def segment_teeth(
 
 @dataclass(eq=False)
 class _OpenFrame:
-    """A frame being tracked: its images, and the latest masks by camera, None if there is no image."""
+    """A frame that is being tracked: its images, and the latest masks by camera, None if there is no image."""
 
     pictures: Pictures
     segments: dict[str, Segment | None] = field(default_factory=dict)
 
 
 class _Segmentation:
-    """One run over the frames of a capture."""
+    """One run of the segmentation over the frames of a capture."""
 
     def __init__(
         self,
@@ -152,7 +152,7 @@ class _Segmentation:
         return self._journal.entries
 
     def _follow(self, start: int, poses: Array) -> None:
-        """Follow the teeth through all frames by their colours, from poses on one of them."""
+        """Follow the teeth through all frames by their colours, starting from the poses in one frame."""
         follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
         follower.start_at(start, poses)
         self._guide = follower.run(range(self._first, self._stop), self._search(follower).again, self._progress)
@@ -180,7 +180,7 @@ class _Segmentation:
         return begin.frame, begin.pose
 
     def _search(self, follower: Follower) -> ArchSearch:
-        """Return a search for the teeth for a follower."""
+        """Return a search for the teeth that uses a follower to refine poses."""
         from jawusd.tracking.region.picture_start import ArchStart
 
         upper, lower = self._tracker.scans
@@ -192,7 +192,7 @@ class _Segmentation:
 
     @contextlib.contextmanager
     def _opened(self, frame: int, pictures: Pictures) -> Iterator[_OpenFrame]:
-        """Make the images of a frame available to the tracker, and collect their masks."""
+        """Make the images of a frame available to the tracker, and collect the masks segmented from them."""
         self._open[frame] = _OpenFrame(pictures)
         try:
             yield self._open[frame]
@@ -233,7 +233,7 @@ class _Segmentation:
             known = {name: model.counts() for name, model in colours.items()}
             with self._opened(frame, pictures) as shown:
                 _, record = next(follow)
-            if (record.status == LOST).any():  # forget colours learned from the wrong region
+            if (record.status == LOST).any():  # discard colours learned from a wrong image region
                 for name, model in colours.items():
                     model.restore(*known[name])
             state.save(frame, step)
@@ -256,7 +256,7 @@ class _Segmentation:
         )
 
     def _keyed(self) -> list[int]:
-        """Return the frames with drawn masks or strokes and known poses."""
+        """Return the frames that have drawn masks or strokes, and known poses."""
         drawn = {name: set(self._keys.frames(name)) for name in self._cameras}
         return [
             frame
@@ -292,7 +292,7 @@ class _Segmentation:
             self._advance("segment again", frame + 1 - self._first)
 
     def _see(self, frame: int, poses: Array, turn: int) -> list[View]:
-        """Segment the images of an open frame, and return them as views for the tracker."""
+        """Segment the images of a frame, and return the masks as views for the tracker."""
         from jawusd.tracking.contour.views import View
 
         shown = self._open[frame]
@@ -302,7 +302,7 @@ class _Segmentation:
             if image is None or own is None:
                 return None
             found = self._segmenters[name].segment(image, poses, turn, self._keys.of(name, own))
-            # Skip arches that were not found by colour: a mask would confirm the wrong pose.
+            # Skip arches that were not found by colour: a mask segmented around a wrong pose would confirm it.
             return None if found is None else found.only(self._guide[frame].found)
 
         shown.segments = dict(zip(self._cameras, self._pool.map(one, self._cameras), strict=True))

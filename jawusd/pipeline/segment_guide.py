@@ -1,4 +1,4 @@
-"""Poses tracked by colour alone, stored beside the masks that were segmented around them and compared with tracks."""
+"""Poses tracked by colour alone: they guide the segmentation, are stored beside the masks and compared with tracks."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from jawusd.pipeline.subject import registration_of
 if TYPE_CHECKING:
     from jawusd.tracking.region.tracker import RegionPose
 
-# Maximum distance [mm] between the jaw poses from masks and from colours, above which one of them must be wrong;
-# correct poses of three takes differed by at most 0.9 mm. Fractions of wrong or lost frames above which a take is
-# reported as partly unreliable (`_FEW`) or as not usable (`_MANY`).
+# Distance [mm] between the jaw poses from masks and from colours above which one of them must be wrong; correct poses
+# of three takes differed by at most 0.9 mm. `_FEW` and `_MANY` are the fractions of wrong or lost frames above which a
+# take is reported as partly unreliable, or as unusable.
 _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 
 
 def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> None:
-    """Write poses tracked by colour, with the hash of their inputs.
+    """Write poses tracked by colour, with the hash of the inputs used.
 
     Raises:
         OutputError: the file cannot be written.
@@ -49,7 +49,7 @@ def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> No
 
 
 def known_guide(folder: Path, inputs: str) -> dict[int, RegionPose]:
-    """Return the stored poses if they have the same inputs; empty if missing or unreadable."""
+    """Return the stored poses if their inputs are unchanged; empty if the file is missing or unreadable."""
     try:
         guide, made_from = _read(folder / GUIDE)
     except JawusdError:
@@ -58,7 +58,7 @@ def known_guide(folder: Path, inputs: str) -> dict[int, RegionPose]:
 
 
 def _read(path: Path) -> tuple[dict[int, RegionPose], str]:
-    """Return the stored poses and the hash of their inputs; empty if missing.
+    """Return the stored poses and the hash of their inputs; both are empty if the file is missing.
 
     Raises:
         FormatError: the file is corrupt.
@@ -77,12 +77,12 @@ def _read(path: Path) -> tuple[dict[int, RegionPose], str]:
 
 
 def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[Tracks, list[Finding]]:
-    """Combine tracks of automatic masks with the poses tracked by colour; also return findings on their agreement.
+    """Combine tracks from automatic masks with the poses tracked by colour; also return findings on their agreement.
 
-    Tracks of other masks are returned unchanged. Masks segmented around a wrong pose confirm that pose; colour edges
-    have independent errors, so the wrong pose is detected as a disagreement. Findings: "footage_doubtful" [%] for
-    frames that are lost or in which the poses differ by more than a millimetre, "footage_unchecked" if there are no
-    poses tracked by colour.
+    Tracks from hand-drawn or imported masks are returned unchanged. Masks segmented around a wrong pose confirm that
+    pose; colour edges have independent errors, so the wrong pose shows as a disagreement. Findings: "footage_doubtful"
+    [%] for frames that are lost or in which the poses differ by more than a millimetre, "footage_unchecked" if there
+    are no poses tracked by colour.
 
     Args:
         landmarks: lower teeth, then condyles, mandible coordinates [mm], shape (5, 3).
@@ -114,13 +114,13 @@ def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[T
 
 
 def _disagreement(tracks: Tracks, poses: Array, points: Array) -> list[Finding]:
-    """Return a finding if masks and colours disagree on points of the lower teeth (N, 3) in too many frames."""
+    """Return a finding if, in too many frames, masks and colours disagree on points (N, 3) of the lower teeth."""
     relative = np.full((len(poses), 4, 4), np.nan)
     both = np.isfinite(poses).all((1, 2, 3))
     relative[both] = relative_pose(poses[both, 0], poses[both, 1])
     away = transform_points(tracks.raw_T_upper_lower, points) - transform_points(relative, points)
     apart_mm = np.linalg.norm(away, axis=-1).mean(-1)
-    bad = ~(apart_mm <= _APART_MM)  # NaN where an arch is lost
+    bad = ~(apart_mm <= _APART_MM)  # the distance is NaN where an arch is lost
     share = float(bad.mean())
     if share <= _FEW:
         return []
@@ -131,7 +131,7 @@ def _disagreement(tracks: Tracks, poses: Array, points: Array) -> list[Finding]:
             "footage_doubtful",
             "warning",
             f"the footage {judgement}: in {bad.sum()} of {len(bad)} frames the jaw is lost, or masks and colours "
-            f"disagree on it by more than {_APART_MM:g} mm; at most {_FEW:.0%} of the frames is usual",
+            f"disagree on its pose by more than {_APART_MM:g} mm; at most {_FEW:.0%} of the frames is usual",
             value=round(100 * share, 1),
             limit=100 * _FEW,
             frame=int(tracks.frames[worst]),

@@ -1,7 +1,7 @@
-"""Records of a segmentation: a journal with a line per finished frame, and a summary with confidences.
+"""Records of a segmentation: a journal with one line per finished frame, and a summary with confidences.
 
-The journal allows interrupted work to be resumed. The summary has a confidence per frame and camera, and lists the
-masks to inspect, worst first.
+An interrupted segmentation is resumed from the journal. The summary has a confidence per frame and camera, and lists
+the masks to inspect, worst first.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from jawusd.pipeline.state import hash_value
 RECORD, SUMMARY, SHEET, LEARNED = "segment.jsonl", "segment.json", "look_at_these.png", "learned.json"
 FORMAT = "jawusd-segment/1"
 _MAX_LEARNED_BYTES = 1 << 20
-# Masks below this confidence need inspection.
+# Confidence below which masks need inspection.
 _LOW_CONFIDENCE = 0.5
-# Symptoms of a bad mask: 1 if larger values are worse, -1 if smaller values are. Each is compared with its median over
-# the take.
+# Symptoms of a bad mask, with 1 if larger values are worse and -1 if smaller ones are. Each is compared with its median
+# over the take.
 _SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
 _LEAST_SPREAD = {"contrast": 0.03, "unexpected": 0.01, "residual_px": 0.05, "uncovered": 0.01}
-_USUAL_OFF = 3.0  # deviation, in robust sigmas, at which a single symptom halves the confidence
-# Likely outline error [px of the working image] along image edges, where there is no edge, and between the arches. Its
-# integral along the outline, divided by the mask's area, is the fraction of the mask that may be wrong. This fraction
-# is comparable across cameras, so frames of all cameras are pooled, with a stricter limit.
+_USUAL_OFF = 3.0  # deviation, in robust standard deviations, at which a single symptom halves the confidence
+# Likely error of a mask's outline [px of the working image] on an image edge, away from edges, and between the arches.
+# Integrated along the outline and divided by the mask's area, it gives the fraction of the mask that may be wrong. This
+# fraction is comparable across cameras, so the frames of all cameras are pooled, with a stricter limit.
 _OUTLINE_PX = (0.4, 2.0, 0.6)
 _OUTLINE, _OUTLINE_SPREAD, _OUTLINE_OFF = "outline", 0.01, 1.5
 _SHEET_FRAMES = 12
@@ -45,7 +45,7 @@ Pair = list[float | None]
 
 
 class CameraEntry(TypedDict):
-    """One camera's masks of a frame; pairs are (upper, lower), None without a mask."""
+    """Quality of one camera's masks in a frame; pairs are (upper, lower), None where there is no mask."""
 
     frame: int
     contrast: Pair
@@ -66,7 +66,7 @@ class TrackEntry(TypedDict):
 
 
 class FrameEntry(TypedDict):
-    """A finished frame: T_world_upper and T_world_lower, their status, masks and tracking."""
+    """A finished frame: T_world_upper and T_world_lower, the status of each, and the quality of masks and tracking."""
 
     poses: list[list[list[float]]]
     status: list[int]
@@ -76,7 +76,7 @@ class FrameEntry(TypedDict):
 
 
 class MaskConfidence(TypedDict):
-    """Confidence 0 .. 1 in the worse of the two masks of an image, with the reason."""
+    """Confidence, 0 .. 1, in the worse of the two masks of an image, and the reason if it is low."""
 
     frame: int
     camera: str
@@ -87,7 +87,7 @@ class MaskConfidence(TypedDict):
 
 
 class Learned(TypedDict):
-    """Result of learning from drawn masks: number of masks, and disagreement with them before and after learning."""
+    """Result of learning from drawn masks: their number, and the disagreement with them before and after learning."""
 
     pictures: int
     disagreement: list[float]
@@ -107,7 +107,7 @@ class SegmentSummary(TypedDict):
 
 
 def auto_masks_folder(capture: Capture) -> Path | None:
-    """Return the folder of a capture's masks if `jawusd segment` wrote all of them, else None."""
+    """Return the folder of a capture's masks if `jawusd segment` wrote all of them, otherwise None."""
     masks = [path for camera in capture.cameras if camera.masks for path in (camera.masks.upper, camera.masks.lower)]
     folders = {path.parents[2] if len(path.parents) > 2 else None for path in masks}
     folder = folders.pop() if len(folders) == 1 else None
@@ -115,14 +115,14 @@ def auto_masks_folder(capture: Capture) -> Path | None:
 
 
 class Journal:
-    """The record of finished frames, in memory and in a file of JSON lines."""
+    """The record of finished frames, kept in memory and in a JSON Lines file."""
 
     def __init__(self, folder: Path, inputs: str, resume: bool) -> None:
-        """Start empty, or with the frames finished from the same inputs.
+        """Open the record, empty or with the frames already finished from the same inputs.
 
         Args:
             inputs: hash of all inputs.
-            resume: keep existing frames if their inputs are the same.
+            resume: keep recorded frames if their inputs are the same.
 
         Raises:
             OutputError: the folder cannot be written, or the file cannot be read.
@@ -187,7 +187,7 @@ def _without_nan(value: object) -> object:
 
 
 def _entry(line: str) -> tuple[int, FrameEntry] | None:
-    """Return the frame and entry of a line; None if it is truncated or corrupt."""
+    """Return the frame and the entry of a journal line; None if the line is truncated or corrupt."""
     try:
         data = json.loads(line)
         known = data.pop("sha256")
@@ -197,7 +197,7 @@ def _entry(line: str) -> tuple[int, FrameEntry] | None:
 
 
 def summarise(entries: Mapping[int, FrameEntry]) -> list[MaskConfidence]:
-    """Return the confidence of every image's masks, in order of frames and cameras."""
+    """Return the confidence in the masks of every image, ordered by frame and camera."""
     keys = [(frame, name) for frame in sorted(entries) for name in entries[frame]["cameras"]]
     found = [entries[frame]["cameras"][name] for frame, name in keys]
     cameras = np.array([name for _, name in keys])
@@ -210,7 +210,7 @@ def summarise(entries: Mapping[int, FrameEntry]) -> list[MaskConfidence]:
     }
     parts = [_off(sign * measured[name], cameras, _LEAST_SPREAD[name]) for name, sign in _SYMPTOMS.items()]
     parts.append(_off(_outline_doubt(found), everywhere, _OUTLINE_SPREAD) * (_USUAL_OFF / _OUTLINE_OFF))
-    off = np.stack(parts, axis=-1)  # (N, 2, S)
+    off = np.stack(parts, axis=-1)  # shape (N, 2, number of symptoms)
     lost = np.array([[state == LOST for state in entries[frame]["status"]] for frame, _ in keys])
     doubt = np.where(lost, np.inf, np.maximum(off, 0).max(-1) / _USUAL_OFF)
     rows: list[MaskConfidence] = []
@@ -230,19 +230,19 @@ def summarise(entries: Mapping[int, FrameEntry]) -> list[MaskConfidence]:
 
 
 def _pairs(values: Sequence[Pair]) -> Array:
-    """Return pairs as an array, shape (N, 2), NaN for None."""
+    """Return pairs as an array, shape (N, 2), with NaN in place of None."""
     return np.array(values, np.float64)
 
 
 def _outline_doubt(found: Sequence[CameraEntry]) -> Array:
-    """Return the fraction of every mask that may be wrong, NaN without a mask, shape (N, 2)."""
+    """Return the fraction of each mask's area that may be wrong, NaN where there is no mask, shape (N, 2)."""
     outline = np.array([entry["outline"] for entry in found], np.float64)
     area = np.array([entry["pixels"] for entry in found], np.float64)
     return np.where(area > 0, outline @ np.array(_OUTLINE_PX) / np.maximum(area, 1), np.nan)
 
 
 def _off(values: Array, groups: NDArray[np.str_], least_spread: float) -> Array:
-    """Return by how many robust sigmas values (N, 2) exceed the median of their group and arch, shape (N, 2)."""
+    """Return the excess of values (N, 2) over the median of their group and arch, in robust sigmas, shape (N, 2)."""
     out = np.zeros_like(values)
     for group in np.unique(groups):
         of = groups == group
@@ -290,7 +290,7 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
 
 
 def _learned(path: Path) -> Learned | None:
-    """Return the result of learning from drawn masks, None if there are none."""
+    """Return the result of learning from drawn masks; None if no masks were drawn."""
     if not path.exists():
         return None
     try:
@@ -304,7 +304,7 @@ def _learned(path: Path) -> Learned | None:
 
 @explain_missing_packages()
 def delete_masks(folder: Path) -> None:
-    """Delete the masks and records that segmentation wrote to a folder, and folders left empty.
+    """Delete the masks and records that a segmentation wrote to a folder, and the folders left empty.
 
     Other files are kept, and so are folders that segmentation did not write.
     """
@@ -319,7 +319,7 @@ def delete_masks(folder: Path) -> None:
         if path.stem.isdigit() and path.resolve().is_relative_to(folder.resolve()):
             path.unlink()
     for path in [*folder.glob("*/upper"), *folder.glob("*/lower"), *folder.glob("*"), folder]:
-        with contextlib.suppress(OSError):  # not empty, or not a folder
+        with contextlib.suppress(OSError):  # the folder is not empty, or the path is not a folder
             path.rmdir()
 
 

@@ -1,4 +1,4 @@
-"""Learn the jaw from facial skin: read a face and a jaw of one performance, and align their clocks."""
+"""Learn jaw motion from facial skin: read the face and the jaw of one performance, and align their clocks."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from jawusd.formats.poses import read_poses_or_parameters
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.markers import LENGTH_UNITS_MM, in_head, read_c3d
 
-SIGMA_MM = 0.15  # standard deviation of d if the file does not state it
-_LARGEST_SIGMA_MM = 1.0  # poses with a larger standard deviation at the incisal point do not count as seen
+SIGMA_MM = 0.15  # standard deviation of d, if the file does not state it
+_LARGEST_SIGMA_MM = 1.0  # standard deviation at the incisal point above which a pose does not count as seen
 
 
 @dataclass(frozen=True, eq=False)
 class JawTake:
-    """The jaw of a take, with the frames in which the teeth were seen.
+    """The jaw motion of a take, and the frames in which the teeth were visible.
 
     Attributes:
         frames: frame numbers, increasing, shape (F,).
         d: jaw parameters [mm], shape (F, 3).
-        seen: d was measured, not interpolated, shape (F,).
+        seen: whether d was measured rather than interpolated, shape (F,).
         sigma_mm: standard deviation of d [mm], shape (F, 3).
-        fps: frames per second, None if unknown.
+        fps: frame rate [1/s]; None if unknown.
     """
 
     frames: Array
@@ -47,11 +47,11 @@ class JawTake:
     fps: float | None
 
     def at_rate(self, fps: float) -> JawTake:
-        """Return the take with another frame rate."""
+        """Return the take with its frame rate replaced."""
         return replace(self, fps=fps)
 
     def with_bite(self, first: int, last: int) -> JawTake:
-        """Return the take with d = 0 from frame first to last, where the teeth are in occlusion."""
+        """Return the take with d = 0 in the frames `first` to `last`, in which the teeth are in occlusion."""
         bite = np.arange(first, last + 1, dtype=np.float64)
         kept = (self.frames < first) | (self.frames > last)
         frames = np.concatenate([self.frames[kept], bite])
@@ -67,10 +67,10 @@ class JawTake:
 
 
 def read_jaw(rig: JawRig, path: str | os.PathLike[str]) -> JawTake:
-    """Read the jaw of a take: tracks.npz, the CSV of a solved performance, or a table of d or poses.
+    """Read the jaw motion of a take from tracks.npz, the CSV of a solved performance, or a table of d or poses.
 
     In tracks, frames count as seen if both arches were tracked without a prior; in a performance, if they are solved;
-    in a table, all frames are.
+    in a table, always.
 
     Raises:
         FormatError: the file is none of these.
@@ -90,7 +90,7 @@ def read_jaw(rig: JawRig, path: str | os.PathLike[str]) -> JawTake:
 
 
 def _states_of(path: Path) -> tuple[Mask, Array]:
-    """Return which frames of the CSV of a performance are solved (F,), and the sigmas of d [mm] (F, 3)."""
+    """Return which frames in the CSV of a performance are solved (F,), and the standard deviations of d [mm] (F, 3)."""
     table = read_table(path, os.stat(path).st_size)
     column = table.header.index("state")
     solved = np.array([row[column].strip() == str(SolveState.SOLVED) for row in table.rows])
@@ -117,14 +117,14 @@ def read_face(
     rigid: Mapping[str, str] | None = None,
     rest_frame: int | None = None,
 ) -> FaceTable:
-    """Read a face: C3D, a marker table, a CSV of Live Link Face, or a face table; points in mm.
+    """Read facial motion from C3D, a marker table, a CSV of Live Link Face, or a face table; points are in mm.
 
     Args:
         path: the file; see `formats.markers`, `formats.arkit` and `formats.face_table`.
-        fps: frames per second, if the file does not state them.
-        unit: unit of points, if the file does not state it.
-        rigid: the rigid body "head" of markers on the head (see `formats.rigid_bodies`); points are then given relative
-            to it. Default: the head is still, or the points are stabilised.
+        fps: frame rate [1/s], if the file does not state it.
+        unit: unit of the points, if the file does not state it.
+        rigid: the rigid body "head", formed by markers on the head (see `formats.rigid_bodies`); points are then
+            returned relative to it. Default: the head does not move, or the points are stabilised.
         rest_frame: frame that defines the shape of the head, if only its markers are named.
 
     Raises:
@@ -160,14 +160,14 @@ def learn_skin(
     offset_s: float | None = None,
     head_error: tuple[float, float] = HEAD_ERROR,
 ) -> tuple[Skin, float]:
-    """Learn d from a face and a jaw of the same performance; both need a frame rate.
+    """Learn to estimate d from facial motion, from face and jaw of one performance; both need a frame rate.
 
     Args:
-        offset_s: added to the face's times to obtain the jaw's; default: estimated.
+        offset_s: seconds to add to the face's times to obtain the jaw's times; default: estimated.
         head_error: see `fitting.skin.fit_skin`.
 
     Returns:
-        The map, and the offset [s].
+        The map from face to d, and the offset [s].
 
     Raises:
         FittingError: see `fitting.skin.clock_offset` and `fitting.skin.fit_skin`.

@@ -1,4 +1,4 @@
-"""Solve a performance of a subject with a rig, and write it: `jawusd solve`."""
+"""Solve the performance of a subject who has a rig, and write the result: `jawusd solve`."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ _USD = (".usd", ".usda", ".usdc", ".usdz")
 
 
 class SolveSummary(TypedDict):
-    """Key figures of a performance; counts are numbers of frames."""
+    """Key figures of a solved performance; counts are numbers of frames."""
 
     frames: int
     solved: int
-    carried: list[tuple[int, int]]  # runs of frames (first, last) in which an arch is occluded
-    lost: list[tuple[int, int]]  # runs of frames in which no pose fits the images
-    within_tolerance: int  # frames outside the bound but within the tolerance of measured poses
-    outside: int  # frames beyond the tolerance
+    carried: list[tuple[int, int]]  # runs of frames, as (first, last), in which an arch is occluded
+    lost: list[tuple[int, int]]  # runs of frames, as (first, last), in which no pose fits the images
+    within_tolerance: int  # number of frames outside the bound, but within the tolerance of measured poses
+    outside: int  # number of frames outside the bound by more than the tolerance
     cameras: list[str]
     sigma_mm: dict[str, float]  # median standard deviation of d1, d2, d3 over solved frames
-    worst_sigma_mm: dict[str, float]  # maximum over all frames
+    worst_sigma_mm: dict[str, float]  # maximum standard deviation over all frames
     limits: str  # what limits the accuracy, in words
     focal: NotRequired[
         dict[str, tuple[float, float]]
-    ]  # ratio of the estimated to the calibrated focal length, and its sigma, by camera
+    ]  # ratio of estimated to calibrated focal length, and its standard deviation, by camera
     findings: NotRequired[list[dict[str, str | float | int]]]
 
 
@@ -69,26 +69,26 @@ def solve(
     allow_outside: bool = False,
     progress: Progress | None = None,
 ) -> Performance:
-    """Solve head pose and jaw parameters of every frame of a shot, and write them if a file is named.
+    """Solve for head pose and jaw parameters in every frame of a shot; optionally write them to a file.
 
     Args:
         rig: `actor.usda`, another layer of it, or `model.npz`.
         shot: the capture of the shot, its capture.toml or folder. Without any masks, the teeth are followed in the
             videos by their colours.
-        out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
+        out: file to write, a table of d (.csv), tracks (.npz), or an animation layer over the rig (.usdc, .usda).
         prim: path of the rig's prim, if a stage has several; an animation layer then targets the stage.
-        overlay: video to write (.mp4) of the solved scans over all cameras side by side.
-        report: page to write (.html), with d and sigma, frames in which an arch is hidden, verdicts, findings and
-            images.
+        overlay: video to write (.mp4), of the solved scans drawn over the images of all cameras side by side.
+        report: page to write (.html), with d and its standard deviations, frames with a hidden arch, verdicts, findings
+            and images.
         fixed_head: the cameras are head-mounted.
-        free_focal: estimate focal lengths; those of the calibration may be off by 10 %.
+        free_focal: estimate the focal lengths; those of the calibration may then be wrong by up to 10 %.
         jobs: number of threads; the result does not depend on it.
         allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
         FormatError, RigError: the rig cannot be read.
         CaptureError, CalibrationError, SyncError: see `track`.
-        TrackingError: the teeth cannot be found in the masks, or the videos.
+        TrackingError: the teeth cannot be found in the masks or the videos.
         OutputError: a file cannot be written.
     """
     from jawusd.tracking.performance.results import tracks_of
@@ -143,7 +143,7 @@ def write_solved(
     fps: float,
     prim: str | None = None,
 ) -> None:
-    """Write a performance to a file of the kind given by its suffix; see `solve`.
+    """Write a performance to a file whose suffix selects the format; see `solve`.
 
     Raises:
         OutputError: the file cannot be written.
@@ -173,12 +173,12 @@ def check_output(
     overlay: str | os.PathLike[str] | None = None,
     report: str | os.PathLike[str] | None = None,
 ) -> None:
-    """Check, before any work, the suffixes of a performance, its overlay and its report.
+    """Check, before any work, the suffixes of the output files: performance, overlay and report.
 
     Raises:
         OutputError: a suffix is not supported.
         RigError: an animation layer needs a USD rig.
-        MissingDependencyError: packages of the report are not installed.
+        MissingDependencyError: packages that the report needs are not installed.
     """
     if report is not None:
         check_page(report)
@@ -218,7 +218,7 @@ def solve_summary(performance: Performance) -> SolveSummary:
 
 
 def _runs(p: Performance, state: SolveState) -> list[tuple[int, int]]:
-    """Return the first and last frame of each run of frames in a state."""
+    """Return the first and the last frame of each run of frames in a given state."""
     runs: list[tuple[int, int]] = []
     for frame in p.frames[p.state == state].tolist():
         if runs and runs[-1][1] == frame - 1:

@@ -45,13 +45,13 @@ def report_solve(
     """Write the report of a solve from its tracks, and return its path.
 
     Args:
-        tracks: the .npz that `solve` wrote.
-        capture: the shot, its capture.toml or folder; None: a report without images and cameras.
+        tracks: the .npz file written by `solve`.
+        capture: the shot, its capture.toml or its folder; None: the report has no images and no cameras.
         page: file to write.
         allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
-        FormatError: the tracks do not come from a solve.
+        FormatError: the tracks were not written by `solve`.
         CaptureError, SyncError: the shot cannot be read.
         OutputError: the page cannot be written.
     """
@@ -75,7 +75,7 @@ def report_solve(
 def write_solve_report(
     page: str | os.PathLike[str], tracks: Tracks, capture: Capture, offsets: Mapping[str, int], progress: Progress
 ) -> None:
-    """Write the report of the tracks of a solve.
+    """Write the report of a solve, given its tracks and cameras.
 
     Args:
         offsets: frame offset by camera.
@@ -97,7 +97,7 @@ def _write(
     left_out: list[str] = []
     overlays: tuple[Overlay, ...] | None = None
     if capture is None:
-        left_out.append("pictures and cameras: no shot was given (--capture).")
+        left_out.append("images and cameras: no shot was given (--capture).")
     else:
         shot = capture
         overlays = attempt("pictures", left_out, lambda: _overlays(shot, offsets, tracks))
@@ -135,10 +135,10 @@ def _overlays(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> t
 
 
 def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return the rows of frames to inspect, with reasons: arch hidden or lost, pose outside or uncertain, or typical.
+    """Return the frames to inspect, as row in the tracks and reason, such as a hidden arch or a pose outside.
 
     Raises:
-        ValueError: the tracks do not come from a solve.
+        ValueError: the tracks were not written by `solve`.
     """
     solved = tracks.solved
     if solved is None:
@@ -162,7 +162,7 @@ def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
 
 
 def solve_limits(cameras: Sequence[str]) -> str:
-    """Return what limits the accuracy of a solve from these cameras, in words."""
+    """Return a phrase that names what limits the accuracy of a solve from these cameras."""
     if len(cameras) == 1:
         return "a single camera: errors are largest along its line of sight"
     return "the rig: its error at the condyles exceeds that of the outlines"

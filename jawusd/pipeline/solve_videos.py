@@ -41,11 +41,11 @@ class PreparedTeeth:
     Attributes:
         scans: upper and lower teeth.
         axes: rotation from scan to anatomical axes (left, up, front), shape (3, 3).
-        search: finds the teeth in images.
+        search: function object that finds the teeth in rough masks.
     """
 
     def __init__(self, capture: Capture, meshes: Mapping[str, Mesh], jaw: JawRig, map_: Mapper) -> None:
-        """Prepare the scans of a capture, registered as in the rig; `map_` runs the search in parallel.
+        """Prepare the scans of a capture, registered as in the rig; the search calls `map_` to run in parallel.
 
         Raises:
             TrackingError: the scans are not in occlusion.
@@ -106,7 +106,7 @@ class VideoShot:
         return Cutter(table, self._teeth.scans, centre).walk(self.footage, frames)
 
     def begin(self, progress: Progress) -> Start[Pose]:
-        """Return a start, from picks in at least two cameras, or from a frame on which the arches are apart.
+        """Return a start, from picks in at least two cameras or from a frame in which the arches are visibly apart.
 
         Raises:
             TrackingError: the teeth were not found.
@@ -117,12 +117,12 @@ class VideoShot:
         return self._searched(self._frames, progress)
 
     def _again(self, frames: range, up_world: Array) -> tuple[int, Pose]:
-        """Search in frames on which the teeth were lost; `up_world` is as in `PictureSearch.run`."""
+        """Search in frames in which the teeth were lost; `up_world` is as in `PictureSearch.run`."""
         begin = self._searched(frames, no_progress, up_world)
         return begin.frame, begin.pose
 
     def _searched(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[Pose]:
-        """Return a start in some frames, as `PictureSearch.run`."""
+        """Return a start of tracking within a range of frames; see `PictureSearch.run`."""
 
         def near(sources: Sequence[CameraSource], frame: int) -> Pose | None:
             return self._teeth.search.at(sources, self.cameras, self._offsets, frame)
@@ -131,7 +131,7 @@ class VideoShot:
         return search.run(frames, progress, up_world)
 
     def _picked(self, bootstrap: Bootstrap) -> Start[Pose]:
-        """Return a start from the picks."""
+        """Return a start of tracking from the picks."""
         frame = bootstrap.frame
 
         def begin() -> tuple[Pose, float]:
@@ -149,7 +149,7 @@ def solve_videos(
     options: VideoOptions,
     progress: Progress,
 ) -> Performance:
-    """Solve a shot from the videos of its cameras, calibrated and by name; see `solve`.
+    """Solve a shot from the videos of its calibrated cameras, given by name; see `solve`.
 
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.

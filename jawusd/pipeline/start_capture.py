@@ -21,16 +21,16 @@ from jawusd.pipeline.state import Progress
 if TYPE_CHECKING:
     from jawusd.media.clip import Clip
 
-_PICTURES = 5  # number of images of a board clip that are examined
+_PICTURES = 5  # number of images examined per board clip
 _USUAL_RATES = tuple(Fraction(n, d) for d in (1, 1001) for n in (24 * d, 25 * d, 30 * d, 50 * d, 60 * d, 120 * d)) + (
     *(Fraction(n * 1000, 1001) for n in (24, 30, 60, 120)),
 )
-_RATE_TOLERANCE = 2e-4  # relative difference below which rates are equal; 24 and 23.976 differ by 1e-3
+_RATE_TOLERANCE = 2e-4  # relative difference below which frame rates count as equal; 24 and 23.976 differ by 1e-3
 
 
 @dataclass
 class CaptureStart:
-    """A draft capture: its description, what was found, what is missing, and notes."""
+    """A draft capture: its capture.toml, what was found, what is missing, and notes."""
 
     path: Path
     sketch: CaptureSketch
@@ -46,7 +46,7 @@ def start_capture(folder: Path, square_mm: float | None, fps: float | None, prog
     Args:
         folder: folder with footage, scans, and board clips or a calibration.
         square_mm: side of the board's squares [mm], which cannot be derived from images.
-        fps: frame rate; None: the rate of the clips.
+        fps: frame rate [1/s]; None: the rate of the clips.
 
     Raises:
         CaptureError: the path is not a folder.
@@ -172,7 +172,7 @@ def _rate(opened: Mapping[PurePath, Clip], out: CaptureStart) -> float | None:
     found = float(np.median(list(rates.values())))
     for path, rate in rates.items():
         if abs(rate / found - 1) > 5e-3:
-            out.notes.append(f"{path} has {rate:.5g} fps, but the others have {found:.5g}")
+            out.notes.append(f"{path} has {rate:.5g} fps, but the other clips have {found:.5g}")
     usual = min(_USUAL_RATES, key=lambda rate: abs(float(rate) / found - 1))
     return round(float(usual) if abs(float(usual) / found - 1) < _RATE_TOLERANCE else found, 5)
 
@@ -180,7 +180,7 @@ def _rate(opened: Mapping[PurePath, Clip], out: CaptureStart) -> float | None:
 def _named_as_calibrated(
     names: dict[PurePath, str], calibrated: Sequence[str], out: CaptureStart
 ) -> dict[PurePath, str]:
-    """Return the calibration's camera names by clip, matched by the words of the clips' paths."""
+    """Return the calibration's camera name of each clip, matched by the words of the clips' paths."""
     fits: dict[PurePath, str] = {}
     for clip in names:
         own = set(words(clip))

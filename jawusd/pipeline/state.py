@@ -34,14 +34,14 @@ from jawusd.formats.text import parse_json, read_text
 FAMILY, VERSION = "jawusd-build", 1
 BUILD_FILE = "build.json"
 LOCK_FILE = ".jawusd-lock"
-CALIBRATION = "calibration.toml"  # written by the build if the capture names no calibration
-LABELS = "labels"  # folder of the labels of scans that are neither painted nor labelled
+CALIBRATION = "calibration.toml"  # calibration that the build writes if the capture names none
+LABELS = "labels"  # folder to which the build writes labels of scans that have neither paint nor labels
 FIRST_PASS = "first_pass.npz"  # tracks without the model as a prior, to which the model is fitted
 _CHUNK_BYTES = 1 << 20
-_ENDING_S = 2.0  # time to wait for a lock: a killed build keeps it until the system has freed its memory
-_MOST_BYTES = 64 << 20  # maximum size of build.json, which lists every mask file of a take
+_ENDING_S = 2.0  # time to wait for a lock [s]; a killed build holds its lock until the system has freed its memory
+_MOST_BYTES = 64 << 20  # maximum size of build.json [bytes]; it lists every mask file of a take
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-# Error numbers that mean that another process holds the lock; others mean that the file system does not support locks.
+# Values of errno that mean that another process holds the lock; other values mean that the file system has no locks.
 _HELD = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
 _MAKE_AGAIN = "Run `jawusd build ... --resume` to make it again, or restore the file that the build wrote."
 _AGAIN = "Delete it, or build with --fresh into a new folder."
@@ -51,11 +51,11 @@ Progress = Callable[[str, int, int], None]
 
 
 def no_progress(stage: str, done: int, total: int) -> None:
-    """Ignore progress."""
+    """Do nothing; the default progress callback."""
 
 
 def hash_files(paths: Iterable[Path]) -> str:
-    """Return the SHA-256 of files' names and contents, in the given order; raises OSError for an unreadable file."""
+    """Return the SHA-256 of the names and contents of files, in the given order; raises OSError if unreadable."""
     total = hashlib.sha256()
     for path in paths:
         check_input(path)
@@ -78,12 +78,12 @@ R_co = TypeVar("R_co", bound=Mapping[str, object], covariant=True)
 
 @dataclass(frozen=True)
 class StageRecord(Generic[R_co]):
-    """One finished stage."""
+    """The record of one finished stage."""
 
     inputs: str  # hash of all inputs of the stage: files, configuration, results of earlier stages
-    outputs: dict[str, str]  # hash by file name, relative to the folder
+    outputs: dict[str, str]  # hash of each output file, by its path relative to the folder
     seconds: float
-    result: R_co  # small results that later stages or reports need
+    result: R_co  # small results needed by later stages or by reports
 
 
 #: Finished stages by name.
@@ -101,7 +101,7 @@ class BuildState:
             self.stages = _read(path)
 
     def valid(self, stage: str, inputs: str) -> StageRecord[Mapping[str, object]] | None:
-        """Return the record of a stage if its inputs and its files on disk are unchanged."""
+        """Return the record of a stage if its inputs and its files on disk are unchanged, otherwise None."""
         record = self.stages.get(stage)
         if record is None or record.inputs != inputs:
             return None
@@ -129,9 +129,9 @@ class BuildState:
         """Return the result of a stage, checked against its type; None if the stage is not recorded.
 
         Raises:
-            FormatError: it has another type.
+            FormatError: the result has a different type.
         """
-        from jawusd.formats.text import of_kind  # imported here, as it is rarely needed
+        from jawusd.formats.text import of_kind  # imported here because it is rarely needed
 
         record = self.stages.get(stage)
         return None if record is None else of_kind(record.result, kind, stage, self.folder / BUILD_FILE, _AGAIN)
@@ -151,7 +151,7 @@ class BuildState:
         return record
 
     def clear(self) -> None:
-        """Delete what earlier builds wrote here, and nothing else."""
+        """Delete the files that earlier builds wrote to the folder, and nothing else."""
         for record in self.stages.values():
             for name in record.outputs:
                 target = (self.folder / name).resolve()
@@ -168,7 +168,7 @@ def _read(path: Path) -> dict[str, StageRecord[Mapping[str, object]]]:
         if not isinstance(data, dict):
             raise ValueError("it is not a JSON object")
         check_format(data.get("format"), FAMILY, VERSION, path)
-        # The hash detects accidental edits, not forgery; types are checked in `BuildState.result`.
+        # The hash detects accidental edits, but not forgery; types are checked in `BuildState.result`.
         if data["sha256"] != hash_value(data["stages"]):
             raise ValueError("it was modified after it was written")
         return {str(name): _record(found) for name, found in data["stages"].items()}
@@ -190,7 +190,7 @@ def _record(found: Mapping[str, object]) -> StageRecord[Mapping[str, object]]:
 
 
 class _Reported(TypedDict, total=False):
-    """The verdict in the result of the stage that writes the report."""
+    """The verdict, as stored in the result of the stage that writes the report."""
 
     verdict: BuildVerdict
 
@@ -198,7 +198,8 @@ class _Reported(TypedDict, total=False):
 def recorded_verdict(folder: Path) -> str | None:
     """Return the verdict on a build; see `verdict_sentence`.
 
-    None for other folders, for builds without a report, and if build.json is corrupt, which `changed_files` reports.
+    Returns None for a folder without a build, for a build without a report, and if build.json is corrupt, which
+    `changed_files` reports.
     """
     try:
         found = BuildState(folder).result("report", _Reported)
@@ -208,7 +209,7 @@ def recorded_verdict(folder: Path) -> str | None:
 
 
 def changed_files(folder: Path) -> list[Finding]:
-    """Return the files of a build that are missing or modified; an empty list for any other folder."""
+    """Return errors for the files of a build that are missing or modified; an empty list if the folder has no build."""
     try:
         return BuildState(folder).changed()
     except FormatError as error:
@@ -216,10 +217,10 @@ def changed_files(folder: Path) -> list[Finding]:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder unless it exists.
+    """Create a folder if it does not exist.
 
     Raises:
-        OutputError: it cannot be created, or OpenUSD could not open files at its path.
+        OutputError: the folder cannot be created, or OpenUSD could not open files at its path.
     """
     check_path(path, OutputError)
     try:
@@ -256,7 +257,7 @@ def _lock(handle: int, folder: Path) -> bool:
     """Lock an open file; return False, with a warning, if the file system has no locks.
 
     Raises:
-        OutputError: another process holds it.
+        OutputError: another process holds the lock.
     """
     deadline = time.monotonic() + _ENDING_S
     while True:
@@ -289,12 +290,12 @@ _PACKAGES = ("numpy", "scipy", "numba", "usd-core", "opencv-contrib-python-headl
 
 
 def origin_now(command: str) -> Origin:
-    """Return the current time and package versions, with the command line ("" if none)."""
+    """Return the origin of a build: the current time, package versions and the command line ("" if none)."""
     return Origin(datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"), command, package_versions())
 
 
 def recorded_origin(result: Mapping[str, object]) -> Origin:
-    """Return the origin recorded by the report stage; empty for builds of earlier versions."""
+    """Return the origin recorded by the report stage; empty for builds by versions that did not record it."""
     found = result.get("origin")
     if not isinstance(found, dict):
         return Origin("", "", {})
@@ -304,7 +305,7 @@ def recorded_origin(result: Mapping[str, object]) -> Origin:
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of this package, of Python and of the packages that results depend on."""
+    """Return the versions of jawusd, of Python and of the packages that results depend on."""
     found = {"jawusd": __version__, "Python": platform.python_version()}
     for name in _PACKAGES:
         try:

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 
 TEETH = {"upper": "upper_teeth", "lower": "lower_teeth"}
 
-# Fraction of the crown border without a crease above which the labels need review. All 51 of 58 synthetic scans with a
-# mean border error below 0.3 mm are below it; plaster casts of patients have 0.07 to 0.11, a cast without teeth 0.77.
+# Fraction of the crown border that follows no crease, above which the labels need review. Of 58 synthetic scans, the 51
+# with a mean border error below 0.3 mm are below it; plaster casts of patients reach 0.07 to 0.11, a cast without teeth
+# 0.77.
 _WEAK_SHARE = 0.15
 
 Origin = Literal["file", "paint", "shape"]
@@ -43,19 +44,19 @@ class LabelledScan:
     mesh: Mesh  # with labels, unless painted
     origin: Origin
     labels: ScanLabels | None  # None if the scan is painted
-    shape: Labelling | None  # result of labelling by shape, if there were neither paint nor labels
+    shape: Labelling | None  # result of labelling by shape, if the scan had neither paint nor labels
     findings: tuple[Finding, ...]
 
 
 def label_teeth(
     meshes: Mapping[str, Mesh], files: Mapping[str, Path], folder: Path | None, *, ignore_files: bool = False
 ) -> dict[str, LabelledScan]:
-    """Return the teeth scans among meshes with their labels, by arch.
+    """Return the teeth scans among the meshes, with their labels, by arch.
 
     Args:
         meshes: meshes by the names in `MESHES`.
         files: mesh files by the same names.
-        folder: folder of the label files; None: that of each scan.
+        folder: folder of the label files; None: the folder of each scan.
         ignore_files: ignore existing label files.
 
     Raises:
@@ -112,14 +113,14 @@ def _by_shape(arch: str, mesh: Mesh, path: Path, other: Array | None) -> Labelle
 
 
 def _weak_border(arch: str, labels: ScanLabels, path: Path) -> tuple[Finding, ...]:
-    """Return a warning if much of the crown border has no crease and the labels were not reviewed."""
+    """Return a warning if much of the crown border follows no crease and the labels were not reviewed."""
     if labels.source == "reviewed" or labels.weak_share <= _WEAK_SHARE:
         return ()
     message = (
         f"{100 * labels.weak_share:.0f} % of the crown border of the {arch} scan has no crease; at most "
         f"{100 * _WEAK_SHARE:.0f} % is usual."
     )
-    hint = "Inspect the picture of `jawusd scans`, and correct the labels in `jawusd view`."
+    hint = "Inspect the image that `jawusd scans` writes, and correct the labels in `jawusd view`."
     return (
         Finding("scan_border_unclear", "warning", message, labels.weak_share, _WEAK_SHARE, path=str(path), hint=hint),
     )
@@ -130,9 +131,9 @@ MESHES = ("upper_teeth", "lower_teeth", *BONES)
 
 
 def load_meshes(capture: Capture) -> dict[str, Mesh]:
-    """Read the scans and bones of a capture, by the names in `MESHES` [mm, scan frame]; bones may be missing.
+    """Read the scans and bones of a capture [mm, scan frame], by the names in `MESHES`; bones may be missing.
 
-    The teeth scans have labels unless they are painted.
+    The returned teeth scans have labels, unless they are painted.
 
     Raises:
         CaptureError: a mesh is corrupt, or its size is implausible in mm.
@@ -142,7 +143,7 @@ def load_meshes(capture: Capture) -> dict[str, Mesh]:
 
 
 def load_labelled(capture: Capture) -> tuple[dict[str, Mesh], list[Finding]]:
-    """Return `load_meshes`, and the findings on the labels of the teeth scans."""
+    """Return the meshes of `load_meshes`, and findings on the labels of the teeth scans."""
     paths = {name: getattr(capture.scans, name) for name in MESHES}
     files = {name: path for name, path in paths.items() if path is not None}
     meshes = read_files(files)
@@ -166,7 +167,7 @@ def read_files(files: Mapping[str, Path]) -> dict[str, Mesh]:
 
 
 def labelled_teeth(capture: Capture, folder: Path | None, *, ignore_files: bool = False) -> list[LabelledScan]:
-    """Return the upper and the lower scan with labels; label files are in a folder (None: beside the scans).
+    """Return the upper and the lower scan with labels; `folder` is that of the label files, None if beside the scans.
 
     Args:
         ignore_files: ignore existing label files.
@@ -179,7 +180,7 @@ def labelled_teeth(capture: Capture, folder: Path | None, *, ignore_files: bool 
 
 
 def registered_meshes(meshes: Mapping[str, Mesh], meta: Mapping[str, object]) -> dict[str, Mesh]:
-    """Return meshes with the lower scan moved by the registration in the metadata of tracks or model, if any."""
+    """Return the meshes, with the lower scan moved by the registration in the metadata of tracks or a model, if any."""
     T = registration_of(meta)
     out = dict(meshes)
     if T is not None and "lower_teeth" in meshes:
@@ -190,7 +191,7 @@ def registered_meshes(meshes: Mapping[str, Mesh], meta: Mapping[str, object]) ->
 
 
 def registration_of(meta: Mapping[str, object]) -> Array | None:
-    """Return the registration (4, 4) of the lower scan in the metadata of tracks or model; None if there is none."""
+    """Return the registration (4, 4) of the lower scan from the metadata of tracks or a model, None if missing."""
     found = meta.get("registration")
     if not isinstance(found, dict) or not found.get("applied"):
         return None
@@ -202,12 +203,12 @@ class Subject:
     """A subject for fitting and reports: anatomical axes, landmarks and meshes."""
 
     name: str  # name of the subject or the capture
-    T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
+    T_anatomical_skull: Array  # transform from the scan frame to the anatomical frame, shape (4, 4)
     landmarks: Array  # `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3)
-    meshes: Mapping[str, Mesh]  # by the names in `MESHES`, scan frame [mm]; may be empty
-    fps: float | None = None  # frame rate of the poses, None if unknown
+    meshes: Mapping[str, Mesh]  # meshes by the names in `MESHES`, in the scan frame [mm]; may be empty
+    fps: float | None = None  # frame rate of the poses [1/s]; None if unknown
     T_rest: Array = field(default_factory=lambda: np.eye(4))  # T_skull_mandible with the teeth closed, shape (4, 4)
-    inferred: tuple[str, ...] = ()  # quantities derived from the meshes instead of given
+    inferred: tuple[str, ...] = ()  # descriptions of quantities that were derived from the meshes, not given
 
     def measured_points(self) -> Array | None:
         """Return the vertices (V, 3) [mm] at which errors are measured: mandible or, without it, lower teeth."""
@@ -218,7 +219,7 @@ class Subject:
 
 
 def registered_subject(subject: Subject, meta: Mapping[str, object]) -> Subject:
-    """Return a subject with the registration of the take applied; see `registered_meshes`."""
+    """Return the subject with the take's registration of the scans applied; see `registered_meshes`."""
     T = registration_of(meta)
     if T is None:
         return subject
@@ -240,7 +241,7 @@ def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = Non
     unknown = sorted(set(named) - set(LANDMARKS))
     if unknown:
         raise CaptureError(
-            f'[anatomy.landmarks] has unknown "{unknown[0]}"; must be one of {", ".join(LANDMARKS)}.',
+            f'[anatomy.landmarks] has the unknown landmark "{unknown[0]}"; must be one of {", ".join(LANDMARKS)}.',
             path=capture.folder / "capture.toml",
         )
     meshes = load_meshes(capture) if meshes is None else meshes
@@ -248,7 +249,7 @@ def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = Non
 
 
 def subject_of_scans(files: Mapping[str, Path], name: str) -> Subject:
-    """Return the subject of mesh files in one coordinate frame, teeth in occlusion.
+    """Return the subject of mesh files that share one coordinate frame, with the teeth in occlusion.
 
     Args:
         files: mesh files by the names in `MESHES`; both teeth scans are required.
@@ -262,7 +263,7 @@ def subject_of_scans(files: Mapping[str, Path], name: str) -> Subject:
 def _measured(
     name: str, meshes: Mapping[str, Mesh], fps: float | None, axes: ArrayLike | None, named: Mapping[str, ArrayLike]
 ) -> Subject:
-    """Derive T_anatomical_skull from the scans unless `axes` is given, and the landmarks missing in `named`."""
+    """Return T_anatomical_skull and all landmarks, deriving from the scans what `axes` and `named` do not give."""
     crowns = {key: mesh.vertices[tooth_labels(mesh) > 0] for key, mesh in meshes.items() if "teeth" in key}
     inferred = []
     if axes is None:
@@ -288,7 +289,7 @@ def _measured(
 
 
 def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
-    """Return the subject of a landmarks file (jawusd-landmarks/1); errors are then measured at the landmarks.
+    """Return the subject described by a landmarks file (jawusd-landmarks/1); errors are measured at the landmarks.
 
     Raises:
         FormatError: see `formats.landmarks.load_landmarks`.

@@ -1,4 +1,4 @@
-"""Track the teeth of a capture: the first pass, the second pass with the fitted model as a prior, and summaries."""
+"""Track the teeth of a capture, in a second pass with the fitted model as a prior, and summarise tracks."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ class TrackSummary(TakeNotes):
 
     frames: int
     tracked: int
-    lost: list[int]  # frame numbers
+    lost: list[int]  # numbers of the lost frames
     lost_reasons: NotRequired[dict[str, dict[str, int]]]  # number of frames lost for each reason, by arch
     recovered: int
     without_a_camera: int
     prior_aided: int
-    sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if unknown
-    coverage_error_percent: float | None  # mean uncovered part of the masks used [%], None without masks
+    sigma_mm: dict[str, float | None]  # median standard deviation of each landmark's position; None if unknown
+    coverage_error_percent: float | None  # mean part of the used masks that the scans do not cover; None without masks
     frames_used: NotRequired[dict[str, int]]  # number of frames in which a camera was used, by camera
 
 
 class ArchSummary(TypedDict):
-    """Tracking of one arch in a frame; for a lost arch, also the quantity that failed its check, and its limit."""
+    """How one arch was tracked in a frame; for a lost arch, also the quantity that failed its check, and the limit."""
 
     status: str
     masks_used: list[str]
@@ -70,7 +70,7 @@ class ArchSummary(TypedDict):
 
 
 class FrameTrackSummary(TypedDict):
-    """Tracking of one frame."""
+    """How one frame was tracked."""
 
     frame: int
     prior_aided: bool
@@ -96,8 +96,8 @@ def track(
         out: `tracks.npz` to write.
         solver: "contour", or "paper" for the paper's method, for comparison.
         backend: renderer of the paper's method, "cpu" or "gl".
-        model: jaw model of this subject, used as a prior to track uncertain frames again.
-        overlay: folder, or .mp4 file, for videos with the tracked scans over the footage; see `write_overlay`.
+        model: jaw model of this subject, used as a prior when uncertain frames are tracked again.
+        overlay: folder or .mp4 file to write, with videos of the tracked scans over the footage; see `write_overlay`.
         jobs: number of threads; the result does not depend on it.
         allow_outside: allow paths in the capture that point outside its folder.
 
@@ -106,7 +106,7 @@ def track(
         SyncError: the cameras cannot be aligned in time.
         TrackingError: the teeth are not found.
         OutputError: a file cannot be written.
-        MissingDependencyError: the extra `build` is not installed, or OpenGL is missing for the GL backend.
+        MissingDependencyError: the extra `build` is not installed, or the GL backend finds no OpenGL.
     """
     progress = progress or no_progress
     capture = open_capture(capture, allow_outside=allow_outside)
@@ -130,7 +130,7 @@ def first_pass(
     solver: str = "contour",
     backend: str = "cpu",
 ) -> Tracks:
-    """Track both arches without a jaw model; parameters and errors as `track`.
+    """Track both arches without a jaw model; other parameters and errors are as for `track`.
 
     Args:
         offsets: frame offset by camera.
@@ -177,9 +177,9 @@ def first_pass(
 def model_pass(
     capture: Capture, offsets: dict[str, int], tracks: Tracks, model: JawModel, jobs: int, progress: Progress
 ) -> Tracks:
-    """Track uncertain frames again with the fitted model as a prior; combine poses tracked by colour with the prior.
+    """Track uncertain frames again with the fitted model as a prior; combine poses tracked by colour with it.
 
-    Parameters and errors as `track`.
+    Other parameters and errors are as for `track`.
 
     Args:
         offsets: frame offset by camera.
@@ -215,7 +215,7 @@ def tracking_config(capture: Capture) -> TrackingConfig:
 
 
 def track_summary(tracks: Tracks) -> TrackSummary:
-    """Return the key figures of tracks: counts, uncertainty at the landmarks, coverage error."""
+    """Return the key figures of tracks: frame counts, uncertainty at the landmarks, and coverage error."""
     lost = tracks.frames[tracks.status.min(1) == LOST]
     tracked = tracks.tracked()
     sigma = np.median(tracks.sigma_mm[tracked], axis=0) if tracked.any() else np.full(len(LANDMARKS), np.nan)
@@ -254,7 +254,7 @@ def frame_summary(tracks: Tracks, frame: int) -> FrameTrackSummary:
     """
     if frame not in tracks.frames:
         raise TrackingError(
-            f"the tracks do not contain it; they run from {tracks.frames[0]} to {tracks.frames[-1]}",
+            f"the tracks do not contain this frame; they run from {tracks.frames[0]} to {tracks.frames[-1]}",
             frame=frame,
         )
     k = int(np.searchsorted(tracks.frames, frame))

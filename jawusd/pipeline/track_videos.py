@@ -1,4 +1,4 @@
-"""Track captures without masks, using the colours of their footage."""
+"""Track captures that have no masks, using the colours of their footage."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from jawusd.tracking.region.picture_start import ArchStart
 
 FEWEST_VIDEOS = 2
-# Minimum fraction of the visible contour that matches the colours, below which picks are rejected. Fractions of six
-# path-traced mouths were 0.26 to 0.5; of three dark, noisy or colourless ones 0.13 to 0.27, with errors up to 0.3 mm. A
-# focal length wrong by 15 % gave 0.05, another subject's lower scan 0.08 and 0.12, with errors above 1 mm.
+# Minimum fraction of the visible contour that matches the colours for picks to be accepted. Six path-traced mouths
+# reached 0.26 to 0.5, and three dark, noisy or colourless ones 0.13 to 0.27 with errors up to 0.3 mm. A focal length
+# wrong by 15 % gave 0.05, and another subject's lower scan 0.08 and 0.12, with errors above 1 mm.
 _LEAST_PICKED_FIT = 0.1
 
 
@@ -83,7 +83,7 @@ def track_videos(
 
 
 def _picked_start(rows: ArchStart, follower: Follower, picks: Bootstrap, frames: range) -> Start[Array]:
-    """Return a start from the picks.
+    """Return a start of tracking from the picks.
 
     Raises:
         TrackingError: the picks are inconsistent, or do not fit the images.
@@ -98,13 +98,13 @@ def _picked_start(rows: ArchStart, follower: Follower, picks: Bootstrap, frames:
 
 @dataclass(frozen=True, eq=False)
 class ArchSearch:
-    """A search for the teeth, for a follower that starts where they are found.
+    """A search for the teeth that starts a follower where they are found.
 
     Attributes:
         capture, footage: the capture, and the images of its cameras.
         offsets: frame offset by camera.
         rows: search for the arches in rough masks.
-        follower: judges the poses found.
+        follower: tracker that refines the poses found, and measures their fit.
     """
 
     capture: Capture
@@ -114,9 +114,9 @@ class ArchSearch:
     follower: Follower
 
     def run(self, frames: range, up_world: Array | None, progress: Progress) -> Start[Array]:
-        """Search in some frames, and start the follower there; the pose is T_world_upper, T_world_lower (2, 4, 4).
+        """Search in a range of frames and start the follower; the pose is T_world_upper, T_world_lower (2, 4, 4).
 
-        `up_world` is the up direction of the head, shape (3,), if it is known.
+        `up_world` is the up direction of the head in the world, shape (3,), if it is known.
 
         Raises:
             TrackingError: the teeth were not found.
@@ -132,9 +132,9 @@ class ArchSearch:
             return found.poses, fit
 
         begin = PictureSearch(self.capture, self.footage, cameras, near, judged).run(frames, progress, up_world)
-        self.follower.start_at(begin.frame, begin.pose)  # again: the search may have tried other starts after this one
+        self.follower.start_at(begin.frame, begin.pose)  # the search may have tried other starts later
         return begin
 
     def again(self, frames: range, up_world: Array) -> Start[Array]:
-        """Search in frames on which the teeth were lost; see `run`."""
+        """Search in frames in which the teeth were lost; see `run`."""
         return self.run(frames, up_world, no_progress)

@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from jawusd.viewer.server import Viewer
     from jawusd.viewer.viewed import ViewedActor
 
-#: Name of the captured motion among the motions of an actor.
+#: Name under which the captured motion is listed among an actor's motions.
 CAPTURED = "captured take"
 
 _TRACKS, _BAKED = "tracks.npz", "anim_capture.usdc"
 _ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
-_MOST_FACES = 8_000  # maximum number of faces of a mesh; renders smoothly in a browser without a GPU
+_MOST_FACES = 8_000  # maximum number of faces of a mesh; browsers without a GPU render it smoothly
 
 
 @explain_missing_packages()
 def open_viewer(
     path: str | os.PathLike[str], host: str, port: int, prim: str | None = None, *, play: bool = True
 ) -> Viewer:
-    """Serve the rig at a path to browsers; see `viewed_actor` for what it raises.
+    """Serve the rig at a path to browsers; for further errors, see `viewed_actor`.
 
     Args:
-        play: Whether pages begin by playing the captured take, if there is one.
+        play: whether pages play the captured take, if there is one, when they are opened.
 
     Raises:
         MissingDependencyError: the viewer is not installed.
@@ -57,12 +57,12 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
     """Load a rig for the viewer.
 
     Args:
-        path: `actor.usda`, another layer or package with the rig, or the folder of a build.
+        path: `actor.usda`, another layer or package that contains the rig, or the folder of a build.
         prim: path of the rig's prim, if a stage has several; motions are then layers over the stage.
 
     Raises:
-        FormatError: not a rig, or one without geometry.
-        RigError: not a USD file.
+        FormatError: the file is not a rig, or the rig has no geometry.
+        RigError: the file is not USD.
     """
     from jawusd.rig.geo import read_geometry
     from jawusd.rig.read import describe, load_rig
@@ -89,7 +89,7 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
 
 
 class ContactView:
-    """Renderer of the contacts of a rig's teeth; the scans are loaded for the first image."""
+    """Renders the contacts of a rig's teeth; the scans are loaded when the first image is drawn."""
 
     def __init__(self, path: Path, rig: JawRig, prim: str) -> None:
         self._path, self._rig, self._prim = path, rig, prim
@@ -106,17 +106,17 @@ class ContactView:
         """Return an image, RGB (h, w, 3), of both arches at d (3,) [mm].
 
         Raises:
-            RigError: the meshes of the rig do not show how the teeth meet.
+            RigError: tooth contact cannot be computed from the rig's meshes.
             MissingDependencyError: a package is missing.
         """
         return self._map.draw(self._rig.pose(d))
 
 
 def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
-    """Return decimated meshes of a rig by the viewer's names, with separate gum, including placeholders.
+    """Return decimated meshes of a rig by the viewer's names, with the gum separate and including placeholders.
 
     Raises:
-        RigError: there is no mandible and no lower teeth.
+        RigError: the rig has neither a mandible nor lower teeth.
     """
     from jawusd.rig.geo import read_geometry, read_gum
     from jawusd.viewer.viewed import for_view
@@ -150,7 +150,7 @@ def motion_names(folder: Path) -> tuple[str, ...]:
 
 
 def load_motion(folder: Path, rig: JawRig, fps: float, name: str, *, prim: str | None = None) -> Clip:
-    """Read one of `motion_names`, with its poses encoded as parameters.
+    """Read one of the motions listed by `motion_names`, with its poses encoded as parameters.
 
     Args:
         fps: frame rate of the take.
@@ -177,7 +177,7 @@ def load_motion(folder: Path, rig: JawRig, fps: float, name: str, *, prim: str |
 
 
 def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool, *, prim: str | None = None) -> Path:
-    """Write a motion as an animation layer beside an actor, or beside a stage for one of its rigs.
+    """Write a motion as an animation layer in the folder of an actor, or in that of a stage for one of its rigs.
 
     Args:
         name: file name without a folder, anim*.usda or anim*.usdc.

@@ -73,11 +73,11 @@ def viewed_capture(
 
     Args:
         path: capture.toml or its folder.
-        tracks: folder of a build of the capture, or tracks.npz; None: the footage alone.
+        tracks: folder of a build of the capture, or tracks.npz; None: only the footage is shown.
         allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
-        FormatError: the capture or the tracks cannot be read, or the tracks belong to other cameras.
+        FormatError: the capture or the tracks cannot be read, or the tracks use cameras that the capture lacks.
         CaptureError: there is no footage, or a file cannot be decoded.
         SyncError: the cameras cannot be aligned in time.
     """
@@ -135,7 +135,7 @@ def viewed_capture(
 
 
 def _tile_px(backdrops: Mapping[str, Backdrop], cut: bool) -> tuple[int, int]:
-    """Return the tile size of each camera; whole images keep the aspect ratio of the first camera."""
+    """Return the size of each camera's tile; tiles of whole images have the aspect ratio of the first camera."""
     if cut:
         return _TILE_PX
     width, height = next(iter(backdrops.values())).size_px
@@ -164,12 +164,12 @@ def _offsets(capture: Capture, build: Path | None, progress: Progress) -> dict[s
 def _frames(
     capture: Capture, poses: Tracks | None, backdrops: Mapping[str, Backdrop], offsets: Mapping[str, int]
 ) -> tuple[int, int]:
-    """Return the first and the last frame to show, of the reference camera."""
+    """Return the first and the last frame of the reference camera to show."""
     if poses is not None and len(poses.frames):
         return int(poses.frames[0]), int(poses.frames[-1])
     if capture.frames is not None:
         return capture.frames[0], capture.frames[1] - 1
-    # from the first to the last image of any camera
+    # frames from the first to the last image of any camera
     return (
         max(0, min(offsets[name] for name in backdrops)),
         max(offsets[name] + backdrop.count - 1 for name, backdrop in backdrops.items()),
@@ -178,7 +178,7 @@ def _frames(
 
 @dataclass(frozen=True, eq=False)
 class _Footage:
-    """Images, regions and poses of a capture for the pages of the viewer; thread-safe."""
+    """Provides the images, teeth regions and poses of a capture for the pages of the viewer; thread-safe."""
 
     capture: Capture
     backdrops: Mapping[str, Backdrop]
@@ -208,7 +208,7 @@ class _Footage:
         look: Look,
         partly: Callable[[NDArray[np.uint8]], None] | None = None,
     ) -> NDArray[np.uint8]:
-        """Return the images of all cameras side by side with the teeth; `partly` as in `CameraWall.draw`."""
+        """Return all cameras' images side by side, with the teeth drawn over them; `partly` as in `CameraWall.draw`."""
         return self.wall.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0), partly=partly)
 
     def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:
@@ -221,7 +221,7 @@ class _Footage:
         return [PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
 
     def teeth_region(self, name: str, frame: int) -> tuple[float, float, float, float] | None:
-        """Return left, top, right and bottom [px] of the masks of a camera at a frame; None without masks."""
+        """Return left, top, right and bottom [px] of the region covered by a camera's masks in a frame, or None."""
         from jawusd.media.masks import open_masks
 
         source = next(camera for camera in self.capture.cameras if camera.name == name)

@@ -47,11 +47,11 @@ class Stage(Generic[R_co]):
 
 
 class StageMissing(Exception):
-    """Raised in a dry run when a stage would have to run."""
+    """Raised in a dry run when a stage cannot be reused."""
 
 
 class Workspace:
-    """Run stages over one capture and record them; stages whose inputs have not changed are reused.
+    """Runs the stages of a build and records them; stages whose inputs have not changed are reused.
 
     Attributes:
         capture: the capture, with the scan labels and the calibration from earlier stages.
@@ -68,7 +68,7 @@ class Workspace:
         read_capture: Callable[[], Capture],
         progress: Progress = no_progress,
     ) -> None:
-        """Open a folder without locking it; `read_capture` reads the capture again after each stage."""
+        """Open a folder without locking it; `read_capture` is called again after each stage."""
         self._read_capture = read_capture
         self._opened = self.capture = capture
         self._watch = InputWatch()
@@ -91,7 +91,7 @@ class Workspace:
 
         Args:
             parts: parts of the capture that the stage reads, by the names of `capture_inputs.input_files`.
-            settings: everything else that determines the result: options, and inputs and outputs of earlier stages.
+            settings: everything else that determines the result, such as options and the results of earlier stages.
             work: function that runs the stage; returns the files written, inside the folder, and the result for
                 build.json.
 
@@ -115,7 +115,7 @@ class Workspace:
         return self.state.finish(stage.name, inputs, outputs, time.perf_counter() - start, result)
 
     def _refuse_changes(self, stage: str) -> None:
-        """Raise an error if inputs of a stage were edited while it ran, as it is unknown which version the stage read.
+        """Raise an error if inputs of a stage were edited while it ran: it is unknown which version the stage has read.
 
         Edits of capture.toml that change no value are ignored.
         """
@@ -129,12 +129,12 @@ class Workspace:
                 f"changed while the stage {stage} ran: {', '.join([*changed, *([] if same else ['capture.toml'])])}. "
                 "The stage is not recorded.",
                 path=self._opened.folder,
-                hint="Run the same command again with --resume: stages that do not depend on it are reused.",
+                hint="Run the same command again with --resume: stages that do not depend on the change are reused.",
             )
 
 
 class DryWorkspace(Workspace):
-    """A workspace that reuses stages but runs none."""
+    """A workspace for dry runs: it reuses stages but runs none."""
 
     def _work(self, stage: Stage[R], inputs: str, work: Callable[[], tuple[list[Path], R]]) -> StageRecord[R]:
         raise StageMissing(stage.name)
@@ -144,10 +144,10 @@ class DryWorkspace(Workspace):
 def opened(
     folder: Path, read_capture: Callable[[], Capture], *, resume: bool, fresh: bool, progress: Progress
 ) -> Iterator[Workspace]:
-    """Open the folder of a build and hold its lock.
+    """Open the folder of a build, and hold its lock for the duration of the context.
 
     Args:
-        read_capture: function that reads the capture, before the folder is created and again after each stage.
+        read_capture: function that reads the capture; called before the folder is created and after each stage.
         resume: continue an earlier build in the folder.
         fresh: delete an earlier build in the folder first.
 

@@ -55,7 +55,7 @@ def test_photos_writes_the_bite_and_pictures(mouth, files, tmp_path, monkeypatch
 def test_pictures_that_cannot_be_used_are_named(files, tmp_path):
     front, left, *rest = files
     twice = run("photos", front, tmp_path / ".." / tmp_path.name / "front.png", *rest)
-    assert isinstance(twice.exception, CaptureError) and 'called "front"' in str(twice.exception)
+    assert isinstance(twice.exception, CaptureError) and 'have the name "front"' in str(twice.exception)
     absent = run("photos", tmp_path / "none.png", *rest)
     assert isinstance(absent.exception, CaptureError) and "none.png" in str(absent.exception)
     cv2.imwrite(str(left), np.zeros((300, 400), np.uint8))

@@ -135,7 +135,7 @@ def test_pictures_that_do_not_show_this_person_are_refused(rig):
     picks = shot.bootstrap
     moved = picks.model_copy(update={"frame": picks.frame + 40})
     far = shot.model_copy(update={"bootstrap": moved, "frames": (moved.frame, moved.frame + 2)})
-    with pytest.raises(TrackingError, match="picks do not match the pictures"):
+    with pytest.raises(TrackingError, match="picks do not match the images"):
         solve(rig, far)
     with pytest.raises(TrackingError, match="frames run from"):
         solve(rig, shot.model_copy(update={"bootstrap": moved}))

@@ -127,7 +127,7 @@ def test_picks_beside_the_teeth_are_refused(offsets):
         return tuple(pick.model_copy(update={"views": views}) for pick, views in zip(picked, moved, strict=True))
 
     wrong = picks.model_copy(update={"upper": shifted(picks.upper), "lower": shifted(picks.lower)})
-    with pytest.raises(TrackingError, match="picks do not match the pictures"):
+    with pytest.raises(TrackingError, match="picks do not match the images"):
         first_pass(unmasked((picks.frame, picks.frame + 2), bootstrap=wrong), offsets, 1, no_progress)
     away = unmasked((picks.frame + 5, picks.frame + 9))
     with pytest.raises(TrackingError, match="frames run from"):
