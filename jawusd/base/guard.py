@@ -25,7 +25,7 @@ try:
 except ImportError:  # Windows has no resource limits
     resource = None  # type: ignore[assignment]  # a module on other systems
 
-#: Environment variable: how much memory [GB] a command may use; 0 for no limit.
+#: Environment variable with the maximum memory [GB] of a command; 0 for no limit.
 SETTING = "JAWUSD_MEMORY_GB"
 
 _FRACTION, _MIN_GB = 0.75, 4.0  # default limit: fraction of the memory, and minimum for usual builds
@@ -59,7 +59,7 @@ def run_in_child() -> None:
     passed = {getattr(signal, name) for name in _PASSED}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {*passed, signal.SIGCHLD})
     parent = os.getpid()
-    gc.freeze()  # otherwise, garbage collection would copy the pages shared by parent and child
+    gc.freeze()  # prevents garbage collection from copying the pages that parent and child share
     child = os.fork()
     if child:
         _exit_like(_wait(child, passed))
@@ -109,8 +109,8 @@ def limit_process(memory: int, cpu_s: int | None = None) -> None:
     """Limit this process and its children.
 
     Args:
-        memory: [bytes], 0 for no limit. Counts private writable memory, not address space that CUDA, numba and threads
-            only reserve.
+        memory: Maximum memory [bytes]; 0 for no limit. Private writable memory counts, but not address space that CUDA,
+            numba and threads only reserve.
         cpu_s: Processor time [s].
     """
     if resource is None:
@@ -192,7 +192,7 @@ def _wait(child: int, passed: set[signal.Signals]) -> int:
             continue
         pid, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
         if pid and os.WIFSTOPPED(status):
-            os.kill(os.getpid(), signal.SIGSTOP)  # so that the shell registers a stopped job
+            os.kill(os.getpid(), signal.SIGSTOP)  # stop as well, so that the shell registers a stopped job
         elif pid:
             return status
 
@@ -253,11 +253,12 @@ def _run_in_subprocess() -> NoReturn:
 
 
 _M_MMAP_THRESHOLD = -3  # parameter of mallopt, from glibc's malloc.h
-_LARGE_BYTES = 8_000_000  # threshold above which glibc maps arrays; mapping is slow: 1 MB makes a report 10 % slower
+# size [bytes] above which glibc maps arrays; mapping is slow: with 1 MB, a report takes 10 % longer
+_LARGE_BYTES = 8_000_000
 
 
 def map_large_arrays() -> None:
-    """Make glibc return arrays of more than 8 MB to the system as soon as they are freed.
+    """Make glibc return the memory of arrays above 8 MB to the system as soon as they are freed.
 
     By default, glibc raises its threshold to the size of the largest block freed so far. The setting applies to the
     whole process; libraries should not call this.

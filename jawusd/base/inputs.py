@@ -12,14 +12,14 @@ from jawusd.base.errors import FormatError, JawusdError
 from jawusd.base.guard import note_input
 
 _LFS = b"version https://git-lfs"
-#: Environment variable: folders that are allowed in every run, separated as in PATH.
+#: Environment variable with the folders that are allowed in every run, separated as in PATH.
 SETTING = "JAWUSD_ALLOW"
 
 _given: ContextVar[tuple[Path, ...]] = ContextVar("allowed_folders", default=())
 
 
 def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatError) -> None:
-    """Check that an input is a regular file, and record it as the current one; the reader reports missing files.
+    """Check that an input is a regular file, and record it for crash reports; the reader reports missing files.
 
     Reading an idle pipe would block, and reading a device may never end. Anonymous pipes are allowed: shells use them
     for process substitution.
@@ -34,7 +34,7 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
     except OSError:  # the name is too long; the reader reports it
         return
     if wrong:
-        raise error("is not a regular file.", path=path, hint="Name a file, not a folder, pipe or device.")
+        raise error("is not a regular file.", path=path, hint="Give a file, not a folder, pipe or device.")
 
 
 def why_unreadable(path: str | os.PathLike[str]) -> tuple[str, str] | None:
@@ -79,11 +79,11 @@ def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
 
 
 def allowed_folders() -> list[Path]:
-    """Return the allowed folders, with links resolved."""
+    """Return the allowed folders, with symbolic links resolved."""
     named = [Path(folder).resolve() for folder in os.environ.get(SETTING, "").split(os.pathsep) if folder]
     return [*_given.get(), *named]
 
 
 def is_allowed(path: Path) -> bool:
-    """Tell whether a file lies in an allowed folder, with links resolved."""
+    """Return whether a file lies in an allowed folder, with symbolic links resolved."""
     return any(path.resolve().is_relative_to(folder) for folder in allowed_folders())

@@ -43,7 +43,7 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
         version: Newest supported version.
 
     Raises:
-        FormatError: not such a file, or damaged.
+        FormatError: not a file of this family, or a damaged one.
         VersionError: written by a newer version.
         UnitsError: other units or twist order.
     """
@@ -54,7 +54,7 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
         with zipfile.ZipFile(path) as archive:
             total = sum(member.file_size for member in archive.infolist())
         if total > _MAX_ARRAY_BYTES:
-            raise FormatError(f"unpacks to {total / 1e9:.1f} GB, the limit is 0.5 GB.", path=path)
+            raise FormatError(f"unpacks to {total / 1e9:.1f} GB; the limit is 0.5 GB.", path=path)
         with np.load(path, allow_pickle=False) as archive:
             for name in archive.files:
                 arrays[name] = archive[name]
@@ -88,7 +88,7 @@ def check_format(found: object, family: str, version: int, path: str | os.PathLi
         raise FormatError(f'states no format; its format must be "{family}/{version}".', path=path)
     name, _, number = str(found).partition("/")
     if name != family or not (number.isascii() and number.isdigit() and len(number) < 10):
-        raise FormatError(f'format is "{found}", expected "{family}/{version}".', path=path)
+        raise FormatError(f'format is "{found}"; expected "{family}/{version}".', path=path)
     if int(number) > version:
         raise VersionError(
             f'format is "{found}"; this version of jawusd reads formats up to "{family}/{version}".',
@@ -140,9 +140,9 @@ def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: ob
     value = arrays[name]
     if value.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, value.shape, strict=True)):
         wanted = "(" + ", ".join("any" if w is None else str(w) for w in shape) + ")"
-        raise FormatError(f'"{name}" has shape {value.shape}, expected {wanted}.', path=str(path))
+        raise FormatError(f'"{name}" has shape {value.shape}; expected {wanted}.', path=str(path))
     if value.dtype.kind not in "fiub":
-        raise FormatError(f'"{name}" has type {value.dtype}, expected numbers.', path=str(path))
+        raise FormatError(f'"{name}" has type {value.dtype}; expected numbers.', path=str(path))
     if finite and value.dtype.kind == "f" and not np.isfinite(value).all():
         raise FormatError(f'"{name}" has values that are not finite.', path=str(path))
     return value

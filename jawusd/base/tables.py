@@ -40,7 +40,7 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
 
     Args:
         path: the file.
-        most_bytes: maximum size of the file.
+        most_bytes: maximum size of the file [bytes].
         encoding: used unless a byte order mark or null bytes indicate UTF-16 or UTF-32.
 
     Raises:
@@ -116,7 +116,7 @@ def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool
 
     Args:
         path: the file.
-        most_bytes: maximum size of the file.
+        most_bytes: maximum size of the file [bytes].
         comment: prefix of lines to skip.
         short_rows: allow rows to end early; the caller checks them with `check_width`.
 
@@ -244,7 +244,7 @@ def _with_points(cells: Sequence[Sequence[str]], named: Callable[[int, int], str
         )
     if all(_MAYBE_THOUSANDS.fullmatch(cell) for _, _, cell in commas):
         raise FormatError(
-            f'{named(i, j)}: "{cell}" is ambiguous, {cell.replace(",", ".")} or {cell.replace(",", "")}.',
+            f'{named(i, j)}: "{cell}" is ambiguous: {cell.replace(",", ".")} or {cell.replace(",", "")}.',
             path=path,
             hint="Write decimals with points, without thousands separators.",
         )

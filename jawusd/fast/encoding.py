@@ -141,7 +141,7 @@ def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> 
         for i in range(3):
             n.trial[i] = x[i] - n.step[i]
         if _settled(n.step) or damping >= MAX_DAMPING:
-            x[:] = n.trial  # the last step costs nothing more and doubles the correct digits
+            x[:] = n.trial  # the last step needs no further evaluation and doubles the number of correct digits
             return
         trial_cost = equations(model, problem, n.trial, w, n.A_trial, n.g_trial)
         if trial_cost <= cost:
@@ -261,7 +261,7 @@ def _finite(T: Array) -> bool:
     """Return whether all entries of T (4, 4) are finite and below `LARGEST`."""
     for i in range(4):
         for k in range(4):
-            if not abs(T[i, k]) < LARGEST:  # comparison is also false for NaN
+            if not abs(T[i, k]) < LARGEST:  # also false for NaN
                 return False
     return True
 
@@ -291,7 +291,7 @@ def judge(
     e: Encoding,
     v: Array,
 ) -> tuple[int, float, float]:
-    """Return reason, residual [mm] and margin [mm] of a pose T (4, 4), as `evaluator.verdicts.judge`; write d to e.x.
+    """Return reason, residual [mm] and margin [mm] of a pose T (4, 4), as in `evaluator.verdicts`; write d to e.x.
 
     If `judging` is false, only d and the residual are computed, and the reason is 0 for every rigid pose.
     """

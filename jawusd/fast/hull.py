@@ -13,7 +13,7 @@ from jawusd.base.arrays import Array
 from jawusd.fast.packing import HULL, MARGIN, ROUNDING, SIDES
 from jawusd.fast.rigid import Vector, device, interval
 
-_NEGLIGIBLE = 45.0  # terms smaller by this exponent are skipped: exp(-45) = 3e-20 is below rounding
+_NEGLIGIBLE = 45.0  # exponent below which terms relative to the largest are skipped: exp(-45) = 3e-20 is below rounding
 
 
 @device

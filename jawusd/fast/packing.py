@@ -16,17 +16,17 @@ from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED, KINDS
 
-# offsets into the model, of any kind
+# offsets into a model of any kind
 KIND = 0  # index into `schema.KINDS`
 COUNT = 1  # number of spline centres; 0 for an additive model
 INCISOR = 2  # incisal point at rest (3,) [mm]
-FROM_ANATOMICAL = 5  # (4, 4), row-major: L in pose = L M Q
-CLOSED = 21  # (4, 4): Q in pose = L M Q
-TO_ANATOMICAL = 37  # (4, 4): inverse of L
-FROM_CLOSED = 53  # (4, 4): inverse of Q
-ADJOINT = 69  # (6, 6): twists from the anatomical to the skull frame
-VECTORS = 105  # (4, 4): vectors that represent the landmarks; see `evaluator.encoding`
-REST = 121  # start of the part that depends on the kind
+FROM_ANATOMICAL = 5  # matrix L (4, 4) in pose = L M Q, row-major
+CLOSED = 21  # matrix Q (4, 4) in pose = L M Q
+TO_ANATOMICAL = 37  # inverse of L (4, 4)
+FROM_CLOSED = 53  # inverse of Q (4, 4)
+ADJOINT = 69  # map (6, 6) of twists from the anatomical to the skull frame
+VECTORS = 105  # vectors (4, 4) that represent the landmarks; see `evaluator.encoding`
+REST = 121  # start of the part that depends on the kind of model
 ANCHORED_KIND, ADDITIVE_KIND = KINDS.index(ANCHORED), KINDS.index(ADDITIVE)
 
 # offsets into an anchored model
@@ -39,8 +39,8 @@ DROP = REST + 35  # coefficients of drop (4,)
 SOFTNESS = REST + 39  # radius of the softened absolute value and ramp [mm]
 FADE = REST + 40  # opening over which the glide surface fades out [mm]
 SPLINE = REST + 41  # centres, column-major (3, m), then kernel weights (m, 3), then the table of the glide surface
-# layout of the table: numbers of knots n2 and n3, both 0 without a table; knots of d2 (n2,), starts (n2 + 1,), likewise
-# for d3, coefficients (n2 + 1, n3 + 1, 4, 4)
+# layout of the glide table: numbers of knots n2 and n3 (0 without a table); knots (n2,) and starts (n2 + 1,) for d2,
+# the same for d3, coefficients (n2 + 1, n3 + 1, 4, 4)
 
 # offsets into an additive model
 CURVES = REST  # offsets at which the three curves start

@@ -67,7 +67,7 @@ def interval(knots: Array, count: int, x: float) -> int:
 
 @device
 def _glide(table: Array, d2: float, d3: float) -> Vector:
-    """Return `curves.GlideTable.at_floats` of a table packed by `packing`; zeros without one."""
+    """Return the result of `curves.GlideTable.at_floats` for a table packed by `packing`; zeros without a table."""
     count2, count3 = int(table[0]), int(table[1])
     if count2 == 0:
         return 0.0, 0.0, 0.0
@@ -90,7 +90,7 @@ FLOATS = Elementary(_sqrt, _exp, _clip, cast("Callable[[object, float, float], V
 
 @device
 def coefficient_slopes(squared: float, a: float, b: float, c: float) -> tuple[float, float]:
-    """Return the derivatives of the second and third of `angle_coefficients` with respect to the squared angle."""
+    """Return the derivatives of b and c of `angle_coefficients` with respect to the squared angle."""
     x = squared
     if x < _SERIES_SQUARED:
         return (

@@ -19,13 +19,14 @@ LANDMARKS = ("incisor", "molar_left", "molar_right", "condyle_left", "condyle_ri
 # the Bonwill triangle (about 100 mm between the condyles and from each to the incisal point), condyles 37 mm above
 # the occlusal plane.
 _CONDYLE_FROM_INCISOR_MM = np.array([50.0, 36.0, -80.0])
-# Typical distances of the first molars from the incisal point, backwards and sideways.
+# Typical posterior and lateral distances of the first molars from the incisal point.
 _MOLAR_BEHIND_INCISOR_MM = 25.0
 _MOLAR_ASIDE_MM = 22.0
-_MIDLINE_MM = 4.0  # the front edge extends this far to each side of the midline
-_MIN_FRONT = 40  # minimum number of points on a front edge
-_MIN_SLABS = 4  # minimum number of coronal slabs with teeth on both sides for a midline
-# Arches are compared by local heights in cells of `_CELL_MM`, or by mean heights if they share fewer than `_MIN_CELLS`.
+_MIDLINE_MM = 4.0  # lateral extent of the incisal edge on each side of the midline
+_MIN_FRONT = 40  # minimum number of points on an incisal edge
+_MIN_SLABS = 4  # minimum number of coronal slabs with teeth on both sides to find the midline
+# Size of the cells in which heights of the dental arches are compared, and minimum number of cells that both arches
+# share; with fewer cells, mean heights are compared.
 _CELL_MM, _MIN_CELLS = 4.0, 6
 
 
@@ -33,7 +34,7 @@ def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Ar
     """Return T_anatomical_skull (4, 4) of two dental scans in occlusion, in any common scan frame.
 
     Up is the normal of the common plane of both arches, from the lower to the upper one; the midline is the mirror
-    axis of the arches in that plane; anterior is the closed end of the horseshoe. Teeth may be missing.
+    axis of the arches in that plane; anterior is the closed end of the horseshoe-shaped arches. Teeth may be missing.
 
     Args:
         upper_vertices, lower_vertices: crown vertices [mm], shapes (N, 3) and (M, 3).
@@ -116,7 +117,7 @@ def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
         depth, middle = [], []
         for low, high in zip(bins[:-1], bins[1:], strict=True):
             slab = x[(z >= low) & (z < high)]
-            # a slab with teeth on one side only has no midpoint
+            # a slab that has teeth on only one side has no midpoint
             if min(np.count_nonzero(slab > midline), np.count_nonzero(slab < midline)) >= 10:
                 depth.append(0.5 * (low + high))
                 middle.append(0.5 * (np.percentile(slab, 1.5) + np.percentile(slab, 98.5)))
@@ -136,7 +137,7 @@ def _thin(points: Array, count: int = 3000) -> Array:
 
 
 def _mirror_angle(flat: Array) -> float:
-    """Return the angle of the axis about which a planar point set is most nearly symmetric, shape (N, 2) -> rad."""
+    """Return the angle [rad] of the axis about which a planar point set (N, 2) is most nearly symmetric."""
     # compare the outline, as radius over angle, with its mirror image: robust to uneven sampling
     flat = flat - 0.5 * (np.percentile(flat, 1, axis=0) + np.percentile(flat, 99, axis=0))
     bins = 360

@@ -37,7 +37,8 @@ class Camera:
         distortion = np.array(self.distortion, dtype=np.float64).ravel()
         if distortion.size not in _ALLOWED_COEFFICIENTS:
             raise ValueError(
-                f"camera {self.name}: {distortion.size} distortion coefficients; must be one of {_ALLOWED_COEFFICIENTS}"
+                f"camera {self.name} has {distortion.size} distortion coefficients; "
+                f"expected one of {_ALLOWED_COEFFICIENTS}"
             )
         object.__setattr__(self, "distortion", distortion)
 
@@ -146,8 +147,8 @@ def _paired(x: Array, y: Array) -> Array:
 
 
 _SAMPLES = 400  # number of radii at which the polynomial is sampled for the fit
-_RADIUS_FACTOR = 1.1  # factor on the fitted image radius, since undistortion may enlarge the image
-_TOLERANCE_PX = 0.005  # K is kept if the coefficients alone fit the lens with at most this error
+_RADIUS_FACTOR = 1.1  # factor by which the fitted radius exceeds that of the image, since undistortion may enlarge it
+_TOLERANCE_PX = 0.005  # maximum error of a fit with K fixed; otherwise K is fitted too
 _ROUNDS, _MAX_DAMPING = 200, 1e12
 
 
@@ -180,7 +181,7 @@ def opencv_radial(K: Array, size_px: tuple[int, int], radial: Array) -> tuple[Ar
 
 
 def opencv_lens(K: Array, recorded_px: Array, ideal: Array) -> tuple[Array, Array, Array, float]:
-    """Return K and OpenCV's eight coefficients, fitted to a lens given by distorted and undistorted points.
+    """Fit K and OpenCV's eight coefficients to a lens that is given by distorted and undistorted points.
 
     K is kept if the coefficients alone fit the lens. Otherwise K is fitted too, which covers linear effects such as an
     anamorphic squeeze. If that is not sufficient, the camera rotation is fitted too, which together with the principal

@@ -14,8 +14,8 @@ _PROBES = 60
 def match_points(source: Array, moved: Array, chosen: NDArray[np.int64], farthest: float) -> NDArray[np.int64] | None:
     """Return the points of a moved and scaled copy of a shape that correspond to chosen points of the shape.
 
-    The principal axes of both are aligned, which leaves four rotations by half turns. The one that fits is used; if
-    several fit, as for symmetric shapes, the one that best preserves the order of the points.
+    The principal axes of both are aligned, which leaves four rotations by half turns. The rotation that fits is used;
+    if several fit, as for symmetric shapes, the rotation that best preserves the order of the points.
 
     Args:
         source: Points of the shape, shape (N, 3); duplicates count once.
@@ -57,7 +57,7 @@ def _principal(points: Array) -> tuple[Array, Array]:
 
 
 def _nearest(wanted: Array, points: Array, farthest: float) -> NDArray[np.int64] | None:
-    """Return the indices of the nearest points (M, 3), sorted by their first coordinate; None if one is too far."""
+    """Return the index of the nearest of points sorted by x, for each wanted point; None if one is too far away."""
     edges = np.searchsorted(points[:, 0], np.stack([wanted[:, 0] - farthest, wanted[:, 0] + farthest]))
     found = np.empty(len(wanted), dtype=np.int64)
     for k, (first, last) in enumerate(edges.T.tolist()):
@@ -86,7 +86,7 @@ def welded(points: Array) -> tuple[Array, NDArray[np.int64]]:
     return sorted_points[first], index
 
 
-_PARALLEL = 1e-12  # a ray counts as parallel to a triangle if the determinant is below this
+_PARALLEL = 1e-12  # determinant below which a line counts as parallel to a triangle
 
 
 def meet_triangles(origin: Array, direction: Array, corners: Array) -> tuple[Array, Array, Array]:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry.se3 import make_transform, transform_points
 
-_MIN_ASPECT = 1e-6  # points count as collinear if the ratio of their second to their first extent is below this
+_MIN_ASPECT = 1e-6  # ratio of the second to the first extent of points, below which they count as collinear
 
 
 def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:
@@ -30,7 +30,7 @@ def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
     p0, q0 = w @ P, w @ Q
     spread = np.linalg.svd((P - p0) * np.sqrt(w)[:, None], compute_uv=False)
     if spread[1] < 1e-9 * max(spread[0], 1e-300):
-        raise ValueError("the source points are collinear: the rotation about their line is undetermined")
+        raise ValueError("the source points are collinear, so the rotation about their line is undetermined")
     U, _, Vt = np.linalg.svd(((P - p0) * w[:, None]).T @ (Q - q0[..., None, :]))
     sign = np.ones((*U.shape[:-2], 1, 3))
     sign[..., 0, 2] = np.sign(np.linalg.det(U @ Vt))
@@ -54,7 +54,7 @@ def rigid_fits(source: ArrayLike, targets: ArrayLike) -> tuple[Array, Array]:
     """
     P, Q = np.asarray(source, dtype=np.float64), np.asarray(targets, dtype=np.float64)
     if P.ndim != 2 or P.shape[1] != 3 or Q.ndim != 3 or Q.shape[1:] != P.shape:
-        raise ValueError(f"need source (N, 3) and targets (F, N, 3), got {P.shape} and {Q.shape}")
+        raise ValueError(f"expected source (N, 3) and targets (F, N, 3), got {P.shape} and {Q.shape}")
     T, rms = np.full((len(Q), 4, 4), np.nan), np.full(len(Q), np.nan)
     present = np.isfinite(Q).all(axis=-1)
     for seen in np.unique(present, axis=0):
@@ -88,7 +88,7 @@ def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:
     """
     M, x = np.asarray(projections, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
     if M.ndim != 3 or M.shape[1:] != (3, 4) or x.shape != (len(M), 2) or len(M) < 2:
-        raise ValueError(f"need projections (C >= 2, 3, 4) and pixels (C, 2), got {M.shape} and {x.shape}")
+        raise ValueError(f"expected projections (C >= 2, 3, 4) and pixels (C, 2), got {M.shape} and {x.shape}")
     rows = (x[:, :, None] * M[:, None, 2, :] - M[:, :2, :]).reshape(-1, 4)
     rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     X = np.linalg.svd(rows)[2][-1]

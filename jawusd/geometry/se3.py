@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry.so3 import hat, so3_exp, so3_left_jacobian, so3_left_jacobian_inverse, so3_log
 
-# Below this angle a [rad] the coupling block uses its series: the relative error of the closed form grows like a^-5.
+# Angle a [rad] below which the coupling block uses its series: the relative error of the closed form grows like a^-5.
 _COUPLING_SERIES_RAD = 0.3
 
 
@@ -58,7 +58,7 @@ def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
 def relative_pose(T_world_upper: ArrayLike, T_world_lower: ArrayLike) -> Array:
     """Return the jaw pose T_skull_mandible from the world poses of the upper and lower teeth (Yang et al. eqs. 1-3).
 
-    All have shape (..., 4, 4).
+    All poses have shape (..., 4, 4).
     """
     return se3_inverse(T_world_upper) @ np.asarray(T_world_lower, dtype=np.float64)
 

@@ -65,13 +65,13 @@ class Chart(Protocol):
         """Return starting points x (n, 3) for displacements u (n, 3) [mm] of the incisal point."""
 
     def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return rotation (n, 3, 3), translation (n, 3) [mm] and spatial derivative S (n, 6, 3) at x."""
+        """Return rotation (n, 3, 3), translation (n, 3) [mm] and derivative S (n, 6, 3) at chart coordinates x."""
 
     def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return d (n, 3) [mm] of x, and dd/dx (n, 3, 3)."""
+        """Return d (n, 3) [mm] at chart coordinates x, and dd/dx (n, 3, 3)."""
 
     def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
-        """Return the d of `decoded` at x, with its first and second derivatives with respect to x."""
+        """Return the d of `decoded` with first and second derivatives with respect to the chart coordinates x."""
 
 
 class AnchoredMotion(MotionModule):
@@ -85,7 +85,7 @@ class AnchoredMotion(MotionModule):
         self._gliding = "glide_d2" in arrays
 
     def start(self, u: Tensor) -> Tensor:
-        """Return u, the chart's coordinates."""
+        """Return u, which is the chart coordinates."""
         return u
 
     def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -121,7 +121,7 @@ class AnchoredMotion(MotionModule):
         return d, inverse(torch.stack([torch.stack(row, dim=1) for row in rows], dim=1))
 
     def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
-        """Return d with its derivatives with respect to u: a step of Newton's method adds the second ones."""
+        """Return d with its derivatives with respect to u: a step of Newton's method adds the second derivatives."""
         d = attached(d, by_x, x)
         u, _ = displacement(self._anchored_numbers().gauge, d[:, 0], d[:, 1], d[:, 2], TENSORS)
         error = torch.stack(u, dim=1) - x
@@ -132,7 +132,7 @@ class AnchoredMotion(MotionModule):
         return found._replace(gauge=found.gauge._replace(glide=self)) if self._gliding else found
 
     def _inverse(self, u: Tensor) -> Tensor:
-        """Return the d (n, 3) of u (n, 3) [mm]: `jawusd.evaluator.gauge.Gauge.inverse`."""
+        """Return the d (n, 3) [mm] of u (n, 3) [mm], as `jawusd.evaluator.gauge.Gauge.inverse` does."""
         gauge = self._anchored_numbers().gauge
         tolerance = 500 * torch.finfo(u.dtype).eps
         d1 = -u[:, 1]
@@ -176,11 +176,11 @@ class AdditiveMotion(MotionModule):
         return _twist_derivative(sum(values), torch.stack(slopes, dim=2))
 
     def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x, which is d, and the identity."""
+        """Return the chart coordinates x, which are d, and the identity as their derivative."""
         return x, torch.eye(3, dtype=x.dtype, device=x.device).expand(x.shape[0], 3, 3)
 
     def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
-        """Return x, which is d."""
+        """Return the chart coordinates x, which are d."""
         return x
 
 

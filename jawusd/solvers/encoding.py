@@ -15,7 +15,8 @@ from jawusd.solvers.solution import applied, attached, capturing, finished, inve
 Residual = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 _STEPS_CAPTURED = 6
-_NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # Newton steps after Gauss-Newton, which is slow for poses off the model
+# number of Newton steps after Gauss-Newton, which converges slowly for poses off the model
+_NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2
 # addition to the Hessian, relative to its diagonal; keeps encodings differentiable where a parameter hardly moves the
 # landmarks
 _MIN_CURVATURE = 1e-9
@@ -36,7 +37,7 @@ def encoded(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[T
 
     Returns:
         d (n, 3) [mm], and the residuals (n, 3 m) [mm]: images of the vectors minus targets. Second derivatives of their
-        sum of squares are exact, those of single residuals are not.
+        sum of squares are exact; those of single residuals are not.
     """
     residual = _residual_of(chart, vectors)
     width = target.shape[1:]

@@ -145,7 +145,7 @@ def _ends(bound: SliceHull, line: HermiteCurve) -> tuple[float, float]:
     valid = np.flatnonzero(inside(d1))
     if not len(valid) or np.diff(valid).max(initial=1) > 1:
         raise EvaluatorError(
-            "the bound of this rig is not one piece from the smallest to the largest opening.",
+            "the bound of this rig is not connected from the smallest to the largest opening.",
             hint="Fit the model again with a wider margin.",
         )
     ends = []

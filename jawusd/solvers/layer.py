@@ -25,7 +25,7 @@ _CORNERS = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
 
 
 class Clearances(nn.Module):
-    """A clearance field over d; all data are buffers.
+    """A clearance field over d; all its data are torch buffers.
 
     Args:
         field: The clearance field of a rig.
@@ -76,7 +76,7 @@ class TemporalPrior(nn.Module):
 
     @full_precision
     def forward(self, d: Tensor, fps: float) -> Tensor:
-        """Return the prior (...) of d (..., F, 3) [mm] at a rate [1/s]; about 3 for motion like that of the take.
+        """Return the prior (...) of d (..., F, 3) [mm] at a frame rate [1/s]; about 3 for motion as in the take.
 
         It is half the sum of the mean squared Mahalanobis norms of velocities and accelerations.
 
@@ -115,7 +115,7 @@ class JawLayer(nn.Module):
         rig: The rig.
 
     Raises:
-        EvaluatorError: the bound of the rig is empty or not in one piece.
+        EvaluatorError: the bound of the rig is empty or not connected.
     """
 
     to_anatomical: Tensor
@@ -170,8 +170,8 @@ class JawLayer(nn.Module):
     def clearance(self, d: Tensor, of: Meeting = "teeth") -> Tensor:
         """Return the clearance (...) [mm] of teeth or condyles at d (..., 3) [mm], as `JawRig.clearance` does.
 
-        It is negative where they penetrate deeper than in the closed bite. It is trilinear between samples, so its
-        derivative is discontinuous.
+        The clearance is negative where the surfaces penetrate deeper than in the closed bite. It is trilinear between
+        samples, so its derivative is discontinuous.
 
         Raises:
             EvaluatorError: the rig has no such clearance.
@@ -238,9 +238,9 @@ class JawLayer(nn.Module):
     def residuals(self, T_skull_mandible: Tensor, sigma_mm: float = 1.0) -> Tensor:
         """Return the prior of `loss` as residuals for least-squares solvers, shape (..., 13).
 
-        Twelve are coordinates of the landmarks' offset from the nearest pose of the model, the last is the distance
-        outside the bound; all are divided by ``sigma_mm``. With 1, the sum of their squares is `loss`, and twice
-        ``J^T J`` is its Gauss-Newton Hessian.
+        Twelve are coordinates of the landmarks' offset from the nearest pose of the model; the last is the distance
+        outside the bound; all are divided by ``sigma_mm``. With ``sigma_mm = 1``, the sum of their squares is `loss`,
+        and twice ``J^T J`` is its Gauss-Newton Hessian.
         """
         d, residuals = self._encode(T_skull_mandible)
         outside = torch.relu(-self.margin(d))

@@ -48,7 +48,7 @@ def check_precision(name: str, found: torch.dtype, own: torch.dtype | None = Non
     """
     if own is not None and own not in _ALLOWED:
         raise TypeError(
-            f"the layer was converted to {own}, too coarse for poses; it computes in float32 or float64. "
+            f"the layer was converted to {own}, which is too coarse for poses; it computes in float32 or float64. "
             "Convert it back with layer.float() after converting the module that contains it."
         )
     if found not in _ALLOWED:

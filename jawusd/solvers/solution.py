@@ -1,8 +1,8 @@
-"""Iterative searches as differentiable functions: autograd does not trace the search; its derivative is attached.
+"""Iterative searches as differentiable functions: autograd does not trace them; derivatives are attached to results.
 
-A search takes rows (n, ...) and returns tensors whose first axis is n. In eager mode it may stop early, depending on
-values; while a graph is captured it takes a fixed number of steps. Derivatives come from the implicit function theorem,
-see `attached`; there are no second derivatives.
+A search takes rows (n, ...) and returns tensors whose first axis is n. In eager mode a search may stop early, depending
+on values; while a graph is captured it takes a fixed number of steps. Derivatives come from the implicit function
+theorem (see `attached`); there are no second derivatives.
 """
 
 from __future__ import annotations

@@ -228,7 +228,7 @@ def test_frames_that_a_table_leaves_out_show_no_markers(tmp_path):
         ("a.mot", "Coordinates\nversion=1\n", "is a motion file of OpenSim"),
         ("a.csv", joined(cells(NANS), ",").replace(".", ","), "commas both as decimal and as column separators"),
         ("a.csv", german(joined(cells())).replace(",", ".", 1), "commas and points cannot both be decimal separators"),
-        ("a.csv", "1,234;2,345;3,456\n", '"1,234" is ambiguous, 1.234 or 1234'),
+        ("a.csv", "1,234;2,345;3,456\n", '"1,234" is ambiguous: 1.234 or 1234'),
         ("a.txt", "time x y z\n0 1 2 3\n", "Supported are C3D, TSV of Qualisys"),
     ],
 )

@@ -121,14 +121,14 @@ def test_every_reader_reads_tables_of_every_locale(tmp_path, reader, locale):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("frame;d1;d2;d3\n1;1,234;2,345;3,456\n", '"1,234" is ambiguous, 1.234 or 1234'),
-        ("frame\td1\td2\td3\n1\t10,500\t2\t3\n", 'line 2, column "d1": "10,500" is ambiguous, 10.500 or 10500'),
-        ('frame,d1,d2,d3\n1,"12,345",2,3\n', '"12,345" is ambiguous, 12.345 or 12345'),
+        ("frame;d1;d2;d3\n1;1,234;2,345;3,456\n", '"1,234" is ambiguous: 1.234 or 1234'),
+        ("frame\td1\td2\td3\n1\t10,500\t2\t3\n", 'line 2, column "d1": "10,500" is ambiguous: 10.500 or 10500'),
+        ('frame,d1,d2,d3\n1,"12,345",2,3\n', '"12,345" is ambiguous: 12.345 or 12345'),
         ("frame;d1;d2;d3\n1;1,5;2.5;3\n", "commas and points cannot both be decimal separators"),
         ("frame;d1;d2;d3\n1;1.234,5;2,5;3\n", "thousands separators are not allowed"),
         ('frame,d1,d2,d3\n1,"1,234.5",2.5,3\n', "thousands separators are not allowed"),
         ("frame;d1;d2;d3\n1;1,234,567;2,5;3\n", '"1,234,567" is not a number'),
-        ("frame;d1;d2;d3\n1,000;1,5;2,5;3\n", 'column "frame": "1,000" is ambiguous, 1.000 or 1000'),
+        ("frame;d1;d2;d3\n1,000;1,5;2,5;3\n", 'column "frame": "1,000" is ambiguous: 1.000 or 1000'),
         ("frame,d1,d2,d3\n1,0,5,0,2,0,1\n", "line 2 has 7 values, .* 4 columns. .* write decimals with points"),
         ("frame;d1;d2;d3\n1;1 234,5;2,5;3\n", '"1 234,5" is not a number'),
         ('frame,d1,d2,d3\n1,"2,3,4\n', "is not a CSV table"),
