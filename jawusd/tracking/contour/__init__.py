@@ -1,4 +1,4 @@
-"""Align both scans with the masks of one frame: contour samples, correspondences, normal equations, quality.
+"""Align both scans with the masks of one video frame: contour samples, correspondences, normal equations, quality.
 
-Imports no other subpackage of tracking, only `config`.
+Within `tracking`, this package imports only `config`.
 """

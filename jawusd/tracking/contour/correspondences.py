@@ -1,4 +1,4 @@
-"""Match contour samples with mask edges along their normals, and sum the normal equations.
+"""Match contour samples with mask edges along their normals, and accumulate the normal equations.
 
 The compiled functions release the GIL and are stateless.
 """
@@ -27,12 +27,12 @@ from jawusd.tracking.contour.samples import (
     pixel_of,
 )
 
-_EDGE = 127.5  # mask value at the outline, where half of a pixel belongs to the teeth
+_EDGE = 127.5  # mask value at the outline, where half of the pixel area belongs to the teeth
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _sample(mask: NDArray[np.uint8], x: float, y: float) -> float:
-    """Interpolate a uint8 image bilinearly; 0 outside."""
+    """Interpolate a uint8 image bilinearly; return 0 outside."""
     if x < 0 or y < 0 or x >= mask.shape[1] - 1 or y >= mask.shape[0] - 1:
         return 0.0
     i = int(x)
@@ -57,7 +57,8 @@ def _at(picture: NDArray[np.float32], x: float, y: float) -> float:
 def _nearest_edge(mask: NDArray[np.uint8], x: float, y: float, nx: float, ny: float, reach: float) -> float:
     """Return the signed distance [px] along the normal to the nearest edge where the mask ends.
 
-    NaN if there is none within reach; positive infinity if the mask extends over the whole reach.
+    The distance is NaN if there is no edge within reach, and positive infinity if the mask extends over the whole
+    reach.
     """
     start = _sample(mask, x, y)
     outer = inner = start
@@ -90,24 +91,24 @@ def search_edges(
     cos_limit: float,
     out: Array,
 ) -> None:
-    """Write the signed distance [px] from every contour sample to the mask edge it should lie on.
+    """Write the signed distance [px] from every contour sample to its mask edge.
 
     Args:
-        samples: shape (n, COLUMNS).
+        samples: contour samples, shape (n, COLUMNS).
         mask, other_mask: masks of this arch and of the other one, 255 = teeth, shape (h, w).
         other_inverse_depth: rendered inverse depth of the other arch's scan [1/mm], 0 = empty, shape (h, w).
         reach_px: search distance in both directions.
         tolerance_mm: minimum depth difference for one arch to hide the other.
-        cos_limit: minimum cosine between the sample's normal and the mask's normal at the edge.
-        out: receives the distances, positive outwards, shape (n,). NaN if the sample is hidden, or no edge of its own
-            object is near; +inf if the mask extends over the whole reach.
+        cos_limit: minimum cosine between the normals of the sample and of the mask edge.
+        out: receives the distances, positive outwards, shape (n,). NaN if the sample is hidden or no edge of its own
+            arch is near; +inf if the mask extends over the whole reach.
     """
     for s in range(len(samples)):
         sample = samples[s]
         x, y, nx, ny, own = sample[U], sample[V], sample[NX], sample[NY], sample[INVERSE_DEPTH]
         out[s] = np.nan
         if _at(other_inverse_depth, x, y) * (1 - tolerance_mm * own) > own:
-            continue  # the other arch is in front
+            continue  # the other arch is in front of the sample
         d = _nearest_edge(mask, x, y, nx, ny, reach_px)
         if np.isfinite(d):
             ex = x + d * nx
@@ -115,7 +116,7 @@ def search_edges(
             gx = _sample(mask, ex + 1, ey) - _sample(mask, ex - 1, ey)
             gy = _sample(mask, ex, ey + 1) - _sample(mask, ex, ey - 1)
             if -(gx * nx + gy * ny) < cos_limit * np.sqrt(gx * gx + gy * gy):
-                continue  # this mask edge crosses the contour: a lip or a neighbouring tooth
+                continue  # a mask edge that crosses the contour belongs to a lip or a neighbouring tooth
             if _sample(other_mask, ex + 2 * nx, ey + 2 * ny) > _EDGE:
                 other = _at(other_inverse_depth, ex + 2 * nx, ey + 2 * ny)
                 if other == 0.0 or other * (1 - 0.25 * tolerance_mm * own) > own:
@@ -160,17 +161,18 @@ def accumulate(
 ) -> tuple[float, float, float, float]:
     """Add the Tukey-weighted normal equations of one arch in one view.
 
-    The residual d of a sample shrinks by n . du when the sample moves by du in the image; du follows from a left
-    twist (omega, v) of the arch about `centre` (Drummond & Cipolla 2002 use the same point-to-edge distances).
+    The residual d of a sample with image normal n decreases by n . du if the sample moves by du in the image; du is
+    caused by a left twist (omega, v) of the arch about `centre` (Drummond & Cipolla 2002 use the same point-to-edge
+    distances).
 
     Args:
         samples, distances: input and output of `search_edges`, shapes (n, COLUMNS) and (n,).
         gate_px: residual above which the Tukey weight is zero.
         score_gate_px: residual above which a sample adds nothing to the score.
-        pull: weight at the gate of samples deep inside the mask; 0 ignores them.
+        pull: weight, at the gate, of samples deep inside the mask; 0 ignores these samples.
         pose: scan to world, shape (4, 4).
         matrix: world [mm] to homogeneous px, shape (3, 4).
-        centre: centre of the twist in the world [mm], shape (3,).
+        centre: centre of the twist in world coordinates [mm], shape (3,).
         precision, gradient: incremented, shapes (6, 6) and (6,); see `OutlineSums`.
         habit_slope, habit_distance, habit_weight: incremented, shapes (K, 6), (K,), (K, K).
 
@@ -229,7 +231,7 @@ def accumulate_outline(
     silhouette: OutlineSums,
     margin: OutlineSums,
 ) -> None:
-    """Write the sums of one arch in one view, separately for silhouette and gingival margin.
+    """Write the normal-equation sums of one arch in one view, separately for silhouette and gingival margin.
 
     Args:
         r, c: arch and view; the sums must be zero there.
@@ -237,7 +239,7 @@ def accumulate_outline(
         silhouettes: number of silhouette samples, which come first.
         limits: gate, score gate and pull, as for `accumulate`.
         where: pose, matrix and centre, as for `accumulate`.
-        silhouette, margin: receive the sums.
+        silhouette, margin: results, the sums over both kinds of samples.
     """
     for k in range(2):
         sums = silhouette if k == 0 else margin
@@ -262,12 +264,13 @@ def scatter_of_tiles(
     shape: tuple[int, int],
     tile_px: int,
 ) -> tuple[Array, Array]:
-    """Return the sum of s s^T over image tiles, shape (6, 6); s is the sum of w J d over the samples in a tile.
+    """Return the sum of s s^T over image tiles, shape (6, 6), where s is the sum of w J d over the samples in a tile.
 
-    The second result uses the gum fraction in place of d: the effect of a gum line drawn one pixel off in single tiles.
+    The second result uses the gum fraction instead of d: the effect of a gum line that is one pixel off in each tile,
+    independently of other tiles.
 
-    Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The
-    ratio to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).
+    Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The ratio
+    of the result to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).
 
     Args:
         samples, distances, gate_px, pose, matrix, centre: as for `accumulate`.

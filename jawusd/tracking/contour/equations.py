@@ -1,8 +1,8 @@
-"""The normal equations of one Gauss-Newton step, and the terms that add to them.
+"""The normal equations of one Gauss-Newton step, and the residual terms that contribute to them.
 
 The unknowns are the left twists (omega [rad], v [mm]) of both arches about their centres. Each constraint on the two
-poses is a `ResidualTerm`: outlines against masks, the prior at the start pose, the jaw model. To add a kind of
-measurement, write a class with `accumulate` and pass it to `ContourSolver.solve`.
+poses is a `ResidualTerm`: mask outlines, the prior at the start pose, and the jaw model. To add a kind of measurement,
+write a class with `accumulate` and pass it to `ContourSolver.solve`.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ def twist_between(start: Array, end: Array, centre: Array) -> Array:
 class OutlineSums(NamedTuple):
     """Sums over matched contour samples per arch and view: weight w, distance d to the mask edge [px], derivative J.
 
-    The annotator's habits (edge px, gum px, gum mm), at free edges, at the gum line in the image, and at the gum line
-    along the crown surface, shift the outline by their product with h, the last three columns of a sample.
+    Annotator bias has three components: at free edges [px], at the gum line in the image [px], and at the gum line
+    along the crown surface [mm]. It shifts the outline by their scalar product with h, the last three columns of a
+    sample.
 
     Attributes:
         precision: sum w J^T J, shape (2, C, 6, 6).
@@ -47,7 +48,7 @@ class OutlineSums(NamedTuple):
         habit_slope: sum w h J, which couples poses with mask biases, shape (2, C, 3, 6).
         habit_distance, habit_weight: sum w h d and sum w h h^T, shapes (2, C, 3) and (2, C, 3, 3).
         weight, square: sum w and sum w d^2, shape (2, C).
-        matched_px: contour length within the gate, shape (2, C).
+        matched_px: contour length with residuals within the gate, shape (2, C).
         score_px: contour length weighted by 1 minus Tukey's loss at the score gate, shape (2, C).
     """
 
@@ -68,7 +69,7 @@ class OutlineSums(NamedTuple):
         return cls(*(np.zeros((2, cameras, *shape)) for shape in shapes))
 
     def plus(self, other: OutlineSums) -> OutlineSums:
-        """Return the sums over both sets of samples."""
+        """Return the sums over the samples of both operands."""
         return OutlineSums(*(ours + theirs for ours, theirs in zip(self, other, strict=True)))
 
 
@@ -79,7 +80,7 @@ class Solution:
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4)
     silhouette: OutlineSums  # sums over the matched samples of silhouettes and borders of the scans
     gingival_margin: OutlineSums  # sums over the matched samples of the crown-gum line
-    centres: Array  # centres of the twists in the world [mm], shape (2, 3)
+    centres: Array  # centres of the twists in world coordinates [mm], shape (2, 3)
     scatters: Array  # first result of `scatter_of_tiles` per arch, summed over views, shape (2, 6, 6)
     gum_scatters: Array  # second result of `scatter_of_tiles` per arch, summed over views, shape (2, 6, 6)
     visible_px: Array  # contour length that could have been matched, per arch and view [px], shape (2, C)
@@ -95,8 +96,8 @@ class NormalEquations:
     """Normal equations of both arches' twists, in named blocks.
 
     Attributes:
-        matrix: precision, arches in the order (upper, lower), shape (12, 12); `upper`, `lower` and `coupling` are
-            views of its blocks.
+        matrix: precision matrix with the arches in the order (upper, lower), shape (12, 12); `upper`, `lower` and
+            `coupling` are views of its blocks.
         right: right-hand side, shape (12,).
         outline_weight: weight of the outline sums per arch [1/px^3], shape (2,): 1, or 1 / (outline variance times
             correlation length) if other terms are log-likelihoods.
@@ -122,22 +123,22 @@ class NormalEquations:
         return self.matrix[:6, 6:]
 
     def add(self, arch: int, precision: Array, right: Array) -> None:
-        """Add a constraint on one arch, shapes (6, 6) and (6,)."""
+        """Add the precision (6, 6) and right-hand side (6,) of a constraint on one arch."""
         (self.upper, self.lower)[arch][:] += precision
         self.right[6 * arch : 6 * arch + 6] += right
 
     def add_joint(self, precision: Array, right: Array) -> None:
-        """Add a joint constraint on both arches, shapes (12, 12) and (12,)."""
+        """Add the precision (12, 12) and right-hand side (12,) of a joint constraint on both arches."""
         self.matrix += precision
         self.right += right
 
     def solve(self) -> Array:
-        """Return the twists of both arches, shape (2, 6)."""
+        """Solve the equations; return the twists of both arches, shape (2, 6)."""
         return np.asarray(np.linalg.solve(self.matrix, self.right), np.float64).reshape(2, 6)
 
 
 class ResidualTerm(Protocol):
-    """A constraint on the poses of both arches."""
+    """A constraint on the poses of both arches, as a sum of squared residuals."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the term's linearised residuals at the poses of a state."""
@@ -145,7 +146,7 @@ class ResidualTerm(Protocol):
 
 
 class SilhouetteTerm:
-    """Penalises distances of crown silhouettes from the edges of their masks."""
+    """Penalises the distances of crown silhouettes from the edges of their masks."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the sums over the matched silhouette samples of all views."""
@@ -153,7 +154,7 @@ class SilhouetteTerm:
 
 
 class GingivalMarginTerm:
-    """Penalises distances of crown-gum lines from the edges of their masks."""
+    """Penalises the distances of crown-gum lines from the edges of their masks."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the sums over the matched samples of the gingival margin of all views."""
@@ -170,7 +171,7 @@ class StartTerm:
     """A weak prior at the start pose, which bounds motions that the masks do not constrain."""
 
     start: Array  # T_world_upper and T_world_lower, shape (2, 4, 4)
-    strength: Array  # precision of every component of the twists, in units of the outline sums, shape (2, 6)
+    strength: Array  # precision of each twist component, in units of the outline's normal equations, shape (2, 6)
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the prior, linearised at the poses of a state."""

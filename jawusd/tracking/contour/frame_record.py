@@ -28,7 +28,7 @@ class Loss(NamedTuple):
     limit: float
 
 
-#: Entry for an arch that is not lost, or whose loss has no recorded reason.
+#: Entry for an arch that is not lost, or for whose loss no reason was recorded.
 NO_LOSS = Loss(LostReason.NONE, np.nan, np.nan)
 
 
@@ -38,13 +38,13 @@ class FrameRecord:
 
     solution: Solution  # the alignment; poses of lost arches are invalid
     status: NDArray[np.int8]  # status of both arches, as in `Tracks`, shape (2,)
-    used: Mask  # masks used, shape (2, C)
+    used: Mask  # whether each mask was used, shape (2, C)
     coverage: Array  # uncovered fraction of every mask, shape (2, C); NaN without a mask
     losses: tuple[Loss, Loss] = (NO_LOSS, NO_LOSS)  # reasons why arches are lost
 
 
 def whole_frames(records: Mapping[int, FrameRecord]) -> list[int]:
-    """Return the frames in which both arches are tracked, in order."""
+    """Return the numbers of the frames in which both arches are tracked, in ascending order."""
     return [frame for frame in sorted(records) if (records[frame].status != LOST).all()]
 
 
@@ -75,7 +75,7 @@ class FrameSummary:
 
 
 _KEPT_FRAMES = 32
-_IN_MEMORY = 16 << 20  # maximum number of bytes held in memory before a file is used: enough for a minute or two
+_IN_MEMORY = 16 << 20  # bytes held in memory before a file is used: enough for one or two minutes of footage
 # Shapes of the sums per arch and view; the first is a symmetric 6 x 6 matrix.
 _SUM_SHAPES = tuple(table.shape[2:] for table in OutlineSums.zeros(1))
 _LOWER = np.tril_indices(6)
@@ -84,7 +84,7 @@ _MIRROR[_LOWER] = _MIRROR[_LOWER[::-1]] = np.arange(len(_LOWER[0]))
 
 
 class PackedRecords(MutableMapping[int, FrameRecord]):
-    """A mapping of frames to records that packs them into a temporary file, so that long takes need little memory.
+    """A mapping of frames to records, which are packed into a temporary file so that long takes need little memory.
 
     Poses and quality figures keep double precision. Sums over samples are stored in single precision, which suffices
     for thousands of distances accurate to 0.01 px. Not thread-safe.
@@ -112,7 +112,7 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
         self._unpacked.pop(frame, None)
 
     def __contains__(self, frame: object) -> bool:
-        return frame in self._places  # the inherited method would unpack the record
+        return frame in self._places  # the inherited `__contains__` would unpack the record
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._places)
@@ -121,7 +121,7 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
         return len(self._places)
 
     def kept(self, frames: Iterable[int]) -> PackedRecords:
-        """Return a mapping with some of the frames, sharing their storage."""
+        """Return a mapping with some of the frames that shares the storage of their records."""
         out = PackedRecords()
         out._store = self._store
         out._places = {frame: self._places[frame] for frame in frames}
@@ -202,7 +202,7 @@ _Places = list[tuple["slice[int, int, int]", tuple[int, ...]]]
 
 @lru_cache(maxsize=8)
 def _places(views: int) -> tuple[_Places, _Places]:
-    """Return slices and shapes of the arrays in a packed record, first those of figures, then those of sums."""
+    """Return slices and shapes of the arrays in a packed record: those of quality figures, and those of sums."""
     half = (len(_LOWER[0]),)
     figures = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
     sums = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]

@@ -1,4 +1,4 @@
-"""The crown-gum line of a scan as 3-D segments, where the crown continues below the gum surface.
+"""The crown-gum line of a scan as 3-D segments, for scans in which crowns continue below the gum surface.
 
 Painted scans often contain whole crowns that dip into a separate gum surface. The visible border is then the curve
 in which the two surfaces intersect, which is not an edge of either mesh.
@@ -18,10 +18,10 @@ _SHORTEST_MM = 1e-3  # minimum length of a segment: shorter ones have no reliabl
 def crown_gum_segments(
     vertices: Array, crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32]
 ) -> tuple[Array, Array]:
-    """Return the segments in which crown triangles intersect gum triangles, and directions across them on the crown.
+    """Return the segments in which crown and gum triangles intersect, and directions across them on the crown.
 
-    End points [mm] have shape (S, 2, 3). The unit vectors across them lie in the crown triangles and are perpendicular
-    to the segments, shape (S, 3). Segments shorter than 1 um are dropped.
+    End points [mm] have shape (S, 2, 3). The directions, shape (S, 3), are unit vectors in the crown triangles,
+    perpendicular to the segments. Segments shorter than 1 um are dropped.
     """
     if not len(crown_faces) or not len(gum_faces):
         return np.zeros((0, 2, 3)), np.zeros((0, 3))
@@ -92,7 +92,7 @@ def _grid(triangles: Array, low: Array, cell: float, count: Indices) -> tuple[In
 def _cut(
     crown: Array, gum: Array, low: Array, cell: float, count: Indices, starts: Indices, items: Indices
 ) -> tuple[Array, Indices]:
-    """Return the segments where crown and gum triangles intersect, and their crown triangles; test each pair once."""
+    """Return the segments in which crown and gum triangles intersect, and indices of their crown triangles."""
     first = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
     first_g = np.empty(3, np.int64)
@@ -110,7 +110,8 @@ def _cut(
                     for q in range(starts[c], starts[c + 1]):
                         g = items[q]
                         _box(gum[g], low, cell, count, first_g, last_g)
-                        # Both boxes may share several cells; the pair is tested only in the first of them.
+                        # The bounding boxes of both triangles may share several cells; the pair is tested only in the
+                        # first of these.
                         if (
                             i != max(first[0], first_g[0])
                             or j != max(first[1], first_g[1])
@@ -131,7 +132,7 @@ def _cut(
 
 @numba.njit(nogil=True, cache=True)
 def _common_segment(a: Array, b: Array, points: Array) -> bool:
-    """Write the ends of the segment in which two triangles intersect; return whether there is one."""
+    """Write the end points of the segment in which two triangles intersect; return whether they intersect."""
     n = 0
     for e in range(3):
         if _pierce(a[e], a[(e + 1) % 3], b, points[n]):
@@ -155,7 +156,7 @@ def _common_segment(a: Array, b: Array, points: Array) -> bool:
 
 @numba.njit(nogil=True, cache=True)
 def _pierce(p: Array, q: Array, triangle: Array, out: Array) -> bool:
-    """Write the point where segment pq crosses a triangle (Moeller & Trumbore 1997); return whether it does."""
+    """Write the point in which segment pq crosses a triangle (Moeller & Trumbore 1997); return whether it does so."""
     dx, dy, dz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     ax, ay, az = triangle[1, 0] - triangle[0, 0], triangle[1, 1] - triangle[0, 1], triangle[1, 2] - triangle[0, 2]
     bx, by, bz = triangle[2, 0] - triangle[0, 0], triangle[2, 1] - triangle[0, 1], triangle[2, 2] - triangle[0, 2]

@@ -1,4 +1,4 @@
-"""Quality of an alignment: score, residual, coverage, covariance."""
+"""Quality of an alignment: score, residuals, coverage of the masks, and covariance."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from jawusd.tracking.contour.views import View
 
 # Standard deviation of the part of the gum-line error that differs from tooth to tooth [px].
 _GUM_BY_TOOTH_PX = 0.3
-# Variance of a standard normal residual after Tukey weighting at 4.685 standard deviations, E[w d^2] / E[w], by
-# quadrature.
+# Variance E[w d^2] / E[w] of a standard normal residual d with Tukey weight w (gate of 4.685 standard deviations),
+# computed by quadrature.
 _TUKEY_VARIANCE = 0.828
 
 
@@ -56,7 +56,7 @@ def _weight_and_square(solution: Solution) -> tuple[Array, Array]:
 def uncovered_px(
     scans: Sequence[Scan], poses: Array, views: Sequence[View], in_threads: Mapper = map
 ) -> tuple[Array, Array]:
-    """Return the numbers of mask pixels not covered by projected crowns (E_SP in eq. 8 of the paper), and of all.
+    """Return the number of mask pixels not covered by projected crowns (E_SP in eq. 8 of the paper), and of all pixels.
 
     Both have a value per arch and view, shape (2, C).
     """
@@ -74,14 +74,14 @@ def uncovered_px(
 
 
 def coverage_error(uncovered: Array, total: Array) -> Array:
-    """Return the uncovered fraction of every mask from the results of `uncovered_px`, NaN without a mask."""
+    """Return the uncovered fraction of every mask from the results of `uncovered_px`; NaN without a mask."""
     return np.where(total > 0, uncovered / np.maximum(total, 1), np.nan)
 
 
 def arch_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], uncovered_price: float) -> Array:
     """Return the matched fraction of each arch's visible contour, less the penalty for uncovered mask, shape (2,) [-].
 
-    It is the median over the views, so that one wrong mask of three is ignored; -inf if nothing is visible.
+    The result is the median over the views, so that one wrong mask of three is ignored; -inf if nothing is visible.
     `uncovered_price` is the penalty of an uncovered pixel in px of contour [1/px].
     """
     uncovered, _ = uncovered_px(scans, solution.poses, views)
@@ -99,11 +99,11 @@ def twist_covariance(solution: Solution, arch: int, sigma_px: float, correlation
 
     Args:
         arch: 0 upper, 1 lower.
-        sigma_px: standard deviation of the mask outline.
+        sigma_px: standard deviation of the outline error.
         correlation_px: correlation length l of outline errors along the contour: n pixels of contour contain n / l
             independent measurements.
 
-    Infinite on the diagonal if the masks do not constrain a motion.
+    The diagonal is infinite if the masks leave a motion unconstrained.
     """
     H = solution.outline.precision[arch].sum(0)
     free = np.diag(np.full(6, np.inf))
@@ -118,10 +118,10 @@ def twist_covariance(solution: Solution, arch: int, sigma_px: float, correlation
 def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, correlation_px: float) -> Array | None:
     """Return the covariance of both arches' left twists about the world origin given masks and prior, shape (12, 12).
 
-    None if masks and prior do not constrain a motion.
+    Return None if masks and prior leave a motion unconstrained.
 
     Args:
-        prior: a further constraint on the two poses, as log-likelihood.
+        prior: a further constraint on the two poses; a log-likelihood.
         sigma_px, correlation_px: as for `twist_covariance`; `sigma_px` per arch, shape (2,).
     """
     equations = NormalEquations()
@@ -143,8 +143,8 @@ def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, c
 def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
     """Return the correlation length of outline errors along the contour, estimated from one frame [px], shape (2,).
 
-    It is tr(H^-1 S) / (6 sigma^2) times `tile_factor`, with precision H and scatter S of the tiles; NaN if the matches
-    do not constrain every motion.
+    The length is tr(H^-1 S) / (6 sigma^2) times `tile_factor`, with precision H and tile scatter S; NaN if the matches
+    leave a motion unconstrained.
     """
     out = np.full(2, np.nan)
     sigma = residual_px(solution)
@@ -169,8 +169,8 @@ def crown_sigma_mm(scan: Scan, solution: Solution, arch: int, config: TrackingCo
 def relative_covariance(T_world_upper: Array, covariance_upper: Array, covariance_lower: Array) -> Array:
     """Return the covariance of the left twist of T_upper_lower about the skull origin, shape (..., 6, 6).
 
-    T_true = T_u^-1 exp(x_l - x_u) T_u T to first order, so the twist is Ad(T_u^-1)(x_l - x_u); the arches' errors are
-    independent because no mask edge is matched by both.
+    With T = T_upper_lower, T_true = T_u^-1 exp(x_l - x_u) T_u T to first order, so the twist is Ad(T_u^-1)(x_l - x_u);
+    the arches' errors are independent because no mask edge is matched by both.
     """
     A = se3_adjoint(se3_inverse(T_world_upper))
     return A @ (covariance_upper + covariance_lower) @ np.swapaxes(A, -1, -2)
@@ -179,7 +179,7 @@ def relative_covariance(T_world_upper: Array, covariance_upper: Array, covarianc
 def landmark_sigmas(T_upper_lower: Array, covariance: Array, landmarks: Array) -> Array:
     """Return the standard deviation of landmarks (L, 3) in the skull frame [mm], shape (..., L).
 
-    `T_upper_lower` has shape (..., 4, 4), `covariance` is that of `relative_covariance`, shape (..., 6, 6).
+    `T_upper_lower` has shape (..., 4, 4); `covariance` (..., 6, 6) is the result of `relative_covariance`.
     """
     points = transform_points(T_upper_lower, landmarks)
     J = np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)

@@ -1,4 +1,4 @@
-"""Renderings and contours of both scans in every camera, redrawn only after the scans have moved."""
+"""Renderings and contours of both scans in every camera, updated only after the scans have moved."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from jawusd.tracking.contour.views import View
 
 _AROUND_PX = 24  # margin rendered around the window, since the window moves with the masks
 _LARGEST_ZOOM = 1.02  # maximum change of scale for which a drawing is warped instead of rendered again
-_MOST_KEPT = 64  # maximum number of drawings in the cache; every camera correction adds new ones
+_MOST_KEPT = 64  # maximum number of drawings in the cache; every correction of the camera poses adds new ones
 
 _Kept = tuple[Array, int]
 
 
 @dataclass(frozen=True, eq=False)
 class Contour:
-    """The scan and parameters of a contour; see `contour_samples`."""
+    """The scan of a contour, and the parameters for sampling it; see `contour_samples`."""
 
     scan: Scan
     step_px: float
@@ -35,19 +35,19 @@ class Contour:
     def samples(
         self, matrix: Array, eye: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32]
     ) -> tuple[Array, int]:
-        """Return the contour samples in a drawing of the scan; arguments and result as for `contour_samples`."""
+        """Return the contour samples in a rendering of the scan; arguments and result as for `contour_samples`."""
         limits = (self.step_px, self.depth_tolerance_mm)
         return contour_samples(self.scan, matrix, eye, labels, inverse_depth, *limits, self.towards_gum)
 
 
 class Drawing:
-    """A rendering of a scan for one camera, which is warped for small motions.
+    """A rendering of a scan for one camera; for small motions, it is warped instead of rendered again.
 
     Warping is accurate because visibility and outline of a scan depend only on the camera centre in scan coordinates.
     """
 
     def __init__(self, scan: Scan, matrix: Array, eye: Array, shape: tuple[int, int]) -> None:
-        """Draw the scan.
+        """Render the scan.
 
         Args:
             scan: the scan of one arch.
@@ -116,12 +116,12 @@ class Drawing:
         return float(np.arctan2(to_drawn[0, 1] - to_drawn[1, 0], to_drawn[0, 0] + to_drawn[1, 1]))
 
     def find_samples(self, contour: Contour) -> None:
-        """Sample a contour in this drawing, unless it is cached."""
+        """Sample a contour in this drawing unless its samples are cached."""
         if contour not in self._contours:
             self._contours[contour] = contour.samples(self._matrix, self._eye, self._labels, self._inverse_depth)
 
     def samples(self, contour: Contour, matrix: Array, shape: tuple[int, int], turned_rad: float) -> _Kept:
-        """Return the samples of a contour at a pose close to that of the last `show`.
+        """Return the samples of a contour at a pose close to that of the last call of `show`.
 
         Args:
             contour: contour of this arch; the drawing may be of a scan with fewer faces.
@@ -129,7 +129,7 @@ class Drawing:
             turned_rad: result of `show`.
 
         Returns:
-            As `contour_samples`; a copy.
+            A copy of the samples, as returned by `contour_samples`.
         """
         self.find_samples(contour)
         kept = self._contours[contour]
@@ -139,10 +139,10 @@ class Drawing:
 
 
 class Drawings:
-    """A cache of the last drawing of every arch for every camera."""
+    """A cache of the last drawings of every arch in every camera."""
 
     def __init__(self, scans: Sequence[Scan], parallax_px: float) -> None:
-        """Start empty; `parallax_px` as for `Drawing.shows`."""
+        """Start with an empty cache; `parallax_px` is as for `Drawing.shows`."""
         self._scans, self._parallax_px = scans, parallax_px
         self._kept: dict[tuple[int, int, bytes], Drawing] = {}
 
@@ -156,7 +156,7 @@ class Drawings:
         Args:
             arch: 0 upper, 1 lower.
             view: index of the view.
-            camera: camera centre in the world [mm], shape (3,).
+            camera: camera centre in world coordinates [mm], shape (3,).
             T_world_scan: the pose, shape (4, 4).
             matrix: projection from scan coordinates [mm] to homogeneous px of the window, shape (3, 4).
             shape: size (h, w) of the window.
@@ -185,7 +185,7 @@ def _moved(
     """Move samples to another pose and write those that lie in the window, silhouettes first.
 
     Returns:
-        The number of samples written, and how many of them are silhouettes.
+        The number of samples written, and the number of silhouette samples among them.
     """
     n, first = 0, 0
     for s in range(len(samples)):
@@ -231,10 +231,10 @@ _CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
 
 
 class Rendering:
-    """Renderings and contours of both scans in every view of one frame, redrawn only after the scans have moved.
+    """Renderings and contours of both scans in every view of one frame, rendered again only after the scans have moved.
 
-    Between redraws, the points of a contour move with the scan. The contour of a rotated scan runs through other
-    points, an error of second order.
+    Between renderings, the points of a contour move with the scan. The true contour of a rotated scan runs through
+    other points; the error is of second order.
     """
 
     def __init__(
@@ -259,7 +259,7 @@ class Rendering:
         self.depths = [np.zeros(shape, np.float32) for shape in shapes]
 
     def update(self, poses: Array) -> None:
-        """Redraw the scans whose projection has moved by more than the allowed distance."""
+        """Render the scans again whose projections have moved by more than the allowed distance."""
 
         def show(task: tuple[int, int]) -> None:
             self._show(*task, poses[task[0]])
@@ -277,7 +277,7 @@ class Rendering:
             pose: T_world_arch at the view's exposure, shape (4, 4).
 
         Returns:
-            As `contour_samples`; a copy.
+            A copy of the samples, as returned by `contour_samples`.
         """
         _, drawing, turned_rad = self._shown[r, c]
         view = self._views[c]
@@ -296,7 +296,7 @@ class Rendering:
         T_world_scan = view.T_delay[r] @ pose
         matrix = view.matrix @ T_world_scan
         drawing = self._drawings.of(r, c, view.eye, T_world_scan, matrix, labels.shape)
-        # sampled here, because threads run this method for several views in parallel
+        # contours are sampled here, because threads run this method for several views in parallel
         drawing.find_samples(self._contours[r])
         at = projected(view.matrix @ pose, self._corners[r])
         self._shown[r, c] = (at, drawing, drawing.show(matrix, labels, depth))

@@ -13,11 +13,12 @@ from jawusd.base.arrays import Array
 from jawusd.tracking.contour.scan import CROWN, GUM, Faces, Scan
 
 # Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the image, contour length that the
-# sample represents [px], inverse depth [1/mm]; then the effect of annotator bias on the outline along the normal:
-# fraction of free edge and of gum line [-], and pixels per mm by which the gum line is moved along the crown surface.
+# sample represents [px], inverse depth [1/mm]; then the effects of annotator bias on the position of the outline along
+# its normal: fraction of free edge and of gum line [-], and motion per mm of gum line moved along the crown surface
+# [px/mm].
 X, Y, Z, U, V, NX, NY, LENGTH, INVERSE_DEPTH, EDGE_SHARE, GUM_SHARE, GUM_SLOPE = range(12)
 COLUMNS = 12
-HABITS = slice(EDGE_SHARE, COLUMNS)  # an outline shifts by samples[:, HABITS] @ (edge px, gum px, gum mm)
+HABITS = slice(EDGE_SHARE, COLUMNS)  # annotator bias shifts outlines by samples[:, HABITS] @ (edge px, gum px, gum mm)
 
 # Distances from visible gum at which an outline starts to count as gum line, and at which it counts fully [mm]:
 # boundaries of painted labels are blurred, since brushes are half a millimetre wide.
@@ -26,8 +27,8 @@ _GUM_FAR_MM, _GUM_NEAR_MM = 1.0, 0.55
 # counts fully [-]. Only biting edges are certainly free of gum, since papillae hide the sides of crowns.
 _LEAST_FACING, _FULL_FACING = -0.6, -0.2
 # Two samples are on the same outline if they lie within `_BESIDE_PX` and the cosine between their normals is at least
-# `_SAME_WAY`. The inner one is dropped if the other is farther out by `_OUTSIDE_PX` plus `_OUTSIDE_SLOPE` times their
-# distance along the outline.
+# `_SAME_WAY`. The inner sample is dropped if the outer one is farther out by `_OUTSIDE_PX` plus `_OUTSIDE_SLOPE` times
+# their distance along the outline.
 _BESIDE_PX, _OUTSIDE_PX, _OUTSIDE_SLOPE, _SAME_WAY = 1.5, 0.05, 0.35, 0.3
 
 
@@ -41,7 +42,7 @@ def contour_samples(
     depth_tolerance_mm: float,
     towards_gum: Array | None = None,
 ) -> tuple[Array, int]:
-    """Return the contour points at which the label changes from crown to anything else, shape (n, COLUMNS).
+    """Return the contour points at which the label changes from crown to another one, shape (n, COLUMNS).
 
     Silhouette samples come first, then those of the gingival margin; the second result is the number of silhouette
     samples.
@@ -160,7 +161,7 @@ def _silhouette(
         if k in (i, j):
             k = faces[f, 2]
         uk, vk, wk = _pixel(matrix, vertices[k, 0], vertices[k, 1], vertices[k, 2])
-        if nx * (uk - ui) + ny * (vk - vi) > 0:  # makes the normal point away from the third corner of the face
+        if nx * (uk - ui) + ny * (vk - vi) > 0:  # make the normal point away from the third corner of the face
             nx = -nx
             ny = -ny
         pieces = max(1, int(np.ceil(length / step_px)))
@@ -177,7 +178,7 @@ def _silhouette(
             sample[NX], sample[NY] = nx, ny
             sample[LENGTH] = length / pieces
             sample[INVERSE_DEPTH] = 1.0 / w
-            # A border of the crown mesh adjoins the gum, or was cut off there.
+            # A border of the crown mesh adjoins the gum, or lies where the gum was cut off.
             sample[GUM_SHARE] = 1.0 if g < 0 else 0.0
             sample[GUM_SLOPE] = _border_slope(vertices, i, j, k, sample, matrix, w) if g < 0 else 0.0
             n += 1
@@ -186,7 +187,7 @@ def _silhouette(
 
 @numba.njit(nogil=True, cache=True)
 def _border_slope(vertices: Array, i: int, j: int, k: int, sample: Array, matrix: Array, w: float) -> float:
-    """Return how far border ij moves along its image normal per mm away from corner k in its triangle [px/mm]."""
+    """Return the motion of border ij along its image normal per mm away from corner k of its triangle [px/mm]."""
     ex, ey, ez = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
     tx, ty, tz = sample[X] - vertices[k, 0], sample[Y] - vertices[k, 1], sample[Z] - vertices[k, 2]
     along = (tx * ex + ty * ey + tz * ez) / max(ex * ex + ey * ey + ez * ez, 1e-18)
@@ -219,7 +220,7 @@ def _visible(
     px_per_mm: float,
     facing_gum: Array,
 ) -> Array:
-    """Keep samples with their own surface visible just inside and no crown just outside; classify edge and gum line."""
+    """Keep samples with their own surface just inside and no crown just outside; classify free edge and gum line."""
     out = np.empty_like(samples)
     height, width = labels.shape
     shows_gum = facing_gum[0] == 0.0 and facing_gum[1] == 0.0
@@ -251,10 +252,10 @@ def _visible(
 
 @numba.njit(nogil=True, cache=True)
 def _outermost(samples: Array, shape: tuple[int, int]) -> Array:
-    """Drop samples that lie inside the outline by less than a pixel, the resolution of `_visible`.
+    """Drop samples that lie inside the outline by less than one pixel, which is the resolution of `_visible`.
 
-    At a rounded edge with small or noisy faces, several silhouette lines can lie within a pixel. Only the outermost is
-    the outline; the others would bias it inwards by 0.03 to 0.05 px.
+    At a rounded edge with small or noisy faces, several silhouette lines can lie within a pixel. Only the outermost one
+    is the outline; the others would bias the outline inwards by 0.03 to 0.05 px.
     """
     rows, columns = int(shape[0] / _BESIDE_PX) + 3, int(shape[1] / _BESIDE_PX) + 3
     last = np.full((rows, columns), -1, np.int32)  # index of the last sample in every cell
@@ -274,7 +275,7 @@ def _outermost(samples: Array, shape: tuple[int, int]) -> Array:
 
 @numba.njit(nogil=True, cache=True)
 def _has_one_outside(samples: Array, s: int, last: NDArray[np.int32], before: NDArray[np.int32]) -> bool:
-    """Return whether another sample of the same outline lies farther out than sample s."""
+    """Return whether another sample on the same outline lies farther out than sample s."""
     u, v, nx, ny = samples[s, U], samples[s, V], samples[s, NX], samples[s, NY]
     j, i = int(v / _BESIDE_PX) + 1, int(u / _BESIDE_PX) + 1
     for row in range(j - 1, j + 2):
@@ -292,7 +293,7 @@ def _has_one_outside(samples: Array, s: int, last: NDArray[np.int32], before: ND
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _nearer(seen: float, own: float, tolerance_mm: float) -> bool:
-    """Return whether a rendered surface hides a sample, by more than the depth tolerance; depths are inverse."""
+    """Return whether a rendered surface is in front of a sample by more than the tolerance; depths are inverse."""
     return seen * (1.0 - tolerance_mm * own) > own
 
 
@@ -304,7 +305,7 @@ def _gum_distance_px(labels: NDArray[np.uint8], u: float, v: float, reach_px: fl
     height, width = labels.shape
     n = int(reach_px)
     best = reach_px * reach_px
-    for dy in range(n + 1):  # outwards, until no remaining pixel can be nearer
+    for dy in range(n + 1):  # search outwards until no remaining pixel can be nearer
         if dy * dy >= best:
             break
         for y in (j - dy, j + dy):
@@ -331,8 +332,8 @@ def _gingival_margin(
     inverse_depth: NDArray[np.float32],
     tolerance_mm: float,
 ) -> Array:
-    """Sample the gingival margin where crown is visible on one side and gum on the other; normals point to the gum."""
-    reach = 1.5  # distance in px to the nearest pixels that lie entirely on one side
+    """Sample the gingival margin where crown is visible on one side and gum on the other; normals point to gum."""
+    reach = 1.5  # distance [px] to the nearest pixels that lie entirely on one side of the margin
     out = np.empty((len(segments), COLUMNS))
     height, width = labels.shape
     n = 0
@@ -346,7 +347,7 @@ def _gingival_margin(
         up, vp, wp = _pixel(matrix, p[0], p[1], p[2])
         uq, vq, wq = _pixel(matrix, q[0], q[1], q[2])
         length = np.sqrt((uq - up) ** 2 + (vq - vp) ** 2)
-        if length < 0.05:  # length in px below which a segment is viewed end-on and its direction undefined
+        if length < 0.05:  # image length [px] below which a segment is viewed end-on, so its direction is undefined
             continue
         nx = reach * (vq - vp) / length
         ny = reach * (up - uq) / length
@@ -364,7 +365,7 @@ def _gingival_margin(
         out[n, X], out[n, Y], out[n, Z], out[n, U], out[n, V] = x, y, z, u, v
         out[n, NX], out[n, NY], out[n, LENGTH], out[n, INVERSE_DEPTH] = nx / reach, ny / reach, length, 1.0 / w
         out[n, EDGE_SHARE], out[n, GUM_SHARE] = 0.0, 1.0
-        # Positive towards the gum, like the normal, whatever the sign of the direction.
+        # The slope is positive towards the gum, like the normal, whatever the sign of the direction.
         out[n, GUM_SLOPE] = abs(_shift_px(out[n], matrix, w, directions[s, 0], directions[s, 1], directions[s, 2]))
         n += 1
     return out[:n]

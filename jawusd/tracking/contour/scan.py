@@ -26,17 +26,17 @@ ARCHES = (0, 1)
 ARCH_NAMES = ("upper", "lower")
 CROWN, GUM = 1, 2  # labels of a rendered scan; 0 is empty
 
-_PROBES = 300  # number of vertices at which motion is measured: enough for means accurate to one per cent
-# Number of crown faces above which all but the last steps use a decimated scan, and number of crown faces of the
-# latter: run time is proportional to it, and the loss of accuracy is below 0.002 mm.
+_PROBES = 300  # number of vertices at which motion is measured: enough for means accurate to 1 %
+# Number of crown faces above which all but the last steps use a decimated scan, and number of crown faces of that scan:
+# run time is proportional to the number of faces, and the loss of accuracy is below 0.002 mm.
 _DENSE_FACES, _THIN_FACES = 60_000, 20_000
 _GUM_SHARE = 0.02  # ratio of gum to crown faces below which gum faces are remnants of removed gum
-_FEWEST_CROWN_FACES = 100  # minimum number of crown faces: fewer have no contour in several directions
+_FEWEST_CROWN_FACES = 100  # minimum number of crown faces: fewer faces lack a contour in some directions
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One arch, ready for projection."""
+    """The scan of one arch, ready for projection."""
 
     name: str  # "upper" or "lower"
     vertices: Array  # welded vertices in scan coordinates [mm], float64, shape (V, 3)
@@ -44,12 +44,12 @@ class Scan:
     crown_faces: Faces  # faces whose contour is matched, int32, shape (F, 3)
     gum_faces: Faces  # faces that only occlude, int32, shape (G, 3)
     planes: Array  # normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used
-    edges: Faces  # vertex, vertex, face, other face or -1 at a border, int32, shape (E, 4)
+    edges: Faces  # edges: two vertices, face, and other face (-1 at a border), int32, shape (E, 4)
     gingival_margin: Array  # segments of the crown-gum line that are not mesh edges [mm], shape (S, 2, 3)
-    margin_directions: Array  # unit vectors on the crown across these segments, shape (S, 3)
+    margin_directions: Array  # unit vectors on the crown surface across these segments, shape (S, 3)
     probes: Array  # vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
     centre: Array  # centroid of the crown vertices [mm], shape (3,)
-    radius_mm: float  # maximum distance of a crown vertex from the centre
+    radius_mm: float  # maximum distance of a crown vertex from `centre`
     # whether labels or paint separate crown from gum (back faces of separated crowns are culled); otherwise the whole
     # scan counts as crown
     painted: bool
@@ -67,7 +67,7 @@ class Scan:
         return points if limit is None else points[:: max(1, len(points) // limit)]
 
     def silhouette(self, matrix: Array, shape: tuple[int, int], left: int = 0, top: int = 0) -> NDArray[np.uint64]:
-        """Return the pixels covered by the crowns in an image of (h, w), as packed bits.
+        """Return the pixels covered by the crowns in an image of size (h, w), as packed bits.
 
         Args:
             matrix: projection from scan coordinates [mm] to homogeneous px, shape (3, 4).
@@ -78,7 +78,7 @@ class Scan:
         return bits
 
     def draw(self, matrix: Array, depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> None:
-        """Draw inverse depth [1/mm] and labels into zeroed images (h, w); `matrix` as for `silhouette`."""
+        """Render inverse depth [1/mm] and labels into zeroed images (h, w); `matrix` is as for `silhouette`."""
         points = self._projected(matrix)
         draw_depth_labels(points, self.crown_faces, 0, 0, self.painted, depth, labels, CROWN)
         draw_depth_labels(points, self.gum_faces, 0, 0, False, depth, labels, GUM)
@@ -95,7 +95,7 @@ def probe_points(scans: Sequence[Scan]) -> Array:
 
 
 def teeth_centre(scans: Sequence[Scan], poses: Array) -> Array:
-    """Return the centre of both arches in the world [mm], shape (3,), at T_world_scan (2, 4, 4)."""
+    """Return the centre of both arches in world coordinates [mm], shape (3,), at poses T_world_scan (2, 4, 4)."""
     return np.mean([transform_point(pose, scan.centre) for pose, scan in zip(poses, scans, strict=True)], axis=0)
 
 
@@ -103,8 +103,8 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
     """Split a teeth scan into crowns and gum and build the tables of the contour search.
 
     Args:
-        mesh: the teeth scan. Crowns are found from its labels, or else its paint (see `formats.mesh.tooth_labels`);
-            without either, the whole scan counts as crown.
+        mesh: the teeth scan. Crowns are found from its labels, otherwise from its paint (see
+            `formats.mesh.tooth_labels`); without labels and paint, the whole scan counts as crown.
         name: "upper" or "lower", for messages.
 
     Raises:
@@ -130,12 +130,12 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
 
 
 def thinned(scan: Scan, crown_faces: int) -> Scan:
-    """Return the arch decimated to about `crown_faces` crown faces; unchanged if it has no more."""
+    """Return the arch decimated to about `crown_faces` crown faces; unchanged if it has no more than that."""
     if len(scan.crown_faces) <= crown_faces:
         return scan
     parts = decimated_scan(scan.vertices, scan.crown_faces, scan.gum_faces, crown_faces)
     thin = _with_tables(scan.name, *parts, scan.painted)
-    # Twists are about the centre, so the decimated scan must have the same one.
+    # Twists are about the centre, so the decimated scan must have the same centre.
     return replace(thin, probes=scan.probes, centre=scan.centre, radius_mm=scan.radius_mm)
 
 
@@ -202,7 +202,7 @@ def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
 
 
 def _edge_table(faces: Faces) -> Faces:
-    """Return vertex, vertex, face, other face (-1 at a border) of every edge, shape (E, 4).
+    """Return two vertices, face, and other face (-1 at a border) of every edge, shape (E, 4).
 
     If more than two faces share an edge, further pairs of faces form separate edges.
     """

@@ -31,7 +31,7 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
-_ROUGH_FACES = 6_000  # number of crown faces of an arch in short trials: a third of those of a decimated scan
+_ROUGH_FACES = 6_000  # number of crown faces of an arch in short trials: a third of that of a decimated scan
 _DENSE_STEPS = 2  # number of steps with all faces of a dense scan, after the decimated scan has converged
 
 # Samples, number of silhouette samples, distances to the mask edge, visible contour length [px].
@@ -49,7 +49,7 @@ class Matched(NamedTuple):
 
 
 class ContourSolver:
-    """Aligns two scans with masks. Keeps a cache, so it is not thread-safe."""
+    """Aligns two scans with masks. Not thread-safe, since drawings are cached."""
 
     def __init__(self, scans: Sequence[Scan], config: TrackingConfig, executor: Executor | None = None) -> None:
         self.scans = tuple(scans)
@@ -64,24 +64,24 @@ class ContourSolver:
         #: A solver with decimated scans; None if no scan is dense.
         self.thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
         self._executor = executor
-        #: Cache of the last drawings.
+        #: Cache of the last drawings of both scans.
         self.drawings = Drawings(self.scans, config.parallax_px)
 
     @cached_property
     def rough(self) -> ContourSolver:
-        """A solver with coarse scans, for short trials."""
+        """A solver with coarse scans, for short trial alignments."""
         scans = [thinned(replace(scan.thin or scan, thin=None), _ROUGH_FACES) for scan in self.scans]
         return ContourSolver(scans, self.config, self._executor)
 
     def exact(self) -> ContourSolver:
         """Return a solver with the same scans that never warps drawings.
 
-        Searches need it: they rank poses by uncovered pixels in small images, and jump between poses.
+        Searches need such a solver: they rank poses by uncovered pixels in small images, and jump between poses.
         """
         return ContourSolver(self.scans, replace(self.config, parallax_px=0.0), self._executor)
 
     def rendering(self, views: Sequence[View]) -> Rendering:
-        """Return a rendering of both scans in the views of one frame, to be shared by all its alignments."""
+        """Return a rendering of both scans in the views of one frame, to be shared by all alignments of that frame."""
         return Rendering(views, self.contours, self.drawings, self.config.redraw_px, self.map)
 
     def forget_drawings(self) -> None:
@@ -104,12 +104,12 @@ class ContourSolver:
         """Align both arches, starting from given poses.
 
         Args:
-            poses: start T_world_upper, T_world_lower, shape (2, 4, 4).
-            views: one per camera.
+            poses: start poses T_world_upper and T_world_lower, shape (2, 4, 4).
+            views: one view per camera.
             gates_px: residual gate of every iteration; if empty, the given poses are only evaluated.
             use: masks to use, shape (2, C); default: all present ones.
             terms: further constraints on the poses.
-            outline_weight: as in `NormalEquations`; needed if the terms are log-likelihoods.
+            outline_weight: as in `NormalEquations`; required if the terms are log-likelihoods.
             rendering: rendering of these views by this solver, shared with other alignments.
         """
         use = present_masks(views) if use is None else use
@@ -147,7 +147,7 @@ class ContourSolver:
             for r in ARCHES:
                 poses[r] = motion_about(state.centres[r], step[r]) @ poses[r]
             left = self.config.gates_after(left, self._motion_mm(step))
-        if iterations:  # prevents accumulation of rounding errors, as predictions multiply poses frame after frame
+        if iterations:  # prevent rounding errors from accumulating, since predictions multiply poses frame after frame
             poses = orthonormalise(poses)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
@@ -170,8 +170,8 @@ class ContourSolver:
             views, use: one view per camera, and the masks to use, shape (2, C).
             gate: residual above which a sample has no weight [px].
             rendering: rendering of these views, shared by all steps of a frame.
-            final: also compute the sums for the covariance.
-            matched: receives the samples that were summed.
+            final: whether to compute the sums for the covariance as well.
+            matched: list to which the matched samples are appended.
         """
         config = self.config
         rendering.update(poses)
@@ -230,7 +230,7 @@ class ContourSolver:
         d = np.sort(d[d < gate])
         if len(d) < 20:
             return gate
-        median = 0.5 * float(d[(len(d) - 1) // 2] + d[len(d) // 2])  # faster than np.median by several times
+        median = 0.5 * float(d[(len(d) - 1) // 2] + d[len(d) // 2])  # several times faster than np.median
         low, high = self.config.final_gate_px
         return min(max(self.config.gate_sigmas * 1.4826 * median, low), high)
 
@@ -242,7 +242,7 @@ class ContourSolver:
 
 
 def _towards_gum(scans: Sequence[Scan]) -> list[Array | None]:
-    """Return the unit vector towards the gum of each arch, in scan coordinates; None if the scan has gum."""
+    """Return the unit vector towards the gum of each arch, in scan coordinates; None for a scan with gum."""
     shown = [scan.shows_gum for scan in scans]
     if all(shown):
         return [None, None]
@@ -255,13 +255,13 @@ _Result = TypeVar("_Result")
 
 
 class ParallelMap:
-    """A parallel `map` for short tasks that wakes one thread per core instead of one per item.
+    """A parallel `map` for short tasks; it wakes one thread per core instead of one per item.
 
     The calling thread works too. Tasks of the tracker take about a millisecond; waking a thread takes a tenth of that.
     """
 
     def __init__(self, executor: Executor) -> None:
-        """Use the threads of an executor."""
+        """Prepare the map to use the threads of an executor."""
         self._executor = executor
         self._more_threads = (os.cpu_count() or 1) - 1
 

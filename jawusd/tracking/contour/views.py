@@ -19,7 +19,7 @@ from jawusd.media.mask_survey import ARCHES, odd_pictures, survey_masks
 from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
 
-#: Minimum number of cameras if only the masks determine the depth of the teeth.
+#: Minimum number of cameras if the depth of the teeth is determined only by masks.
 FEWEST_CAMERAS = 2
 
 _BORDER_PX = 20  # margin of a view around the masks: more than the widest search
@@ -27,27 +27,27 @@ _CHUNK = 48  # number of frames buffered when iterating backwards: about 20 MB
 
 
 class EdgeSearch(Protocol):
-    """Finds the image edges that contour samples should lie on."""
+    """Finds the image edges on which contour samples should lie."""
 
     def search(
         self, samples: Array, count: int, arch: int, drawn: Drawn, limits: tuple[float, float, float]
     ) -> tuple[Array, Array]:
-        """Return the distance of each sample to its edge [px], NaN if there is none, and its weight.
+        """Return the distance of each sample to its image edge [px], NaN without an edge, and its weight.
 
-        Weights are 0 .. 1, NaN for samples hidden by the other arch.
+        Weights are in 0 .. 1, NaN for samples hidden by the other arch.
 
         Args:
-            samples: shape (n, COLUMNS); the first `count` are silhouette.
-            limits: reach [px], depth tolerance [mm], minimum cosine; as in `search_edges`.
+            samples: contour samples, shape (n, COLUMNS); the first `count` are on silhouettes.
+            limits: reach [px], depth tolerance [mm] and minimum cosine, as in `search_edges`.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Both arches as rendered in an image."""
+    """Renderings of both arches in an image."""
 
-    own: NDArray[np.uint8]  # labels of the searched arch alone: CROWN, GUM or 0, shape (h, w)
+    own: NDArray[np.uint8]  # labels of the searched arch, rendered alone: CROWN, GUM or 0, shape (h, w)
     other: NDArray[np.uint8]  # labels of the other arch, shape (h, w)
     other_inverse_depth: NDArray[np.float32]  # inverse depth of the other arch [1/mm], 0 = empty, shape (h, w)
 
@@ -57,20 +57,21 @@ class View:
     """The masks of one camera in one frame, undistorted, at working resolution."""
 
     matrix: Array  # world [mm] to homogeneous px of this image, shape (3, 4)
-    eye: Array  # camera centre in the world [mm], shape (3,)
+    eye: Array  # camera centre in world coordinates [mm], shape (3,)
     # masks of the upper and lower arch, uint8, 255 = teeth, shape (2, h, w); zeros without a mask
     masks: NDArray[np.uint8]
     present: Mask  # whether each of the two masks exists, shape (2,)
     # motion of the arches in the world from the reference camera's exposure to this camera's, shape (2, 4, 4)
     T_delay: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
-    # outward mask bias at free edges [px], at the gum line [px], along the gum [mm], shape (2, 3)
+    # outward mask bias: at free edges [px], at the gum line [px], and along the crown at the gum line [mm]; shape (2,
+    # 3)
     habits: Array = field(default_factory=lambda: np.zeros((2, 3)))
-    # search for outlines by colour, used instead of masks
+    # search for tooth borders by colour, which replaces the masks
     edges: EdgeSearch | None = None
 
 
 class MaskViews:
-    """Reads the masks of all cameras by frame of the reference camera; a context manager.
+    """Reads the masks of all cameras by frame number of the reference camera; a context manager.
 
     Attributes:
         cameras: the cameras with masks that are not all black, in capture order.
@@ -89,14 +90,15 @@ class MaskViews:
         """Open the masks and choose the working resolution.
 
         Args:
-            sources, cameras: all cameras of the capture; the calibrated ones by name.
-            offsets: reference frame minus own frame number of every camera.
+            sources: all cameras of the capture.
+            cameras: calibrated cameras by name.
+            offsets: time offset of every camera: the reference frame number minus its own frame number.
             centre_world: position of the teeth at the start [mm], shape (3,).
             working_px_per_mm: resolution at the teeth; images are never enlarged.
             fewest: minimum number of cameras with masks.
 
         Raises:
-            TrackingError: fewer cameras have masks, or a camera is not calibrated or not synchronised.
+            TrackingError: fewer than `fewest` cameras have masks, or a camera is not calibrated or not synchronised.
             CaptureError: masks are missing, corrupt, of the wrong size, or not masks.
         """
         self._stack = ExitStack()
@@ -143,7 +145,7 @@ class MaskViews:
     def around(self, frame: int, reach: int) -> list[list[View]]:
         """Return the views of a frame and of up to `reach` frames before and after it, in order.
 
-        Masks are decoded once, in file order, since each jump reopens the files.
+        Masks are decoded once and in file order, since every jump reopens the files.
 
         Raises:
             CaptureError: a mask cannot be decoded.
@@ -156,7 +158,7 @@ class MaskViews:
         return [list(views) for views in zip(*cameras, strict=True)]
 
     def walk(self, first: int, stop: int, step: int = 1) -> Iterator[tuple[int, list[View]]]:
-        """Yield the frames of a range with their views; step -1 goes backwards, but reads forwards in chunks."""
+        """Yield the frames of a range with their views; with step -1 in reverse, though masks are read forwards."""
         if step > 0:
             for frame in range(first, stop):
                 yield frame, self.at(frame)
@@ -182,7 +184,7 @@ def masked_sources(
     """Return the cameras with masks that are not all black.
 
     Raises:
-        TrackingError: fewer than `fewest` cameras have such masks, or one of these is not calibrated or not
+        TrackingError: fewer than `fewest` cameras have such masks, or one of these cameras is not calibrated or not
             synchronised.
         CaptureError: masks are missing, corrupt, of the wrong size, or not masks.
     """
@@ -213,7 +215,7 @@ def masked_sources(
 
 
 def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple[int, int]:
-    """Return the image size that gives a world point the desired resolution, at most the recorded size.
+    """Return the image size at which a world point has the desired resolution, at most the recorded size.
 
     Raises:
         TrackingError: the point lies behind the camera.
@@ -233,7 +235,7 @@ def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple
 def _view(working: WorkingView, masks: Sequence[NDArray[np.uint8] | None]) -> View:
     """Return the view of a camera, cropped to its masks."""
     camera = working.camera
-    # Masks without a pixel above half have no outline: they are too small at this resolution.
+    # Masks without a pixel above half coverage have no outline: they are too small at this resolution.
     highest = [None if m is None else m.max(axis=1) for m in masks]
     masks = [m if h is not None and h.max() > 127 else None for m, h in zip(masks, highest, strict=True)]
     present = np.array([m is not None for m in masks])

@@ -77,7 +77,7 @@ class RigTracker:
         self._failed = self._frame = 0
 
     def begin(self, cut: Cut, pose: Pose) -> FrameFit:
-        """Learn the colours of a first frame at a pose accurate to some tenths of a millimetre; return its fit."""
+        """Learn colours from a first frame at a pose accurate to some tenths of a millimetre; return the frame fit."""
         arches = self._coordinates.arches(pose)
         self._colours.begin(cut(arches), arches)
         sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
