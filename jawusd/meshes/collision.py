@@ -1,4 +1,4 @@
-"""Penetration depth of two solids over many relative poses."""
+"""Compute the penetration depth of two solids in many relative poses."""
 
 from __future__ import annotations
 
@@ -16,25 +16,26 @@ from jawusd.geometry.points import welded
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.meshes.solid import DistanceGrid, distance_grid, outer_faces
 
-#: Maximum distance measured [mm]; larger ones are truncated.
+#: Maximum measured distance between solids [mm]; larger distances are truncated to it.
 FARTHEST_MM = 1.5
 #: Default grid step for surfaces with the curvature of teeth [mm].
 STEP_MM = 0.25
 
 _SAMPLE_MM = 0.5  # maximum spacing of surface samples
-_BOXES_MM = (4.8, 2.4, 1.2, 0.6)  # edge lengths of the nested boxes of the tree
+_BOXES_MM = (4.8, 2.4, 1.2, 0.6)  # edge lengths of the nested boxes in the tree of surface samples
 _PARTS = 16  # number of chunks into which poses are split for threads
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points of a surface in a tree of boxes, so that all points of a distant box are skipped at once.
+    """Points of a surface, sorted into a tree of boxes so that all points of a distant box are skipped at once.
 
     Attributes:
-        points: the points, sorted by the smallest boxes [mm], shape (P, 3).
-        balls: bounding sphere of each box's points, centre and radius [mm], shape (B, 4); boxes in depth-first order.
+        points: the points, in the order of the smallest boxes [mm], shape (P, 3).
+        balls: bounding sphere of the points of each box, centre and radius [mm], shape (B, 4). Boxes are in depth-first
+            order.
         nodes: for each box, the range of its points (first, one past the last; 0, 0 for boxes with children), and the
-            index of the next box that is not inside it, shape (B, 3).
+            index of the next box that is not inside the box, shape (B, 3).
     """
 
     points: Array
@@ -44,7 +45,7 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A solid: its distance grid and surface samples, in its own frame (y vertical)."""
+    """Distance grid and surface samples of a solid, in the coordinate frame of the solid (y vertical)."""
 
     grid: DistanceGrid
     samples: Samples
@@ -53,7 +54,7 @@ class Solid:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two opposing solids, the upper one fixed."""
+    """Two opposing solids; the upper one is fixed, the lower one moves."""
 
     upper: Solid
     lower: Solid
@@ -61,17 +62,17 @@ class Pair:
     def depth(self, T_upper_lower: Array) -> Array:
         """Return the penetration depth of the surfaces [mm], shape (n,), in poses (n, 4, 4).
 
-        It is the largest distance to the surface of one solid over all points of the other surface inside it. For
-        separate surfaces it is negative, down to -`FARTHEST_MM`.
+        The depth is the largest distance that a surface point of one solid has to the surface of the other solid while
+        inside it. For separate surfaces the depth is negative, down to -`FARTHEST_MM`.
         """
         return self._deepest(T_upper_lower, -FARTHEST_MM, np.inf)
 
     def is_deeper(self, T_upper_lower: Array, limit_mm: float) -> Mask:
-        """Return where `depth` exceeds a limit, shape (n,); faster than computing the depth itself."""
+        """Return whether the depth exceeds a limit in each pose, shape (n,); faster than computing the depth itself."""
         return self._deepest(T_upper_lower, max(limit_mm, -FARTHEST_MM), limit_mm) > limit_mm
 
     def _deepest(self, T_upper_lower: Array, least: float, enough: float) -> Array:
-        """Return the depths [mm], shape (n,), with `least` as lower limit; values above `enough` are not exact."""
+        """Return the depths [mm], shape (n,), clamped to at least `least`; depths above `enough` are not exact."""
         there = np.ascontiguousarray(T_upper_lower)
         back = np.ascontiguousarray(se3_inverse(there))
         found = np.full(len(there), least)
@@ -90,14 +91,14 @@ class Pair:
 
 
 def distances(grid: DistanceGrid, points: Array) -> Array:
-    """Return the signed distances at points (n, 3) [mm], shape (n,); outside the grid at least `FARTHEST_MM`."""
+    """Return the signed distances at points (n, 3) [mm], shape (n,); at least `FARTHEST_MM` outside the grid."""
     found = np.empty(len(points))
     _look_up_all(found, np.ascontiguousarray(points), _field(grid))
     return found
 
 
 def tips_box(corners: Array, up: float, height_mm: float) -> Array:
-    """Return the box (2, 3) [mm] around a solid, from its tips to `height_mm` towards its base; see `solid`."""
+    """Return the box (2, 3) [mm] around the part of a solid within `height_mm` of its tips; see `solid`."""
     box = np.array([corners.min(axis=(0, 1)) - FARTHEST_MM, corners.max(axis=(0, 1)) + FARTHEST_MM])
     if up > 0:
         box[1, 1] = min(box[1, 1], box[0, 1] + height_mm + FARTHEST_MM)
@@ -112,18 +113,18 @@ def solid(corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> So
     Args:
         corners: triangles counter-clockwise seen from outside [mm], shape (F, 3, 3), y vertical.
         up: see `outer_faces`.
-        box: where the solid matters, rows low and high [mm], shape (2, 3).
-        step_mm: step of the distance grid, which is interpolated linearly.
+        box: region in which the solid is sampled, its low and high corner [mm], shape (2, 3).
+        step_mm: step of the distance grid; distances between its points are interpolated linearly.
     """
     outer, entering = outer_faces(corners, up)
-    # Distances up to FARTHEST_MM are interpolated from exact values if these extend one cell diagonal farther.
+    # Interpolated distances up to FARTHEST_MM need exact values up to one cell diagonal beyond it.
     grid = distance_grid(corners, outer, box, step_mm, up, FARTHEST_MM + 3.0**0.5 * step_mm)
     near = ((corners <= box[1]) & (corners >= box[0])).all(axis=2).any(axis=1)
     return Solid(grid, in_boxes(surface_points(corners[outer & near], _SAMPLE_MM)), entering)
 
 
 def surface_points(corners: Array, apart_mm: float) -> Array:
-    """Sample triangles (F, 3, 3) at most `apart_mm` apart; return points (P, 3) [mm], including corners."""
+    """Sample triangles (F, 3, 3) at points at most `apart_mm` apart, including corners; return points (P, 3) [mm]."""
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     parts = np.maximum(np.ceil(longest / apart_mm), 1).astype(int)
     found = [np.empty((0, 3))]
@@ -150,14 +151,14 @@ def in_boxes(points: Array) -> Samples:
 
 
 def _firsts(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the indices of rows (P, k) that differ from the row before, followed by P."""
+    """Return the indices of the rows of (P, k) that differ from the previous row, followed by P."""
     changes = np.ones(len(keys), dtype=bool)
     changes[1:] = (keys[1:] != keys[:-1]).any(axis=1)
     return np.append(np.flatnonzero(changes), len(keys))
 
 
 def _balls(points: Array, start: NDArray[np.int64]) -> Array:
-    """Return bounding balls (n, 4) of runs of points: centre, radius [mm]."""
+    """Return the bounding spheres (n, 4) of runs of points: centre and radius [mm]."""
     if not len(points):
         return np.empty((0, 4))
     count = np.diff(start)
@@ -167,7 +168,7 @@ def _balls(points: Array, start: NDArray[np.int64]) -> Array:
 
 
 class _Field(NamedTuple):
-    """A distance grid for compiled functions: flattened values, count along each axis, origin, 1/step."""
+    """Distance grid for compiled functions: flattened values, number of points along each axis, origin, 1/step."""
 
     values: NDArray[np.float32]
     nx: int
@@ -186,7 +187,7 @@ def _field(grid: DistanceGrid) -> _Field:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _look_up(field: _Field, x: float, y: float, z: float) -> float:
-    """Return the distance at a point, linear between values; outside the grid at least FARTHEST_MM."""
+    """Return the distance at a point, interpolated linearly; at least FARTHEST_MM outside the grid."""
     fx, fy, fz = (x - field.x) * field.per_mm, (y - field.y) * field.per_mm, (z - field.z) * field.per_mm
     nx, ny, nz = field.nx, field.ny, field.nz
     if not (0 <= fx < nx - 1 and 0 <= fy < ny - 1 and 0 <= fz < nz - 1):
@@ -195,7 +196,7 @@ def _look_up(field: _Field, x: float, y: float, z: float) -> float:
     i, j, k = int(fx), int(fy), int(fz)
     a, b, c = fx - i, fy - j, fz - k
     values = field.values
-    # unsigned indices avoid numba's check for negative ones
+    # Unsigned indices avoid numba's check for negative indices.
     one, row, layer = np.uint64(1), np.uint64(nz), np.uint64(ny * nz)
     at = np.uint64((i * ny + j) * nz + k)
     low = (values[at] * (1 - c) + values[at + one] * c) * (1 - b) + (
@@ -216,7 +217,7 @@ def _look_up_all(found: Array, points: Array, field: _Field) -> None:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _away(field: _Field, M: Array, x: float, y: float, z: float) -> float:
-    """Return the distance at the image of a point under M."""
+    """Return the distance at a point transformed by M."""
     return _look_up(
         field,
         M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3],
@@ -227,7 +228,7 @@ def _away(field: _Field, M: Array, x: float, y: float, z: float) -> float:
 
 @numba.njit(nogil=True, cache=True)
 def _deepest_of(field: _Field, M: Array, points: Array, first: int, end: int, best: float) -> float:
-    """Return the depth of the deepest point under M, or `best` if none is deeper."""
+    """Return the depth of the deepest point of a surface moved by M, or `best` if no point is deeper."""
     for p in range(first, end):
         best = max(best, -_away(field, M, points[p, 0], points[p, 1], points[p, 2]))
     return best
@@ -237,11 +238,11 @@ def _deepest_of(field: _Field, M: Array, points: Array, first: int, end: int, be
 def _deepen(
     depth: Array, T: Array, enough: float, field: _Field, points: Array, balls: Array, nodes: NDArray[np.int64]
 ) -> None:
-    """Raise each depth[i] to that of the deepest point under T[i], or to any value above `enough`."""
+    """Raise depth[i] to that of the deepest point of a surface moved by T[i], or to any value above `enough`."""
     last = 0
     for i in range(len(T) if len(nodes) else 0):
         M = T[i]
-        # start with the deepest point of the previous pose, which prunes most others
+        # The box with the deepest point in the previous pose is tested first, since it prunes most other boxes.
         best = _deepest_of(field, M, points, nodes[last, 0], nodes[last, 1], depth[i])
         n = 0
         while n < len(nodes) and best <= enough:

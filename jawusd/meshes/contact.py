@@ -1,4 +1,4 @@
-"""How the teeth of a subject meet: both scans as solids, the clearance of poses, and images of the contacts."""
+"""Contacts of a subject's teeth: both scans as solids, the clearance of poses, and images of the contacts."""
 
 from __future__ import annotations
 
@@ -17,29 +17,30 @@ from jawusd.formats.mesh import BASE, DEEP, TOUCHING, Mesh
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.meshes.collision import FARTHEST_MM, STEP_MM, Pair, Solid, distances, solid, tips_box
 
-_CROWN_MM = 14.0  # maximum height of crowns above the gum
+_CROWN_MM = 14.0  # maximum height of a crown above the gum
 # minimum fraction of lines whose first crossing enters the scan; at least 0.93 for consistent winding
 _LEAST_WOUND = 0.6
 _WIDEST_GAP_MM = 1.0
 _DEEPEST_MM = 2.5
 _COARSEST_MM = 1.5
 
-_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # grid step and maximum opening of the teeth's clearance field
-_CLOSE_MM = 1.0  # larger clearances come from the coarse field; twice NEAR_MM, below which errors are measured
-_BEYOND_MM = 1.0  # poses up to this far outside the bound are sampled too
-_FREE_MM = 0.8  # the field ends where all valid poses at larger openings have at least this clearance
-_ERROR_SAMPLES = 30000  # number of random samples over the field; one in twenty is a valid pose with close teeth
+_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # grid step and maximum mouth opening of sampled tooth clearances
+# Clearances above this are sampled with the coarse step; twice NEAR_MM, below which errors are measured.
+_CLOSE_MM = 1.0
+_BEYOND_MM = 1.0  # distance from the bound up to which poses outside it are also sampled
+_FREE_MM = 0.8  # minimum clearance of all valid poses at larger mouth openings for sampling to stop
+_ERROR_SAMPLES = 30000  # number of random test poses; one in twenty is a valid pose with the teeth close together
 _CAPTURED_QUANTILE = 0.01
 _LARGEST_LIMIT_MM = 1.0
 Picture = NDArray[np.uint8]
 
 _ENAMEL, _PAPER = np.array([236.0, 229.0, 212.0]), 255
 _LIGHT = np.array([0.3, 0.87, -0.4])
-_FLOOR_MM = 11.0  # maximum depth below the tips of the surfaces drawn; deeper ones are gum
+_FLOOR_MM = 11.0  # maximum depth below the crown tips at which a surface is drawn; deeper surfaces are gum
 
 
 class NoContact(Exception):
-    """The scans do not allow computing contacts; the message gives the reason."""
+    """Raised if contacts cannot be computed from the scans; the message gives the reason."""
 
 
 class Surfaces(Protocol):
@@ -47,7 +48,7 @@ class Surfaces(Protocol):
 
     @property
     def closed_mm(self) -> float:
-        """Penetration depth in the closed bite."""
+        """Penetration depth in the closed bite [mm]."""
 
     def clearances(self, T_skull_mandible: Array) -> Array:
         """Return the clearance [mm], shape (n,), in poses (n, 4, 4), relative to the closed bite."""
@@ -55,10 +56,10 @@ class Surfaces(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Teeth:
-    """Both arches in the anatomical frame, the lower one in the closed bite.
+    """Both dental arches in the anatomical frame, the lower one in the closed bite.
 
     Attributes:
-        pair: Both as solids.
+        pair: Both arches as solids.
         closed_mm: Penetration depth in the closed bite; negative for a gap.
         T_anatomical_skull: Skull to anatomical coordinates, shape (4, 4).
         T_rest: T_skull_mandible of the closed bite, shape (4, 4).
@@ -70,30 +71,30 @@ class Teeth:
     T_rest: Array
 
     def clearances(self, T_skull_mandible: Array) -> Array:
-        """Return the clearance [mm], shape (n,), of poses (n, 4, 4): depth of the closed bite minus that of each."""
+        """Return the clearance [mm], shape (n,), in poses (n, 4, 4): closed-bite depth minus depth in the pose."""
         A = self.T_anatomical_skull
         return self.closed_mm - self.pair.depth(A @ T_skull_mandible @ se3_inverse(A @ self.T_rest))
 
 
 def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Array) -> Teeth:
-    """Return both arches as solids.
+    """Return both dental arches as solids.
 
     Args:
         upper: Upper scan, skull frame [mm].
         lower: Lower scan, mandible frame [mm].
 
     Raises:
-        NoContact: A scan is too coarse or inconsistently wound, or the closed bite is implausible.
+        NoContact: A scan is too coarse or inconsistently wound, or the arches are too far apart or overlap too much.
     """
     placed = (("upper", upper, T_anatomical_skull, 1.0), ("lower", lower, T_anatomical_skull @ T_rest, -1.0))
-    with ThreadPoolExecutor(len(placed)) as pool:  # most of the work releases the GIL
+    with ThreadPoolExecutor(len(placed)) as pool:  # threads, since most of the work releases the GIL
         pair = Pair(*pool.map(lambda row: _solid(*row), placed))
     closed = float(pair.depth(np.eye(4)[None])[0])
     if closed < -_WIDEST_GAP_MM:
         raise NoContact(f"in occlusion, the arches are more than {_WIDEST_GAP_MM:g} mm apart")
     if closed > _DEEPEST_MM:
         raise NoContact(
-            f"in occlusion, the teeth penetrate each other by {closed:.1f} mm (at most {_DEEPEST_MM:g} mm allowed)"
+            f"in occlusion, the teeth penetrate each other by {closed:.1f} mm; at most {_DEEPEST_MM:g} mm is allowed"
         )
     return Teeth(pair, closed, T_anatomical_skull, T_rest)
 
@@ -103,7 +104,9 @@ def _solid(name: str, mesh: Mesh, T: Array, up: float) -> Solid:
     corners = transform_points(T, mesh.vertices)[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     if not len(corners) or np.median(edges) > _COARSEST_MM:
-        raise NoContact(f"the {name} scan is too coarse: edges of {np.median(edges) if len(edges) else 0:.1f} mm")
+        raise NoContact(
+            f"the {name} scan is too coarse: its edges measure {np.median(edges) if len(edges) else 0:.1f} mm"
+        )
     return wound_solid(f"{name} scan", corners, up, tips_box(corners, up, _CROWN_MM))
 
 
@@ -114,7 +117,7 @@ def wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float
         NoContact: The winding is inconsistent; the message names the mesh.
     """
     found = solid(corners, up, box, step_mm)
-    if found.entering < 0.5:  # the mesh is inside out
+    if found.entering < 0.5:  # flip a mesh that is inside out
         found = solid(np.ascontiguousarray(corners[:, ::-1]), up, box, step_mm)
     if found.entering < _LEAST_WOUND:
         raise NoContact(f"the triangles of the {name} are not consistently wound")
@@ -129,7 +132,7 @@ def sample_field(
     Args:
         surfaces: The opposing surfaces.
         rig: The rig.
-        step_mm: Grid step; twice this where the surfaces are apart.
+        step_mm: Grid step where surfaces are close; elsewhere, the step is twice as large.
         most_opening_mm: Largest opening that is sampled; less if the surfaces separate earlier.
     """
     box = _box(surfaces, rig, step_mm, most_opening_mm)
@@ -143,9 +146,9 @@ def sample_field(
 def _sampled(
     surfaces: Surfaces, rig: JawRig, box: Array, step_mm: float, coarse: ContactField | None = None
 ) -> ContactField:
-    """Sample the clearance over a box (3, 2) [mm]; given a coarse field, only where its clearances are small.
+    """Sample the clearance over a box (3, 2) [mm]; given coarse samples, only where their clearances are small.
 
-    Every axis has a grid point at 0, so that the closed bite is exact.
+    Every axis has a grid point at 0, so that the clearance is exact in the closed bite.
     """
     ends = [(np.floor(low / step_mm), np.ceil(high / step_mm)) for low, high in box]
     axes = [step_mm * np.arange(first, last + 1) for first, last in ends]
@@ -165,7 +168,7 @@ def _sampled(
 
 
 def _box(surfaces: Surfaces, rig: JawRig, step_mm: float, most_opening_mm: float) -> Array:
-    """Return the parameter range (3, 2) [mm] of the field, which covers the bound where surfaces are close."""
+    """Return the parameter range (3, 2) [mm] to sample: the part of the rig's bound where surfaces are close."""
     wide = rig.d_range + np.array([-_BEYOND_MM, _BEYOND_MM])
     wide[0, 1] = min(wide[0, 1], most_opening_mm)
     axes = [np.linspace(low, high, n) for (low, high), n in zip(wide, (33, 9, 7))]
@@ -180,7 +183,7 @@ def _box(surfaces: Surfaces, rig: JawRig, step_mm: float, most_opening_mm: float
 
 
 def _error(surfaces: Surfaces, rig: JawRig, field: ContactField) -> float:
-    """Return the largest error [mm] of the field at random valid parameters where the surfaces are close."""
+    """Return the largest error [mm] of interpolated clearances at random valid parameters with close surfaces."""
     rng = np.random.default_rng(0)
     low = field.first_mm
     d = rng.uniform(low, low + field.step_mm * (np.array(field.values.shape) - 1), (_ERROR_SAMPLES, 3))
@@ -194,13 +197,13 @@ def _error(surfaces: Surfaces, rig: JawRig, field: ContactField) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Arch:
-    """The biting side of an arch as a height map.
+    """The occlusal side of an arch as a height map.
 
     Attributes:
-        points: Surface points, frame of the solid [mm], shape (n, 3).
-        pixels: Their rows and columns in the image, shape (n, 2).
-        shade: Brightness, shape (n,).
-        size: Rows and columns of the image.
+        points: Surface points in the coordinate frame of the solid [mm], shape (n, 3).
+        pixels: Row and column of each point in the image, shape (n, 2).
+        shade: Brightness of each point, shape (n,).
+        size: Number of rows and columns of the image.
     """
 
     points: Array
@@ -210,15 +213,15 @@ class _Arch:
 
 
 class ContactMap:
-    """Images of the contacts of one subject's teeth in any pose, like articulating paper."""
+    """Images of a subject's tooth contacts in any pose, like marks of articulating paper."""
 
     def __init__(self, teeth: Teeth) -> None:
-        """Prepare both arches."""
+        """Prepare the height maps of both arches."""
         self._teeth = teeth
         self._arches = _arch(teeth.pair.upper, 1.0), _arch(teeth.pair.lower, -1.0)
 
     def draw(self, T_skull_mandible: Array) -> Picture:
-        """Return the arches side by side, front teeth at the top, subject's left on the right, RGB (h, w, 3)."""
+        """Draw both arches side by side, front teeth at the top, subject's left on the right; return RGB (h, w, 3)."""
         A, pair = self._teeth.T_anatomical_skull, self._teeth.pair
         T = A @ T_skull_mandible @ se3_inverse(A @ self._teeth.T_rest)
         upper, lower = self._arches
@@ -233,7 +236,8 @@ class ContactMap:
     def _picture(self, arch: _Arch, apart: Array) -> Picture:
         colors = arch.shade[:, None] * _ENAMEL
         closed = max(self._teeth.closed_mm, 0.0)
-        apart = apart + min(self._teeth.closed_mm, 0.0)  # a gap between the scans in the closed bite counts as contact
+        # If the scans have a gap in the closed bite, that gap counts as contact.
+        apart = apart + min(self._teeth.closed_mm, 0.0)
         for mark in reversed(TOUCHING):
             colors[apart < mark.apart_mm] = mark.color
         colors[apart < DEEP.apart_mm - closed] = DEEP.color
@@ -243,7 +247,7 @@ class ContactMap:
 
 
 def _arch(solid: Solid, up: float) -> _Arch:
-    """Return the surface points at which vertical lines from the other jaw first meet a solid."""
+    """Return the points at which vertical lines from the opposing jaw first meet a solid."""
     grid = solid.grid
     values = grid.values if up > 0 else grid.values[:, ::-1]
     inside = values < 0
@@ -251,7 +255,7 @@ def _arch(solid: Solid, up: float) -> _Arch:
     i, k = np.nonzero(inside.any(axis=1) & (layer > 0))
     j = layer[i, k]
     before, after = values[i, j - 1, k].astype(float), values[i, j, k].astype(float)
-    place = j - after / (after - before)  # position of the surface, in grid layers
+    place = j - after / (after - before)  # interpolated position of the surface, in units of grid layers
     row = place if up > 0 else values.shape[1] - 1 - place
     height = np.full(values.shape[::2], np.nan)
     height[i, k] = place * grid.step_mm
@@ -264,7 +268,7 @@ def _arch(solid: Solid, up: float) -> _Arch:
 
 
 def _shade(height: Array, step_mm: float) -> Array:
-    """Return the brightness of a height map (nx, nz) [mm], shape (nx, nz), lit from behind."""
+    """Return the brightness (nx, nz) of a height map (nx, nz) [mm] that is lit from behind."""
     known: Mask = np.isfinite(height)
     filled = np.where(known, height, np.nanmax(height))
     x, z = np.gradient(filled, step_mm)

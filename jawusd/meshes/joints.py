@@ -1,7 +1,7 @@
-"""Condyles and fossae of a subject: the bone of mandible and skull around both joints, as solids.
+"""Condyles and fossae of a subject: mandible and skull around both jaw joints, as solids.
 
-Cartilage and disc separate the bones of a joint but are not in the scans, and tracking and model errors are largest at
-the condyles. Clearances are therefore reported, but never used to reject poses.
+In a joint, cartilage and disc separate the bones but are not in the scans, and tracking and model errors are largest at
+the condyles. Clearances of the joints are therefore reported, but never used to reject poses.
 """
 
 from __future__ import annotations
@@ -18,24 +18,26 @@ from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.meshes.collision import FARTHEST_MM, Pair
 from jawusd.meshes.contact import NoContact, wound_solid
 
-#: Step of sampled clearances [mm].
+#: Grid step of sampled joint clearances [mm].
 STEP_MM = 0.8
 
-_GRID_MM = 0.5  # step of the distance grid; clearances differ by at most 0.014 mm from those with 0.25 mm
-_CONDYLES = [index for index, name in enumerate(LANDMARKS) if name.startswith("condyle")]  # left, right
-_CONDYLE_MM = 10.0  # radius around the landmark that contains the condylar head but not the coronoid process
-_REACH_MM = 26.0  # maximum translation of the condylar head, which may pass the eminence
-_COARSEST_MM = 4.0  # maximum median edge length; a condyle is about 8 mm deep
+_GRID_MM = 0.5  # step of the distance grid; clearances differ by at most 0.014 mm from those of a 0.25 mm grid
+# Indices of the left and the right condyle.
+_CONDYLES = [index for index, name in enumerate(LANDMARKS) if name.startswith("condyle")]
+_CONDYLE_MM = 10.0  # distance from the condyle landmark that includes the condylar head but not the coronoid process
+_REACH_MM = 26.0  # maximum translation of the condylar head, which may move past the articular eminence
+_COARSEST_MM = 4.0  # maximum median edge length of a bone's triangles; a condyle is about 8 mm deep
 _FEWEST_FACES = 30
-_DEEPEST_MM, _WIDEST_MM = 2.5, 8.0  # closed bite: maximum penetration into the skull, and distance to it
+# Maximum penetration of a condyle into the skull, and distance from it, in the closed bite.
+_DEEPEST_MM, _WIDEST_MM = 2.5, 8.0
 
 
 @dataclass(frozen=True, eq=False)
 class Joints:
-    """Both joints in the anatomical frame, the mandible in the closed bite.
+    """Both jaw joints in the anatomical frame, the mandible in the closed bite.
 
     Attributes:
-        pairs: Skull and condyle as solids, left and right.
+        pairs: Skull and condyle as solids, for the left and the right joint.
         closed: Penetration depth of each condyle into the skull in the closed bite [mm], shape (2,); negative for gaps,
             down to -`collision.FARTHEST_MM`.
         T_anatomical_skull: Skull to anatomical coordinates, shape (4, 4).
@@ -49,7 +51,7 @@ class Joints:
 
     @property
     def closed_mm(self) -> float:
-        """Penetration depth of the deeper condyle in the closed bite."""
+        """Penetration depth of the deeper condyle in the closed bite [mm]."""
         return float(self.closed.max())
 
     def clearances(self, T_skull_mandible: Array) -> Array:
@@ -64,11 +66,11 @@ class Joints:
 
 
 def find_joints(skull: Mesh, mandible: Mesh, landmarks: Array, T_anatomical_skull: Array, T_rest: Array) -> Joints:
-    """Return both joints as solids.
+    """Return both jaw joints as solids.
 
     Args:
-        skull: Skull frame [mm].
-        mandible: Mandible frame [mm].
+        skull: Mesh of the skull, skull frame [mm].
+        mandible: Mesh of the mandible, mandible frame [mm].
         landmarks: `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3).
 
     Raises:
@@ -85,7 +87,8 @@ def find_joints(skull: Mesh, mandible: Mesh, landmarks: Array, T_anatomical_skul
         _check_near(pair, depth)
     if closed.max() > _DEEPEST_MM:
         raise NoContact(
-            f"in occlusion, a condyle penetrates the skull by {closed.max():.1f} mm (at most {_DEEPEST_MM:g} mm)"
+            f"in occlusion, a condyle penetrates the skull by {closed.max():.1f} mm; at most "
+            f"{_DEEPEST_MM:g} mm is allowed"
         )
     return Joints((left, right), closed, T_anatomical_skull, T_rest)
 
@@ -105,14 +108,14 @@ def _check_near(pair: Pair, depth_mm: float) -> None:
         return
     gap, _ = cKDTree(pair.upper.samples.points).query(pair.lower.samples.points)
     if gap.min() > _WIDEST_MM:
-        raise NoContact(f"a condyle is {gap.min():.1f} mm from the skull (at most {_WIDEST_MM:g} mm allowed)")
+        raise NoContact(f"a condyle is {gap.min():.1f} mm from the skull; at most {_WIDEST_MM:g} mm is allowed")
 
 
 def _check_fine(name: str, corners: Array, box: Array) -> None:
     """Raise NoContact if a bone is missing or too coarse in a box (2, 3) [mm]."""
     part = corners[((corners >= box[0]) & (corners <= box[1])).all(axis=2).any(axis=1)]
     if len(part) < _FEWEST_FACES:
-        raise NoContact(f"the {name} has no bone at the condyles")
+        raise NoContact(f"the mesh of the {name} has no bone at the condyles")
     edge = float(np.median(np.linalg.norm(part - np.roll(part, 1, axis=1), axis=2)))
     if edge > _COARSEST_MM:
-        raise NoContact(f"the {name} is too coarse at the condyles: edges of {edge:.1f} mm")
+        raise NoContact(f"the mesh of the {name} is too coarse at the condyles: its edges measure {edge:.1f} mm")

@@ -23,24 +23,23 @@ from jawusd.formats.mesh_ply import read_ply
 from jawusd.formats.mesh_stl import read_stl
 from jawusd.geometry.points import welded
 
-# Re-exported for scripts that read and label scans.
+# Winding, tooth_labels and winding are re-exported for scripts that read and label scans.
 __all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]
 
 _NO_FACES = "Export the surface, not a point cloud, with the suffix of its format."
-# Diagonal of the bounding box [mm]: minimum, typical value, maximum. A full arch measures about 80, a mandible 165, a
-# skull 290.
+# Bounding box diagonal of each kind of mesh [mm]: minimum, typical value, maximum. A scan of a full arch measures about
+# 80 mm, a mandible 165 mm, a skull 290 mm.
 _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
 
 
-@np.errstate(invalid="ignore", over="ignore")  # damaged vertices are reported below if faces use them
+@np.errstate(invalid="ignore", over="ignore")  # non-finite vertices are reported later, if a face uses them
 def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
-    """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM; vertices keep the file's order.
+    """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM; vertices keep the order of the file.
 
     Polygons are triangulated; STL files give three vertices per triangle. Texture coordinates are read from OBJ and
     PLY; materials and textures are ignored. Closed meshes that are inside out are flipped. Unused vertices keep
-    their index but move to the position of a used one. The kind, teeth scan or bone, sets the accepted range of
-    sizes.
+    their index but move to the position of a used one. `kind`, teeth scan or bone, determines the accepted sizes.
 
     Raises:
         CaptureError: the file is missing, damaged, truncated or too large, has no triangles or non-finite coordinates,
@@ -51,13 +50,15 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     check_input(path, CaptureError)
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise CaptureError(f"meshes must be {', '.join(MESHES)} files.", path=path, hint="Convert the mesh.")
+        raise CaptureError(
+            f"is not a supported mesh file; expected {', '.join(MESHES)}.", path=path, hint="Convert the mesh."
+        )
     try:
         if (said := why_unreadable(path)) is not None:
             raise CaptureError(said[0], path=path, hint=said[1])
         data = read(path)
     except FileNotFoundError as error:
-        raise CaptureError("no such mesh.", path=path, hint="Check the path in capture.toml.") from error
+        raise CaptureError("there is no such mesh file.", path=path, hint="Check the path in capture.toml.") from error
     except (OSError, ValueError, OverflowError) as error:
         raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it again.") from error
     if len(data.faces) == 0:
@@ -67,7 +68,7 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
 
 @explain_missing_packages("dcm")
 def _read_dcm(path: Path) -> MeshData:
-    """Read a 3Shape scan, with colours from its texture.
+    """Read a 3Shape DCM scan; vertex colours come from its texture.
 
     Raises:
         CaptureError: the file is damaged.
@@ -78,7 +79,7 @@ def _read_dcm(path: Path) -> MeshData:
         found = open3sdcm.load(str(path))
         vertices, faces = np.array(found.vertices, np.float64), np.array(found.faces).astype(np.int64)
         texture, corners = found.texture, found.uv
-    except Exception as error:  # the parser raises its own exceptions for damaged and encrypted files
+    except Exception as error:  # open3sdcm raises exceptions of its own for damaged and encrypted files
         raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it as PLY or STL.") from error
     return MeshData(vertices, faces, _texture_colors(texture, corners, faces, len(vertices)))
 
@@ -89,7 +90,7 @@ _READERS = {".ply": read_ply, ".stl": read_stl, ".obj": read_obj, ".dcm": _read_
 def _texture_colors(
     texture: bytes | None, corners: Array | None, faces: NDArray[np.int64], count: int
 ) -> NDArray[np.uint8] | None:
-    """Return vertex colours sampled from a JPEG texture at the last texture coordinates of each vertex (v up)."""
+    """Return vertex colours, sampled from a JPEG texture at the last texture coordinates (v up) of each vertex."""
     if texture is None or corners is None or len(corners) != faces.size:
         return None
     image = cv2.imdecode(np.frombuffer(texture, np.uint8), cv2.IMREAD_COLOR)
@@ -109,7 +110,8 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
     outside = np.flatnonzero(((faces < 0) | (faces >= len(data.vertices))).any(axis=1))
     if outside.size:
         raise CaptureError(
-            f"triangle {outside[0]} refers to a vertex that does not exist; there are {len(data.vertices)}.",
+            f"triangle {outside[0]} refers to a vertex that does not exist; the mesh has "
+            f"{len(data.vertices)} vertices.",
             path=path,
             hint="Export the mesh again.",
         )
@@ -126,10 +128,10 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
     if not low <= diagonal <= high:
         fitting = {unit: abs(math.log(diagonal * mm / typical)) for unit, mm in _UNITS_MM.items() if diagonal > 0}
         unit = min(fitting, key=fitting.__getitem__) if fitting else ""
-        guess = f" It looks like {unit}." if fitting and low <= diagonal * _UNITS_MM[unit] <= high else ""
+        guess = f" Its lengths look like {unit}." if fitting and low <= diagonal * _UNITS_MM[unit] <= high else ""
         raise CaptureError(
-            f"the mesh is {diagonal:.4g} mm across its bounding box; a {kind} must measure {low:g} to "
-            f"{high:g} mm.{guess}",
+            f"the bounding box diagonal of the mesh is {diagonal:.4g} mm; expected {low:g} to {high:g} mm for a "
+            f"{kind}.{guess}",
             path=path,
             hint="Lengths must be in mm: scale the mesh and export it again.",
         )
@@ -141,11 +143,11 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
 
 
 class Winding(NamedTuple):
-    """Winding of a mesh."""
+    """Winding of a mesh's triangles, and whether the mesh is closed."""
 
     closed: bool  # whether every edge is shared by exactly two triangles, in opposite directions
-    outward: bool  # whether triangles are counter-clockwise seen from outside; only probable if not closed
-    volume_mm3: float  # signed volume, positive if outward
+    outward: bool  # whether triangles are counter-clockwise seen from outside; a guess if the mesh is not closed
+    volume_mm3: float  # enclosed volume; positive if triangles are wound outward
 
 
 def winding(mesh: Mesh) -> Winding:

@@ -4,12 +4,12 @@ The compiled functions release the GIL and have no state, so threads may call th
 cached on disk; argument types are fixed (C-contiguous float32 / int32 / uint64 arrays), so that another dtype raises a
 TypeError instead of triggering a second compilation.
 
-Conventions: OpenCV pixels, the centre of the top left pixel of the image is (0, 0). A buffer covers a *region* of the
-image of its own shape that starts at pixel (x0, y0). A silhouette is a (h, words) uint64 array; bit ``x & 63`` of word
-``x >> 6`` is pixel x of the region; bits beyond the width stay zero.
+Conventions: pixel coordinates are OpenCV's, with the centre of the top left pixel at (0, 0). A buffer covers a region
+of the image that has the buffer's shape and starts at pixel (x0, y0). A silhouette is a (h, words) uint64 array; bit
+``x & 63`` of word ``x >> 6`` is pixel x of the region; bits beyond the width stay zero.
 
 Edge rule: a pixel is covered iff its centre lies inside a projected triangle or on its border. Every edge is evaluated
-from its upper end, so that both of its triangles get equal values and closed meshes have no cracks. Pixels covered
+from its upper end, so that both adjacent triangles get equal values and closed meshes have no cracks. Pixels covered
 twice do not affect unions or nearest depths. (A top-left rule would drop centres exactly on the outline.)
 """
 
@@ -25,7 +25,8 @@ from jawusd.base.arrays import Mask
 _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _ONE = np.uint64(1)
 _LOW6 = 63
-_MIN_DEPTH = np.float32(1e-3)  # minimum depth [mm]: triangles with a corner closer, or behind the camera, are not drawn
+# Minimum depth [mm]; triangles with a closer corner, or one behind the camera, are not drawn.
+_MIN_DEPTH = np.float32(1e-3)
 
 
 def _array(dtype: types.Type, mutable: bool = False) -> types.Array:
@@ -50,8 +51,8 @@ def project(vertices: Singles, matrix: Singles, out: Singles) -> None:
     """Project vertices with a 3x4 matrix.
 
     Args:
-        vertices: (V, 3) float32, mm, in the source frame of the matrix.
-        matrix: (3, 4) float32, K [R | t] @ T; maps homogeneous mm to (u z, v z, z).
+        vertices: (V, 3) float32 [mm], in the coordinate frame that the matrix maps from.
+        matrix: (3, 4) float32, K [R | t] @ T; maps homogeneous coordinates [mm] to (u z, v z, z).
         out: (V, 3) float32, receives u [px], v [px], depth z [mm]. u, v are undefined where z <= 0.
     """
     for i in range(vertices.shape[0]):
@@ -67,9 +68,9 @@ def project(vertices: Singles, matrix: Singles, out: Singles) -> None:
 
 @numba.njit(nogil=True, cache=True)
 def _hidden(points: Singles, a: int, b: int, c: int, cull: bool) -> bool:
-    """Return whether a triangle is skipped: it touches the camera plane or, with `cull`, is a back face.
+    """Return whether a triangle is skipped because it touches the camera plane or, with `cull`, is a back face.
 
-    With y down, an outward counter-clockwise face seen from the front has a negative signed area.
+    With y down, a counter-clockwise face seen from the front has a negative signed area.
     """
     if not (points[a, 2] > _MIN_DEPTH and points[b, 2] > _MIN_DEPTH and points[c, 2] > _MIN_DEPTH):
         return True
@@ -104,7 +105,7 @@ def _edges(points: Singles, a: int, b: int, c: int) -> _Edges:
 
 @numba.njit(nogil=True, cache=True)
 def _interval(low: float, high: float, first: int, last: int) -> tuple[int, int]:
-    """Return the integers of [low, high] within [first, last] as (i, j); i > j if there are none, or for NaN.
+    """Return the first and last integer (i, j) in both [low, high] and [first, last]; i > j if none, or for NaN.
 
     Values are clamped as floats first, since casting a NaN or a huge coordinate to an integer is undefined.
     """
@@ -121,7 +122,7 @@ def _interval(low: float, high: float, first: int, last: int) -> tuple[int, int]
 
 @numba.njit(nogil=True, cache=True)
 def _span(edges: _Edges, y: int, first: int, last: int) -> tuple[int, int]:
-    """Return the first and last covered pixel (i, j) of image row y within the columns [first, last]."""
+    """Return the columns (i, j) of the first and last covered pixel of image row y, within columns [first, last]."""
     ax, ay, bx, by, cx, cy, slope_ac, slope_ab, slope_bc = edges
     if ay == cy:  # a degenerate triangle, projected to a line along the row
         return _interval(min(ax, bx, cx), max(ax, bx, cx), first, last)
@@ -134,7 +135,7 @@ def _span(edges: _Edges, y: int, first: int, last: int) -> tuple[int, int]:
 
 @numba.njit(nogil=True, cache=True)
 def _fill(row: Bits, i: int, j: int) -> None:
-    """Set bits i..j (inclusive) of a bit row."""
+    """Set bits i to j (inclusive) of a bit row."""
     word = i >> 6
     last = j >> 6
     head = _ALL << np.uint64(i & _LOW6)
@@ -159,14 +160,14 @@ def draw_silhouette(
         faces: (F, 3) int32, valid indices into points (not checked).
         x0, y0: image pixel at the buffer's top left corner.
         width: pixels per row; bits.shape[1] must be at least words_for(width).
-        cull: whether to skip back faces; only for closed meshes with outward winding, where the result is the same.
+        cull: whether to skip back faces; allowed for closed meshes with outward winding, where it changes nothing.
         bits: (h, words) uint64; clear it before the first call.
 
     Raises:
         ValueError: the buffer's rows are shorter than width.
     """
     if bits.shape[1] * 64 < width:
-        raise ValueError("bits: rows have fewer than width pixels")
+        raise ValueError("bits: the rows have fewer than `width` pixels")
     for f in range(faces.shape[0]):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         if _hidden(points, a, b, c, cull):
@@ -181,7 +182,7 @@ def draw_silhouette(
 
 @numba.njit(nogil=True, cache=True)
 def _inverse_depth_plane(points: Singles, a: int, b: int, c: int) -> tuple[float, float, float, float, float]:
-    """Return 1/z at corner a, its image gradient, and its range: 1/z is affine over a projected triangle."""
+    """Return 1/z at corner a, and its image gradient and range; 1/z is affine over a projected triangle."""
     ia = 1.0 / points[a, 2]
     ib = 1.0 / points[b, 2]
     ic = 1.0 / points[c, 2]
@@ -218,7 +219,7 @@ def draw_depth_labels(
 
     Args:
         points, faces, x0, y0, cull: as for `draw_silhouette`.
-        inverse_depth: (h, w) float32, 1/z [1/mm], 0 = empty; clear it before the first call. A tie keeps the old value.
+        inverse_depth: (h, w) float32, 1/z [1/mm], 0 = empty; clear it before the first call. Ties keep the old value.
         labels: (h, w) uint8, receives `label` where the mesh is nearest; an empty (0, 0) array disables this.
 
     Raises:
@@ -226,7 +227,7 @@ def draw_depth_labels(
     """
     keep_labels = labels.shape[0] > 0
     if keep_labels and labels.shape != inverse_depth.shape:
-        raise ValueError("labels: must be empty or have the shape of inverse_depth")
+        raise ValueError("labels: the array must be empty or have the shape of inverse_depth")
     for f in range(faces.shape[0]):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         if _hidden(points, a, b, c, cull):
@@ -241,7 +242,8 @@ def draw_depth_labels(
             row = inverse_depth[y - y0]
             start = corner + dv * (y - points[a, 1])
             for x in range(i, j + 1):
-                # Clamp, since on slivers the gradient is ill-conditioned and would extrapolate beyond the corners.
+                # Clamp: on slivers, the ill-conditioned gradient would extrapolate beyond the values at the
+                # corners.
                 value = np.float32(min(max(start + du * (x - points[a, 0]), low), high))
                 if value > row[x - x0]:
                     row[x - x0] = value
@@ -270,13 +272,13 @@ def count_bits(bits: Bits) -> np.int64:
 
 @numba.njit(_INT(_BITS, _BITS), nogil=True, cache=True)
 def count_and_not(first: Bits, second: Bits) -> np.int64:
-    """Count the pixels set in first and not in second; both (h, words) uint64.
+    """Count the pixels that are set in `first` but not in `second`; both have shape (h, words), uint64.
 
     Raises:
         ValueError: the two images differ in shape.
     """
     if first.shape != second.shape:
-        raise ValueError("bit rows: the two images differ in shape")
+        raise ValueError("bit rows: the two images have different shapes")
     total = np.uint64(0)
     for y in range(first.shape[0]):
         for k in range(first.shape[1]):
@@ -296,7 +298,7 @@ def pack_bits(mask: Mask | NDArray[np.uint8]) -> Bits:
         ValueError: mask is not two-dimensional.
     """
     if mask.ndim != 2:
-        raise ValueError(f"mask: needs shape (h, w), found {mask.shape}")
+        raise ValueError(f"mask: the shape is {mask.shape}; expected (h, w)")
     height, width = mask.shape
     padded = np.zeros((height, words_for(width) * 64), bool)
     padded[:, :width] = mask != 0
@@ -310,6 +312,6 @@ def unpack_bits(bits: Bits, width: int) -> Mask:
         ValueError: the rows are shorter than width.
     """
     if bits.ndim != 2 or bits.shape[1] * 64 < width:
-        raise ValueError(f"bits: needs shape (h, >= {words_for(width)}), found {bits.shape}")
+        raise ValueError(f"bits: the shape is {bits.shape}; expected (h, n) with n >= {words_for(width)}")
     bytes_ = np.ascontiguousarray(bits.astype("<u8", copy=False)).view(np.uint8)
     return np.unpackbits(bytes_, axis=1, bitorder="little")[:, :width].view(bool)

@@ -1,4 +1,4 @@
-"""Simplified and cleaned surfaces: decimation by quadric edge collapse, and bones as manifolds."""
+"""Simplify and repair surfaces: decimation by quadric edge collapse, and repair of bones to manifolds."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import GUM, TOOTH, Mesh, crown_face_mask
 from jawusd.geometry.points import welded
 
-# Offset [mm] that separates parts of a surface touching in a single point, since validators report coincident points
-# as unmerged seams.
+# Offset [mm] by which parts of a surface that touch in a single point are separated; validators report coincident
+# points as unmerged seams.
 _APART_MM = 1e-3
 
 
 def decimated(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Array, NDArray[np.int32]]:
-    """Return vertices (V', 3) and about `count` faces of a surface (V, 3), (F, 3); open borders are preserved.
+    """Decimate a surface (V, 3), (F, 3) to about `count` faces; return vertices (V', 3) and faces (F', 3).
 
-    Quadric edge collapse (Garland & Heckbert 1997).
+    The method is quadric edge collapse (Garland & Heckbert 1997). Open borders are preserved.
     """
     if not len(faces):
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
@@ -34,7 +34,7 @@ def decimated(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Ar
 
 
 def proxy_of(mesh: Mesh, count: int) -> Mesh:
-    """Return a mesh of about `count` faces, plus one per border edge; crowns and gum stay separate.
+    """Return a scan decimated to about `count` faces, plus one per border edge, with crowns and gum kept separate.
 
     Borders are preserved, including the one between crown and gum. The result has labels of crown and gum, but no
     colours or texture coordinates.
@@ -72,17 +72,17 @@ def decimated_scan(
     parts = [decimated(vertices, faces, int(share * len(faces))) for faces in (crown_faces, gum_faces)]
     points = np.concatenate([p for p, _ in parts])
     crowns, gum = parts[0][1], parts[1][1] + len(parts[0][0])
-    # Merge the duplicated border of both sides back into the crown-gum line.
+    # The points of the crown-gum line exist in both parts; merge them.
     places, index = welded(points)
     index = index.astype(np.int32)
     return places, np.ascontiguousarray(index[crowns]), np.ascontiguousarray(index[gum])
 
 
 def manifold(mesh: Mesh) -> Mesh:
-    """Return a surface, repaired to be manifold.
+    """Return a surface repaired to be manifold.
 
     Coincident points are merged, degenerate and duplicate faces dropped; at edges with more than two faces, only the
-    two largest are kept; connected faces are wound consistently; parts that touch in one point get separate points.
+    two largest faces are kept; connected faces are wound consistently; parts that touch in one point are separated.
     """
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     surface.merge_vertices()
@@ -95,7 +95,7 @@ def manifold(mesh: Mesh) -> Mesh:
 
 
 def _surplus_faces(surface: trimesh.Trimesh) -> Mask:
-    """Return which faces are neither the largest nor the second largest at one of their edges, shape (F,)."""
+    """Return the mask of faces that at one of their edges are not among the two largest faces, shape (F,)."""
     _, edge, count = np.unique(surface.edges_sorted, axis=0, return_inverse=True, return_counts=True)
     owner = np.repeat(np.arange(len(surface.faces)), 3)
     out = np.zeros(len(surface.faces), dtype=bool)

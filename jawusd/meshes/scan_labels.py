@@ -1,7 +1,7 @@
 """Separate crown and gum of a teeth scan by its shape, and by its colours where these differ.
 
-Scans come in two kinds. Where crowns are separate components, each component is crown or gum. Where one surface covers
-crowns and gum, the boundary between them is the crease around every crown.
+There are two kinds of scans. If crowns are separate components of the mesh, each component is crown or gum. If one
+surface covers crowns and gum, the boundary between them is the crease around every crown.
 """
 
 from __future__ import annotations
@@ -18,55 +18,58 @@ from jawusd.meshes.scan_surface import ScanSurface
 from jawusd.meshes.scan_tops import Tops, biting_direction, topped_by, tops
 from jawusd.meshes.scan_walk import CreaseWalk
 
-# Bounding box diagonal [mm] that is larger than that of any crown, including scanned root and gum, and smaller than
-# that of the gum of an arch or quadrant.
+# Bounding box diagonal [mm] that separates crowns, including scanned root and gum, from the gum of an arch or quadrant;
+# the former are smaller, the latter larger.
 _TOOTH_MM = 30.0
-_FEWEST_FACES = 100  # minimum number of faces; scans with fewer cannot be labelled or tracked
+_FEWEST_FACES = 100  # minimum number of faces of a scan; scans with fewer cannot be labelled or tracked
 # Bounding box diagonal of the smallest crown [mm]; smaller components are scraps and brackets, which take the label of
-# their neighbours.
+# the adjacent component.
 _CROWN_MM = 4.0
-# Fraction of a component's height whose lowest vertices are the gum seeds if there are no better ones.
+# Fraction of a component's height, from its lower end, in which vertices become gum seeds if there are no better ones.
 _LOWEST = 0.12
-# Maximum rate at which walks leave a crown top for the gum, per mm of the top's outline [1/mm]; the limit is divided by
-# a factor that grows with the depth of the top below the hull of the arch. Rates on 40 scans of one surface: 0.003
-# (median) to 0.030 at crowns, 0.026 to 0.074 at ridges without teeth, which are mostly below the hull.
+# Maximum rate at which random walks from a crown top reach the gum, per mm of the top's outline [1/mm]. The limit is
+# divided by a factor that grows with the depth of the top below the hull of the dental arch. Observed rates (40 scans,
+# each one surface): 0.003 (median) to 0.030 at crowns, 0.026 to 0.074 at ridges without teeth, most of which are below
+# the hull.
 _LEAVING, _STRICTER_PER_MM, _STRICTEST_MM = 0.06, 3.0, 0.6
-# Maximum fraction of a component's crown-gum border without a crease, median over an arch, for which the components
-# are taken to contain gum. Observed: 0.02 to 0.162 for crowns with a collar of gum (58 scans of synthetic subjects with
-# 5,000 faces and more), 0.8 to 1.0 for plain synthetic crowns, 0.24 to 0.34 for plain real ones, and 0.167 in one scan
-# seen from the roots, whose grooves and necks resemble short creases.
+# Maximum fraction of a component's crown-gum border that has no crease (median over a dental arch) for the components
+# to be treated as crowns with gum. Observed: 0.02 to 0.162 for crowns with a collar of gum (58 scans of synthetic
+# subjects with 5,000 faces and more); 0.8 to 1.0 for synthetic crowns without gum, 0.24 to 0.34 for real ones, and
+# 0.167 in one scan recorded from the root side, whose grooves and necks resemble short creases.
 _MOST_WEAK = 0.165
-_COARSE_MM = 1.2  # longer edges do not resolve creases at the gum line, so that apparent crowns may contain gum
-# Minimum height of a component's lower end above that of the adjacent crown, as a fraction of the crown's height, for
-# which the component is attached to the crown (a bracket) and not gum.
+# Median edge length above which creases at the gum line are not resolved, so that crowns may include gum.
+_COARSE_MM = 1.2
+# Minimum height of a small component's lower end above the lower end of the adjacent crown, as a fraction of the
+# crown's height, for the component to be attached to the crown (such as a bracket) instead of being gum.
 _ON_CROWN = 0.2
-# Minimum difference in redness between the highest points and points far below them, in standard deviations, for which
-# colours are used; it is smaller for stone casts and untextured scans.
+# Minimum difference in redness between the highest points and points far below them, in standard deviations, for vertex
+# colours to be used; stone casts and untextured scans stay below it.
 _LEAST_CONTRAST = 4.0
-_FAR_BELOW_MM = 9.0  # depth below the highest point nearby beyond which few crowns extend
-_FEWEST = 50  # colours need at least this many vertices that are certainly crown, and as many that are certainly gum
+_FAR_BELOW_MM = 9.0  # depth below the highest nearby point that few crowns exceed
+_FEWEST = 50  # minimum number of vertices that are certainly crown, and of those certainly gum, for colours to be used
 _GRAIN = 0.003  # standard deviation of redness due to 8-bit quantisation
 
 
 @dataclass(frozen=True, eq=False)
 class Labelling:
-    """Labels of a scan from its shape."""
+    """Crown and gum labels of a scan."""
 
-    labels: NDArray[np.uint8]  # GUM or TOOTH per vertex of the scan, shape (V,)
-    up: Array  # the direction in which the crowns point, shape (3,)
-    # fraction of the crown-gum border that does not follow a crease, 0 .. 1; 0 without a border, 1 if the faces are too
-    # large to resolve creases
+    labels: NDArray[np.uint8]  # GUM or TOOTH for each vertex of the scan, shape (V,)
+    up: Array  # direction in which the crowns point, shape (3,)
+    # Fraction of the crown-gum border that does not follow a crease, 0 to 1; 0 if there is no border, 1 if the faces
+    # are too large to resolve creases.
     weak_share: float
 
 
 def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
     """Separate crown and gum of a teeth scan by its shape, and by its colours where these differ.
 
-    A scan of crowns only is entirely crown.
+    A scan that contains only crowns is labelled entirely as crown.
 
     Args:
         mesh: the scan [mm].
-        towards: centre of the other arch in the same frame, teeth in occlusion, shape (3,), or None.
+        towards: centre of the opposing arch in the coordinate frame of the scan, teeth in occlusion, shape (3,), or
+            None.
     """
     surface = ScanSurface.of(mesh)
     if len(surface.faces) < _FEWEST_FACES:
@@ -85,7 +88,7 @@ def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
 
 
 def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) -> tuple[Mask, float]:
-    """Return which vertices are crown, shape (v,), and the fraction of mixed components' borders without a crease."""
+    """Return which vertices are crown, shape (v,), and the fraction of crown-gum borders that have no crease."""
     piece, extent = surface.piece, _extent_mm(surface)
     small = extent < _TOOTH_MM
     starts = np.bincount(piece, seen.crown, len(extent))
@@ -93,7 +96,7 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
     bearing = (extent > _CROWN_MM) & (starts > 0) | alone
     high = (seen.crown | (alone & (starts == 0))[piece] & (_height_share(surface, up) > 1 - _LOWEST)) & bearing[piece]
     if (bearing & small).sum() >= 3 and high[~small[piece]].sum() < 0.2 * high.sum():
-        bearing &= small  # components larger than these separate crowns are then their gum
+        bearing &= small  # with several separate crowns, larger components are their gum
         high &= small[piece]
     low = seen.gum | ~bearing[piece]
     surely = np.bincount(piece, seen.gum, len(extent)) > 0
@@ -116,7 +119,7 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
 
 
 def _carried(surface: ScanSurface, up: Array, crowns: Mask, others: Mask) -> Mask:
-    """Return which other components (P,) are attached to a crown that is a separate component, shape (P,)."""
+    """Return which of the components `others` (P,) are attached to one of the components `crowns` (P,), shape (P,)."""
     out = np.zeros(len(others), dtype=bool)
     if not crowns.any() or not others.any():
         return out
@@ -142,7 +145,7 @@ def _extent_mm(surface: ScanSurface) -> Array:
 
 
 def _height_share(surface: ScanSurface, up: Array) -> Array:
-    """Return the relative height of every vertex in its component, 0 lowest to 1 highest, shape (v,)."""
+    """Return the relative height of each vertex in its component, from 0 (lowest) to 1 (highest), shape (v,)."""
     height = surface.vertices @ up
     count = int(surface.piece.max()) + 1
     low, high = np.full(count, np.inf), np.full(count, -np.inf)
@@ -152,7 +155,7 @@ def _height_share(surface: ScanSurface, up: Array) -> Array:
 
 
 def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
-    """Return the crowns with scraps assigned to the adjacent larger component."""
+    """Return the crown vertices after giving scraps the label of the adjacent larger component."""
     scrap = (_extent_mm(surface) < _CROWN_MM)[surface.piece]
     if not scrap.any() or scrap.all():
         return crown
@@ -163,12 +166,12 @@ def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
 
 
 def crown_by_colour(colors: NDArray[np.uint8], surface: ScanSurface, seen: Tops) -> Array | None:
-    """Return each vertex's probability of being crown, judged by its colour, 0 .. 1, shape (v,).
+    """Return the probability that each vertex is crown, judged by its colour, 0 to 1, shape (v,).
 
-    None if the colours are not informative.
+    Return None if the colours are not informative.
 
     Args:
-        colors: red, green, blue per vertex of the scan, shape (V, 3).
+        colors: red, green and blue of each vertex of the scan, shape (V, 3).
     """
     count = len(surface.vertices)
     total = np.maximum(colors.sum(axis=1, dtype=np.float64), 1.0)

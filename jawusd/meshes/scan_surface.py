@@ -1,4 +1,4 @@
-"""A teeth scan as a clean surface: points merged, degenerate and duplicate faces dropped; components and creases."""
+"""Clean surface of a teeth scan: merged points, no degenerate or duplicate faces; its components and creases."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array, Indices
 from jawusd.formats.mesh import Mesh
 
-# Length over which normals are averaged before curvature is computed [mm]; scanners round creases by some tenths of a
+# Length [mm] over which normals are averaged before curvature is computed. Scanners round creases by some tenths of a
 # millimetre and cause ripples of some hundredths.
 _SCALE_MM = 0.35
 _MOST_ROUNDS = 12
-_FINE_MM = 0.4  # creases use vertex normals up to this edge length, and face angles from twice this length
+# Creases are found from vertex normals up to this edge length, and from face angles above twice this length.
+_FINE_MM = 0.4
 _SEEN_MM = 0.75  # cell size of the test for visibility from above
 
 
 @dataclass(frozen=True, eq=False)
 class ScanSurface:
-    """A scan with shared vertices."""
+    """Surface of a scan whose faces share vertices."""
 
     vertices: Array  # positions [mm], shape (v, 3)
     faces: NDArray[np.int64]  # vertex indices, shape (f, 3)
-    of_vertex: Indices  # index of the surface vertex for every scan vertex, shape (V,)
-    piece: Indices  # index of the connected component of every vertex, shape (v,)
-    merged: int  # number of coincident scan vertices
+    of_vertex: Indices  # index of the surface vertex of each scan vertex, shape (V,)
+    piece: Indices  # index of the connected component of each vertex, shape (v,)
+    merged: int  # number of scan vertices merged with a coincident vertex
     empty: int  # number of dropped degenerate faces
     repeated: int  # number of dropped duplicate faces
 
     @classmethod
     def of(cls, mesh: Mesh) -> ScanSurface:
-        """Clean a scan."""
+        """Return the cleaned surface of a scan."""
         vertices, index = merged_places(mesh.vertices)
         merged = len(mesh.vertices) - len(vertices)
         faces = index[mesh.faces]
@@ -81,7 +82,7 @@ class ScanSurface:
     def wound(self, up: Array) -> ScanSurface:
         """Return the surface with inward-facing components flipped; `up` (3,) is the occlusal direction.
 
-        The part of a component that is visible from above must face upwards.
+        A component faces outward if its part that is visible from the occlusal side faces that side.
         """
         corners = self.vertices[self.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -101,7 +102,7 @@ class ScanSurface:
         return ScanSurface(self.vertices, faces, self.of_vertex, self.piece, self.merged, self.empty, self.repeated)
 
     def normals(self) -> Array:
-        """Return unit normals of the vertices, averaged over some tenths of a millimetre, shape (v, 3)."""
+        """Return the unit normals of the vertices, averaged over some tenths of a millimetre, shape (v, 3)."""
         corners = self.vertices[self.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         n = len(self.vertices)
@@ -110,7 +111,7 @@ class ScanSurface:
         edges = self.edges()
         length = self.edge_mm(edges)
         mean = averaging(edges, n)
-        # One averaging step has a standard deviation of about 0.7 edges; variances add.
+        # The kernel of one averaging step has a standard deviation of about 0.7 edge lengths; variances add.
         for _ in range(int(np.clip(round(2 * (_SCALE_MM / max(length, 1e-6)) ** 2), 0, _MOST_ROUNDS))):
             normals = mean @ normals
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -118,9 +119,10 @@ class ScanSurface:
     def creases(self, edges: Indices) -> Array:
         """Return the inward curvature at every vertex [1/mm], shape (v,), >= 0.
 
-        It is the negated smaller principal curvature, where that is negative, from Taubin's tensor of the normal
+        This is the negated smaller principal curvature where that is negative, from Taubin's tensor of the normal
         curvatures along the edges ("Estimating the tensor of curvature of a surface from a polyhedral approximation",
-        ICCV 1995), computed with averaged normals. Where edges are too long for that, folds between faces are used.
+        ICCV 1995), computed with averaged normals. Where edges are too long for this, fold angles between faces are
+        used.
         """
         n = len(self.vertices)
         normals = self.normals()
@@ -130,7 +132,7 @@ class ScanSurface:
         ends, bend, along = edges.ravel(), np.repeat(bend, 2), np.repeat(along / np.sqrt(square)[:, None], 2, axis=0)
         one, two = _tangents(normals)
         a, b = (np.einsum("ij,ij->i", along, axis[ends]) for axis in (one, two))
-        # Least squares for the symmetric 2 x 2 tensor from k = xx a^2 + 2 xy a b + yy b^2.
+        # Fit the symmetric 2 x 2 curvature tensor to k = xx a^2 + 2 xy a b + yy b^2 by least squares.
         rows = np.stack([a * a, 2 * a * b, b * b], axis=1)
         A = np.empty((n, 3, 3))
         y = np.empty((n, 3))
@@ -166,7 +168,7 @@ class ScanSurface:
 
 
 def merged_places(vertices: Array) -> tuple[Array, Indices]:
-    """Return the unique positions (v, 3) of vertices (V, 3), and the index for every vertex, shape (V,)."""
+    """Return the unique positions (v, 3) of vertices (V, 3), and the index of the position of each vertex, (V,)."""
     order = np.lexsort(vertices.T)
     ranked = vertices[order]
     new = np.r_[True, (ranked[1:] != ranked[:-1]).any(axis=1)]
@@ -176,7 +178,7 @@ def merged_places(vertices: Array) -> tuple[Array, Indices]:
 
 
 def averaging(edges: Indices, count: int) -> csr_array:
-    """Return the matrix that averages the value at each of `count` vertices with the mean value at its neighbours."""
+    """Return the matrix that averages the value at each of `count` vertices with the mean of its neighbours' values."""
     rows, columns = np.r_[edges[:, 0], edges[:, 1]], np.r_[edges[:, 1], edges[:, 0]]
     degree = np.maximum(np.bincount(rows, minlength=count), 1)
     own = np.arange(count)
@@ -185,7 +187,7 @@ def averaging(edges: Indices, count: int) -> csr_array:
 
 
 def _tangents(normals: Array) -> tuple[Array, Array]:
-    """Return two orthonormal tangents of unit normals (v, 3)."""
+    """Return two orthonormal tangents for each unit normal (v, 3)."""
     helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     one = np.cross(normals, helper)
     one /= np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-12)

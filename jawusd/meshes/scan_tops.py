@@ -1,4 +1,4 @@
-"""The occlusal direction of an arch, and seed points of a scan that are certainly crown or gum."""
+"""Find the occlusal direction of a dental arch, and seed points of a scan that are certainly crown or gum."""
 
 from __future__ import annotations
 
@@ -10,45 +10,45 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jawusd.base.arrays import Array, Indices, Mask
 
-_CELL_MM = 0.75  # cell size of the height map
-# Maximum distance of a crown's points from its highest point in plan view: half the width of a wide molar.
+_CELL_MM = 0.75  # cell size of the height map of an arch
+# Maximum distance between a crown's points and its highest point in plan view; half the width of a wide molar.
 _REACH_MM = 4.5
-# Maximum depth below the highest point nearby of points that are certainly crown; even worn crowns protrude by 3 mm.
+# Maximum depth below the highest nearby point for a point to be certainly crown; even worn crowns protrude by 3 mm.
 _BAND_MM = 1.5
-# Maximum depth of crown tops below the hull of the arch; a curve of Spee or an open bite causes 3 to 4 mm, and ridges
-# without teeth are deeper.
+# Maximum depth of a crown top below the hull of the dental arch. A curve of Spee or an open bite causes 3 to 4 mm;
+# ridges without teeth are deeper.
 _UNDER_HULL_MM = 4.5
-# Points are not crown if they are farther than `_ASIDE_MM` from every crown top in plan view, or deeper than `_DEEP_MM`
-# below the hull of the arch.
+# Distance from every crown top in plan view, and depth below the hull of the dental arch, beyond which a point is not
+# crown.
 _ASIDE_MM, _DEEP_MM = 5.0, 13.0
 _LEVEL = 0.95  # minimum vertical component of the normal of a hull facet that counts as level
 _ROUNDS = 3
-_MIDDLE_CELLS = 2  # search radius for components above a component's centre, in cells in plan view
+_MIDDLE_CELLS = 2  # radius in plan view [cells] in which components above a component's centre are searched
 
 
 @dataclass(frozen=True, eq=False)
 class Tops:
     """Depth of an arch's vertices below its highest points, and vertices that are certainly crown or gum."""
 
-    below: Array  # depth below the highest point nearby [mm], shape (v,)
-    top_depth: Array  # depth of that highest point below the hull of the arch [mm], shape (v,)
-    crown: Mask  # vertices that are certainly crown, shape (v,)
-    gum: Mask  # vertices that are certainly gum, shape (v,)
+    below: Array  # depth of each vertex below the highest nearby point [mm], shape (v,)
+    top_depth: Array  # depth of the highest point near each vertex below the hull of the arch [mm], shape (v,)
+    crown: Mask  # which vertices are certainly crown, shape (v,)
+    gum: Mask  # which vertices are certainly gum, shape (v,)
 
 
 def biting_direction(points: Array, towards: Array | None) -> Array:
-    """Return the direction in which the crowns of an arch point, shape (3,).
+    """Return the direction in which the crowns of a dental arch point, shape (3,).
 
     Args:
         points: vertices of the arch, shape (v, 3).
-        towards: centre of the other arch, shape (3,), in the same frame with the teeth in occlusion; without it, the
-            rougher side of the surface is used.
+        towards: centre of the opposing arch, shape (3,), in the same coordinate frame with the teeth in occlusion. If
+            it is None, the crowns are on the rougher side of the surface.
     """
     middle = points.mean(axis=0)
     _, size, axes = np.linalg.svd(points - middle, full_matrices=False)
     if towards is not None and np.linalg.norm(towards - middle) > _BAND_MM:
         away = (towards - middle) / np.linalg.norm(towards - middle)
-        # Prefer directions in which the arch is thin, since an overjet also displaces arches along the occlusal plane.
+        # Prefer the thin direction of the arch, since an overjet displaces the arches along the occlusal plane.
         nearest = axes[(np.abs(axes @ away) / np.maximum(size, 1e-9)).argmax()]
         up = nearest * np.sign(nearest @ away)
     else:
@@ -63,7 +63,7 @@ def biting_direction(points: Array, towards: Array | None) -> Array:
 
 
 def _roughness(points: Array, up: Array) -> float:
-    """Return the roughness of the upper side of points along a direction (3,), relative to its hull [mm]."""
+    """Return the roughness [mm] of the upper side of points along a direction (3,), relative to the convex hull."""
     seen = tops(points, up)
     return float(np.std(seen.top_depth[seen.below < _BAND_MM]))
 
@@ -89,7 +89,7 @@ def topped_by(points: Array, up: Array, piece: Indices) -> Mask:
     """Return which components have no other component above their centre, shape (P,).
 
     Args:
-        piece: component of every point, shape (v,).
+        piece: component index of each point, shape (v,).
     """
     cells, height, heights = _height_map(points, up)
     count = int(piece.max()) + 1
@@ -104,7 +104,7 @@ def topped_by(points: Array, up: Array, piece: Indices) -> Mask:
 
 
 def _height_map(points: Array, up: Array) -> tuple[Indices, Array, Array]:
-    """Return the cell (v, 2) and height (v,) of every point, and the largest height per cell, -inf where empty."""
+    """Return the cell (v, 2) and height (v,) of each point, and the largest height in each cell, -inf if empty."""
     one = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     one /= np.linalg.norm(one)
     plan = points @ np.stack([one, np.cross(up, one)], axis=1)
@@ -116,7 +116,7 @@ def _height_map(points: Array, up: Array) -> tuple[Indices, Array, Array]:
 
 
 def _hull_height(heights: Array) -> Array:
-    """Return the height of the upper convex hull over every cell of a map, with its level facets extended."""
+    """Return the height of the upper convex hull over each cell of a map, with the hull's level facets extended."""
     filled = np.argwhere(np.isfinite(heights))
     places = np.column_stack([filled * _CELL_MM, heights[tuple(filled.T)]])
     out = np.full(heights.shape, np.nan)
@@ -125,7 +125,7 @@ def _hull_height(heights: Array) -> Array:
     except (QhullError, ValueError):  # a flat or tiny component has no convex hull
         out[tuple(filled.T)] = places[:, 2].max()
         return out
-    # Steep hull facets lead down to palate, folds or base plate beside the teeth; extend the level facets over them.
+    # Steep hull facets lead down to the palate, folds or base plate beside the teeth; level facets replace them.
     level = planes[:, 2] > _LEVEL
     planes = planes[level] if level.any() else planes[planes[:, 2].argmax()][None]
     over = -(places[:, :2] @ planes[:, :2].T + planes[:, 3]) / planes[:, 2]

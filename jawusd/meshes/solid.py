@@ -1,6 +1,6 @@
-"""Signed distance grids of scans, negative inside the crowns; scans may be open at the base.
+"""Compute signed distance grids of scans, negative inside the crowns; scans may be open at the base.
 
-Inside and outside are determined along vertical lines from the other jaw: a point of a line is inside if the line has
+Inside and outside are determined along vertical lines from the opposing jaw: a point is inside if the line has
 entered more surfaces than it has left. Unlike parity, this winding number handles overlaps (Jacobson et al. 2013, ACM
 TOG 32:33). The surface need not be closed, but must be consistently wound. Faces inside other parts, for example where
 neighbouring teeth overlap, are ignored.
@@ -19,19 +19,21 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.meshes.spreading import spread
 
 _BUCKET_MM = 1.0  # cell size in the (x, z) plane of the triangle lookup
-_BAND_CELLS = 3.0  # band around triangles in which nearest triangles are exact; they are propagated from there
+# Width of the band around triangles in which the nearest triangle is found exactly and then propagated.
+_BAND_CELLS = 3.0
 _DIAGONAL_CELLS = 3.0**0.5
-_OFF_FACE_MM = 0.01  # offset of the test point for the outside of a face
-_JITTER_MM = np.array([1.23e-4, 0.0, 2.71e-4])  # line offset that avoids vertices and edges at round coordinates
+_OFF_FACE_MM = 0.01  # offset of the point that tests whether a face is outside
+# Offset of vertical lines that avoids vertices and edges at round coordinates.
+_JITTER_MM = np.array([1.23e-4, 0.0, 2.71e-4])
 _MOST_CROSSINGS = 256
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceGrid:
-    """Signed distances on a grid.
+    """Signed distances at the points of a regular grid.
 
     Attributes:
-        origin: position of the first value [mm], shape (3,).
+        origin: position of the first grid point [mm], shape (3,).
         step_mm: grid step along every axis.
         values: signed distances [mm], negative inside, shape (nx, ny, nz), float32.
     """
@@ -42,7 +44,7 @@ class DistanceGrid:
 
 
 class _Columns(NamedTuple):
-    """Triangles by cells of the (x, z) plane: those over cell i are ``faces[start[i] : start[i + 1]]``."""
+    """Triangles by cells of the (x, z) plane: triangles over cell i are ``faces[start[i] : start[i + 1]]``."""
 
     low: Array
     shape: tuple[int, int]
@@ -51,15 +53,15 @@ class _Columns(NamedTuple):
 
 
 def outer_faces(corners: Array, up: float) -> tuple[Mask, float]:
-    """Find the faces that bound a solid open at one side, and check their winding.
+    """Find the faces that bound a solid which is open on one side, and check their winding.
 
     Args:
         corners: triangles [mm], shape (F, 3, 3), y vertical.
         up: 1.0 if the solid is entered upwards (upper teeth), -1.0 if downwards (lower teeth).
 
     Returns:
-        Outer faces, shape (F,); and the fraction of vertical lines that enter the solid at the first crossing: 1 for
-        triangles counter-clockwise seen from outside, 0 for the opposite.
+        Which faces are outer faces, shape (F,), and the fraction of vertical lines that enter the solid at the first
+        crossing: 1 for triangles that are counter-clockwise seen from outside, 0 for clockwise ones.
     """
     flipped = _upwards(corners, up)
     columns = _columns_of(flipped)
@@ -75,16 +77,16 @@ def outer_faces(corners: Array, up: float) -> tuple[Mask, float]:
 def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: float, far_mm: float) -> DistanceGrid:
     """Sample the signed distance to a solid: exact near its surface, sometimes slightly too large farther away.
 
-    The error exceeds 0.01 mm for 0.4 % of values 0.5 to 1 mm inside teeth and for 2 % of those 1 to 2 mm inside; it is
+    The error exceeds 0.01 mm at 0.4 % of points 0.5 to 1 mm inside teeth, and at 2 % of points 1 to 2 mm inside; it is
     0.12 mm at most.
 
     Args:
         corners: all triangles [mm], shape (F, 3, 3), y vertical, counter-clockwise seen from outside.
         outer: faces that bound the solid (see `outer_faces`), shape (F,).
-        box: extent of the grid, rows low and high [mm], shape (2, 3).
+        box: extent of the grid, its low and high corner [mm], shape (2, 3).
         step_mm: grid step.
         up: see `outer_faces`.
-        far_mm: distances outside the solid above this need not be exact, but must be at least this large.
+        far_mm: distance outside the solid above which values need not be exact, only at least this large.
     """
     nx, ny, nz = (int(n) for n in np.ceil((box[1] - box[0]) / step_mm) + 1)
     kept = np.ascontiguousarray(corners[outer])
@@ -98,14 +100,14 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
 
 
 def _walls(corners: Array, origin: Array, step: float, shape: tuple[int, ...]) -> Array:
-    """Return the grid's first and last cells, (2, 3), along axes where triangles extend beyond it, else infinity."""
+    """Return the grid's first and last cells (2, 3) along axes on which triangles extend beyond it, else infinity."""
     last = np.array(shape) - 1
     low, high = (corners.reshape(-1, 3) - origin).min(axis=0), (corners.reshape(-1, 3) - origin).max(axis=0)
     return np.array([np.where(low < 0, 0.0, -np.inf), np.where(high > step * last, last, np.inf)])
 
 
 def _upwards(corners: Array, up: float) -> Array:
-    """Return triangles with the open side up and the same winding."""
+    """Return triangles turned so that the open side is up, with unchanged winding."""
     if up > 0:
         return np.ascontiguousarray(corners)
     return np.ascontiguousarray((corners * [1.0, -1.0, 1.0])[:, ::-1])
@@ -133,7 +135,7 @@ def _crossing(corners: Array, f: int, x: float, z: float) -> tuple[int, float]:
     bx, by, bz = corners[f, 1, 0] - x, corners[f, 1, 1], corners[f, 1, 2] - z
     cx, cy, cz = corners[f, 2, 0] - x, corners[f, 2, 1], corners[f, 2, 2] - z
     u, v, w = bx * cz - cx * bz, cx * az - ax * cz, ax * bz - bx * az
-    area = u + v + w  # minus the y component of the normal
+    area = u + v + w  # negated y component of the triangle's normal
     if not ((u >= 0 and v >= 0 and w >= 0) or (u <= 0 and v <= 0 and w <= 0)) or area == 0:
         return 0, 0.0
     return (1 if area > 0 else -1), (u * ay + v * by + w * cy) / area
@@ -141,7 +143,7 @@ def _crossing(corners: Array, f: int, x: float, z: float) -> tuple[int, float]:
 
 @numba.njit(nogil=True, cache=True)
 def _crossings(points: Array, corners: Array, columns: _Columns) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the winding count below each point, and the kind of the lowest crossing below it."""
+    """Return the winding number at each point, and the type of the lowest crossing below it (1 enters, -1 leaves)."""
     low, shape, start, faces = columns
     count = np.zeros(len(points), np.int64)
     first = np.zeros(len(points), np.int64)
@@ -207,7 +209,7 @@ def _squared_distance(corners: Array, f: int, x: float, y: float, z: float) -> f
         s, t = s / area, t / area
         return (px - s * ux - t * vx) ** 2 + (py - s * uy - t * vy) ** 2 + (pz - s * uz - t * vz) ** 2
     best = np.inf
-    for edge in range(3):  # the nearest point lies on an edge
+    for edge in range(3):  # otherwise, the nearest point lies on an edge of the triangle
         if edge == 0:
             s, t = min(max(pu / uu, 0.0), 1.0), 0.0
         elif edge == 1:
@@ -224,9 +226,9 @@ def _squared_distance(corners: Array, f: int, x: float, y: float, z: float) -> f
 def _nearest_faces(
     corners: Array, origin: Array, step: float, shape: tuple[int, int, int], band: float
 ) -> NDArray[np.int32]:
-    """Return the nearest triangle at grid points near triangles, shape (nx, ny, nz); -1 elsewhere."""
+    """Return the index of the nearest triangle for grid points near a triangle, -1 elsewhere, shape (nx, ny, nz)."""
     nearest = np.full(shape, -1, np.int32)
-    # beyond the band, a triangle whose box contains a grid point is not always the nearest
+    # Beyond the band, a triangle whose box contains a grid point may not be the nearest one.
     best = np.full(shape, np.float32((band * step) ** 2), np.float32)
     for f in range(len(corners)):
         low, high = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -266,8 +268,8 @@ def _set_distances(
             to_wall = min(i - walls[0, 0], walls[1, 0] - i, j - walls[0, 1], walls[1, 1] - j)
             for k in range(nz):
                 own = found = nearest[i, j, k]
-                # Lower bound of the distance: the band around a surface within the walls is `_BAND_CELLS` wide, less at
-                # most a cell diagonal.
+                # Lower bound of the distance: distance to the nearest grid point of the band around the surface, plus
+                # the width `_BAND_CELLS` of the band, less a cell diagonal.
                 least = step * min(
                     np.sqrt(away[i, j, k]) + _BAND_CELLS - _DIAGONAL_CELLS, to_wall, k - walls[0, 2], walls[1, 2] - k
                 )

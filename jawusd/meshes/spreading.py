@@ -1,6 +1,6 @@
-"""Feature transform: assign the number of the nearest numbered cell, and its distance, to every cell of a grid.
+"""Feature transform: for each cell of a grid, find the nearest numbered cell and its distance.
 
-The method of Maurer et al. (2003), IEEE TPAMI 25:265, axis by axis. Working in integers and in place, it takes a
+The method is that of Maurer et al. (2003), IEEE TPAMI 25:265, axis by axis. It uses integers and works in place, with a
 fraction of the time and memory of scipy's transform, which stores three coordinates per cell.
 """
 
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 @numba.njit(nogil=True, cache=True)
 def spread(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Replace negative cell numbers by that of the nearest numbered cell, in place; ties use the first cell in order.
+    """Replace negative cell numbers by the number of the nearest numbered cell, in place; ties use the first cell.
 
     Args:
         numbers: numbers of the cells, shape (nx, ny, nz).
 
     Returns:
-        The squared distances to these cells [cells^2], shape (nx, ny, nz); larger than any distance in the grid if all
-        numbers are negative.
+        The squared distances to the nearest cells [cells^2], shape (nx, ny, nz); larger than any distance in the grid
+        if all numbers are negative.
     """
     nx, ny, nz = numbers.shape
     away = np.empty((nx, ny, nz), np.int32)
@@ -37,7 +37,7 @@ def spread(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @numba.njit(nogil=True, cache=True)
 def _along_first(numbers: NDArray[np.int32], away: NDArray[np.int32]) -> None:
-    """Propagate numbers along the first axis, and set the squared distances."""
+    """Propagate cell numbers along the first axis, and set the squared distances."""
     nx, ny, nz = numbers.shape
     none = nx + ny + nz
     for i in range(nx):
@@ -65,18 +65,18 @@ def _along_line(
     squared: NDArray[np.int64],
     site: NDArray[np.int64],
 ) -> None:
-    """Propagate numbers along a line of cells with known squared distances across it.
+    """Propagate cell numbers along a line of cells whose squared distances across the line are known.
 
     Args:
         numbers, away: numbers and squared distances of the cells of the line, shape (n,).
-        before, squared, site: work arrays of at least this length.
+        before, squared, site: work arrays with at least as many elements.
     """
     last = -1
     for y in range(len(numbers)):
         before[y], squared[y] = numbers[y], away[y]
         if numbers[y] < 0:
             continue
-        while last >= 1:  # remove sites that are not nearest to any cell
+        while last >= 1:  # remove numbered cells that are not nearest to any cell
             a, b = site[last] - site[last - 1], y - site[last]
             u, v, w = squared[site[last - 1]], squared[site[last]], squared[y]
             if (a + b) * v - b * u - a * w - a * b * (a + b) <= 0:

@@ -149,17 +149,18 @@ def test_numbers_that_cannot_be(tmp_path: Path) -> None:
 )
 def test_wrong_units_are_named(tmp_path: Path, scale: float, unit: str) -> None:
     arch(scale).export(tmp_path / "a.stl")
-    with pytest.raises(CaptureError, match=rf"must measure 20 to 150 mm\. It looks like {unit}\..*must be in mm"):
+    wrong = rf"expected 20 to 150 mm for a scan\. Its lengths look like {unit}\..*must be in mm"
+    with pytest.raises(CaptureError, match=wrong):
         meshio.load_mesh(tmp_path / "a.stl")
 
 
 def test_bones_may_be_larger_than_scans(tmp_path: Path) -> None:
     arch(4).export(tmp_path / "a.stl")
     assert len(meshio.load_mesh(tmp_path / "a.stl", kind="bone").faces) == len(arch().faces)
-    with pytest.raises(CaptureError, match="a scan must measure 20 to 150 mm"):
+    with pytest.raises(CaptureError, match="expected 20 to 150 mm for a scan"):
         meshio.load_mesh(tmp_path / "a.stl")
     arch(12).export(tmp_path / "b.stl")
-    with pytest.raises(CaptureError, match="a bone must measure 50 to 500 mm"):
+    with pytest.raises(CaptureError, match="expected 50 to 500 mm for a bone"):
         meshio.load_mesh(tmp_path / "b.stl", kind="bone")
 
 
