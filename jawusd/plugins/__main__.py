@@ -1,7 +1,7 @@
 """Write the files that run inside other programs.
 
 python -m jawusd.plugins jawusd_blender.zip    the Blender extension
-python -m jawusd.plugins FOLDER                reader, and recipes for Maya, Houdini and Unreal
+python -m jawusd.plugins FOLDER                the reader, and recipes for Maya, Houdini and Unreal
 """
 
 import sys

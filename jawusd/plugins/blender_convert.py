@@ -2,8 +2,8 @@
 
     blender -b --factory-startup -P blender_convert.py -- take.fbx take.usdc 24
 
-It also runs in a Python with `bpy`. The last argument is the frame rate of files that do not state one, such as glTF;
-it is ignored for FBX. Time 0 is frame 0.
+It also runs in a Python with `bpy`. The last argument is the frame rate for files that do not contain one, such as
+glTF; it is ignored for FBX. Time 0 becomes frame 0.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import traceback
 
 import bpy
 
-_STILL = 1e-6  # maximum variation of a curve that counts as constant
+_STILL = 1e-6  # maximum variation of an animation curve that counts as constant
 _TRANSFORM_PATHS = ("location", "rotation", "scale", "pose.bones")
 
 
@@ -39,8 +39,8 @@ def convert(source: str, target: str, fps: float) -> None:
 def _assign_takes() -> None:
     """Assign to every object the take of an FBX file in which it moves.
 
-    By default, Blender's FBX exporter writes every action for every object, for example the camera's action for the
-    jaw, and its importer assigns the first action.
+    By default, Blender's FBX exporter writes every action for every object, such as the camera's action for the jaw;
+    the importer then assigns the first action.
 
     Raises:
         ValueError: A mesh moves in several takes, so the choice is ambiguous.
@@ -51,7 +51,7 @@ def _assign_takes() -> None:
         moving = [action for action in bpy.data.actions if action.name.startswith(f"{found.name}|") and _moves(action)]
         if len(moving) > 1:
             names = ", ".join(action.name for action in moving)
-            raise ValueError(f"export it with All Actions off: {found.name} moves in several takes, {names}")
+            raise ValueError(f"{found.name} moves in several takes ({names}); export the file with All Actions off")
         if moving:
             data = found.animation_data
             data.action = moving[0]
@@ -61,7 +61,7 @@ def _assign_takes() -> None:
 
 def _moves(action: bpy.types.Action) -> bool:
     """Return whether an action moves an object or its bones."""
-    layers = getattr(action, "layers", None)  # not in Blender 4.2
+    layers = getattr(action, "layers", None)  # Blender 4.2 has no layers
     bags = [bag for layer in layers for strip in layer.strips for bag in strip.channelbags] if layers else [action]
     curves = [curve for bag in bags for curve in bag.fcurves if curve.data_path.startswith(_TRANSFORM_PATHS)]
     values = [[point.co[1] for point in curve.keyframe_points] for curve in curves]

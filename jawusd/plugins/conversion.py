@@ -13,9 +13,9 @@ from jawusd.base.errors import FormatError, MissingDependencyError
 from jawusd.base.inputs import check_input
 from jawusd.formats.gltf import frame_rate
 
-#: Suffixes of the files that are converted by Blender.
+#: Suffixes of the files that Blender converts.
 SUFFIXES = (".fbx", ".glb", ".gltf")
-#: Environment variable with the path of Blender, or of a Python with `bpy`.
+#: Name of the environment variable with the path of Blender, or of a Python with `bpy`.
 SETTING = "JAWUSD_BLENDER"
 
 _SCRIPT = Path(__file__).with_name("blender_convert.py")
@@ -23,12 +23,12 @@ _TIMEOUT_S = 900
 
 
 def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps: float) -> Path:
-    """Convert a file to a USD stage in a folder; time 0 is frame 0.
+    """Convert a file to a USD stage in a folder; time 0 becomes frame 0.
 
     Args:
         path: An .fbx, .glb or .gltf file.
         folder: Folder of the stage.
-        fps: Frame rate of files that do not state one, such as glTF of other programs.
+        fps: Frame rate for files that do not contain one, such as glTF files of other programs.
 
     Raises:
         MissingDependencyError: Blender is not installed.
@@ -39,7 +39,7 @@ def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps:
     if not path.is_file():
         raise FormatError("there is no such file.", path=path)
     command = [*_blender(path), "--", str(path.resolve()), str(target), repr(frame_rate(path) or fps)]
-    # this process's plugins are incompatible with Blender's OpenUSD
+    # The OpenUSD plugins of this process are incompatible with Blender's OpenUSD.
     environment = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, env=environment, check=False)

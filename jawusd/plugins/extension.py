@@ -1,4 +1,4 @@
-"""Write the files that run inside other programs: the Blender extension as a zip, the reader and recipes as scripts."""
+"""Write the files that run inside other programs: the Blender extension (zip), the reader and the recipes (scripts)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jawusd.plugins.vendoring import vendored_files
 _HERE = Path(__file__).parent
 _READER = "jawusd_reader.py"
 _SCRIPTS = ("jawusd_recipes.py",)
-# file time in the zip; fixed, so that the zip is reproducible
+# time stamp of the files in the zip; constant, so that the zip is reproducible
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 
@@ -35,7 +35,7 @@ def build_extension(out: Path) -> Path:
 
 
 def copy_scripts(folder: Path) -> list[Path]:
-    """Write the reader and the scripts that use it to a folder, which is created if missing; return their paths.
+    """Write the reader and the scripts that use it to a folder, created if missing; return the paths of the files.
 
     Raises:
         OSError: A file cannot be written.
@@ -72,7 +72,7 @@ def packed_reader() -> str:
 
 
 def _collect(source: Path, modules: dict[Path, ast.Module]) -> None:
-    """Parse a module and the modules of jawusd that it imports, in order of dependency."""
+    """Parse a module and the modules of jawusd that it imports; dependencies come first."""
     tree = ast.parse(source.read_text(encoding="utf-8"))
     for node in tree.body:
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("jawusd."):
@@ -83,7 +83,7 @@ def _collect(source: Path, modules: dict[Path, ast.Module]) -> None:
 
 
 def _body(source: Path, tree: ast.Module, imported: dict[str, set[str]]) -> str:
-    """Return a module without docstring and imports; imports of the standard library are added to `imported`."""
+    """Return a module without docstring and imports; add imports from the standard library to `imported`."""
     lines: list[str | None] = [*source.read_text(encoding="utf-8").splitlines()]
     for node in ast.walk(tree):
         if isinstance(node, (ast.Import, ast.ImportFrom)) and node not in tree.body and "jawusd" in ast.unparse(node):
@@ -98,7 +98,7 @@ def _body(source: Path, tree: ast.Module, imported: dict[str, set[str]]) -> str:
 
 
 def _add_import(source: Path, node: ast.Import | ast.ImportFrom, imported: dict[str, set[str]]) -> None:
-    """Add an import of the standard library to the header of the packed file."""
+    """Add an import from the standard library to the header of the packed file."""
     names = {alias.name for alias in node.names}
     modules = [str(node.module)] if isinstance(node, ast.ImportFrom) else sorted(names)
     renamed = any(alias.asname or alias.name == "*" for alias in node.names)

@@ -1,7 +1,7 @@
-"""Read and evaluate jaw rigs in any Python: one file without dependencies, not even jawusd.
+"""Read and evaluate jaw rigs in any Python: one file without dependencies, independent of jawusd itself.
 
-`python -m jawusd.plugins FOLDER` writes that file; put it next to your script. `model.npz` needs only Python 3.9. USD
-files need the `pxr` modules, which Blender, Maya, Houdini and Unreal include.
+`python -m jawusd.plugins FOLDER` writes this file; put it next to your script. To read `model.npz`, it needs only
+Python 3.9; to read USD files, it needs the `pxr` modules, which Blender, Maya, Houdini and Unreal include.
 
     import jawusd_reader
     rig = jawusd_reader.load("actor/actor.usda")
@@ -52,7 +52,7 @@ _OPERATIONS = FloatOperations()
 
 
 class ReaderError(Exception):
-    """A file is not a jaw rig, or is too new for this reader."""
+    """A file that is not a jaw rig, or is too new for this reader."""
 
 
 def load(path: str, prim_path: str | None = None) -> Rig:
@@ -63,14 +63,14 @@ def load(path: str, prim_path: str | None = None) -> Rig:
         prim_path: The rig's prim, if the stage has several rigs.
 
     Raises:
-        ReaderError: No rig, a newer version, or USD without `pxr`.
+        ReaderError: The file contains no rig, its version is too new, or it is USD and `pxr` is missing.
     """
     if str(path).endswith(".npz"):
         return _from_npz(str(path))
     try:
         from pxr import Tf, Usd
     except ImportError:
-        raise ReaderError("reading USD needs the pxr modules; without them, load model.npz") from None
+        raise ReaderError("reading USD needs the pxr modules; load model.npz if they are not available") from None
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
@@ -79,12 +79,12 @@ def load(path: str, prim_path: str | None = None) -> Rig:
         return from_prim(stage.GetPrimAtPath(prim_path))
     prims = find_rigs(stage)
     if len(prims) != 1:
-        raise ReaderError(f"{path} has {len(prims)} jaw rigs; name the prim")
+        raise ReaderError(f"{path} contains {len(prims)} jaw rigs; set prim_path to the prim of one rig")
     return from_prim(prims[0])
 
 
 def find_rigs(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Return the rig prims in a stage, found by raw metadata, so that the schema plugin is not needed."""
+    """Return the rig prims in a stage, found by their raw metadata, which does not require the schema plugin."""
     applied = [(prim, prim.GetMetadata("apiSchemas")) for prim in stage.Traverse()]
     return [prim for prim, names in applied if names is not None and SCHEMA in names.GetAddedOrExplicitItems()]
 
@@ -110,7 +110,7 @@ def from_prim(prim: Usd.Prim) -> Rig:
         attribute = prim.GetAttribute(name) if prim else None
         found = attribute.Get() if attribute else None
         if found is None:
-            raise ReaderError(f"{name} is missing: the jaw rig is incomplete")
+            raise ReaderError(f"the jaw rig is incomplete: {name} is missing")
         return found
 
     _check_version(value("jaw:formatVersion"))
@@ -133,7 +133,7 @@ def _flat(value: float | Sequence[float] | str) -> list[float]:
 def _attributes_of(kind: str, gliding: bool) -> dict[str, tuple[str, ...]]:
     """Return the names of the attributes that poses and margins need; ``gliding`` models also have a glide table."""
     if kind not in MODELS:
-        raise ReaderError(f"model kind {kind!r} is unknown to this reader")
+        raise ReaderError(f"model kind {kind!r} is not supported by this reader")
     every = {**arrays_of(kind), **(GLIDE_ARRAYS if gliding else {})}
     specs = {name: spec for name, spec in every.items() if not name.startswith(_NOT_NEEDED)}
     return {name: (spec.attribute,) if spec.attribute else D_RANGE_ATTRIBUTES for name, spec in specs.items()}
@@ -141,7 +141,7 @@ def _attributes_of(kind: str, gliding: bool) -> dict[str, tuple[str, ...]]:
 
 def _check_version(version: object) -> None:
     if int(str(version)) > FORMAT_VERSION:
-        raise ReaderError(f"format version {version}; this reader supports up to {FORMAT_VERSION}")
+        raise ReaderError(f"the format version is {version}; this reader supports versions up to {FORMAT_VERSION}")
 
 
 def _from_npz(path: str) -> Rig:
@@ -153,10 +153,10 @@ def _from_npz(path: str) -> Rig:
         (text,) = _npy("meta", raw["meta"])
         meta = json.loads(str(text))
     except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError) as error:
-        raise ReaderError(f"{path} is not a jaw model, or damaged ({error})") from None
+        raise ReaderError(f"{path} is damaged or is not a jaw model ({error})") from None
     family, _, version = str(meta.get("format")).partition("/")
     if family != "jawusd-model":
-        raise ReaderError(f"{path} has format {meta.get('format')}, expected jawusd-model")
+        raise ReaderError(f"{path} has format {meta.get('format')}; expected jawusd-model")
     _check_version(version)
     arrays = {}
     for name in _attributes_of(meta.get("kind"), "glide_d2" in raw):
@@ -167,14 +167,14 @@ def _from_npz(path: str) -> Rig:
 
 
 def _npy(name: str, data: bytes) -> Sequence[float | str]:
-    """Return the values of a .npy file, row by row (numpy/lib/format.py: versions 1 to 3, any order and byte order).
+    """Return the values of a .npy file in row-major order (versions 1 to 3 and any memory layout; numpy/lib/format.py).
 
     Raises:
-        ReaderError: It is damaged, or contains neither numbers nor a single text.
+        ReaderError: The file is damaged, or contains neither numbers nor a single text.
     """
     try:
         if data[:6] != b"\x93NUMPY":
-            raise ValueError("it does not start like a .npy file")
+            raise ValueError("it has no .npy header")
         long_header = data[6] > 1
         start = 12 if long_header else 10
         (length,) = struct.unpack("<I" if long_header else "<H", data[8:start])
@@ -184,7 +184,7 @@ def _npy(name: str, data: bytes) -> Sequence[float | str]:
         if descr[1] == "U":
             return [body[: 4 * int(descr[2:])].decode("utf-32-be" if order == ">" else "utf-32-le").rstrip("\0")]
         if descr[1:] not in _CODES:
-            raise ValueError(f"type {descr}")
+            raise ValueError(f"type {descr} is not supported")
         values = struct.unpack(f"{order}{math.prod(shape)}{_CODES[descr[1:]]}", body)
     except (ValueError, SyntaxError, LookupError, TypeError, struct.error) as error:
         raise ReaderError(f"array {name} cannot be read ({error})") from None
@@ -192,7 +192,7 @@ def _npy(name: str, data: bytes) -> Sequence[float | str]:
 
 
 def _by_rows(values: Sequence[float], shape: Sequence[int]) -> Sequence[float]:
-    """Return the values of an array in row-major order, given in column-major order."""
+    """Reorder the values of an array from column-major to row-major order."""
     places, step = [0], 1
     for count in shape:
         places, step = [place + i * step for place in places for i in range(count)], step * count
@@ -204,10 +204,10 @@ class Rig:
 
     Attributes:
         kind: "anchored" or "additive".
-        arrays: The model's arrays by name, each a flat list, row by row.
+        arrays: The model's arrays by name, each a flat list in row-major order.
         d_range: ((min, max), (min, max), (min, max)) of d1, d2, d3 [mm].
-        formula: Evaluates the model's motion in the anatomical frame.
-        matrices: T_skull_anatomical, and T_anatomical_mandible in the closed bite, row by row.
+        formula: Evaluator of the model's motion in the anatomical frame.
+        matrices: T_skull_anatomical, and T_anatomical_mandible in the closed bite, as lists of rows.
     """
 
     def __init__(self, kind: str, arrays: dict[str, list[float]]) -> None:
@@ -224,11 +224,11 @@ class Rig:
         self._openings = [first_mm - beyond + (i + 0.5) * self._spacing_mm for i in range(_SLICES)]
 
     def to_json(self) -> str:
-        """Return the rig as text, to store in a scene; `from_json` reads it."""
+        """Return the rig as text that can be stored in a scene; `from_json` reads it."""
         return json.dumps({"kind": self.kind, "arrays": self.arrays})
 
     def pose(self, d1: float, d2: float, d3: float) -> Rows:
-        """Return T_skull_mandible [mm] of jaw parameters [mm]: four rows, for column vectors."""
+        """Return T_skull_mandible [mm] at jaw parameters [mm], as four rows of a matrix for column vectors."""
         motion = self.formula.motion((d1, d2, d3), self.formula.tables, _OPERATIONS)
         M = [[*turn, shift] for turn, shift in zip(motion.turn, motion.t)] + [[0.0, 0.0, 0.0, 1.0]]
         for i in range(3):
@@ -236,7 +236,7 @@ class Rig:
         return _product(_product(self.matrices[0], M), self.matrices[1])
 
     def margin(self, d1: float, d2: float, d3: float) -> float:
-        """Return the signed distance to the bound [mm], positive inside."""
+        """Return the signed distance from jaw parameters to the bound [mm], positive inside."""
         return self._bound.margin((d1, d2, d3), self._bound.tables, _OPERATIONS)
 
     def is_inside(self, d1: float, d2: float, d3: float) -> bool:
@@ -244,9 +244,9 @@ class Rig:
         return self.margin(d1, d2, d3) >= -ON_BOUND_MM
 
     def project(self, d1: float, d2: float, d3: float) -> Triple[float]:
-        """Return the nearest jaw parameters [mm] inside the bound: d itself if it is inside, NaN if it is not finite.
+        """Return the nearest jaw parameters [mm] inside the bound: d itself if it is inside, NaN if d is not finite.
 
-        A search starts from every opening that may lead to a point nearer than the best so far.
+        A local search starts from every opening that may lead to a nearer point than the nearest found so far.
 
         Raises:
             ReaderError: The bound is empty.
@@ -274,7 +274,8 @@ class Rig:
     def ranges(self, d1: float, d2: float = 0.0, d3: float = 0.0) -> tuple[Pair, Pair]:
         """Return the valid (min, max) of d2 at this d3, and of d3 at this d2 [mm]; (nan, nan) if no value is valid.
 
-        The bound ends some tenths of a mm before the limits of d1; beyond, the last valid opening is used.
+        The bound ends some tenths of a millimetre before the limits of d1; beyond its end, the last valid opening is
+        used.
         """
         d1 = self._nearest_opening(d1, d2, d3)
         along_d2 = _chord(lambda x: self.margin(d1, x, d3), *self.d_range[1])
@@ -292,7 +293,7 @@ class Rig:
 
 
 def _chord(margin: Callable[[float], float], low: float, high: float) -> Pair:
-    """Return the zeros of a concave margin: its maximum by ternary search, then bisection on both sides."""
+    """Return the two zeros of a concave margin: find its maximum by ternary search, then bisect on both sides."""
     a, b = 2.0 * low - high, 2.0 * high - low
     for _ in range(_SEARCH_STEPS):
         p, q = a + (b - a) / 3.0, b - (b - a) / 3.0
@@ -320,7 +321,7 @@ def _rigid_inverse(A: Rows) -> Rows:
 
 
 def decompose(T: Rows) -> tuple[Triple[float], tuple[float, float, float, float]]:
-    """Return the translation (x, y, z) and the unit quaternion (w, x, y, z), w >= 0, of a rigid 4x4."""
+    """Return the translation (x, y, z) and the unit quaternion (w, x, y, z), w >= 0, of a rigid 4 x 4 matrix."""
     (a, b, c, x), (d, e, f, y), (g, h, i, z) = T[0], T[1], T[2]
     candidates = (
         (1 + a + e + i, h - f, c - g, d - b),
@@ -328,7 +329,7 @@ def decompose(T: Rows) -> tuple[Triple[float], tuple[float, float, float, float]
         (c - g, b + d, 1 - a + e - i, f + h),
         (d - b, c + g, f + h, 1 - a - e + i),
     )
-    # the candidate with the largest component is the most accurate
+    # The candidate with the largest component is the most accurate.
     q = candidates[max(range(4), key=lambda k: candidates[k][k])]
     length = math.copysign(math.sqrt(sum(v * v for v in q)), q[0] if q[0] != 0 else 1.0)
     return (x, y, z), (q[0] / length, q[1] / length, q[2] / length, q[3] / length)

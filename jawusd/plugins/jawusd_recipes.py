@@ -16,12 +16,12 @@ Put both files on the Python path of the program. `model.npz` can be read withou
     # Unreal: the mandible's binding in a level sequence, and keys of d1, d2, d3 by frame
     recipes.unreal_keys(rig, binding, {0: (0, 0, 0), 24: (20, 0, 0)})
 
-Every whole frame gets a key, with linear interpolation between them: with sparse keys the jaw would leave its path by
-millimetres. Parameters outside the bound are replaced by the nearest valid ones, with a warning. `measured=True` keeps
-them, for captured takes of the subject. Angles are continuous from frame to frame.
+Every whole frame gets a key, with linear interpolation between keys; with sparse keys, the jaw would leave its path by
+millimetres. Parameters outside the bound are replaced by the nearest valid parameters, with a warning; `measured=True`
+keeps them, for captured takes of the subject. Angles are continuous from frame to frame.
 
 The mandible's transform is replaced by T_skull_mandible; its parent must have the pose of the skull. Lengths are in
-millimetres; if the parent does not scale them, set `scale`, 0.1 for centimetres.
+millimetres; if the scene uses another unit and the parent does not scale, set `scale`, such as 0.1 for centimetres.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import unreal
 
 Rows = Sequence[Sequence[float]]
-Keys = Mapping[int, Sequence[float]]  # d1, d2, d3 [mm] by frame
+Keys = Mapping[int, Sequence[float]]  # d1, d2, d3 [mm] by frame number
 
 _MAYA_ROTATE_ORDERS = ("xyz", "yzx", "zxy", "xzy", "yxz", "zyx")
 
@@ -55,13 +55,13 @@ def every_frame(keys: Keys) -> dict[int, list[float]]:
 
 
 def poses(rig: jawusd_reader.Rig, keys: Keys, *, measured: bool = False) -> dict[int, Rows]:
-    """Return T_skull_mandible [mm] at every key; warn if keys are outside the bound.
+    """Return T_skull_mandible [mm] at every key; warn about keys outside the bound.
 
     Args:
         rig: The rig.
         keys: d1, d2, d3 [mm] by frame.
-        measured: Keep keys outside the bound, because measured poses may be slightly outside. Otherwise they are moved
-            to the nearest valid d.
+        measured: Whether to keep keys outside the bound, since measured poses may be slightly outside. Otherwise, they
+            are moved to the nearest valid d.
     """
     outside = {frame: -rig.margin(*d) for frame, d in keys.items() if not rig.is_inside(*d)}
     if outside:
@@ -80,7 +80,7 @@ def poses(rig: jawusd_reader.Rig, keys: Keys, *, measured: bool = False) -> dict
 def nearest_turn(
     angles: Sequence[float], previous: Sequence[float] | None, middle: int = 1, full: float = 360.0
 ) -> list[float]:
-    """Return the equivalent Euler angles that are nearest to those of the previous frame.
+    """Return the equivalent Euler angles nearest to those of the previous frame.
 
     Args:
         angles: Three Euler angles.
@@ -97,7 +97,7 @@ def nearest_turn(
 
 
 def row_matrix(T: Rows, scale: float = 1.0) -> list[float]:
-    """Return a pose as 16 numbers for programs with row vectors, Maya and Houdini: transposed, lengths scaled."""
+    """Return a pose as 16 numbers for programs with row vectors (Maya, Houdini): transposed, with scaled lengths."""
     rows = [[T[i][j] for i in range(3)] + [0.0] for j in range(3)]
     return [x for row in [*rows, [scale * T[i][3] for i in range(3)] + [1.0]] for x in row]
 
@@ -105,8 +105,8 @@ def row_matrix(T: Rows, scale: float = 1.0) -> list[float]:
 def unreal_pose(T: Rows, scale: float = 0.1) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return location and quaternion (x, y, z, w) of a pose in Unreal's left-handed axes with Z up.
 
-    Unreal's USD importer swaps y and z, a reflection S. R becomes S R S, whose rotation axis is that of R with y and z
-    swapped, negated.
+    Unreal's USD importer swaps y and z, which is a reflection S. A rotation R becomes S R S; its axis is that of R with
+    y and z swapped, negated.
     """
     (x, y, z), (qw, qx, qy, qz) = jawusd_reader.decompose(T)
     return (scale * x, scale * z, scale * y), (-qx, -qz, -qy, qw)
@@ -161,7 +161,7 @@ def maya_bake(
 
 
 def houdini_controls(rig: jawusd_reader.Rig, node: hou.Node) -> None:
-    """Add the three parameters to a node."""
+    """Add d1, d2 and d3 to a node as parameters."""
     import hou
 
     group = node.parmTemplateGroup()

@@ -1,4 +1,4 @@
-"""Copy modules of jawusd, and all jawusd modules they import, into a package that must work without jawusd."""
+"""Copy modules of jawusd, with all jawusd modules that they import, into a package that must work without jawusd."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _VERSION = re.compile(r"^__version__ = .*$", re.MULTILINE)
 
 
 def vendored_files(stubs: Iterable[Path]) -> dict[str, str]:
-    """Return the contents of the files to add to a package, by path in the package.
+    """Return the contents of the files to be added to a package, by path in the package.
 
     Args:
         stubs: `.pyi` files that import the required names, each in the form `from jawusd.x import y as y`.
 
     Returns:
-        A module for each stub, and below `jawusd/` the modules that they import.
+        A module for each stub and, below `jawusd/`, the modules that these modules import.
 
     Raises:
         ValueError: A module imports jawusd in a form other than `from jawusd.x import y`.
@@ -60,7 +60,7 @@ def _imported(tree: ast.Module) -> Iterator[str]:
 
 
 def _relative(module: str, source: str) -> str:
-    """Return the source of a module with imports of jawusd made relative."""
+    """Return the source of a module with its imports from jawusd made relative."""
     parts = module.split(".")[1:]
     dots = "." * (len(parts) + (_file(module).name == "__init__.py"))
     return _OURS.sub(lambda found: f"{found[1]}from {dots}{found[2][1:]} import", source)

@@ -186,7 +186,7 @@ def test_takes_of_other_objects_are_not_taken_for_the_jaws(session, folder, tmp_
     if blender == "blender45":
         assert_holds_take(*arguments)
     else:
-        with pytest.raises(AssertionError, match="All Actions off: Mandible moves in several takes, .*CameraAction"):
+        with pytest.raises(AssertionError, match="Mandible moves in several takes .*CameraAction.*All Actions off"):
             assert_holds_take(*arguments)
 
 

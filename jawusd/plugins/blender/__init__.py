@@ -1,6 +1,6 @@
 """Blender add-on for jaw rigs imported from USD: sliders, keys, handles, cameras, and export back to USD.
 
-`python -m jawusd.plugins FILE.zip` builds the extension and adds the modules of jawusd that it needs.
+`python -m jawusd.plugins FILE.zip` builds the extension, which includes the modules of jawusd that it needs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from . import bake, handle, jaw, operators, panel, scene, vendored
 
 
 class JawUsdHook(bpy.types.USDHook):
-    """Link the rigs of an imported stage."""
+    """Hook that links the rigs of an imported stage."""
 
     bl_idname = "jawusd_hook"
     bl_label = "jawusd jaw rigs"
@@ -32,7 +32,7 @@ class JawUsdHook(bpy.types.USDHook):
 
 
 def glTF2_pre_export_callback(export_settings: Mapping[str, logging.Logger]) -> None:
-    """Warn if a glTF file would lack the motion of a jaw; Blender's exporter calls this by name."""
+    """Warn if a glTF file would lack the motion of a jaw; Blender's exporter calls this function by name."""
     warning = bake.warning(bpy.context.scene)
     if warning:
         export_settings["log"].warning(warning)
@@ -41,7 +41,7 @@ def glTF2_pre_export_callback(export_settings: Mapping[str, logging.Logger]) -> 
 def register() -> None:
     """Register the hook, the panel and the handlers that restore rigs in reopened files."""
     vendored.find_blender_pxr(bpy.utils.resource_path)
-    # fails here if pxr is missing: with a registered hook, Blender would abort
+    # Fail here if pxr is missing: with a registered hook, Blender would abort.
     import pxr.Usd  # noqa: F401
 
     bpy.utils.register_class(JawUsdHook)

@@ -1,4 +1,4 @@
-"""Bake drivers to keys: FBX, glTF, game engines, and Blender without the add-on need keys."""
+"""Bake drivers to keys, which FBX, glTF, game engines, and Blender without the add-on need."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ SETTINGS = {
     "WM_OT_collada_export": {},
 }
 _CHANNELS = ("location", "rotation_quaternion")
-# Key of the name of a property that only this mandible has. FBX export assigns an action to every object that has all
-# channels of the action; a channel for that property prevents this.
+# Key under which the name of a property is stored that only this mandible has. FBX export assigns an action to every
+# object that has all channels of the action; a channel for the unique property prevents this.
 _OWN = "jawusd_own"
-_LINEAR = 1  # Blender's enum value of linear interpolation
+_LINEAR = 1  # Blender's enum value for linear interpolation
 
 
 def warning(scene: bpy.types.Scene) -> str | None:
-    """Return a warning if the exporters of `SETTINGS` would lose motion of a scene, otherwise None."""
+    """Return a warning if the exporters in `SETTINGS` would lose motion of a scene; otherwise, None."""
     names = [found.name for found in scene.objects if jaw.is_driven(found)]
     return f"{', '.join(names)} will not move: its motion is on the sliders. Bake it to keys first." if names else None
 
 
 def parameters_over(actor: bpy.types.Object, scene: bpy.types.Scene, frames: range) -> vendored.Array:
-    """Return the displayed d of an actor in each frame, shape (F, 3) [mm]; the scene's frame is restored."""
+    """Return the displayed d of an actor in each frame, shape (F, 3) [mm]; restore the scene's current frame."""
     present, subframe, d = scene.frame_current, scene.frame_subframe, []
     for frame in frames:
         scene.frame_set(frame)
@@ -41,7 +41,7 @@ def parameters_over(actor: bpy.types.Object, scene: bpy.types.Scene, frames: ran
 
 
 def frames_of(actor: bpy.types.Object, scene: bpy.types.Scene, span: str) -> range:
-    """Return the frame range of the scene, or of an actor's take: from the first to the last key of its sliders.
+    """Return the frame range of the scene, or that of an actor's take, from the first to the last key of its sliders.
 
     Raises:
         vendored.JawusdError: The take has no keys.

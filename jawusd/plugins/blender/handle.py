@@ -1,4 +1,4 @@
-"""Handles at chin or incisor: dragging a handle moves the sliders by inverse kinematics, inside the bound."""
+"""Handles at the chin or the incisor; dragging a handle moves the sliders by inverse kinematics, inside the bound."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 from . import jaw, vendored
 
 _POINT, _ACTOR = "jawusd_point", "jawusd_handle_of"
-_MOVED_MM = 1e-3  # minimum displacement of a handle that counts as a drag; above single-precision rounding
+_MOVED_MM = 1e-3  # minimum displacement of a handle that counts as a drag, greater than single-precision rounding
 
 
 def add(actor: bpy.types.Object, point: tuple[float, float, float], name: str) -> bpy.types.Object:
-    """Add and return a handle for a point of the mandible [mm], mandible frame."""
+    """Add a handle at a point of the mandible [mm], in the mandible frame, and return it."""
     handle = bpy.data.objects.new(name, None)
     handle.empty_display_type, handle.empty_display_size = "SPHERE", 3.0
     for collection in actor.users_collection:
@@ -24,7 +24,7 @@ def add(actor: bpy.types.Object, point: tuple[float, float, float], name: str) -
 
 
 def handles() -> list[bpy.types.Object]:
-    """Return the handles in the file."""
+    """Return all handles in the current file."""
     return [found for found in bpy.data.objects if _POINT in found and found.get(_ACTOR) is not None]
 
 
@@ -55,7 +55,7 @@ def follow(handle: bpy.types.Object) -> bool:
 
 @bpy.app.handlers.persistent
 def _dragged(_: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Move sliders to follow dragged handles, and handles to follow jaws that were moved in other ways."""
+    """Move the sliders to follow dragged handles, and the handles to follow jaws that were moved in other ways."""
     moved = {update.id.original for update in depsgraph.updates if isinstance(update.id, bpy.types.Object)}
     for handle in handles():
         if handle in moved and not jaw.curves(handle):
@@ -74,12 +74,12 @@ _HANDLERS = (("depsgraph_update_post", _dragged), ("frame_change_post", _played)
 
 
 def register() -> None:
-    """Install the handlers."""
+    """Install the handlers that synchronise handles and sliders."""
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
 
 
 def unregister() -> None:
-    """Remove the handlers."""
+    """Remove the handlers installed by `register`."""
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).remove(handler)

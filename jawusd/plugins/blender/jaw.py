@@ -1,4 +1,4 @@
-"""Jaw rigs in a scene: sliders, drivers of the mandible, keys from the file."""
+"""Jaw rigs in a scene: sliders, drivers of the mandible, and keys read from the file."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # prim paths to the objects a
 SOURCE, KEEP, FPS = "jawusd_source", "keep_valid", "jawusd_fps"
 _STORE, _ACTOR, _FIXED = "jawusd_rig", "jawusd_actor", "jawusd_fixed"
 _FUNCTION, _OLD_FUNCTION = "jawusd_offset", "jawusd_channel"
-# Channels that the drivers set. A driver that fails, without the add-on or with scripts disabled, evaluates to 0. The
-# mandible's transform is therefore its rest pose, and the drivers set offsets that are 0 at rest: the delta location,
-# and x, y, z of the delta rotation, whose w is constant.
+# Channels that the drivers set. A driver that fails, because the add-on is missing or scripts are disabled, evaluates
+# to 0. The mandible's transform is therefore its rest pose, and the drivers set offsets that are 0 at rest: the delta
+# location, and x, y, z of the delta rotation, whose w is constant.
 _CHANNELS = (*(("delta_location", i) for i in range(3)), *(("delta_rotation_quaternion", i) for i in (1, 2, 3)))
 # The w of the delta rotation, which Blender normalises. It is large because Blender 5.0 rounds driven values within
 # 1e-4 of 0 or 1, which for a unit quaternion would move the chin by up to 0.02 mm.
 _QUATERNION_W = 1024.0
 
-_rigs: dict[str, vendored.JawRig] = {}  # evaluators by the text stored in the actor
+_rigs: dict[str, vendored.JawRig] = {}  # evaluators by the rig text stored in the actor
 _poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
 
 
@@ -78,20 +78,20 @@ def _note_missing_sliders(prim: Usd.Prim, nearest: bpy.types.Object | None) -> N
 
 
 def without_sliders() -> list[str]:
-    """Return a line for each rig in the file without sliders: its prim, the reason, and the remedy."""
+    """Return a line for each rig in the file that has no sliders: its prim, the reason, and the remedy."""
     return [line for found in bpy.data.objects for line in str(found.get(_FIXED, "")).splitlines()]
 
 
 def actors() -> list[bpy.types.Object]:
-    """Return the objects with a rig."""
+    """Return the objects that have a rig."""
     return [found for found in bpy.data.objects if _STORE in found]
 
 
 def mandible_of(actor: bpy.types.Object) -> bpy.types.Object:
     """Return the mandible of an actor.
 
-    Children of the actor are searched first, because library overrides in reopened files refer to the actor in the
-    library.
+    Children of the actor are searched first: in reopened files, the mandibles of library overrides refer to the actor
+        in the library.
 
     Raises:
         vendored.JawusdError: The mandible was deleted.
@@ -109,10 +109,10 @@ def meshes_of(mandible: bpy.types.Object) -> list[bpy.types.Object]:
 
 
 def rig_of(actor: bpy.types.Object) -> vendored.JawRig:
-    """Return the evaluator of an actor, cached by the stored text.
+    """Return the evaluator of an actor, cached by the text of the rig stored in the actor.
 
     Raises:
-        vendored.JawusdError: It was stored by an older version of the add-on.
+        vendored.JawusdError: The rig was stored by an older version of the add-on.
     """
     text = actor[_STORE]
     if text not in _rigs:
@@ -125,7 +125,7 @@ def rig_of(actor: bpy.types.Object) -> vendored.JawRig:
 
 
 def parameters(actor: bpy.types.Object) -> tuple[float, float, float]:
-    """Return d1, d2, d3 [mm] of the sliders."""
+    """Return the slider values d1, d2, d3 [mm]."""
     d1, d2, d3 = (float(actor[name]) for name in vendored.PARAMETERS)
     return d1, d2, d3
 
@@ -146,7 +146,7 @@ def _kept(rig: vendored.JawRig, d: tuple[float, float, float]) -> tuple[float, f
 def _text_of(rig: vendored.JawRig) -> str:
     """Return a rig as text that a scene can store."""
     packed = io.BytesIO()
-    # Blender's numpy lacks the argument `allow_pickle`, which the type stubs require
+    # Blender's numpy lacks the argument `allow_pickle`, which the type stubs require.
     np.savez(packed, **{**rig.arrays, "meta": np.array(json.dumps(rig.meta))})  # type: ignore[arg-type]  # flags are named
     return base64.b64encode(zlib.compress(packed.getvalue())).decode()
 
@@ -160,13 +160,13 @@ def _source_of(prim: Usd.Prim) -> str:
 
 
 def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
-    """Return the object created from a prim, or from the prim's only child if Blender merged the two."""
+    """Return the object created from a prim, or from its only child if Blender merged the two prims."""
     below = [other for other in prim_map if str(other).startswith(f"{path}/")]
     return next((found for other in (path, *below) for found in _objects(prim_map, other)), None)
 
 
 def _nearest_object(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
-    """Return the object created from a prim or its nearest ancestor."""
+    """Return the object created from a prim or, without one, from its nearest ancestor."""
     return next((found for other in reversed(path.GetPrefixes()) for found in _objects(prim_map, other)), None)
 
 
@@ -187,7 +187,7 @@ def _add_sliders(actor: bpy.types.Object, rig: vendored.JawRig, values: list[flo
 
 
 def _set_limits(actor: bpy.types.Object, rig: vendored.JawRig) -> None:
-    """Set the range of the sliders. Blender clamps keyed values to the hard range, which is therefore far wider."""
+    """Set the range of the sliders. The hard range is far wider, since Blender clamps keyed values to it."""
     for name, label, (low, high) in zip(vendored.PARAMETERS, vendored.LABELS, rig.d_range.tolist()):
         slack = high - low
         ui = actor.id_properties_ui(name)
@@ -195,7 +195,7 @@ def _set_limits(actor: bpy.types.Object, rig: vendored.JawRig) -> None:
 
 
 def drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
-    """Drive the mandible by the actor's d1, d2, d3 instead of by keys or the file's cached motion."""
+    """Drive the mandible by the actor's d1, d2, d3 instead of by keys or by the motion cached from the file."""
     for constraint in list(mandible.constraints):
         if constraint.type == "TRANSFORM_CACHE":
             mandible.constraints.remove(constraint)
@@ -225,18 +225,18 @@ def remove_drivers(mandible: bpy.types.Object) -> None:
 
 
 def is_driven(mandible: bpy.types.Object) -> bool:
-    """Return whether a mandible is moved by the sliders instead of by its own keys."""
+    """Return whether a mandible is moved by the sliders and not by its own keys."""
     return bool(_drivers(mandible, (_FUNCTION,)))
 
 
 def _drivers(mandible: bpy.types.Object, functions: tuple[str, ...]) -> list[bpy.types.FCurve]:
-    """Return the drivers of a mandible that call one of the functions."""
+    """Return the drivers of a mandible that call one of the named functions."""
     data = mandible.animation_data
     return [curve for curve in data.drivers if curve.driver.expression.startswith(functions)] if data else []
 
 
 def _key(actor: bpy.types.Object, prim: Usd.Prim) -> None:
-    """Key the sliders with the samples and splines of the file, linearly interpolated."""
+    """Key the sliders with the samples and splines of the USD file, linearly interpolated."""
     from . import vendored_usd
 
     for name in vendored.PARAMETERS:
@@ -252,12 +252,12 @@ def _key(actor: bpy.types.Object, prim: Usd.Prim) -> None:
 
 
 def curves(found: bpy.types.Object) -> list[bpy.types.FCurve]:
-    """Return the curves of an object's action."""
+    """Return the animation curves of an object's action."""
     return [curve for collection in curve_lists(found) for curve in collection]
 
 
 def curve_lists(found: bpy.types.Object) -> list[bpy.types.bpy_prop_collection[bpy.types.FCurve]]:
-    """Return the curve collections of an object: of its action slot (Blender 4.4 and later), or of its action."""
+    """Return the curve collections of an object's action slot (Blender 4.4 and later) or of its action."""
     data = found.animation_data
     if data is None or data.action is None:
         return []
@@ -268,11 +268,11 @@ def curve_lists(found: bpy.types.Object) -> list[bpy.types.bpy_prop_collection[b
 
 
 def _offset(mandible: bpy.types.Object, d1: float, d2: float, d3: float, keep: float, channel: int) -> float:
-    """Return a channel of the mandible's offset from its rest pose, in the actor's units [mm]: the driver function."""
+    """Return one channel of the mandible's offset from its rest pose [mm]; this is the driver function."""
     actor = mandible[_ACTOR]
     key = (actor[_STORE], d1, d2, d3, bool(keep))
     if key not in _poses:
-        _poses.clear()  # keeps only the latest pose, because the six channels of a pose are evaluated in succession
+        _poses.clear()  # keep only the latest pose, since the six channels of a pose are evaluated in succession
         rig = rig_of(actor)
         T, rest = rig.pose(_kept(rig, (d1, d2, d3)) if keep else (d1, d2, d3)), rig.pose((0.0, 0.0, 0.0))
         w, *turn = vendored.wxyz_from_matrix(T[:3, :3] @ rest[:3, :3].T).tolist()
@@ -289,7 +289,7 @@ def _install(*_: object) -> None:
         if _drivers(mandible, (_OLD_FUNCTION,)):
             with contextlib.suppress(vendored.JawusdError):  # the panel displays the error
                 drive(mandible, mandible[_ACTOR])
-        # Blender disables drivers whose function is missing; setting the expression makes it retry
+        # Blender disables drivers whose function is missing; setting the expression makes it try again.
         for curve in _drivers(mandible, (_FUNCTION,)):
             curve.driver.expression = str(curve.driver.expression)
 

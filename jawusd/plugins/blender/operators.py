@@ -1,4 +1,4 @@
-"""Operators of the panel: key, handle, export, bake."""
+"""Operators of the panel: key, add handle, export, bake."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class JAWUSD_OT_handle(bpy.types.Operator):
 
     bl_idname = "jawusd.handle"
     bl_label = "Add Jaw Handle"
-    bl_description = "Add an empty to drag the jaw with; the sliders follow, inside the bound"
+    bl_description = "Add an empty with which you can drag the jaw; the sliders follow, inside the bound"
     bl_options = {"REGISTER", "UNDO"}
 
     __annotations__ = {
@@ -58,7 +58,7 @@ class JAWUSD_OT_handle(bpy.types.Operator):
 
 
 def _chin(actor: bpy.types.Object, rig: vendored.JawRig) -> vendored.Array:
-    """Return the lowest vertex of the mandible below the incisal point [mm], mandible frame."""
+    """Return the lowest vertex of the mandible below the incisal point [mm], in the mandible frame."""
     meshes = jaw.meshes_of(jaw.mandible_of(actor))
     points = np.concatenate([np.array([v.co for v in mesh.data.vertices], dtype=np.float64) for mesh in meshes])
     side, up, _ = (rig.T_anatomical_skull @ rig.T_rest)[:3, :3] @ (points - rig.landmarks[0]).T
@@ -90,12 +90,12 @@ class JAWUSD_OT_export(bpy.types.Operator, ExportHelper):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         moved = float(np.linalg.norm(inside.d[inside.given] - d, axis=1).max())
-        self.report({"INFO"}, f"{len(frames)} frames, moved by up to {moved:.2f} mm to stay inside the bound")
+        self.report({"INFO"}, f"{len(frames)} frames, with d moved by up to {moved:.2f} mm to stay inside the bound")
         return {"FINISHED"}
 
 
 class JAW_OT_bake_to_keys(bpy.types.Operator):
-    """Operator of the bake button; in scripts: `bpy.ops.jaw.bake_to_keys()`."""
+    """Operator of the bake button; scripts call `bpy.ops.jaw.bake_to_keys()`."""
 
     bl_idname = "jaw.bake_to_keys"
     bl_label = "Bake to Keys"

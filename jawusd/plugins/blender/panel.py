@@ -1,4 +1,4 @@
-"""Panels: sliders of the rigs in the scene, validity of their poses, and a warning about what an export would lose."""
+"""Panels: sliders of the rigs in the scene, validity of the poses, and a warning if an export would lose motion."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from . import bake, jaw, operators, vendored
 
 
 class JAWUSD_PT_sliders(bpy.types.Panel):
-    """Jaw parameters of every rig in the scene."""
+    """Panel with the jaw parameters of every rig in the scene."""
 
     bl_label = "Jaw"
     bl_category = "Jaw"
@@ -17,11 +17,11 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Show the panel if the file has a rig."""
+        """Show the panel if the file contains a rig."""
         return bool(jaw.actors() or jaw.without_sliders())
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw sliders, bound and buttons of every rig."""
+        """Draw sliders, distance to the bound and buttons of every rig."""
         for actor in jaw.actors():
             box = self.layout.box()
             box.label(text=actor.name)
@@ -58,7 +58,7 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
 
 
 class JAW_PT_export(bpy.types.Panel):
-    """Warning about motion that an export loses, next to the export settings in the file browser."""
+    """Panel next to the export settings in the file browser that warns about motion that an export loses."""
 
     bl_label = "Jaw"
     bl_space_type = "FILE_BROWSER"
@@ -66,7 +66,7 @@ class JAW_PT_export(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Show the panel if a file with a rig is exported to a format without drivers."""
+        """Show the panel when a file with a rig is exported to a format without drivers."""
         exporter = context.space_data.active_operator
         return exporter is not None and exporter.bl_idname in bake.SETTINGS and bool(jaw.actors())
 
@@ -82,7 +82,7 @@ class JAW_PT_export(bpy.types.Panel):
 
 
 def _readout(rig: vendored.JawRig, d: tuple[float, float, float]) -> list[tuple[str, str]]:
-    """Return lines with icons that state how far parameters d [mm] are inside or outside the bound."""
+    """Return lines of text, with icons, on how far parameters d [mm] are inside or outside the bound."""
     inside, distance = bool(rig.is_inside(d)), abs(float(rig.margin(d)))
     word = "inside" if inside else "OUTSIDE"
     lines = [(f"{word} the bound by {distance:.1f} mm", "INFO" if inside else "ERROR")]

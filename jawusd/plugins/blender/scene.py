@@ -1,4 +1,4 @@
-"""Settings of a take in the scene: rate, frame range and units, and cameras with their footage."""
+"""Settings of a take in the scene: frame rate, frame range, units, and cameras with their footage."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def apply_stage_settings(stage: Usd.Stage) -> None:
-    """Set rate, frame range and unit of the scene to those of a stage."""
+    """Set frame rate, frame range and unit of length of the scene to those of a stage."""
     scene, rate = bpy.context.scene, stage.GetTimeCodesPerSecond()
     scene.render.fps = max(1, round(rate))
     scene.render.fps_base = scene.render.fps / rate
@@ -24,7 +24,7 @@ def apply_stage_settings(stage: Usd.Stage) -> None:
 
 
 def add_plates(stage: Usd.Stage, prim_map: Mapping[Sdf.Path, list[bpy.types.ID]]) -> None:
-    """Show the undistorted footage of a take behind its cameras, if `jawusd plates` has written it."""
+    """Show the undistorted footage of a take as the background of its cameras, if `jawusd plates` has written it."""
     scene, first = bpy.context.scene, None
     for path, made in prim_map.items():
         prim = stage.GetPrimAtPath(path)
@@ -49,7 +49,7 @@ def _show(camera: bpy.types.Camera, pattern: str, last: int) -> None:
     image.source = "SEQUENCE"
     background = camera.background_images.new()
     background.image, background.alpha, background.display_depth = image, 1.0, "BACK"
-    # the number in a plate's file name is its USD time code, which equals the scene's frame
+    # The number in a plate's file name is its USD time code, which equals the scene's frame.
     user = background.image_user
     user.frame_start, user.frame_offset, user.frame_duration = 1, 0, max(last, 1)
     camera.show_background_images = True
