@@ -1,4 +1,4 @@
-"""Libraries of rigs: an index of a folder, and jaw motion for a subject without a capture.
+"""Libraries of rigs: the index of a folder, and jaw motion for a subject without a capture.
 
-Imports only `base`, `geometry`, `formats` and `evaluator`.
+This package imports only `base`, `geometry`, `formats` and `evaluator`.
 """

@@ -1,7 +1,7 @@
 """The index of a folder of rigs: `library.json`, format jawusd-library/1.
 
-The index only caches the scan; its paths are never opened. Rigs are searched for only within the folder, and reread
-when their content has changed.
+The index only caches the results of scanning the folder; the paths in it are never opened. Rigs are searched for only
+within the folder, and read again if their content has changed.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ Loader = Callable[[Path], JawRig]
 class Entry:
     """The index entry of one rig."""
 
-    path: str  # file of the rig, relative to the folder, with slashes
+    path: str  # path of the rig's file relative to the folder, with forward slashes
     actor: str  # name of the subject
-    kind: str  # kind of the model
-    content: str  # SHA-256 of the rig's files
-    ranges_mm: dict[str, list[float]]  # lowest and highest value of each parameter
+    kind: str  # kind of the rig's model
+    content: str  # SHA-256 hash of the rig's files
+    ranges_mm: dict[str, list[float]]  # minimum and maximum of each jaw parameter
     # landmarks by name, in the subject's own landmark frame (occlusal plane, origin at the lower incisal point)
     landmarks_mm: dict[str, list[float]]
     condylar_distance_mm: float  # distance between the condyle centres
     condyle_incisor_mm: float  # distance from the midpoint of the condyles to the incisal point
-    errors_mm: dict[str, object]  # error tables from the model's header
+    errors_mm: dict[str, object]  # error tables from the header of the model
     not_shown: bool  # whether the capture lacks a movement, which makes the rig unusable for transfer
 
     def landmarks(self) -> Array:
-        """Return the landmarks in the order of `LANDMARKS` [mm], shape (5, 3)."""
+        """Return the landmarks [mm] in the order of `LANDMARKS`, shape (5, 3)."""
         return np.array([self.landmarks_mm[name] for name in LANDMARKS])
 
 
 @dataclass(frozen=True)
 class Library:
-    """A scanned folder."""
+    """A folder of rigs after scanning."""
 
     folder: Path  # resolved path of the folder
     entries: tuple[Entry, ...]  # rigs in the folder, sorted by path
@@ -67,18 +67,18 @@ class Library:
     reread: int  # number of new or changed rigs
 
     def find(self, name: str) -> Entry:
-        """Return the rig of a subject, by name or path.
+        """Return the rig of a subject, given the subject's name or path.
 
         Raises:
-            FormatError: no rig matches, or several do.
+            FormatError: no rig matches, or several rigs match.
         """
         found = [entry for entry in self.entries if name in (entry.path, entry.actor, str(Path(entry.path).parent))]
         if not found:
             known = ", ".join(entry.actor for entry in self.entries) or "no rigs"
-            raise FormatError(f'has no rig of "{name}"; it contains {known}.', path=self.folder)
+            raise FormatError(f'has no rig named "{name}"; it contains {known}.', path=self.folder)
         if len(found) > 1:
             paths = ", ".join(entry.path for entry in found)
-            raise FormatError(f'has several rigs of "{name}": {paths}.', path=self.folder, hint="Give the path.")
+            raise FormatError(f'has several rigs named "{name}": {paths}.', path=self.folder, hint="Give the path.")
         return found[0]
 
     def search(self, text: str) -> tuple[Entry, ...]:
@@ -89,12 +89,12 @@ class Library:
 def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
     """Scan a folder and update its index.
 
-    Every subfolder with a `model.npz`, or else an `actor.usda`, is one subject. Links out of the folder are not
+    Every subfolder with a `model.npz` or, without it, an `actor.usda`, is one subject. Links out of the folder are not
     followed.
 
     Raises:
-        FormatError: a missing folder, too many folders, or a corrupt index.
-        VersionError: an index written by a newer version.
+        FormatError: the folder is missing or has too many subfolders, or the index is corrupt.
+        VersionError: the index was written by a newer version.
         OutputError: the updated index cannot be written.
     """
     root = Path(folder).resolve()
@@ -119,7 +119,7 @@ def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
 
 
 def load_donors(library: Library, load: Loader) -> list[Donor]:
-    """Read the rigs of all subjects whose captures include every movement, named by their paths.
+    """Read the rigs of all subjects whose captures include every movement; name them by their paths.
 
     Raises:
         JawusdError: a rig has become unreadable since the scan.
@@ -130,7 +130,7 @@ def load_donors(library: Library, load: Loader) -> list[Donor]:
 def _rig_files(root: Path) -> Iterator[Path]:
     for count, (where, folders, files) in enumerate(os.walk(root, followlinks=False)):
         if count >= _MAX_FOLDERS:
-            raise FormatError(f"has more than {_MAX_FOLDERS} subfolders, too many for a library.", path=root)
+            raise FormatError(f"has more than {_MAX_FOLDERS} subfolders, which is the limit for a library.", path=root)
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in (MODEL_FILE, ACTOR_FILE):
             if name in files:
@@ -139,18 +139,18 @@ def _rig_files(root: Path) -> Iterator[Path]:
 
 
 def _content(path: Path, root: Path) -> str:
-    """Return the SHA-256 of the files a rig is read from.
+    """Return the SHA-256 of the files from which a rig is read.
 
     Raises:
-        FormatError: one of them is not a regular file inside the library, or cannot be read.
+        FormatError: one of the files is not a regular file inside the library, or cannot be read.
     """
     total = hashlib.sha256()
     parts = [path]
-    if path.name == ACTOR_FILE:  # OpenUSD opens the files referenced by the interface layer, in its folder
+    if path.name == ACTOR_FILE:  # OpenUSD also opens the files in this folder that the interface layer references
         parts += sorted(p for p in path.parent.iterdir() if p.suffix.startswith(".usd") and p != path)
     for part in parts:
         if not part.resolve().is_relative_to(root):
-            raise FormatError(f"{part.name} is a link out of the library and is not followed.", path=path)
+            raise FormatError(f"{part.name} is a link out of the library; such links are not followed.", path=path)
         if not part.is_file():
             raise FormatError(f"{part.name} is not a file.", path=path)
         total.update(part.name.encode() + b"\0")
@@ -190,7 +190,7 @@ def _read_index(path: Path) -> dict[str, Entry]:
         return {}
     try:
         if path.stat().st_size > _MAX_INDEX_BYTES:
-            raise ValueError(f"{path.stat().st_size} bytes")
+            raise ValueError(f"it has {path.stat().st_size} bytes")
         data = json.loads(path.read_text(encoding="utf-8"))
         check_format(data.get("format"), FAMILY, VERSION, path)
         return {entry.path: entry for entry in map(_entry_of, data["rigs"])}

@@ -1,11 +1,12 @@
 """Motion for a subject without a capture: the motion of the library's subjects, transferred and averaged.
 
-Motion is transferred by the five landmarks. The displacement of each landmark is scaled laterally by the ratio of the
-two subjects' condylar distances, and in the sagittal plane by the ratio of their distances from the condyles to the
-incisal point. The pose is the rigid motion that best fits the displaced landmarks.
+Motion is transferred through the five landmarks. The displacement of each landmark is scaled laterally by the ratio of
+the two subjects' intercondylar distances, and in the sagittal plane by the ratio of the distances between condyles and
+incisal point. The resulting pose is the rigid motion that best fits the displaced landmarks.
 
-The weight of a library subject decreases with the distance between the landmarks. The bandwidth and the expected error
-come from leave-one-out validation: each subject of the library is predicted from the others.
+The weight of a library subject decreases with the distance between its landmarks and those of the target subject. The
+bandwidth of the weights and the expected error come from leave-one-out validation: each subject of the library is
+predicted from the others.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class Donor:
 
     @property
     def landmarks(self) -> Array:
-        """The landmarks with the teeth together, skull frame [mm], shape (5, 3), in the order of `LANDMARKS`."""
+        """Landmarks with the teeth together, skull frame [mm], shape (5, 3), in the order of `LANDMARKS`."""
         return transform_points(self.rig.T_rest, self.rig.landmarks)
 
 
@@ -46,40 +47,40 @@ def condyle_incisor_mm(landmarks: Array) -> float:
 
 
 def landmark_distance_mm(a: Array, b: Array) -> float:
-    """Return the rms distance [mm] between two subjects' landmarks (5, 3) [mm] after a rigid fit."""
+    """Return the rms distance [mm] between two subjects' landmarks (5, 3) [mm] after rigid alignment."""
     left = transform_points(rigid_fit(a, b), a) - b
     return float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
 def displacements(donor: Donor, target: Array, shares: Array) -> Array:
-    """Return the target's landmark displacements for a donor's motion, target's frame [mm], shape (K, 5, 3).
+    """Return a donor's motion as displacements of the target's landmarks, in the target's frame [mm], shape (K, 5, 3).
 
     Args:
         target: Landmarks of the target subject with the teeth together [mm], shape (5, 3).
-        shares: Parameters as fractions of the ranges (see `JawRig.normalized`), shape (K, 3).
+        shares: Jaw parameters as fractions of their ranges (see `JawRig.normalized`), shape (K, 3).
     """
     rest = donor.landmarks
     d = donor.rig.denormalized(shares)
     moved = transform_points(donor.rig.pose(d), donor.rig.landmarks) - rest
     width = condylar_distance_mm(target) / condylar_distance_mm(rest)
     reach = condyle_incisor_mm(target) / condyle_incisor_mm(rest)
-    axes = landmark_frame(target)[:3, :3]  # rows: left, up and anterior in the target's frame
+    axes = landmark_frame(target)[:3, :3]  # rows of the matrix: left, up and anterior in the target's frame
     to_target = axes.T @ np.diag([width, reach, reach]) @ axes @ rigid_fit(rest, target)[:3, :3]
     return moved @ to_target.T
 
 
-# Candidate bandwidths [mm]: landmark distance at which a weight falls to exp(-1/2); inf means equal weights.
+# Candidate bandwidths [mm]: landmark distance at which a weight decreases to exp(-1/2); inf means equal weights.
 BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)
-_POSES = 1600  # number of poses predicted
+_POSES = 1600  # number of poses to predict
 _POSES_LEFT_OUT = 120  # number of poses per subject in leave-one-out validation
 _MIN_DONORS = 2  # minimum number of subjects for leave-one-out validation
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Leave-one-out errors."""
+    """Errors of a leave-one-out validation."""
 
-    # landmark errors [mm], shape (K, 5), by name of the subject left out; predicted and true poses are compared at
+    # landmark errors [mm], shape (K, 5), by name of the held-out subject; predicted and true poses are compared at
     # equal fractions of the ranges, so that errors of the ranges are included
     errors_mm: dict[str, Array]
 
@@ -88,7 +89,7 @@ class Expected:
         return np.concatenate(list(self.errors_mm.values()))
 
     def summary(self) -> dict[str, object]:
-        """Return mean, 95 % quantile and largest error over landmarks [mm], and the mean by subject."""
+        """Return mean, 95 % quantile and maximum of the errors over landmarks [mm], and the mean of each subject."""
         errors = self.pooled()
         return {
             "measured": "leave-one-out over the library, at the landmarks, at equal shares of the ranges",
@@ -99,7 +100,7 @@ class Expected:
         }
 
     def table(self) -> dict[str, dict[str, float]]:
-        """Return mean, median, p95 and max by landmark [mm], in the form of a model's error tables."""
+        """Return mean, median, p95 and max of the errors by landmark [mm], in the form of a model's error tables."""
         return {
             name: {
                 "mean": float(column.mean()),
@@ -114,32 +115,32 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """Result of leave-one-out over a library."""
+    """Result of leave-one-out validation over a library."""
 
-    # landmark distance at which a weight falls to exp(-1/2), inf for equal weights; None if only the closest subject is
-    # used
+    # landmark distance at which a weight decreases to exp(-1/2); inf for equal weights; None if only the closest
+    # subject is used
     bandwidth_mm: float | None
-    expected: Expected | None  # leave-one-out result; None if the library has a single subject
+    expected: Expected | None  # result of leave-one-out validation; None if the library has a single subject
 
 
 @dataclass(frozen=True, eq=False)
 class PersonalMotion:
-    """The motion predicted for a subject."""
+    """Motion predicted for a subject."""
 
     # T_skull_mandible in the landmark frame, the identity with the teeth together, shape (N, 4, 4)
     poses: Array
-    weights: dict[str, float]  # weights of the library's subjects, by name; they sum to 1
-    learned: Learned  # bandwidth of the weights, and the expected error
+    weights: dict[str, float]  # weights of the library's subjects by name; their sum is 1
+    learned: Learned  # bandwidth of the weights, and expected error
 
 
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
-    """Predict every subject of a library from the others, and choose the bandwidth of the weights.
+    """Predict every subject of a library from the other subjects, and choose the bandwidth of the weights.
 
     Args:
         closest: Whether to use only the subject with the most similar landmarks instead of an average.
 
     Raises:
-        FittingError: no donors.
+        FittingError: there are no donors.
     """
     if not donors:
         raise FittingError("the library has no subject whose motion can be transferred.")
@@ -163,7 +164,7 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
 
 
 def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) -> PersonalMotion:
-    """Predict the motion of a subject from landmarks and a library.
+    """Predict the motion of a subject from its landmarks and a library.
 
     Args:
         target: Landmarks of the subject with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
@@ -179,14 +180,14 @@ def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) ->
 
 
 def _captured_shares(donor: Donor, count: int) -> Array:
-    """Return about `count` of a subject's captured poses, in time order, as fractions of the ranges."""
+    """Return about `count` of a subject's captured poses in temporal order, as fractions of the ranges."""
     codes = donor.rig.captured_d
     step = -(-len(codes) // max(count, 1))
     return donor.rig.normalized(codes[::step])
 
 
 def _weights(donors: Sequence[Donor], target: Array, bandwidth_mm: float | None) -> Array:
-    """Return the weights (n,), which sum to 1; without a bandwidth, only the closest subject counts."""
+    """Return the weights (n,) of the donors, which sum to 1; without a bandwidth, only the closest donor counts."""
     distance = np.array([landmark_distance_mm(donor.landmarks, target) for donor in donors])
     if bandwidth_mm is None:
         return (np.arange(len(donors)) == distance.argmin()).astype(np.float64)

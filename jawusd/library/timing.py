@@ -1,11 +1,11 @@
-"""Preserve the timing of a retargeted curve: it rises and falls where the original does.
+"""Preserve the timing of a retargeted curve, so that it rises and falls where the original curve does.
 
 Ranges depend on the opening, so a curve retargeted by fractions of the ranges may peak some frames before or after the
 original. The result is the least-squares nearest curve that moves in the same direction as the original between any two
-samples: isotonic regression (Barlow et al. 1972) whose direction follows the sign of the original's steps. It is solved
-exactly by dynamic programming; its state is the cost of all samples so far as a function of the last value. The
-derivative of that cost is piecewise linear and increasing, and each step truncates one end of it, as in R. Tibshirani,
-H. Hoefling, R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
+samples: isotonic regression (Barlow et al. 1972) whose direction follows the sign of the original's steps. The problem
+is solved exactly by dynamic programming, whose state is the cost of all samples so far as a function of the last value.
+The derivative of this cost is piecewise linear and increasing, and each step truncates one of its ends, as in R.
+Tibshirani, H. Hoefling, R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 
-STILL_MM = 1e-6  # steps of the original up to this size count as having no direction
+STILL_MM = 1e-6  # maximum step of the original that counts as having no direction
 
 
 def follow(original: Array, carried: Array, least: float) -> Array:
-    """Return the curve (F,) [mm] nearest to a retargeted one, among those that rise and fall with the original (F,).
+    """Return the curve (F,) [mm] nearest to a retargeted curve among all that rise and fall with the original (F,).
 
     Args:
-        least: Minimum step of the result per 1 mm step of the original, > 0; keeps peaks from becoming plateaus.
+        least: Minimum step of the result per 1 mm step of the original, > 0; it keeps peaks from becoming plateaus.
     """
     steps = np.diff(original)
     still = np.flatnonzero(np.abs(steps) < STILL_MM) + 1
@@ -36,7 +36,7 @@ def follow(original: Array, carried: Array, least: float) -> Array:
 
 
 def _zigzag(rising: Mask, wanted: Array) -> Array:
-    """Return the values z (n,) nearest to ``wanted`` (n,): z[i + 1] >= z[i] where ``rising`` (n - 1,), otherwise <=."""
+    """Return the z (n,) nearest to ``wanted`` (n,) with z[i + 1] >= z[i] where ``rising`` (n - 1,), <= elsewhere."""
     cost = _Slopes()
     cost.add(wanted[0])
     limits = np.empty(len(rising))
@@ -51,9 +51,10 @@ def _zigzag(rising: Mask, wanted: Array) -> Array:
 
 
 class _Slopes:
-    """The derivative of a convex, piecewise quadratic cost, as line segments between knots.
+    """Derivative of a convex, piecewise quadratic cost, stored as line segments between knots.
 
-    Lines are (slope, offset); a knot is its position and the changes of slope and offset there, from left to right.
+    A line is (slope, offset). A knot is its position and the changes of slope and offset there; knots run from left to
+    right.
     """
 
     def __init__(self) -> None:
@@ -61,12 +62,12 @@ class _Slopes:
         self._knots: deque[tuple[float, float, float]] = deque()
 
     def add(self, wanted: float) -> None:
-        """Add half the squared distance to a value."""
+        """Add half the squared distance from a value to the cost."""
         self._first = (self._first[0] + 1.0, self._first[1] - wanted)
         self._last = (self._last[0] + 1.0, self._last[1] - wanted)
 
     def cut(self, right: bool) -> float:
-        """Return the minimiser, and make the cost constant from there to the right, or to the left."""
+        """Return the minimiser of the cost, and make the cost constant on its right or on its left."""
         sign, end, (slope, offset) = (-1, -1, self._last) if right else (1, 0, self._first)
         while self._knots:
             position, bend, shift = self._knots[end]
