@@ -1,4 +1,4 @@
 """Find the poses in the first frame, from picks or by search, and check the scans and picks.
 
-Imports `contour` and `config`; never `sequence`, `performance` or `region`.
+This package imports `contour` and `config`, but never `sequence`, `performance` or `region`.
 """

@@ -44,7 +44,7 @@ class Start:
 
     frame: int  # frame number of the reference camera
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
-    notes: dict[str, object]  # how the start was found, for the meta data of the tracks
+    notes: dict[str, object]  # how the start was found, for the metadata of the tracks
     findings: tuple[Finding, ...] = ()  # findings about scans and picks
     T_anatomical_scan: Array = field(default_factory=lambda: np.eye(4))  # scan frame to (left, up, front) axes
 

@@ -1,4 +1,4 @@
-"""Track a whole take: frame by frame, with whole-take corrections, smoothing, and a second pass with the jaw model.
+"""Track a whole take: frame by frame, then with whole-take corrections, smoothing, and a pass with the jaw model.
 
-Imports `initialization`, `contour` and `config`; never `performance` or `region`.
+This package imports `initialization`, `contour` and `config`, but never `performance` or `region`.
 """

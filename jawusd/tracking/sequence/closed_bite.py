@@ -1,10 +1,10 @@
-"""Frames with the teeth together, which reveal registration errors of the scans and constant errors of a take.
+"""Frames with closed teeth, which reveal registration errors of the scans and constant pose errors of a take.
 
-The scans are exported in occlusion, so T_upper_lower is the identity with the teeth together, up to three errors: the
-scans' registration, outlines drawn with the same bias in every frame, and the noise of single frames. Each has a known
-spread, so linear least squares attributes the measured deviation to them. Most registrations are accurate to some
-hundredths of a millimetre, but outliers are large: registration errors follow a Student distribution, which is fitted
-by reweighting (Lange, Little & Taylor 1989).
+The scans are exported in occlusion, so T_upper_lower is the identity with closed teeth, except for three errors: errors
+of the scans' registration, outline biases common to all frames, and the noise of single frames. The spread of each
+error is known, so linear least squares attributes the measured deviation to them. Most registrations are accurate to
+some hundredths of a millimetre, but outliers are large: a Student distribution is therefore assumed for registration
+errors, and fitted by reweighting (Lange, Little & Taylor 1989).
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import TakeEquations, pose_response
 
-# Criteria for frames with the teeth at rest in contact: maximum relative motion [mm/frame at the teeth], and maximum
-# distance from their pose in the named or most closed frame [mm].
+# Criteria for frames in which the teeth rest in contact: maximum relative motion of the arches [mm/frame at the teeth],
+# and maximum distance from the relative pose in the named frame or the frame with the smallest opening [mm].
 _STILL_MM, _SAME_BITE_MM = 0.12, 0.2
-_LONGEST_REST = 24  # maximum number of frames used on either side; more add no information
+_LONGEST_REST = 24  # maximum number of rest frames used on either side; more would add no information
 
 
 @dataclass(frozen=True, eq=False)
 class RestFrames:
-    """Frames with the teeth together, and how to use them.
+    """Frames with closed teeth, and whether to correct the lower scan by them.
 
     Attributes:
         frames: frame numbers.
-        named: whether the capture specifies one of these frames.
+        named: whether the capture specifies one of the frames.
         point, lower: centre of the teeth, and of the lower crowns, in scan coordinates [mm], shape (3,).
         apply: whether to correct the position of the lower scan.
     """
@@ -54,12 +54,13 @@ class RestFrames:
 def rest_frames(
     records: Mapping[int, FrameRecord], named: int | None, up: Array, point: Array, probes: Array
 ) -> tuple[int, ...]:
-    """Return the frames in which the teeth rest together, around a named frame or the frame with the most closed jaw.
+    """Return the frames in which the teeth rest together, around a named frame or the frame with the smallest opening.
 
     Args:
-        named: frame named in the capture; if None, the most closed frame is searched for.
+        named: frame named in the capture; if None, the frame with the smallest jaw opening is searched for.
         up: unit vector from the lower to the upper teeth in scan axes, shape (3,).
-        point, probes: centre of the teeth (3,), and points spread over the lower ones (N, 3), scan coordinates [mm].
+        point, probes: centre of the teeth (3,), and points spread over the lower teeth (N, 3), in scan coordinates
+            [mm].
     """
     relative = {frame: relative_pose(*records[frame].solution.poses) for frame in whole_frames(records)}
     if named is None:
@@ -91,25 +92,25 @@ def _moved_mm(one: Array, other: Array, probes: Array) -> float:
     return float(np.linalg.norm(gap, axis=1).mean())
 
 
-# Scale of the Student distribution of the registration error, which includes the effect of bite force [mm]; lever arm
-# that converts it to a rotation [mm].
+# Scale of the Student distribution of the registration error [mm], which includes the effect of bite force; and lever
+# arm that converts this scale to a rotation [mm].
 _BITE_MM = 0.03
 _ARCH_MM = 25.0
-# degrees of freedom of the Student distribution: about one registration in a hundred is off by ten sigmas
+# degrees of freedom of the Student distribution: about 1 % of registrations are off by ten times the scale
 _DEGREES_OF_FREEDOM = 4.0
 #: Fraction of the outline error variance that is constant over a take, in addition to annotator bias [-]: if it were
 #: larger, noise in a few frames with closed teeth would shift the whole take.
 STEADY = 0.3
 _FEWEST_FRAMES = 2
-# Number of effectively independent measurements per frame with closed teeth, and its maximum for all together:
+# Effective number of independent measurements per frame with closed teeth, and maximum for all such frames:
 # neighbouring frames have nearly the same outline error.
 _NEW_PER_FRAME, _MOST_FRAMES = 0.25, 3.0
-_USUAL_FRAMES = 2000  # number of evenly spread frames from which the median covariance of a long take is computed
+_USUAL_FRAMES = 2000  # number of evenly spaced frames from which the median covariance of a long take is computed
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedBite:
-    """Errors measured with the teeth together; twists are (omega [rad], v [mm]) about `point` in scan axes.
+    """Errors measured in frames with closed teeth; twists are (omega [rad], v [mm]) about `point` in scan axes.
 
     Attributes:
         frames: the frames used.
@@ -129,7 +130,7 @@ class ClosedBite:
     remaining: Array
 
     def correct(self, poses: Array, registered: bool) -> Array:
-        """Return poses (F, 2, 4, 4) without constant errors; if `registered`, for the lower scan moved by `motion`."""
+        """Return poses (F, 2, 4, 4) without constant errors; if `registered`, of the lower scan moved by `motion`."""
         out = poses @ se3_inverse(self.steady_motions(False))
         if registered:
             out[:, 1] = out[:, 1] @ se3_inverse(self.motion())
@@ -147,7 +148,7 @@ class ClosedBite:
         return np.asarray(translation(self.point) @ se3_exp(self.registration) @ translation(-self.point), np.float64)
 
     def report(self, rest: RestFrames) -> Registration:
-        """Return the registration for the tracks' meta data."""
+        """Return the registration as stored in the tracks' metadata."""
         A = se3_adjoint(translation(self.point - rest.lower))
         twist, sigma = A @ self.registration, np.sqrt(np.diag(A @ self.registration_covariance @ A.T))
         return {
@@ -168,7 +169,8 @@ class ClosedBite:
             covariance, steady: total covariance before the correction, and the part of it that is constant over the
                 take, shapes (F, 6, 6).
             T_world_scan: poses in whose axes the error is constant, shape (F, 4, 4).
-            which: 0 upper arch, 1 lower arch, 2 lower relative to upper (`T_world_scan` is identity then).
+            which: 0 upper arch, 1 lower arch, 2 lower arch relative to upper arch (for which `T_world_scan` is the
+                identity).
         """
         A = se3_adjoint(translation(-self.point) @ se3_inverse(T_world_scan))
         back = np.linalg.inv(A)
@@ -184,7 +186,7 @@ class ClosedBite:
 
 
 def steady_part(outline: Array, habits: Array) -> Array:
-    """Return the part of pose covariances that is constant over a take, of any shape.
+    """Return the part of pose covariances (of any shape) that is constant over a take.
 
     Args:
         outline: covariance due to the outline errors of single frames.
@@ -196,13 +198,13 @@ def steady_part(outline: Array, habits: Array) -> Array:
 def closed_bite(
     frames: NDArray[np.int64], poses: Array, outline: Array, habits: Array, rest: RestFrames
 ) -> ClosedBite | None:
-    """Attribute the deviation from occlusion in the rest frames to its causes; None if too few of these are tracked.
+    """Attribute the deviation from occlusion in the rest frames to its causes; None with too few tracked rest frames.
 
     Args:
-        frames: shape (F,).
+        frames: frame numbers, shape (F,).
         poses: T_world_upper, T_world_lower, shape (F, 2, 4, 4), NaN where lost.
-        outline, habits: parts of the covariances of their left twists as in `steady_part`, shapes (F, 2, 6, 6).
-        rest: frames with the teeth together.
+        outline, habits: parts of the covariances of the poses' left twists, as in `steady_part`, shapes (F, 2, 6, 6).
+        rest: frames with closed teeth.
     """
     point = rest.point
     known = np.asarray(np.isfinite(poses).all((1, 2, 3)) & np.isfinite(outline).all((1, 2, 3)), bool)
@@ -243,17 +245,17 @@ _OFF_MM, _OFF_DEG, _OFF_SIGMAS = 0.2, 0.5, 3.0
 
 
 def registration_findings(found: Registration) -> list[Finding]:
-    """Return a warning if the registration of the scans contradicts the rest frames, a note if it was corrected."""
+    """Return a warning if the registration of the scans contradicts the rest frames; a note if it was corrected."""
     shift, turn, sigma_mm, sigma_deg = registration_sizes(found)
     shifted, turned = shift > max(_OFF_MM, _OFF_SIGMAS * sigma_mm), turn > max(_OFF_DEG, _OFF_SIGMAS * sigma_deg)
     if not shifted and not turned:
         return []
     frames = f"{found['frames'][0]} to {found['frames'][-1]}"
-    where = f"in frames {frames}" + ("" if found["named"] else ", the most closed ones")
+    where = f"in frames {frames}" + ("" if found["named"] else ", which have the smallest jaw opening")
     off = f"the lower scan is {shift:.2f} mm and {turn:.1f} degrees off the bite of the take {where}"
     if found["applied"]:
         return [Finding("scan_registration", "note", f"{off}: corrected", value=shift, limit=_OFF_MM)]
-    # without a named frame, the mouth may never have closed
+    # without a named frame, the teeth may never have been closed
     severity: Severity = "warning" if found["named"] else "note"
     hint = 'Register the scans again, or set registration = "take" in [scans] if the teeth are in occlusion there.'
     return [Finding("scan_registration", severity, off, value=shift, limit=_OFF_MM, hint=hint)]
@@ -268,7 +270,7 @@ def registration_unknown(rest: RestFrames) -> Finding:
     return Finding("registration_unknown", "note", f"{where}: the bite of the scans was not checked", hint=hint)
 
 
-# Maximum registration error [mm, deg]; beyond it, the mouth cannot have been closed.
+# Maximum registration error [mm, deg]; with larger deviations, the teeth cannot have been closed.
 _MOST_MM, _MOST_DEG = 3.0, 8.0
 
 
@@ -276,7 +278,7 @@ def check_registration(found: Registration) -> None:
     """Reject a registration correction that is too large.
 
     Raises:
-        TrackingError: the lower scan is too far off the bite of the take.
+        TrackingError: the lower scan is too far off its position in the closed bite of the take.
     """
     shift, turn, *_ = registration_sizes(found)
     if found["applied"] and (shift > _MOST_MM or turn > _MOST_DEG):
@@ -295,7 +297,7 @@ def observe_bite(
     extrinsics: Extrinsics,
     variance_px3: Array,
 ) -> None:
-    """Add the observation that the teeth are together to a take, which makes biases that separate them unlikely.
+    """Add the observation that the teeth are closed to a take; outline biases that separate the teeth become unlikely.
 
     `variance_px3` is the outline variance times correlation length per arch [px^3], shape (2,).
     """
@@ -319,7 +321,7 @@ def observe_bite(
 
 
 def _registration_spread(found: Array, others: Array) -> Array:
-    """Return the covariance of the registration, given the deviation (6,) and the covariance of other errors (6, 6)."""
+    """Return the covariance of the registration for a deviation (6,) and the covariance of all other errors (6, 6)."""
     bite = np.diag(np.r_[np.full(3, (_BITE_MM / _ARCH_MM) ** 2), np.full(3, _BITE_MM**2)])
     spread = bite
     for _ in range(50):

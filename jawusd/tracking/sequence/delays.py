@@ -14,7 +14,7 @@ from jawusd.tracking.contour.scan import ARCHES
 
 
 def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:
-    """Return the motion of both arches from the reference exposure to each camera's own, shape (C, 2, 4, 4)."""
+    """Return the motion of both arches from the reference exposure to each camera's exposure, shape (C, 2, 4, 4)."""
     out = np.tile(np.eye(4), (len(delays), 2, 1, 1))
     for arch in ARCHES:
         motion = _motion_twists(records, frame, arch)
@@ -26,11 +26,11 @@ def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array)
 
 
 def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
-    """Return the twist per frame about the arch's centre, and its change per frame, shapes (6,), of a parabola in time.
+    """Fit a parabola in time; return the twist per frame about the arch's centre and its change per frame, shapes (6,).
 
-    The parabola passes through both neighbouring frames, or through two frames on one side if the other is not tracked.
-    More frames would smooth too much, since a jaw starts and stops within a frame or two. Across a gap, uniform motion
-    is assumed. None without tracked frames nearby.
+    The parabola passes through both neighbouring frames, or through two frames on one side if the other side is not
+    tracked. More frames would smooth too much, since a jaw starts and stops within one or two frames. Across a gap,
+    uniform motion is assumed. Without tracked frames nearby, the result is None.
     """
 
     def step(frames: int) -> Array:
@@ -52,7 +52,7 @@ def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) ->
 def interpolation_errors(records: Mapping[int, FrameRecord], frame: int, arch: int, delays: Array) -> Array:
     """Return the error of the parabola of `delay_motions`, as twists about the centre, shape (C, 6).
 
-    It is the next term of Newton's interpolation, from the third difference of four consecutive frames.
+    The error is the next term of Newton's interpolation, from the third difference of four consecutive frames.
     """
     first = next((f for f in (frame - 1, frame - 2, frame, frame - 3) if _all_tracked(records, f, arch)), None)
     if first is None:
@@ -62,7 +62,7 @@ def interpolation_errors(records: Mapping[int, FrameRecord], frame: int, arch: i
     steps = [twist_between(here, there, centre) for here, there in zip(poses[:-1], poses[1:], strict=True)]
     third = steps[2] - 2.0 * steps[1] + steps[0]
     offset = frame - first
-    nodes = np.array([0, 1, 2] if offset < 2 else [1, 2, 3])  # frame offsets of the nodes of the parabola
+    nodes = np.array([0, 1, 2] if offset < 2 else [1, 2, 3])  # time offsets of the parabola's nodes [frames]
     share = np.prod(delays[:, None] + (offset - nodes), axis=1) / 6.0
     return np.asarray(share[:, None] * third, np.float64)
 
@@ -88,9 +88,9 @@ BRIDGE_FRAMES = 6
 
 
 def bridge(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
-    """Interpolate an arch linearly between tracked frames: its pose (4, 4) and twist per frame about its centre (6,).
+    """Interpolate an arch linearly between tracked frames; return its pose (4, 4) and twist per frame about its centre.
 
-    None without tracked frames nearby on both sides.
+    The twist has shape (6,). Return None without tracked frames nearby on both sides.
     """
     reach = range(1, BRIDGE_FRAMES + 1)
     before = next((frame - k for k in reach if _is_tracked(records, frame - k, arch)), None)

@@ -1,4 +1,4 @@
-"""Corrections of camera poses estimated from a whole take: their prior, and corrected views."""
+"""Corrections of camera poses, estimated from a whole take; prior of the corrections, and corrected views."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from jawusd.tracking.contour.views import View
 class Extrinsics:
     """Corrections of camera poses.
 
-    For camera c, the world is moved by exp(twists[c]) about the pivot; this motion multiplies T_cam_world from the
-    right. A motion common to all cameras would be a motion of the world, so the twists are constrained to sum to zero.
+    For camera c, the world is moved by exp(twists[c]) about the pivot; T_cam_world is multiplied by this motion from
+    the right. A motion common to all cameras would be a motion of the world, so the sum of the twists is constrained to
+    zero.
     """
 
     T_cam_world: Array  # the calibrated poses, shape (C, 4, 4)
-    pivot: Array  # centre of the teeth, where the masks constrain motion best, in the world [mm], shape (3,)
+    pivot: Array  # centre of the teeth in world coordinates [mm], where the masks constrain motion best, shape (3,)
     twists: Array  # the corrections [rad, mm], shape (C, 6)
-    sigma: Array  # their standard deviations [rad, mm], shape (C, 6)
+    sigma: Array  # standard deviations of the corrections [rad, mm], shape (C, 6)
 
     @classmethod
     def calibrated(cls, cameras: Sequence[Camera], pivot: Array) -> Extrinsics:
@@ -38,7 +39,7 @@ class Extrinsics:
         return motion_about(self.pivot, self.twists)
 
     def then(self, twists: Array, sigma: Array) -> Extrinsics:
-        """Return the corrections composed with further ones, shapes (C, 6)."""
+        """Return the corrections composed with further twists and their standard deviations, shapes (C, 6)."""
         both = se3_log(se3_exp(self.twists) @ se3_exp(twists))
         return replace(self, twists=both - both.mean(0), sigma=sigma)
 
@@ -57,7 +58,7 @@ class Extrinsics:
     def precision(self, turn_rad: float, move_mm: float) -> Array:
         """Return the prior precision of the twists of each camera, shape (C, 6, 6).
 
-        The priors are on rotations about the camera's centre and on its translations, with the configured standard
+        The priors apply to rotations about the camera centre and to translations, with the configured standard
         deviations per axis.
         """
         A = se3_adjoint(translation(-self.pivot) @ se3_inverse(self.T_cam_world))
@@ -65,7 +66,7 @@ class Extrinsics:
         return np.linalg.inv(A @ (variance[:, None] * np.swapaxes(A, -1, -2)))
 
     def report(self, names: Sequence[str]) -> CameraCorrections:
-        """Return corrections, uncertainties and corrected poses by camera name, for the tracks' meta data."""
+        """Return corrections, uncertainties and corrected poses by camera name, for the tracks' metadata."""
 
         def by_name(values: Array) -> dict[str, list[float]]:
             return dict(zip(names, values.tolist(), strict=True))
@@ -87,7 +88,7 @@ def twist_transfer(pivot: Array, centre: Array) -> Array:
 
 
 def corrected_cameras(cameras: Sequence[Camera], meta: TracksMeta) -> list[Camera]:
-    """Return cameras with the corrections of pose and focal length from the meta data of tracks."""
+    """Return cameras with the corrections of pose and focal length that are stored in the metadata of tracks."""
     poses = meta["extrinsics"]["T_cam_world"] if "extrinsics" in meta else {}
     moved = [replace(c, T_cam_world=np.array(poses.get(c.name, c.T_cam_world))) for c in cameras]
     focal = meta.get("focal", {})
@@ -95,9 +96,10 @@ def corrected_cameras(cameras: Sequence[Camera], meta: TracksMeta) -> list[Camer
 
 
 def _with_focal(camera: Camera, factor: float) -> Camera:
-    """Return a camera with its focal length multiplied by a factor, keeping the distortion of each pixel.
+    """Return a camera with its focal length multiplied by a factor f; the distortion of each pixel is kept.
 
-    Normalised coordinates x become x / f, so k1 becomes f^2 k1, and p1 becomes f p1, in OpenCV's formula.
+    Normalised coordinates x become x / f; in OpenCV's distortion model, k1 therefore becomes f^2 k1, and p1 becomes f
+    p1.
     """
     K = camera.K.copy()
     K[:2, :2] *= factor

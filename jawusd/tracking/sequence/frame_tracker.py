@@ -35,7 +35,7 @@ _FEWEST_MASKS = 2
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A solution with its uncovered and total mask pixels, and the masks used, per arch and view, shape (2, C)."""
+    """A solution with its uncovered and total mask pixels and the masks used, each per arch and view, shape (2, C)."""
 
     solution: Solution
     uncovered: Array
@@ -62,7 +62,7 @@ class _Instant:
 
 
 class FrameTracker:
-    """Tracks frames from predictions, with increasingly expensive attempts if an alignment looks wrong."""
+    """Tracks frames from predictions, with increasingly expensive attempts while an alignment looks wrong."""
 
     def __init__(self, solver: ContourSolver, config: TrackingConfig, history: History) -> None:
         self._solver = solver
@@ -81,7 +81,7 @@ class FrameTracker:
 
         Args:
             starts: predicted T_world_upper and T_world_lower, the most likely first, each shape (2, 4, 4).
-            views: one per camera.
+            views: one view per camera.
             pose_history: further starts for the multi-start search, each shape (2, 4, 4); None disables that search.
             reach_px: expected error of the first start.
         """
@@ -99,12 +99,12 @@ class FrameTracker:
             if bad.any() and (attempt != self._search_many_starts or pose_history is not None):
                 trial = attempt(trial, bad, instant)
         kept = trial.use & ~self._spoiled(trial, 1)
-        if (kept != trial.use).any():  # excludes masks that biased the first attempt
+        if (kept != trial.use).any():  # exclude masks that biased the first attempt
             trial = self._try(trial.solution.poses, views, gates, kept)
         return self._record(first, trial)
 
     def align_once(self, start: Array, views: Sequence[View], reach_px: float) -> FrameRecord:
-        """Align a frame from one prediction, shape (2, 4, 4), without further attempts; see `track`."""
+        """Align a frame from one pair of predicted poses (2, 4, 4), without further attempts; see `track`."""
         trial = self._begin(start, views, self._config.gates_from(reach_px))
         return self._record(trial, trial)
 
@@ -149,7 +149,7 @@ class FrameTracker:
         return np.asarray(bad & trial.use.any(1))
 
     def _uneven(self, trial: _Trial) -> Mask:
-        """Return which arches are alarming, or fit one view far worse than usual, shape (2,)."""
+        """Return which arches are alarming (see `_alarming`), or fit one view far worse than usual, shape (2,)."""
         limit = self._config.uneven_residual * self.history.usual_residual()[:, None]
         return self._alarming(trial) | (trial.use & (view_residual_px(trial.solution) > limit)).any(1)
 
@@ -160,21 +160,21 @@ class FrameTracker:
         return ~(residual_px(trial.solution) < self._config.suspect_residual * self.history.usual_residual())
 
     def _badly_covered(self, trial: _Trial) -> Mask:
-        """Return which masks are covered less than in recent frames, shape (2, C)."""
+        """Return which masks are covered less by their scans than in recent frames, shape (2, C)."""
         return trial.use & (trial.coverage - self.history.usual_coverage() > self._config.suspect_coverage)
 
     def _spoiled(self, trial: _Trial, fewest: int) -> Mask:
-        """Return the masks that their scan does not fit while it fits at least `fewest` others, shape (2, C)."""
+        """Return the masks that a scan does not fit although it fits at least `fewest` other masks, shape (2, C)."""
         dead = trial.use & (score_px(trial.solution) < self._config.dead_score * self.history.usual_score())
-        uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # as for a lost arch
+        uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # same limit as for a lost arch
         wrong = self._badly_covered(trial) | uncovered | dead
         for r in ARCHES:
             if (trial.use[r] & ~wrong[r]).sum() < fewest:
-                wrong[r] = False  # it is likelier that the pose is wrong than that so many masks are
+                wrong[r] = False  # a wrong pose is more likely than so many wrong masks
         return wrong
 
     def _losses(self, trial: _Trial) -> tuple[Loss, Loss]:
-        """Return the first check that each arch fails."""
+        """Return, for each arch, the first check that it fails."""
         c, solution = self._config, trial.solution
         residual, score, usual = residual_px(solution), score_px(solution).sum(1), self.history.usual_score().sum(1)
         masks, matched = trial.use.sum(1), matched_px(solution)
@@ -205,7 +205,7 @@ class FrameTracker:
         return trial
 
     def _drop_conflicting_masks(self, trial: _Trial, suspect: Mask, instant: _Instant) -> _Trial:
-        """Exclude a mask if the other masks of its arch then agree far better."""
+        """Exclude a mask if the other masks of the same arch then agree far better."""
         c = self._config
         for r in np.flatnonzero(suspect):
             for k in np.flatnonzero(trial.use[r]):
@@ -221,7 +221,7 @@ class FrameTracker:
         return trial
 
     def _try_wide_gates(self, trial: _Trial, suspect: Mask, instant: _Instant) -> _Trial:
-        """Try again with wide gates from the predictions and from the current poses."""
+        """Try again with wide residual gates, from the predictions and from the current poses."""
         for start in (*instant.starts, trial.solution.poses):
             wide = self._try(start, instant.views, self._config.wide_gates_px, trial.use)
             trial = self._better(trial, wide, suspect, instant)
@@ -245,14 +245,14 @@ class FrameTracker:
         return trial
 
     def _onto_masks(self, pose: Array, r: int, views: Sequence[View], use: Mask) -> Array:
-        """Return the pose, moved onto its masks if they are out of reach of the search."""
+        """Return the pose of an arch, moved onto its masks if these are out of reach of the search."""
         shift = shift_to_masks(self._solver.scans[r], pose, r, views, use)
         if np.linalg.norm(shift) <= self._config.search_rings[0][0]:
             return pose
         return translation(shift) @ pose
 
     def _better(self, trial: _Trial, other: _Trial, arches: Mask, instant: _Instant) -> _Trial:
-        """Combine two attempts by choosing the better pose of each of the given arches."""
+        """Combine two attempts: for each of the given arches, choose the better pose."""
         price = self._config.uncovered_price
         take = arches & (other.objective(price).sum(1) > trial.objective(price).sum(1))
         if not take.any():
@@ -264,7 +264,7 @@ class FrameTracker:
 
 
 def _around(pose: Array, centre: Array, rings: Sequence[tuple[float, float]]) -> Iterator[Array]:
-    """Yield a pose, and for each ring (mm, rad) its translations along and rotations about each axis, both ways."""
+    """Yield a pose and, for each ring (mm, rad), the pose translated along and rotated about each axis, both ways."""
     yield pose
     c = transform_point(pose, centre)
     for mm, rad in rings:

@@ -1,4 +1,4 @@
-"""Tracking with masks that are made during tracking, around poses found by colour."""
+"""Tracking with masks that are generated while tracking, around poses found by colour."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History
 
-#: Returns the views of a frame of the reference camera. Arguments: the frame, expected T_world_upper and T_world_lower,
-#: shape (2, 4, 4), and the round, which is 0 for poses not yet aligned with masks.
+#: Function that returns the views of a frame. Arguments: the frame number of the reference camera, expected
+#: T_world_upper and T_world_lower, shape (2, 4, 4), and the index of the round, which is 0 for poses not yet aligned
+#: with masks.
 MakeViews = Callable[[int, Array, int], Sequence[View]]
 
-# number of rounds: picks are a few tenths of a millimetre off, and each round removes most of the remaining error
+# number of rounds: picks are some tenths of a millimetre off, and each round removes most of the remaining error
 _FIRST_ROUNDS = 3
 
 
 class GuidedTracker:
-    """Tracks the teeth frame by frame, with masks made around poses found by colour."""
+    """Tracks the teeth frame by frame, with masks generated around poses found by colour."""
 
     def __init__(
         self,
@@ -50,8 +51,9 @@ class GuidedTracker:
 
         Args:
             upper, lower: teeth scans in one coordinate frame, in occlusion [mm].
-            see: makes the masks of a frame; masks made around a wrong pose tend to confirm it.
-            rounds: number of times that masks and poses of a frame are updated in turn.
+            see: function that generates the masks of a frame; masks generated around a wrong pose tend to confirm that
+                pose.
+            rounds: number of times that the masks and then the poses of a frame are updated.
 
         Raises:
             TrackingError: a scan cannot be tracked.
@@ -75,7 +77,7 @@ class GuidedTracker:
         """
         if bootstrap is None:
             raise TrackingError(
-                "without masks, tracking starts from picks, and the capture has none",
+                "without masks, tracking starts from picks, but the capture has no picks",
                 hint="Pick vertices on the page of `jawusd view CAPTURE`, or add [bootstrap]: three or more vertices "
                 "of each scan with their pixels in two cameras.",
             )
@@ -99,19 +101,19 @@ class GuidedTracker:
     def follow(
         self, frames: range, guide: Mapping[int, Array], past: Sequence[FrameSummary]
     ) -> Iterator[tuple[int, FrameRecord]]:
-        """Yield frames with their records, in which lost arches have the poses of the guide.
+        """Yield frame numbers and records; poses of lost arches are replaced by those of `guide`.
 
         Args:
             frames: frame numbers in either direction, starting next to a frame in `past`.
-            guide: T_world_upper and T_world_lower by frame, as found by colour, shape (2, 4, 4).
-            past: the frames tracked before, from the first aligned one to the neighbour of `frames`.
+            guide: T_world_upper and T_world_lower, as found by colour, shape (2, 4, 4), by frame.
+            past: records of the frames tracked before, from the first aligned frame to the neighbour of `frames`.
         """
         history = History(self._config.history_frames, self._config.score_frames)
         for before in past:
             history.add_summary(before)
         tracker = FrameTracker(self._solver, self._config, history)
         for frame in frames:
-            self._solver.forget_drawings()  # makes the poses of resumed runs equal to those of uninterrupted ones
+            self._solver.forget_drawings()  # so that resumed runs have the same poses as uninterrupted ones
             start = guide[frame]
             record = tracker.track([start], self._see(frame, start, 0), None)
             for turn in range(1, self._rounds):
@@ -133,5 +135,5 @@ class GuidedTracker:
 
 
 def _without_lost(record: FrameRecord, otherwise: Array) -> Array:
-    """Return the poses of a record, shape (2, 4, 4), with those of lost arches replaced."""
+    """Return the poses of a record, shape (2, 4, 4), with the poses of lost arches replaced."""
     return np.where((record.status == LOST)[:, None, None], otherwise, record.solution.poses)

@@ -14,9 +14,9 @@ from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.scan import ARCHES
 
 _KEPT_POSES = 16  # maximum number of earlier poses kept: enough to cover the range of motion of a jaw
-_APART_MM = 2.0  # minimum distance between poses kept: closer ones converge to the same local minimum
-# Number of failed multi-start searches allowed in any take, and number of frames for each further one: at up to five
-# seconds per search, all together take no longer than tracking.
+_APART_MM = 2.0  # minimum distance between the poses kept: closer ones converge to the same local minimum
+# Number of failed multi-start searches allowed in any take, and number of frames for each further search: at up to five
+# seconds per search, all searches together take no longer than tracking.
 _FRUITLESS, _FRAMES_PER_FRUITLESS = 8, 32
 _RECENT = 8  # number of frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
 
@@ -25,9 +25,9 @@ class MotionPredictor:
     """Extrapolates poses with constant velocity, and keeps earlier poses as starts for recovery."""
 
     def __init__(self, poses: Array, points: Array) -> None:
-        """Start at rest. Prediction errors are measured at `points` of both arches, shape (2, N, 3)."""
+        """Start at rest; prediction errors are measured at `points` of both arches, shape (2, N, 3)."""
         self._points = points
-        self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # both arches add an entry per frame
+        self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # each arch adds one entry per frame
         self._last = np.array(poses)
         self._step: list[Array | None] = [None, None]
         self._lost_for = np.zeros(2, int)
@@ -35,7 +35,7 @@ class MotionPredictor:
         self._seen: list[Array] = []
 
     def predict(self) -> Array:
-        """Return the expected T_world_upper, T_world_lower of the next frame, shape (2, 4, 4)."""
+        """Return the expected T_world_upper and T_world_lower of the next frame, shape (2, 4, 4)."""
         out = self._last.copy()
         for r, step in enumerate(self._step):
             if step is not None:
@@ -53,13 +53,13 @@ class MotionPredictor:
         return [moving, self._last.copy(), half]
 
     def update(self, poses: Array, found: Mask, seen: Mask, guessed: bool = False) -> None:
-        """Add the next frame; arches not found keep their predictions, or the given guesses.
+        """Add the next frame; for arches not found, keep the predictions or the given guesses.
 
         Args:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            found: arches with reliable poses, shape (2,).
-            seen: arches with any mask, shape (2,).
-            guessed: whether the poses given for arches not found are better guesses than predictions.
+            found: whether each arch has a reliable pose, shape (2,).
+            seen: whether each arch has any mask, shape (2,).
+            guessed: whether the given poses of arches not found are better guesses than the predictions.
         """
         expected = self.predict()
         for r in ARCHES:
@@ -82,11 +82,11 @@ class MotionPredictor:
         self.remember(poses, found)
 
     def miss_mm(self) -> float:
-        """Return the largest recent error of a prediction at the given points [mm]."""
+        """Return the largest recent prediction error at the points of the arches [mm]."""
         return max(self._misses, default=0.0)
 
     def remember(self, poses: Array, found: Mask) -> None:
-        """Keep poses of both arches, shape (2, 4, 4), as starts for later frames if they differ from those kept."""
+        """Keep poses of both arches (2, 4, 4) as starts for later frames if they differ from the poses kept so far."""
         if not found.all():
             return
         new = se3_inverse(poses[0]) @ poses[1]
@@ -95,7 +95,7 @@ class MotionPredictor:
         self._seen = [*self._seen[-_KEPT_POSES + 1 :], np.array(poses)]
 
     def search_is_due(self) -> bool:
-        """Return whether a multi-start search is due: always at first, then less and less often while it fails.
+        """Return whether a multi-start search is due: at first always, then less and less often while searches fail.
 
         Frames without masks do not count, so the search runs as soon as the teeth reappear.
         """
@@ -111,13 +111,13 @@ class MotionPredictor:
 class SearchBudget:
     """A budget for failed multi-start searches in a take.
 
-    A search takes as long as tracking ten to fifty frames, and wrong masks would trigger failing searches on every
-    frame that has them, forwards and backwards. Work is counted instead of time, so results do not depend on the
-    machine.
+    A search takes as long as tracking ten to fifty frames, and wrong masks would trigger a failing search on every
+    frame with wrong masks, both forwards and backwards. Work is counted instead of time, so results do not depend on
+    the machine.
     """
 
     def __init__(self, frames: int) -> None:
-        """Set the budget for a take of `frames` frames."""
+        """Set the search budget for a take of `frames` frames."""
         self.most = self._left = _FRUITLESS + frames // _FRAMES_PER_FRUITLESS
         self.fruitless = 0
         self._searched: set[int] = set()
@@ -125,7 +125,7 @@ class SearchBudget:
 
     @property
     def left_out(self) -> set[int]:
-        """Frames on which a search was due but never ran."""
+        """The frames on which a search was due but never ran."""
         return self._refused - self._searched
 
     def allows(self, frame: int) -> bool:
@@ -142,7 +142,7 @@ class SearchBudget:
 
 
 class _Partial(NamedTuple):
-    """Quality of frames in which a camera is missing, used if there are no complete frames."""
+    """Quality of frames in which a camera is missing; used if there are no complete frames."""
 
     scores: deque[Array]
     residuals: deque[Array]
@@ -150,7 +150,7 @@ class _Partial(NamedTuple):
 
 
 class _Usual(NamedTuple):
-    """Medians; see the methods of `History`."""
+    """Medians of recent frames; see the methods of `History`."""
 
     score: Array
     residual: Array
@@ -158,13 +158,13 @@ class _Usual(NamedTuple):
 
 
 class History:
-    """The quality of recent good frames, as reference for the next one.
+    """The quality of recent good frames, as a reference for the next frame.
 
-    If a camera is missing throughout the take, frames without it are the reference.
+    If a camera is missing in all frames, frames without it serve as the reference.
     """
 
     def __init__(self, length: int, score_length: int) -> None:
-        """Start empty; use at most `length` recent frames, and at most `score_length` for scores."""
+        """Start without frames; use at most `length` recent frames, and at most `score_length` frames for scores."""
         self._scores: deque[Array] = deque(maxlen=score_length)
         self._residuals: deque[Array] = deque(maxlen=length)
         self._coverages: deque[Array] = deque(maxlen=length)
@@ -172,7 +172,7 @@ class History:
         self._usual: _Usual | None = None
 
     def add(self, record: FrameRecord) -> None:
-        """Add a frame; only well-tracked arches count."""
+        """Add the record of a frame; only well-tracked arches count."""
         self.add_summary(FrameSummary.of(record))
 
     def add_summary(self, past: FrameSummary) -> None:
@@ -215,7 +215,7 @@ def _median(values: deque[Array], otherwise: float | Array) -> Array:
     """Return medians that ignore NaN; `np.nanmedian` is ten times slower for so few values."""
     if not values:
         return np.asarray(otherwise, np.float64)
-    stack = np.sort(np.array(values), axis=0)  # NaN is sorted to the end
+    stack = np.sort(np.array(values), axis=0)  # NaN is sorted to the end of the array
     known = np.isfinite(stack).any(0)
     count = (~np.isnan(stack)).sum(0)
     low, high = (np.take_along_axis(stack, at[None], axis=0)[0] for at in (np.maximum(count - 1, 0) // 2, count // 2))

@@ -24,42 +24,42 @@ from jawusd.geometry import (
 )
 from jawusd.tracking.contour.equations import NormalEquations, Solution
 
-_NORMAL_DIRECTIONS = 3  # number of directions off the model: six degrees of freedom minus the three of the model
+_NORMAL_DIRECTIONS = 3  # number of directions off the model: six degrees of freedom of a pose minus three of the model
 
 
 @dataclass(frozen=True, eq=False)
 class KinematicPrior:
-    """A prior that penalises the distance of relative poses from a jaw model, but not motion within the model.
+    """A prior that penalises the distance of relative poses from a jaw model, but not motion along the model.
 
-    The deviation of a pose from the model, the left twist xi with T_upper_lower = exp(xi) pose(d), costs
-    xi^T P xi after minimisation over d: P = 3 / s^2 (M - M J (J^T M J)^-1 J^T M) with the landmark metric M
-    (xi^T M xi = mean squared displacement), the model's Jacobian J, and the rms distance s of captured poses from the
-    model, spread over three directions. This is the prior of Zoss et al. 2018 (an empirical rig), with its width
+    The deviation of a pose from the model is the left twist xi with T_upper_lower = exp(xi) pose(d). Its cost,
+    minimised over d, is xi^T P xi with P = 3 / s^2 (M - M J (J^T M J)^-1 J^T M) where M is the landmark metric (xi^T M
+    xi = mean squared displacement), J the model's Jacobian, and s the rms distance of captured poses from the model,
+    which is spread over three directions. This is the prior of Zoss et al. 2018 (an empirical rig) with a width
     estimated from the capture.
     """
 
-    jaw: JawRig  # the subject's model
+    jaw: JawRig  # the subject's jaw model
     spread_mm: float  # rms landmark distance s of good tracked poses from the model [mm]
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the log-likelihood of the deviation from the model, linearised."""
+        """Add the linearised log-likelihood of the deviation from the model."""
         poses = state.poses
         relative = relative_pose(poses[0], poses[1])
         deviation, precision = self.deviation(relative)
         to_skull = se3_adjoint(se3_inverse(poses[0]))
         about = [se3_adjoint(make_transform(np.eye(3), centre)) for centre in state.centres]
-        # To first order exp(xi') = exp(Ad(T_u^-1) (x_l - x_u)) exp(xi).
+        # To first order, exp(xi') = exp(Ad(T_u^-1) (x_l - x_u)) exp(xi) for twists x_u and x_l of both arches.
         slope = np.hstack([-to_skull @ about[0], to_skull @ about[1]])
         equations.add_joint(slope.T @ precision @ slope, -slope.T @ precision @ deviation)
 
     def deviation(self, relative: Array) -> tuple[Array, Array]:
-        """Return the twist (6,) from the nearest model pose to T_upper_lower (4, 4), and P there (6, 6)."""
+        """Return the twist (6,) from the nearest model pose to T_upper_lower (4, 4), and its precision P (6, 6)."""
         d = self.jaw.encode(relative)[0]
         pose = self.jaw.pose(d)
         return se3_log(relative @ se3_inverse(pose)), self._precision(d, pose)
 
     def _precision(self, d: Array, pose: Array) -> Array:
-        """Return P at a model pose, shape (6, 6)."""
+        """Return the precision P of the deviation at a model pose, shape (6, 6)."""
         M = mandible_metric(transform_points(pose, self.jaw.landmarks))
         # The left Jacobian converts the derivative of the logarithm to that of the pose (Barfoot 2017, eq. 7.85).
         J = se3_left_jacobian(self.jaw.twist(d)) @ self.jaw.jacobian(d)
@@ -68,21 +68,22 @@ class KinematicPrior:
         return _NORMAL_DIRECTIONS / self.spread_mm**2 * normal
 
 
-_FEWEST = 15  # minimum number of poses for estimating the spread about the model
+_FEWEST = 15  # minimum number of poses for estimating their spread about the model
 _ROUNDS = 3  # number of linearisations: the model is nearly linear within the range of pose errors
 
 
 def weigh_with_model(tracks: Tracks, jaw: JawRig) -> Tracks:
-    """Return tracks with final relative poses that are most likely under their covariance and the model.
+    """Return tracks whose final relative poses are the most likely ones given the raw poses and the model.
 
-    Intended for tracks from colours, whose errors extend over whole teeth: the model improves molars and condyles, and
-    hardly changes the incisal point. The result is the mean of two Gaussians, relinearised `_ROUNDS` times; the spread
-    of the `KinematicPrior` is the rms distance of raw poses from the model. Upper teeth, raw poses, covariances and
-    sigmas remain as measured. The meta data store the width of the prior as `prior_spread_mm`.
+    The function is intended for tracks from colours, whose errors extend over whole teeth: the model improves the
+    positions of molars and condyles, and hardly changes that of the incisal point. The result is the mean of the
+    product of two Gaussians, relinearised `_ROUNDS` times; the spread of the `KinematicPrior` is the rms distance of
+    raw poses from the model. Upper teeth, raw poses, covariances and sigmas remain as measured. The width of the prior
+    is stored in the metadata as `prior_spread_mm`.
 
     Args:
         tracks: tracks from colours, fitted without a model.
-        jaw: the model fitted to them.
+        jaw: the jaw model fitted to the tracks.
     """
     known = np.isfinite(tracks.raw_T_upper_lower).all((1, 2)) & np.isfinite(tracks.T_upper_lower).all((1, 2))
     known &= np.isfinite(tracks.covariance_relative).all((1, 2))
@@ -100,7 +101,7 @@ def weigh_with_model(tracks: Tracks, jaw: JawRig) -> Tracks:
 
 
 def _likeliest(measured: Array, covariance: Array, prior: KinematicPrior) -> Array:
-    """Return the most likely T_upper_lower (4, 4) given a measurement, its left covariance, and the model."""
+    """Return the most likely T_upper_lower (4, 4), given a model, a measurement, and its left twist's covariance."""
     information, pose = np.linalg.inv(covariance), measured
     for _ in range(_ROUNDS):
         deviation, precision = prior.deviation(pose)

@@ -32,7 +32,7 @@ from jawusd.tracking.sequence.kinematic_prior import KinematicPrior
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
 # Standard deviation of the worst landmark above which a frame is tracked again [mm]: about the error of a
-# three-parameter model; with a smaller one, masks alone are more accurate.
+# three-parameter jaw model. Below it, masks alone are more accurate.
 _HARD_MM = 0.3
 _FEWEST_GOOD = 15  # minimum number of good frames for using the model as a prior
 
@@ -58,14 +58,14 @@ def refine_tracks(
 ) -> Tracks:
     """Track the hard frames again with the fitted model as a prior on the relative pose.
 
-    Changes final poses, `prior_aided`, and the uncertainties of lost frames. Raw poses are unchanged, so no model is
-    fitted to, or evaluated on, poses influenced by its own prior.
+    The function changes final poses, `prior_aided`, and the uncertainties of lost frames. It leaves raw poses
+    unchanged, so that no model is fitted to poses influenced by its own prior, or evaluated on them.
 
     Args:
         tracks: result of the first pass.
-        jaw: the model fitted to them.
+        jaw: the jaw model fitted to the tracks.
         capture, cameras, offsets, upper, lower, config, threads: as for `track_capture`.
-        progress: called with the number of hard frames done, and their total.
+        progress: called with the number of hard frames done and the total number of hard frames.
 
     Raises:
         CaptureError: a mask cannot be read.
@@ -100,14 +100,14 @@ def refine_tracks(
 
 @dataclass(frozen=True, eq=False)
 class _Refined:
-    """Poses of a frame (2, 4, 4) with the joint covariance of their left world twists (12, 12)."""
+    """Poses of both arches in a frame (2, 4, 4), and the joint covariance (12, 12) of their left world twists."""
 
     poses: Array
     covariance: Array
 
 
 class _SecondPass:
-    """Aligns single frames with the prior, and rejects poses that do not fit the masks."""
+    """Aligns single frames with the prior, and rejects results that do not fit the masks."""
 
     def __init__(self, solver: ContourSolver, config: TrackingConfig, prior: KinematicPrior, tracks: Tracks) -> None:
         self._solver, self._config, self._prior, self._tracks = solver, config, prior, tracks
@@ -143,7 +143,7 @@ class _SecondPass:
 
 
 def _spread_mm(jaw: JawRig, tracks: Tracks, good: Mask) -> float:
-    """Return the rms landmark distance of good raw poses from the model [mm], tracking noise included."""
+    """Return the rms landmark distance of good raw poses from the model [mm], including tracking noise."""
     residual_mm = jaw.encode(tracks.raw_T_upper_lower[good])[1]
     return float(np.sqrt(np.mean(residual_mm**2)))
 
@@ -158,7 +158,7 @@ def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
     """Return start poses of every frame, T_world_upper and T_world_lower, shape (F, 2, 4, 4).
 
     A lost arch is placed from the other one with the jaw parameters interpolated between measured frames. If both are
-    lost, the head is interpolated linearly.
+    lost, the head pose is interpolated linearly.
     """
     frames = tracks.frames.astype(np.float64)
     d = jaw.interpolate(frames[measured], jaw.encode(tracks.raw_T_upper_lower[measured], inside=True)[0], frames)
@@ -183,7 +183,7 @@ def _corrected_views(views: Sequence[View], tracks: Tracks, k: int, poses: Array
     """Return the views of frame index k, corrected by the whole-take estimates of the first pass."""
     before, after = poses[max(k - 1, 0)], poses[min(k + 1, len(poses) - 1)]
     span = max(1, min(k + 1, len(poses) - 1) - max(k - 1, 0))
-    velocity = se3_log(after @ se3_inverse(before)) / span  # twist per frame
+    velocity = se3_log(after @ se3_inverse(before)) / span  # twist of the arch per frame
     meta, out = tracks.meta, []
     steady = poses[k] @ np.array(meta.get("steady_error", np.tile(np.eye(4), (2, 1, 1)))) @ se3_inverse(poses[k])
     for name, view in zip(tracks.camera_names, views, strict=True):
@@ -194,7 +194,7 @@ def _corrected_views(views: Sequence[View], tracks: Tracks, k: int, poses: Array
 
 
 def _relative_covariance(poses: Array, covariance: Array) -> Array:
-    """Return the covariance of T_upper_lower's left twist, from the joint covariance of both arches, shape (6, 6)."""
+    """Return the covariance of T_upper_lower's left twist (6, 6), from the joint covariance of both arches."""
     A = se3_adjoint(se3_inverse(poses[0]))
     slope = np.hstack([-A, A])
     return slope @ covariance @ slope.T

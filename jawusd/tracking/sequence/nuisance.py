@@ -1,4 +1,4 @@
-"""Nuisance parameters of a whole take: delays below a frame, mask biases, errors of camera poses."""
+"""Nuisance parameters of a whole take: delays shorter than a frame, mask biases, and errors of camera poses."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class Nuisances:
     Attributes:
         delays: exposure times relative to the first camera [frames], shape (C,): the image of camera c for a frame was
             taken at time frame + delays[c].
-        habits: outward mask bias, per arch and camera, shape (2, C, 3): at free edges and at the gum line [px
-            at working resolution], and along the gum surface [mm]; see `OutlineSums`.
+        habits: outward mask bias, per arch and camera, shape (2, C, 3): at free edges and at the gum line [px at
+            working resolution], and along the crown surface at the gum line [mm]; see `OutlineSums`.
         shift_px: the resulting mean shift of edges and gum line, shape (2, C, 2).
-        sigma_delays, sigma_habits, sigma_shift_px: their standard deviations.
+        sigma_delays, sigma_habits, sigma_shift_px: standard deviations of these estimates.
         twists, sigma_twists: corrections of the camera poses as in `Extrinsics`, shape (C, 6).
-        contour_px: rms of the contour shift by the twists that poses of the teeth cannot compensate.
+        contour_px: rms of that part of the contour shift by the twists that poses of the teeth cannot compensate [px].
         covariance: covariance of all unknowns in the order of `TakeEquations`, zero where not estimated, shape (U, U).
     """
 
@@ -44,14 +44,14 @@ class Nuisances:
     covariance: Array
 
     def plus(self, more: Nuisances) -> Nuisances:
-        """Return the sum of these estimates and further ones of delays and annotator biases."""
+        """Return the sum of these estimates and further estimates of delays and annotator biases."""
         shift = self.shift_px + more.shift_px
         return replace(more, delays=self.delays + more.delays, habits=self.habits + more.habits, shift_px=shift)
 
     def matters(self, config: TrackingConfig) -> bool:
-        """Return whether any estimate exceeds its limit; those of delays and camera poses must also be significant.
+        """Return whether any estimate exceeds its limit; delays and camera poses must also be significant.
 
-        Habits have a prior, so even an insignificant estimate is the most likely value.
+        Annotator biases have a prior, so even an insignificant estimate is the most likely value.
         """
         wide = np.abs(self.shift_px) > config.refine_bias_px
         return bool(self.late(config) or wide.any() or self.cameras_moved(config))
@@ -72,7 +72,7 @@ class Nuisances:
         return bool(clear and self.contour_px > config.refine_shift_px)
 
 
-# Prior standard deviation of the delays that remain after cameras are synchronised to whole frames.
+# Prior standard deviation of the delays that remain after cameras have been synchronised to whole frames.
 _PRIOR_DELAY_FRAMES = 0.5
 
 
@@ -81,9 +81,9 @@ class AnnotatorPrior:
     """Prior standard deviations of mask biases.
 
     Attributes:
-        edge_px, gum_px, gum_mm: bias of edges and gum line together, of the gum line relative to edges, and along the
-            surface.
-        arch_px, arch_mm, camera_px: differences between arches and between cameras.
+        edge_px, gum_px, gum_mm: common bias of free edges and gum line, bias of the gum line relative to free edges,
+            and bias of the gum line along the crown surface.
+        arch_px, arch_mm, camera_px: differences of the bias between arches and between cameras.
         frames: effective number of independent frames in a take [-]: few, since all frames show the same lips and
             teeth.
     """
@@ -106,7 +106,7 @@ DRAWN_BESIDE_CROWNS = replace(DRAWN, frames=0.75)
 
 
 class _Layout:
-    """Indices of the unknowns of a take: delays, annotator biases, camera twists."""
+    """Indices of the unknowns of a take: delays, annotator biases, and camera twists."""
 
     def __init__(self, cameras: int, annotator: AnnotatorPrior = DRAWN) -> None:
         self.cameras, self._annotator = cameras, annotator
@@ -122,7 +122,7 @@ class _Layout:
             out[2, [cameras + 2, of_arch + 2]] = 1.0
 
     def twist(self, camera: int) -> slice[int, int, None]:
-        """Return the slice of a camera's twist."""
+        """Return the slice of a camera's twist in the unknowns."""
         return slice(self.twists + 6 * camera, self.twists + 6 * camera + 6)
 
     def habits(self, arch: int, camera: int) -> Array:
@@ -137,7 +137,7 @@ class _Layout:
         return np.r_[np.full(self.cameras, _PRIOR_DELAY_FRAMES), habits, np.full(4 * self.cameras, of.camera_px)]
 
     def redundancy(self, frames: int) -> Array:
-        """Return the factor by which a number of frames overstates the information on each unknown, shape (size,)."""
+        """Return the factor by which a number of frames overstates the information on each of the unknowns (size,)."""
         out = np.ones(self.size)
         out[self.cameras : self.twists] = max(1.0, frames / self._annotator.frames)
         return out
@@ -148,8 +148,8 @@ class TakeEquations:
 
     The residual of a sample is d = J (x + delay_c v + A y_c) + h . b_c with the pose correction x of its frame, the
     arch's velocity v, the camera's twist y_c transferred to the arch's centre by A, and the biases b_c of the masks.
-    Delays, habits and twists are shared by all frames, which gives a bordered block-diagonal system, solved by its
-    Schur complement (as in bundle adjustment, Triggs et al. 1999).
+    Delays, biases and twists are shared by all frames. The resulting system is block-diagonal with a border, and is
+    solved by its Schur complement (as in bundle adjustment, Triggs et al. 1999).
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class TakeEquations:
         frames: Iterable[int] | None = None,
         annotator: AnnotatorPrior = DRAWN,
     ) -> None:
-        """Sum over the given frames, by default all; lost arches and frames without both neighbours are skipped.
+        """Sum over the given frames (default: all); lost arches and frames without both neighbours are skipped.
 
         Args:
             records: records by frame.
@@ -172,7 +172,7 @@ class TakeEquations:
         self._layout = _Layout(len(extrinsics.twists), annotator)
         size, C = self._layout.size, self._layout.cameras
         self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
-        # gum line: sums of weights, and of weighted image shifts per mm along the surface
+        # sums of weights, and of weighted image shifts per mm along the surface, at the gum line
         self._gum = np.zeros((2, C, 2))
         self._frames = 0
         self._seen_S, self._seen_r = np.zeros((size, size)), np.zeros(size)
@@ -189,15 +189,15 @@ class TakeEquations:
                     self._gum[arch] += solution.outline.habit_weight[arch, :, 1, 1:]
 
     def observe(self, slope: Array, deviation: Array, precision: Array) -> None:
-        """Add an observation besides the masks: deviation + slope @ unknowns is zero with the given precision.
+        """Add an observation that does not come from masks: deviation + slope @ unknowns = 0 with a given precision.
 
-        Shapes (n, U), (n,) and (n, n).
+        `slope`, `deviation` and `precision` have shapes (n, U), (n,) and (n, n).
         """
         self._seen_S += slope.T @ precision @ slope
         self._seen_r -= slope.T @ precision @ deviation
 
     def normal_equations(self) -> tuple[Array, Array]:
-        """Return matrix and right-hand side of the normal equations without priors, shapes (U, U) and (U,)."""
+        """Return the matrix (U, U) and right-hand side (U,) of the normal equations without priors."""
         return self._S, self._r
 
     def prior_covariance(self) -> Array:
@@ -205,7 +205,7 @@ class TakeEquations:
         return np.diag(np.r_[self._layout.prior_sigma() ** 2, np.zeros(6 * self._layout.cameras)])
 
     def solve(self, config: TrackingConfig, cameras_move: bool) -> Nuisances:
-        """Return the estimates; camera poses are estimated only if `cameras_move`."""
+        """Solve for the nuisance parameters; camera poses are estimated only if `cameras_move`."""
         layout = self._layout
         C, size, first_twist = layout.cameras, layout.size, layout.twists
         redundancy = layout.redundancy(self._frames)
@@ -213,7 +213,7 @@ class TakeEquations:
         S[:first_twist, :first_twist] += np.diag(redundancy[:first_twist] / layout.prior_sigma() ** 2)
         for c, precision in enumerate(self._extrinsics.precision(config.refine_turn_rad, config.refine_move_mm)):
             S[layout.twist(c), layout.twist(c)] += precision
-        # A delay common to all cameras cannot be distinguished from the motion.
+        # A delay common to all cameras cannot be distinguished from the motion of the teeth.
         keep = np.arange(1, size if cameras_move else first_twist)
         covariance = np.zeros((size, size))
         covariance[np.ix_(keep, keep)] = np.linalg.inv(S[np.ix_(keep, keep)])
@@ -251,7 +251,7 @@ def pose_response(records: Mapping[int, FrameRecord], frame: int, arch: int, ext
 
 
 def corrected_pose(records: Mapping[int, FrameRecord], frame: int, arch: int, nuisances: Nuisances) -> Array:
-    """Return the pose of an arch, shape (4, 4), corrected to first order for delays and mask biases, not for twists."""
+    """Return the pose of an arch (4, 4), corrected to first order for delays and mask biases, not for camera twists."""
     velocity = velocity_twist(records, frame, arch)
     solution = records[frame].solution
     outline, habits = solution.outline, nuisances.habits[arch]
@@ -274,7 +274,7 @@ def interpolation_covariance(records: Mapping[int, FrameRecord], frame: int, arc
 def _reduced(
     solution: Solution, velocity: Array, arch: int, pivot: Array, layout: _Layout
 ) -> tuple[Array, Array, Array]:
-    """Return the normal equations of one frame with the pose eliminated, and the response of the pose to the unknowns.
+    """Return the normal equations of one frame with the pose eliminated, and the pose's response to the unknowns.
 
     The response is the twist about the arch's centre per unit of the unknowns, shape (6, U).
     """

@@ -1,4 +1,4 @@
-"""Passes over the frames of a take: away from the first frame, back to it, and backwards into every gap."""
+"""Tracking passes over the frames of a take: away from the first frame, back to it, and backwards into every gap."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from jawusd.tracking.sequence.history import History, MotionPredictor, SearchBud
 
 Progress = Callable[[int, int], None]
 
-# Maximum number of frames around a restart that initialise the tracker: without it, long takes with many gaps would
-# need quadratic time.
+# Maximum number of frames around a restart from which the tracker is initialised: without this limit, long takes with
+# many gaps would take quadratic time.
 _NEARBY_FRAMES = 4000
 _AGREED_MM = 0.05  # maximum distance between arch centres for tracking in both directions to agree
 
@@ -51,7 +51,8 @@ class Passes:
 
         Args:
             frame: reference frame number.
-            poses: T_world_scan of both arches there, close enough to be aligned, shape (2, 4, 4).
+            poses: T_world_scan of both arches in that frame, close enough for the alignment to converge, shape (2, 4,
+                4).
 
         Raises:
             TrackingError: the teeth do not fit the masks of that frame.
@@ -79,10 +80,9 @@ class Passes:
             self._progress(len(self.records), self._stop - self._first)
 
     def track_back_to(self, start: int) -> None:
-        """Track to the first frame from one with a good fit, and past it until both directions agree.
+        """Track from a frame with a good fit to the first frame, and past that until both tracking directions agree.
 
-        The first frame was aligned before the usual fit of this take was known, and its neighbours were tracked from
-        it.
+        The first frame was aligned before the usual fit of the take was known, and its neighbours were tracked from it.
         """
         seen = nearest_well_seen(self.records, start)
         if seen is None or seen == start:
@@ -118,7 +118,7 @@ class Passes:
     def beside(
         self, frame: int, records: Mapping[int, FrameRecord] | None = None
     ) -> tuple[FrameTracker, MotionPredictor]:
-        """Return a tracker and a predictor initialised from the frames around a tracked one."""
+        """Return a tracker and a motion predictor, initialised from the frames around a tracked frame."""
         records = records or self.records
         history = History(self._config.history_frames, self._config.score_frames)
         known = sorted(records, key=lambda f: -abs(f - frame))[-_NEARBY_FRAMES:]
@@ -152,7 +152,7 @@ class Passes:
 
 
 def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
-    """Return runs of frames in which an arch is lost, as first frame and one past the last."""
+    """Return the runs of frames in which an arch is lost, each as first frame and one past the last."""
     lost = [frame for frame in sorted(records) if (records[frame].status == LOST).any()]
     runs: list[list[int]] = []
     for frame in lost:
@@ -163,19 +163,19 @@ def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
     return [(a, b) for a, b in runs]
 
 
-# Minimum score and maximum residual of a frame with a good fit, relative to the medians of the take. They only
+# Minimum score and maximum residual of a frame with a good fit, relative to the medians of the take. These limits only
 # determine the frame from which tracking returns to the first frame.
 _LEAST_SCORE, _MOST_RESIDUAL = 0.8, 1.2
 # Minimum matched fraction of the visible contour, and maximum residual, both relative to the medians of the take: an
-# arch that violates both was matched with lip edges instead of teeth. Last, minimum number of frames for the medians.
-# False-alarm rate: at most 1.4 %.
+# arch that violates both was matched with lip edges instead of teeth. Last value: minimum number of frames for the
+# medians. False-alarm rate: at most 1.4 %.
 _POOR_SHARE, _POOR_RESIDUAL, _TELLING_FRAMES = 0.5, 1.6, 6
 
 
 def nearest_well_seen(records: Mapping[int, FrameRecord], start: int) -> int | None:
     """Return the frame nearest to a given one in which both arches fit as well as usual in the take.
 
-    None if there is none.
+    Return None if there is no such frame.
     """
     frames = [frame for frame, record in records.items() if (record.status == TRACKED).all()]
     if not frames:
@@ -190,7 +190,7 @@ def nearest_well_seen(records: Mapping[int, FrameRecord], start: int) -> int | N
 
 
 def mark_poorly_seen_lost(records: MutableMapping[int, FrameRecord]) -> None:
-    """Mark arches as lost in frames where they match far less contour than usual, with far larger residuals."""
+    """Mark arches as lost in frames in which they match far less contour than usual, with far larger residuals."""
     frames = sorted(records)
     kept = np.array([records[frame].status != LOST for frame in frames])
     share, residual = (np.full((len(frames), 2), np.nan) for _ in range(2))

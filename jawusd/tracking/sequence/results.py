@@ -38,9 +38,9 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, interpolation_covariance, pose_response
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
-#: Refines all measured poses by further information. Arguments and results are: poses (F, 2, 4, 4), NaN where lost, the
-#: covariances of their left twists about the world origin (F, 2, 6, 6), and those of T_upper_lower's left twists about
-#: the skull origin (F, 6, 6).
+#: Function that refines all measured poses by further information. Its arguments and results are poses (F, 2, 4, 4),
+#: NaN where lost, the covariances of their left twists about the world origin (F, 2, 6, 6), and those of
+#: T_upper_lower's left twists about the skull origin (F, 6, 6).
 Fusion = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 
@@ -55,13 +55,13 @@ def assemble(
     notes: TracksMeta,
     fuse: Fusion | None = None,
 ) -> Tracks:
-    """Return the tracks of a take: raw poses as aligned, optionally refined by `fuse`; final poses smoothed over time.
+    """Return the tracks of a take: raw poses as aligned or refined by `fuse`, and final poses smoothed over time.
 
     The covariances are those of the raw poses: outline errors change slowly, so smoothing reduces them little.
     `landmarks` are in mandible coordinates [mm], shape (5, 3).
 
     Raises:
-        TrackingError: the registration of the scans should be corrected, but the mouth was not closed.
+        TrackingError: the registration of the scans is to be corrected, but the teeth are never closed.
     """
     frames = np.array(sorted(records), np.int64)
     raw, status, losses, centres, coverage, used, residual, matched = _columns(records, frames)
@@ -111,11 +111,11 @@ def assemble(
 
 
 def _columns(records: Mapping[int, FrameRecord], frames: NDArray[np.int64]) -> list[Array]:
-    """Return each value of `_figures` as one array over all frames."""
+    """Return each value of `_figures` as an array over all frames."""
     rows = (_figures(records[frame]) for frame in frames.tolist())
     first = next(rows)
     columns = [np.empty((len(frames), *value.shape)) for value in first]
-    # records are read one at a time, since all of a long take would need much memory
+    # records are read one at a time, since all records of a long take would need much memory
     for k, row in enumerate(chain([first], rows)):
         for column, value in zip(columns, row, strict=True):
             column[k] = value
@@ -137,7 +137,7 @@ def _measured(
     correlation: float,
     rest: RestFrames,
 ) -> tuple[Array, Array, Array, ClosedBite | None]:
-    """Return poses (F, 2, 4, 4), their covariances (F, 2, 6, 6), those of relative poses (F, 6, 6), and the bite.
+    """Return poses (F, 2, 4, 4), their covariances (F, 2, 6, 6), covariances of relative poses (F, 6, 6), and the bite.
 
     `raw` are the poses as aligned, NaN where lost; `correlation` is the correlation length of outline errors [px].
     """
@@ -145,7 +145,7 @@ def _measured(
     outline, habits = _covariances(records, correlation, nuisances, extrinsics)
     bite = closed_bite(frames, raw, outline, habits, rest)
     covariance, steady = outline + habits, steady_part(outline, habits)
-    del outline, habits  # frees arrays as large as the tracks themselves
+    del outline, habits  # free arrays that are as large as the tracks themselves
     relative = _relative_covariance(raw, covariance)
     if bite is None:
         return raw, covariance, relative, None
@@ -157,7 +157,7 @@ def _measured(
 
 
 def _bite_report(bite: ClosedBite | None, rest: RestFrames, findings: list[dict[str, str | float | int]]) -> TracksMeta:
-    """Return the meta data about the frames with closed teeth; their findings are appended to those given."""
+    """Return the metadata about the frames with closed teeth, including the given findings and those about the bite."""
     if bite is None:
         return {"findings": [*findings, registration_unknown(rest).as_json()]}
     registration = bite.report(rest)
@@ -170,7 +170,7 @@ def _bite_report(bite: ClosedBite | None, rest: RestFrames, findings: list[dict[
 
 
 def _habits_report(nuisances: Nuisances, camera_names: tuple[str, ...]) -> TracksMeta:
-    """Return the meta data about annotator bias."""
+    """Return the metadata about annotator bias."""
 
     def by_camera(values: Array) -> dict[str, list[float]]:
         return dict(zip(camera_names, values.T.tolist(), strict=True))
@@ -206,7 +206,7 @@ def take_correlation_px(records: Mapping[int, FrameRecord], config: TrackingConf
 
 
 def _of_tracked(records: Mapping[int, FrameRecord], figure: Callable[[Solution], Array]) -> Array:
-    """Return a value of every frame and arch, NaN where lost, shape (F, 2)."""
+    """Return a value of every frame and arch, NaN where the arch is lost, shape (F, 2)."""
     return np.stack([np.where(r.status != LOST, figure(r.solution), np.nan) for r in records.values()])
 
 
@@ -215,7 +215,7 @@ def _covariances(
 ) -> tuple[Array, Array]:
     """Return the covariance of both arches' left twists, NaN where lost, in two parts of shape (F, 2, 6, 6).
 
-    The first is caused by outline errors of each frame, the second by the nuisance parameters of the take.
+    The first part is caused by outline errors of each frame, the second by the nuisance parameters of the take.
     """
     outline, habits = np.full((2, len(records), 2, 6, 6), np.nan)
     for k, frame in enumerate(sorted(records)):

@@ -1,4 +1,4 @@
-"""Final poses: smoothed over time, and combined with a second measurement."""
+"""Final poses: smoothing over time, and combination with a second measurement."""
 
 from __future__ import annotations
 
@@ -23,27 +23,29 @@ from jawusd.geometry import (
 )
 from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance
 
-# Number of frames on either side over which process noise is estimated: a third of a second at 24 fps in all.
+# Number of frames on either side over which process noise is estimated: the whole window is a third of a second at 24
+# fps.
 _WINDOW = 4
-# Minimum variance of second differences, relative to that expected from independent noise [-]: outline errors common to
-# neighbouring frames cancel in second differences.
+# Minimum variance of second differences, relative to the variance expected from independent noise [-]: outline errors
+# common to neighbouring frames cancel in second differences.
 _FLOOR = 0.5
 _SHORTEST = 5  # minimum number of frames for estimating process noise
 
 
 def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, centre: Array) -> Array:
-    """Return smooth poses, by a fixed-interval smoother.
+    """Return poses smoothed over time by a fixed-interval smoother.
 
-    Minimises sum x_k^T C_k^-1 x_k + sum a_k^T Q_k^-1 a_k over left twists x_k about a fixed point, with the second
-    differences a_k of the poses: the smoother of a random walk in velocity (Rauch, Tung & Striebel 1965), with Q_k
-    estimated from nearby raw second differences less their noise, so that sudden stops are preserved.
+    The smoother minimises sum x_k^T C_k^-1 x_k + sum a_k^T Q_k^-1 a_k over left twists x_k about a fixed point, with
+    pose covariances C_k and second differences a_k of the poses. This corresponds to a random walk in velocity (Rauch,
+    Tung & Striebel 1965). The process noise Q_k is estimated from nearby second differences of the raw poses less their
+    measurement noise, so that sudden stops are preserved.
 
-    Lost frames stay NaN, and runs of fewer than five frames stay unchanged.
+    Lost frames remain NaN, and runs of fewer than five frames remain unchanged.
 
     Args:
         frames: frame numbers, shape (F,).
         poses: measured poses, NaN where lost, shape (F, 4, 4).
-        covariance: covariance of their left twists about the world origin, shape (F, 6, 6).
+        covariance: covariance of the poses' left twists about the world origin, shape (F, 6, 6).
         centre: the fixed point, near the moving points [mm], shape (3,).
     """
     to = make_transform(np.eye(3), -np.asarray(centre))
@@ -95,14 +97,14 @@ def _corrections(poses: Array, covariance: Array) -> Array:
 def combine(tracks: Tracks, poses: Array, covariance: Array, landmarks: Array) -> Tracks:
     """Return tracks combined with a second measurement of their poses, each weighted by its covariance.
 
-    If the two contradict each other, the covariance is scaled by the Birge ratio (Birge 1932). Lost arches use the
-    second measurement.
+    If the two measurements contradict each other, the covariance is scaled by the Birge ratio (Birge 1932). For lost
+    arches, the second measurement is used.
 
     Args:
-        tracks: the first measurement; their raw poses are combined and smoothed again.
+        tracks: the first measurement; its raw poses are combined with the second one and smoothed again.
         poses: T_world_upper and T_world_lower, NaN where they were not found, shape (F, 2, 4, 4).
-        covariance: covariance of their left world twists, shape (F, 2, 6, 6).
-        landmarks: points whose uncertainty is reported, mandible coordinates [mm], shape (5, 3).
+        covariance: covariance of the poses' left twists about the world origin, shape (F, 2, 6, 6).
+        landmarks: points whose uncertainty is reported, in mandible coordinates [mm], shape (5, 3).
     """
     raw, spread, status = [], [], tracks.status.copy()
     for r, name in enumerate(("upper", "lower")):
@@ -140,7 +142,7 @@ def combine(tracks: Tracks, poses: Array, covariance: Array, landmarks: Array) -
 
 
 def _weighted(one: Array, one_covariance: Array, other: Array, other_covariance: Array) -> tuple[Array, Array]:
-    """Return weighted means of poses (F, 4, 4) and their covariances (F, 6, 6); `other` where `one` is missing."""
+    """Return weighted means of poses (F, 4, 4), and covariances (F, 6, 6); where `one` is missing, return `other`."""
     known, also = (
         np.isfinite(pose).all((1, 2)) & np.isfinite(covariance).all((1, 2))
         for pose, covariance in ((one, one_covariance), (other, other_covariance))

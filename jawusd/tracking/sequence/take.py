@@ -1,4 +1,4 @@
-"""Tracking of a whole take: the first frame, passes over all frames, and whole-take corrections."""
+"""Tracking of a whole take: alignment of the first frame, passes over all frames, and whole-take corrections."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from jawusd.tracking.sequence.take_checks import (
 )
 from jawusd.tracking.sequence.time_checks import frame_shifts, time_findings
 
-_SETTLED_REST = 6  # number of frames with the teeth together among those on which nuisance parameters are iterated
+_SETTLED_REST = 6  # number of frames with closed teeth among the frames on which nuisance parameters are iterated
 # If errors of these kinds are found, camera poses are not corrected, since the corrections would hide them.
 _SHOWN_AS_MOTION = ("focal_length", "scan_size", "lens_distortion", "scans_mirrored")
 _CHECKED_FRAMES = 8  # number of frames tested for wrong lenses and scan sizes, which takes half a second
@@ -60,12 +60,12 @@ def track_capture(
 
     Args:
         capture: provides masks, frame range and bootstrap picks; without picks, the first pose is searched for.
-        cameras: calibrated; world lengths in mm.
-        offsets: reference frame minus own frame number, per camera name.
+        cameras: calibrated cameras; world lengths are in mm.
+        offsets: time offsets by camera name: the reference frame number minus the camera's own frame number.
         upper, lower: teeth scans in one coordinate frame, in occlusion [mm].
-        landmarks: points whose uncertainty is reported, mandible (= scan) coordinates [mm], shape (5, 3).
+        landmarks: points whose uncertainty is reported, in mandible (= scan) coordinates [mm], shape (5, 3).
         threads: number of worker threads; the result does not depend on it.
-        progress: called once per frame with the number of frames done, and their total.
+        progress: called once per frame with the number of frames done and the total number of frames.
 
     Raises:
         TrackingError: only one camera, swapped masks or scans, or no frame on which the teeth can be aligned.
@@ -128,7 +128,7 @@ class _Take(Passes):
     def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
         """Estimate delays, annotator biases and camera poses; correct significant ones and align all frames again.
 
-        Camera poses are corrected only if `may_move`, since wrong lenses or scan sizes have effects similar to those of
+        Camera poses are corrected only if `may_move`, since wrong lens parameters or scan sizes have similar effects as
         moved cameras.
         """
         c = self._config
@@ -158,9 +158,9 @@ class _Take(Passes):
         return found, extrinsics
 
     def _late_cameras(self, equations: TakeEquations, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
-        """Correct delays of about a frame first; None without such delays.
+        """Correct delays of about one frame in advance; return None without such delays.
 
-        A camera with such a delay also seems to have moved, and its masks seem wrong where the jaw is fast.
+        A camera with such a delay also seems to have moved, and its masks seem to be wrong where the jaw is fast.
         """
         c = self._config
         found = equations.solve(c, False)
@@ -171,7 +171,7 @@ class _Take(Passes):
         return found
 
     def scans_and_lenses(self, left: Array) -> list[Finding]:
-        """Return findings about focal lengths, lenses and scans from the uncorrected take.
+        """Return findings about focal lengths, lens distortion and scans from the uncorrected take.
 
         Args:
             left: unit vector in scan coordinates, shape (3,).
@@ -198,7 +198,7 @@ class _Take(Passes):
         return DRAWN if all(scan.shows_gum for scan in self._solver.scans) else DRAWN_BESIDE_CROWNS
 
     def _middle(self) -> Array:
-        """Return the centre of the teeth in the world [mm], shape (3,)."""
+        """Return the centre of the teeth in world coordinates [mm], shape (3,)."""
         return np.median([record.solution.centres for record in self.records.values()], axis=(0, 1))
 
     def _settle(
@@ -242,7 +242,7 @@ class _Take(Passes):
             status = np.where(found & unreliable, RECOVERED, record.status).astype(np.int8)
             self.records[frame] = replace(record, status=status)
             tracker.history.add(record)
-            # frees records that are no longer needed, which saves memory in long takes
+            # free records that are no longer needed, to save memory in long takes
             before.pop(frame - BRIDGE_FRAMES, None)
 
 
@@ -253,14 +253,14 @@ def _corrected_views(
     nuisances: Nuisances,
     extrinsics: Extrinsics,
 ) -> list[View]:
-    """Return the views of a frame with delays, biases and camera poses corrected."""
+    """Return the views of a frame with corrected delays, mask biases and camera poses."""
     moved = delay_motions(records, frame, nuisances.delays)
     views = extrinsics.correct(views)
     return [replace(view, T_delay=moved[c], habits=nuisances.habits[:, c]) for c, view in enumerate(views)]
 
 
 def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]:
-    """Return starts for aligning a frame again: its poses, preceded by interpolated ones if an arch is lost."""
+    """Return starts for aligning a frame again: its poses, preceded by interpolated poses if an arch is lost."""
     own = records[frame].solution.poses
     lost = np.flatnonzero(records[frame].status == LOST)
     even = own.copy()

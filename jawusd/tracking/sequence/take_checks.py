@@ -1,4 +1,4 @@
-"""Findings of a tracked take about its inputs: calibration, scans, masks, cameras, and abandoned searches.
+"""Findings about the inputs of a tracked take (calibration, scans, masks, cameras), and about searches left out.
 
 False-alarm rates come from `tests/benchmarks/population.py`; docs/explanation/constants.md lists them.
 """
@@ -43,20 +43,20 @@ class LensLimits:
     knock: float
 
 
-#: Limits for drawn masks. Sigmas of magnifications include possible camera motion along the optical axis.
+#: Limits for drawn masks. Standard deviations of magnifications include possible camera motion along the optical axis.
 OF_MASKS = LensLimits(0.02, 0.015, 0.002, 1.2, 3.0, 8.0)
-#: Limits for tracking by colour, whose sigmas are larger, and which cannot detect lens distortion.
+#: Limits for tracking by colour, in which standard deviations are larger and lens distortion cannot be detected.
 OF_COLOURS = LensLimits(0.03, 0.015, np.inf, np.inf, 1.6, np.inf)
-# Maximum magnification change by distortion [-], that of an uncalibrated lens with k1 = -0.4 at a distance of 130 mm:
-# larger changes are due to wrong masks of side teeth.
+# Maximum change of magnification by lens distortion [-], reached by an uncalibrated lens with k1 = -0.4 at a distance
+# of 130 mm: larger changes are due to wrong masks of side teeth.
 _MOST_BEND = 0.015
-# Rotation and motion of a camera since its calibration above which a warning is given, although they are corrected.
+# Rotation and motion of a camera since its calibration above which a warning is given, although both are corrected.
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
 _KNOCKED_MORE = 1.5  # minimum ratio of a knocked camera's motion to that of any other camera
 _TELLING_CAMERAS = 3  # minimum number of cameras for identifying a wrong one: if two differ, either may be wrong
 # Minimum matched fraction of the visible contour, and maximum residual, both relative to the other scan: a scan that
-# violates both belongs to another subject. Last, minimum number of frames for the decision. False-alarm rate: at most
-# 14 %.
+# violates both belongs to another subject. Last value: minimum number of frames for the decision. False-alarm rate: at
+# most 14 %.
 _FITS_LESS, _FITS_ROUGHER, _TELLING_FRAMES = 0.35, 1.5, 3
 _CLEARLY = 4.0  # minimum significance for a warning [standard deviations]
 
@@ -64,13 +64,13 @@ _CLEARLY = 4.0  # minimum significance for a warning [standard deviations]
 def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits = OF_MASKS) -> list[Finding]:
     """Return findings about scans, focal lengths, lenses and masks from the magnification of the cameras.
 
-    Kinds: "scan_size" [%], "focal_length" [%], "camera_moved" [degrees], "lens_distortion" [%], "side_teeth" [%],
-    "masks_wide" [px].
+    Kinds of the findings, with the units of their values: "scan_size" [%], "focal_length" [%], "camera_moved"
+    [degrees], "lens_distortion" [%], "side_teeth" [%], "masks_wide" [px].
     """
     out = []
     knocked = _knocked(found, limits)
     common = found.common
-    sigma = float(np.sqrt(np.mean(found.sigma_scale**2) / len(found.scale)))  # since camera motions are independent
+    sigma = float(np.sqrt(np.mean(found.sigma_scale**2) / len(found.scale)))  # motions of cameras are independent
     if abs(common) > max(limits.common, limits.clear * sigma) and (np.sign(found.scale) == np.sign(common)).all():
         out.append(
             Finding(
@@ -90,12 +90,12 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
                 Finding(
                     "focal_length",
                     "warning",
-                    f"it shows the teeth {_than(own)} than expected from its calibration and the other cameras; "
+                    f"this camera shows the teeth {_than(own)} than expected from its calibration and the others; "
                     f"at most {limits.scale:.0%} is usual. Its focal length or its distance is wrong.",
                     value=round(100 * own, 2),
                     limit=100 * limits.scale,
                     camera=name,
-                    hint="Calibrate it again with the lens, zoom and focus of the recording.",
+                    hint="Calibrate this camera again with the lens, zoom and focus of the recording.",
                 )
             )
         elif c == knocked:
@@ -107,7 +107,7 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
 
 
 def _knocked(found: Magnification, limits: LensLimits) -> int | None:
-    """Return the camera that moved most significantly relative to the others; None if there is none."""
+    """Return the camera that moved most significantly relative to the others; None if no camera did."""
     if len(found.motion_clear) < _TELLING_CAMERAS:
         return None
     *_, second, worst = np.argsort(found.motion_clear).tolist()
@@ -121,10 +121,10 @@ def _moved(name: str, turn_rad: float, move_mm: float, clear: float) -> Finding:
     return _camera_moved(
         name,
         turn_deg,
-        f"it seems to have turned, relative to the other cameras, by {turn_deg:.2f} degrees and moved by "
+        f"this camera seems to have turned, relative to the others, by {turn_deg:.2f} degrees and moved by "
         f"{move_mm:.1f} mm since its calibration, {clear:.0f} times the uncertainty; "
         f"up to {OF_MASKS.knock:g} times is usual.",
-        "It was knocked, or its calibration is wrong: calibrate it again, or exclude it.",
+        "The camera was knocked, or its calibration is wrong: calibrate it again, or exclude it.",
     )
 
 
@@ -138,8 +138,8 @@ def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
         return Finding(
             "side_teeth",
             "warning",
-            f"25 mm from the optical axis its masks show the teeth {_than(bend)} than in the centre; no lens distorts "
-            f"by more than {_MOST_BEND:.1%} there. The masks of the side teeth are wrong.",
+            f"this camera's masks show the teeth {_than(bend)} at 25 mm from the optical axis than in the centre; no "
+            f"lens distorts by more than {_MOST_BEND:.1%} there. The masks of the side teeth are wrong.",
             value=round(100 * bend, 2),
             limit=100 * _MOST_BEND,
             camera=name,
@@ -148,12 +148,12 @@ def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
     return Finding(
         "lens_distortion",
         "warning",
-        f"25 mm from the optical axis it shows the teeth {_than(bend)} than expected by its calibration; at most "
-        f"{limits.bend:.1%} is usual. Its lens distortion is wrong.",
+        f"this camera shows the teeth {_than(bend)} at 25 mm from the optical axis than expected by its calibration; "
+        f"at most {limits.bend:.1%} is usual. Its lens distortion is wrong.",
         value=round(100 * bend, 2),
         limit=100 * limits.bend,
         camera=name,
-        hint="Check the signs and the order of the distortion coefficients, or calibrate it again.",
+        hint="Check the signs and the order of the distortion coefficients, or calibrate the camera again.",
     )
 
 
@@ -176,12 +176,12 @@ def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[F
         Finding(
             "masks_wide",
             "warning",
-            f"its masks are {abs(bias):.1f} px {'wider' if bias > 0 else 'narrower'} than those of the other cameras "
+            f"the masks are {abs(bias):.1f} px {'wider' if bias > 0 else 'narrower'} than those of the other cameras "
             f"at working resolution; at most {limits.bias_px} px is usual.",
             value=round(bias, 2),
             limit=limits.bias_px,
             camera=name,
-            hint="Draw them again, or exclude this camera.",
+            hint="Draw these masks again, or exclude this camera.",
         )
     ]
 
@@ -189,7 +189,7 @@ def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[F
 def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Finding]:
     """Return a warning for each camera that moved significantly since its calibration.
 
-    Kind: "camera_moved" [degrees].
+    The kind of the finding is "camera_moved", its value an angle [degrees].
     """
     out = []
     for name, twist, sigma in zip(names, extrinsics.twists, extrinsics.sigma, strict=True):
@@ -197,17 +197,17 @@ def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Findin
         clear = (np.abs(twist) > _CLEARLY * sigma).any()
         if clear and (turn > _TURN_DEG or move > _MOVE_MM):
             message = (
-                f"it has turned by {turn:.2f} degrees and moved by {move:.1f} mm since its calibration "
+                f"this camera has turned by {turn:.2f} degrees and moved by {move:.1f} mm since its calibration "
                 f"(up to {_TURN_DEG:g} degrees and {_MOVE_MM:g} mm is usual); corrected."
             )
-            out.append(_camera_moved(name, turn, message, "It was knocked: calibrate again to be sure."))
+            out.append(_camera_moved(name, turn, message, "The camera was knocked: calibrate it again to be sure."))
     return out
 
 
 def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
     """Return a warning for a scan that barely fits its own masks.
 
-    Kind: "scan_misfit" [% of the visible contour].
+    The kind of the finding is "scan_misfit", its value the matched fraction [% of the visible contour].
     """
     whole = [records[frame].solution for frame in whole_frames(records)]
     if len(whole) < _TELLING_FRAMES:
@@ -222,9 +222,9 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
                 Finding(
                     "scan_misfit",
                     "warning",
-                    f"the {name} scan barely fits its own masks: {share[r]:.0%} of its visible contour, within "
-                    f"{rough[r]:.1f} px; the {ARCH_NAMES[other]} one fits {share[other]:.0%}, within "
-                    f"{rough[other]:.1f} px. Its poses are unreliable.",
+                    f"the {name} scan barely fits its own masks: {share[r]:.0%} of its visible contour matches, "
+                    f"to {rough[r]:.1f} px; of the {ARCH_NAMES[other]} scan, {share[other]:.0%} matches, to "
+                    f"{rough[other]:.1f} px. The poses of the {name} scan are unreliable.",
                     value=round(100 * float(share[r]), 1),
                     limit=round(100 * _FITS_LESS * float(share[other]), 1),
                     hint=f"Check that the {name} scan is a recent one of this subject, and that its masks show the "
@@ -237,7 +237,7 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
 def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) -> list[Finding]:
     """Return a warning if the search budget was exhausted, so that frames stay lost without a search.
 
-    Kind: "searches_left_out" [frames].
+    The kind of the finding is "searches_left_out", its value a number of frames.
     """
     lost = [f for f in sorted(searches.left_out) if ((records[f].status == LOST) & records[f].used.any(1)).any()]
     if not lost:
@@ -246,9 +246,9 @@ def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) 
         Finding(
             "searches_left_out",
             "warning",
-            f"{searches.fruitless} searches for lost teeth failed, the limit for a take of this length (at most "
-            f"{searches.most} more failures than successes); in {len(lost)} frames, of which this is the first, lost "
-            "teeth were not searched for.",
+            f"{searches.fruitless} searches for lost teeth failed, which is the limit for a take of this length (at "
+            f"most {searches.most} more failures than successes); in {len(lost)} frames, of which this is the first, "
+            "lost teeth were not searched for.",
             value=len(lost),
             limit=searches.most,
             frame=lost[0],
@@ -257,16 +257,16 @@ def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) 
     ]
 
 
-_HALF = 0.5  # minimum fraction of a camera's masks that are used; below it, the camera mostly contradicts the others
+_HALF = 0.5  # minimum fraction of a camera's masks that are used; with fewer, it mostly contradicts the others
 
 
 def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -> list[Finding]:
     """Return a warning for each camera whose masks were never or rarely used.
 
-    Kinds: "camera_not_used", with the number of frames that have masks; "camera_rarely_used", with the used fraction.
+    The kind of a finding is "camera_not_used" or "camera_rarely_used", its value the fraction of masks used.
     """
     frames = sorted(records)
-    present = np.array([np.isfinite(records[frame].coverage) for frame in frames])  # shape (F, 2, C)
+    present = np.array([np.isfinite(records[frame].coverage) for frame in frames])  # mask exists, shape (F, 2, C)
     used = np.array([records[frame].used for frame in frames])
     out = []
     for c, name in enumerate(names):
@@ -280,7 +280,7 @@ def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -
                     f"used in 0 of {len(frames)} frames: it has no masks from frame {frames[0]} to {frames[-1]}.",
                     value=0,
                     camera=name,
-                    hint="Check `frames`, the numbers of its masks and its time offset.",
+                    hint="Check `frames`, the frame numbers of the camera's masks, and its time offset.",
                 )
             )
         elif not with_use or taken.sum() < _HALF * seen.sum():
@@ -299,8 +299,8 @@ def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -
     return out
 
 
-_FRAMES = 4  # number of frames aligned with the scans and with their mirror images, which takes a second or two
-# Minimum ratio of the contour matched by the mirror images to that matched by the scans for a warning [-]; correct
+_FRAMES = 4  # number of frames aligned with scans and mirrored scans, which takes one or two seconds
+# Minimum ratio of the contour matched by mirrored scans to that matched by the given scans for a warning [-]; correct
 # scans reach at most 0.98.
 _LEAST_RATIO = 1.15
 
@@ -308,10 +308,10 @@ _LEAST_RATIO = 1.15
 def mirror_findings(
     scans: Sequence[Scan], left: Array, instants: Iterable[Instant], config: TrackingConfig
 ) -> list[Finding]:
-    """Return a warning if more contour matches with left and right of the scans exchanged. Kind: "scans_mirrored".
+    """Return a warning of kind "scans_mirrored" if mirrored scans (left and right exchanged) match more contour.
 
     Args:
-        scans: upper and lower.
+        scans: upper and lower scan.
         left: unit vector to the left in scan coordinates, shape (3,).
         instants: some aligned frames of the take.
     """
@@ -325,15 +325,15 @@ def mirror_findings(
             f"mirrored scans match {ratio:.2f} times as much of the outlines: left and right are exchanged",
             value=round(ratio, 2),
             limit=_LEAST_RATIO,
-            hint="Export them again without mirroring; one axis may have been negated.",
+            hint="Export the scans again without mirroring; one axis may have been negated.",
         )
     ]
 
 
 def mirror_ratio(scans: Sequence[Scan], left: Array, instants: Iterable[Instant], config: TrackingConfig) -> float:
-    """Return the ratio of contour matched by the mirrored scans to that by the given ones; NaN without frames.
+    """Return the ratio of contour matched by mirrored scans to contour matched by the given scans; NaN without frames.
 
-    Arguments as for `mirror_findings`.
+    The arguments are those of `mirror_findings`.
     """
     middle = np.mean([scan.centre for scan in scans], axis=0)
     pair = [ContourSolver(own, config) for own in (scans, [mirrored(scan, middle, left) for scan in scans])]

@@ -1,9 +1,9 @@
-"""Synchronisation errors found in a tracked take: late cameras, and dropped or repeated frames.
+"""Synchronisation errors found in a tracked take: late or early cameras, and dropped or repeated frames.
 
-Delays below a frame are estimated with linear equations (`TakeEquations`). Where the jaw moves fast, they fail for
-delays of a whole frame, because masks of the wrong frame are rejected or bias the jaw pose. With masks, neighbouring
-frames of each camera are therefore compared with the pose estimated from the other cameras. Without masks, a step of
-the delay is fitted.
+Delays shorter than a frame are estimated with linear equations (`TakeEquations`). Where the jaw moves fast, these
+equations fail for delays of a whole frame, because masks of the wrong frame are rejected or bias the jaw pose. With
+masks, neighbouring frames of each camera are therefore compared with the pose estimated from the other cameras. Without
+masks, a step in the delay is fitted.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
 from jawusd.tracking.sequence.results import outline_variance
 
 SHIFTS = (-1, 0, 1)  # time shifts of the compared masks [frames]
-_CHECKED_FRAMES = 18  # number of frames checked per take, which take a tenth of a second each
-_FEWEST = 3  # minimum number of conclusive frames on either side of a step, since two masks in a row may be wrong
-# Minimum margin by which a shift fits better than all others, and maximum to which margins are clipped, as fractions of
-# the visible contour [-].
+_CHECKED_FRAMES = 18  # number of frames checked per take; each takes 0.1 s
+_FEWEST = 3  # minimum number of conclusive frames on either side of a step, since two successive masks may be wrong
+# Minimum margin by which a shift fits better than all others, and upper limit to which margins are clipped, both as
+# fractions of the visible contour [-].
 _LEAST_LEAD, _MOST_LEAD = 0.1, 0.5
-# Minimum fit of a camera's masks at the best shift [-]: below it, something other than the time is wrong. False-alarm
-# rate: at most 4 %.
+# Minimum fit of a camera's masks at the best shift [-]: below it, something other than the time offset is wrong.
+# False-alarm rate: at most 4 %.
 _LEAST_FIT = -0.1
-# Minimum margin over the best fit of the other cameras [-], which suffices if these fit badly, as when the jaw was lost
-# after a dropped frame.
+# Minimum margin over the best fit of the other cameras [-]; sufficient if the other cameras fit badly, for example when
+# the jaw was lost after a dropped frame.
 _BETTER_FIT = 0.15
 
 
@@ -61,8 +61,8 @@ class FrameShifts:
 
     Attributes:
         frames: the frames checked, shape (F,).
-        fit: matched contour less the penalty for uncovered mask, relative to the visible contour, per frame, camera and
-            shift, shape (F, C, 3); NaN if the camera or all others have no mask.
+        fit: matched contour less the penalty for uncovered mask, relative to the visible contour, for each frame,
+            camera and shift, shape (F, C, 3); NaN if the camera or all others have no mask.
     """
 
     frames: NDArray[np.int_]
@@ -71,8 +71,8 @@ class FrameShifts:
     def clearest(self) -> Shift | None:
         """Return the most significant shift; None if the masks of all cameras are synchronous.
 
-        The shift of one camera biases the poses that the other cameras are compared with, so they seem to be shifted as
-        well.
+        The shift of one camera biases the poses with which the other cameras are compared, so these seem to be shifted
+        as well.
         """
         found = [shift for c in range(self.fit.shape[1]) for shift in self._shifts_of(c)]
         return max(found, key=lambda entry: entry[0])[1] if found else None
@@ -82,13 +82,13 @@ class FrameShifts:
         return _agree(self._conclusive(camera)[1][:, SHIFTS.index(0)])
 
     def _conclusive(self, c: int) -> tuple[NDArray[np.int_], Array]:
-        """Return the indices of frames conclusive for a camera, and the lead of each shift in them, shape (n, 3)."""
+        """Return the indices of frames conclusive for a camera, and the margin of each shift in them, shape (n, 3)."""
         leads = _leads(self.fit[:, c])
         rows = np.flatnonzero(np.isfinite(leads).all(1))
         return rows, np.clip(leads[rows], -_MOST_LEAD, _MOST_LEAD)
 
     def _others_at_best(self, c: int, rows: NDArray[np.int_]) -> Array:
-        """Return the fit of the other cameras' masks at the best shift of each, inf if none has a mask, shape (n,)."""
+        """Return the median best fit of the other cameras' masks, shape (n,); inf if no other camera has a mask."""
         others = np.delete(self.fit[rows], c, axis=1).max(2)
         usual = np.full(len(rows), np.inf)
         seen = np.isfinite(others).any(1)
@@ -111,22 +111,22 @@ class FrameShifts:
 
 
 def _leads(fit: Array) -> Array:
-    """Return the lead of each shift over the best other shift, shape (F, 3)."""
+    """Return the margin by which each shift fits better than the best other shift, shape (F, 3)."""
     return np.stack([fit[:, k] - np.delete(fit, k, axis=1).max(1) for k in range(fit.shape[1])], axis=1)
 
 
 def _agree(leads: Array, above: Array | None = None) -> bool:
-    """Return whether a shift leads in enough frames and in the majority, and fits well enough where it leads."""
+    """Return whether a shift fits best in enough frames and in the majority, and well enough where it fits best."""
     leading = leads > _LEAST_LEAD
     clear = leading.sum() >= _FEWEST and np.median(leads) > _LEAST_LEAD
     return bool(clear and (above is None or np.median(above[leading]) > 0.0))
 
 
 def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: ContourSolver) -> FrameShifts:
-    """Compare the masks of some frames with fast jaw motion with those of neighbouring frames.
+    """Compare the masks of frames with fast jaw motion with the masks of neighbouring frames.
 
-    If all masks are synchronous at both ends of the take, the frames between are skipped: a step there would have to be
-    followed by its opposite.
+    If all masks are synchronous at both ends of the take, the frames between are skipped: a step in the delay there
+    would have to be followed by the opposite step.
 
     Args:
         records: records of all frames of the take.
@@ -147,7 +147,7 @@ def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: C
 
 
 def _fits(record: FrameRecord, around: Sequence[Sequence[View]], solver: ContourSolver) -> Array:
-    """Return the fit of every camera's masks at every shift, to poses from the other cameras only, shape (C, 3)."""
+    """Return the fit of every camera's masks, at every shift, to poses from the other cameras only, shape (C, 3)."""
     config, poses, views = solver.config, record.solution.poses, around[SHIFTS.index(0)]
     rendering = solver.rendering(views)
     out = np.full((len(views), len(SHIFTS)), np.nan)
@@ -189,7 +189,7 @@ def _in_window(view: View, other: View) -> NDArray[np.uint8]:
 
 
 def _fast_frames(records: Mapping[int, FrameRecord]) -> list[int]:
-    """Return frames spread over the take: from every part, the frame with the fastest motion of the lower arch."""
+    """Return frames spread over the take: the frame with the fastest motion of the lower arch in every part."""
     centres = {frame: records[frame].solution.centres[1] for frame in sorted(records)}
     inner = [frame for frame in centres if frame - 1 in centres and frame + 1 in centres]
     if not inner:
@@ -199,13 +199,13 @@ def _fast_frames(records: Mapping[int, FrameRecord]) -> list[int]:
     return [inner[max(part, key=lambda i: moved[i])] for part in parts]
 
 
-_PRIOR_FRAMES = 1.0  # prior standard deviation of a step of the delay
+_PRIOR_FRAMES = 1.0  # prior standard deviation of a step in the delay
 _LEAST_FRAMES = 2  # minimum number of frames on either side of a step
 
 
 @dataclass(frozen=True)
 class DelayStep:
-    """The most significant step of a camera's delay: size and standard deviation [frames], and first frame after it."""
+    """The most significant step in a camera's delay: size, standard deviation [frames], and first frame after it."""
 
     step: float
     sigma: float
@@ -215,14 +215,14 @@ class DelayStep:
 def delay_steps(
     records: Mapping[int, FrameRecord], variance_px3: Array, extrinsics: Extrinsics, frames: list[int]
 ) -> list[DelayStep]:
-    """Return the most significant step of every camera's delay; empty with too few frames.
+    """Return the most significant step in every camera's delay; an empty list with too few frames.
 
-    For every camera and frame in turn, a delay from that frame on is added to the unknowns of the take (see
-    `TakeEquations`), and all others are eliminated.
+    For every camera and frame in turn, an additional delay from that frame on is added to the unknowns of the take (see
+    `TakeEquations`), and all other unknowns are eliminated.
 
     Args:
         records, variance_px3, extrinsics: as for `TakeEquations`.
-        frames: frames in which both arches are tracked, in order.
+        frames: frames in which both arches are tracked, in ascending order.
     """
     if len(frames) < 2 * _LEAST_FRAMES:
         return []
@@ -257,9 +257,9 @@ def delay_steps(
 
 
 _CLEARLY = 4.0  # minimum significance of a delay or step [standard deviations]
-_LATE_FRAMES = 0.7  # minimum delay for a warning; free-running cameras differ by up to half a frame
+_LATE_FRAMES = 0.7  # minimum delay for a warning: free-running cameras differ by up to half a frame
 # Smallest step in a camera's delay that triggers a warning, in a take without masks [frames]. Steps are missed where
-# the jaw is fast.
+# the jaw moves fast.
 _STEP_FRAMES = 0.5
 
 
@@ -271,15 +271,16 @@ def time_findings(
     config: TrackingConfig,
     shifts: FrameShifts | None = None,
 ) -> list[Finding]:
-    """Return warnings about cameras that are a frame late or early, from the start or from some frame on.
+    """Return warnings about cameras that are a frame late or early, throughout the take or from some frame on.
 
     Args:
         names: names of the cameras.
         records: records of all frames.
         nuisances, extrinsics, config: estimates and settings of the take.
-        shifts: fit of the masks of neighbouring frames; without masks, steps are found from delays below a frame.
+        shifts: fit of the masks of neighbouring frames; None without masks, when steps are found from delays shorter
+            than a frame.
 
-    Kinds: "camera_late" [frames], "frame_dropped" [frames].
+    Kinds of the findings, with the units of their values: "camera_late" [frames], "frame_dropped" [frames].
     """
     late = {k: float(nuisances.delays[k]) for k in range(len(names)) if _is_late(nuisances, k)}
     if shifts is None:
@@ -304,12 +305,12 @@ def _late(names: Sequence[str], frames: Mapping[int, float]) -> list[Finding]:
         Finding(
             "camera_late",
             "warning",
-            f"its images are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its offset implies; "
-            f"below {_LATE_FRAMES} frames is usual.",
+            f"the images of this camera are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its time "
+            f"offset implies; less than {_LATE_FRAMES} frames is usual.",
             value=round(late, 2),
             limit=_LATE_FRAMES,
             camera=names[camera],
-            hint=f"Check its offset in [sync]: {round(late):+d} frames would fit better.",
+            hint=f"Check this camera's offset in [sync]: {round(late):+d} frames would fit better.",
         )
         for camera, late in frames.items()
     ]
@@ -320,8 +321,8 @@ def _step_of_delay(
 ) -> list[Finding]:
     """Return a warning if the delay of a camera changes within the take."""
     steps = delay_steps(records, outline_variance(records, config), extrinsics, whole_frames(records))
-    # Poses partly follow the camera whose delay steps, so the other cameras seem to step the opposite way; the true
-    # step is the most significant one.
+    # The poses partly follow the camera with the step in its delay, so the other cameras seem to have an opposite step;
+    # the true step is the most significant one.
     clearest = max(range(len(steps)), key=lambda c: abs(steps[c].step) / steps[c].sigma, default=None)
     if clearest is None:
         return []
@@ -335,8 +336,8 @@ def _dropped(name: str, step: float, frame: int) -> Finding:
     return Finding(
         "frame_dropped",
         "warning",
-        f"its delay changes by {step:+.1f} frames near here: a frame was dropped or repeated; below "
-        f"{_STEP_FRAMES} frames is usual.",
+        f"the delay of this camera changes by {step:+.1f} frames near here: a frame was dropped or repeated; less "
+        f"than {_STEP_FRAMES} frames is usual.",
         value=round(step, 2),
         limit=_STEP_FRAMES,
         camera=name,
