@@ -41,13 +41,13 @@ def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) ->
 
     if not holds_stage(source):
         return read_motion(loaded, source)
-    own = None if source.suffix.lower() in USD_SUFFIXES else prim  # the stage may have the rig at another prim path
+    own = None if source.suffix.lower() in USD_SUFFIXES else prim  # the rig's prim path in the stage may differ
     found = read_stage_motion(loaded, rig, source, own, None, None, None)
     return AuthoredMotion(found.frames, found.d, found.fps)
 
 
 def _kept(loaded: JawRig, source: Path | None, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
-    """Return the motion inside the bound, and the changes; warn about a stage, FBX or glTF without motion."""
+    """Return the motion inside the bound, and the changes made; warn if a stage, FBX or glTF has no motion."""
     from jawusd.cli.motion import kept_inside
     from jawusd.cli.stage_commands import holds_stage, moved_mm, still_lines
 
@@ -88,7 +88,7 @@ def _is_glb(path: Path) -> bool:
 def _write(
     out: Path, rig: Path, loaded: JawRig, motion: AuthoredMotion, rate: float, prim: str | None, splines: Path | None
 ) -> tuple[AuthoredMotion, list[str]]:
-    """Write a layer or a .glb, and the keys as splines; return the motion written, and notes."""
+    """Write a layer or a .glb, and optionally the keys as splines; return the motion written, and notes."""
     from jawusd.cli.motion import follow_curves, knots_of
     from jawusd.rig import write_animation, write_splines
     from jawusd.rig.glb import frame_at_zero, write_glb
@@ -124,7 +124,8 @@ def animate(
     mapping: Annotated[
         Path | None,
         typer.Option(
-            help="The actor's mapping of --arkit, from arkit-fit or skin-fit. Default: fractions of the ranges.",
+            help="Mapping of the actor's ARKit weights to d, from arkit-fit or skin-fit. "
+            "Default: fractions of the ranges.",
             show_default=False,
         ),
     ] = None,
@@ -140,7 +141,7 @@ def animate(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Write an animation layer over a rig, or meshes and motion as .glb; clamping to the bound is reported."""
+    """Write an animation layer over a rig, or meshes and motion as .glb; frames clamped to the bound are reported."""
     import jawusd
     from jawusd.cli.animate_commands import read_face
     from jawusd.cli.motion import carried_over, emit_motion, resampled
@@ -166,7 +167,7 @@ def animate(
     emit_motion(out, rate, motion, changes, as_json)
 
 
-_CLAMPED_MM = 0.005  # minimum value that is listed; smaller ones would be printed as 0.00
+_CLAMPED_MM = 0.005  # minimum distance that is listed; smaller ones would be printed as 0.00
 
 
 def arkit_fit(
@@ -178,13 +179,13 @@ def arkit_fit(
             help="The jaw of the same performance: tracks.npz, d.csv, or a table of poses.", show_default=False
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The mapping (JSON).")] = Path("arkit.json"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Mapping to write (JSON).")] = Path("arkit.json"),
     fps: Annotated[
         float | None, typer.Option(min=0.001, help="Frames per second of the face. Default: from its time codes.")
     ] = None,
     jaw_fps: Annotated[
         float | None,
-        typer.Option(min=0.001, help="Frames per second of the jaw. Default: of the tracks or the rig."),
+        typer.Option(min=0.001, help="Frames per second of the jaw. Default: that of the tracks or the rig."),
     ] = None,
     offset: Annotated[
         float | None,
@@ -197,9 +198,9 @@ def arkit_fit(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Fit the mapping from a subject's ARKit jaw weights to d, from face and jaw captured together; for `animate`.
+    """Fit the mapping from a subject's ARKit jaw weights to d, for `animate`; face and jaw must be captured together.
 
-    The subject must open the jaw wide, and move it to both sides and forward.
+    In the take, the subject must open the jaw wide, and move it to both sides and forward.
     """
     import jawusd
     from jawusd.fitting.face import fit_arkit
@@ -222,14 +223,15 @@ def arkit_fit(
         as_json,
         lambda: [
             f"{out}: from {found.frames} frames, the face starts {found.offset_s:.3f} s after the jaw's frame 0",
-            f"held-out error at the incisal point {found.error_mm:.2f} mm, by fractions {found.shares_error_mm:.2f} mm",
+            f"held-out error at the incisal point {found.error_mm:.2f} mm; "
+            f"by fractions of the ranges {found.shares_error_mm:.2f} mm",
         ],
     )
 
 
 def arkit_table(
     rig: RigArg,
-    out: Annotated[Path, typer.Option("-o", "--out", help="The table (CSV).")] = Path("joint.csv"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Table to write (CSV).")] = Path("joint.csv"),
     mapping: Annotated[
         Path | None,
         typer.Option(help="The actor's mapping, from arkit-fit. Default: fractions of the ranges.", show_default=False),
@@ -259,7 +261,7 @@ def arkit_table(
 
 
 def _jaw_of_take(rig: JawRig, path: Path, source: Path, fps: float | None, prim: str | None) -> tuple[Array, Array]:
-    """Return times [s] (N,) and d [mm] (N, 3) of tracks or a table."""
+    """Return times [s], shape (N,), and d [mm], shape (N, 3), of tracks or a table."""
     import numpy as np
 
     from jawusd.cli.motion import read_pose_table
@@ -277,10 +279,10 @@ def _jaw_of_take(rig: JawRig, path: Path, source: Path, fps: float | None, prim:
 
 
 def rate_of(rig: Path, prim: str | None) -> float:
-    """Return the frames per second of a rig, for a jaw that does not state its rate.
+    """Return the frame rate of a rig, for a jaw motion whose file does not state one.
 
     Raises:
-        typer.BadParameter: the rig does not state it.
+        typer.BadParameter: the rig does not state a frame rate.
     """
     from jawusd.cli.options import USD_SUFFIXES
     from jawusd.rig import describe
@@ -291,16 +293,16 @@ def rate_of(rig: Path, prim: str | None) -> float:
 
 
 def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None) -> AuthoredMotion:
-    """Read the jaw of an ARKit face capture, by the subject's mapping or as fractions of the subject's ranges.
+    """Read the jaw motion of an ARKit face capture, by the subject's mapping or as fractions of the ranges of motion.
 
-    Without a mapping, JawOpen 1 is the full opening, and JawLeft minus JawRight and JawForward are fractions of the
-    ranges at that opening. Left is the subject's left.
+    Without a mapping, JawOpen = 1 is the full opening, and (JawLeft - JawRight) and JawForward are fractions of the
+    ranges of motion at the current opening. Left is the subject's left.
 
     Args:
         source: CSV of Live Link Face.
-        fps: frame rate of the motion, None for the rate of the time codes.
-        mapping: file written by `jawusd arkit-fit`, or by `jawusd skin-fit` from the same blend shapes; None for
-            fractions of the ranges.
+        fps: frame rate of the motion [1/s]; None: the rate of the time codes.
+        mapping: file written by `jawusd arkit-fit`, or by `jawusd skin-fit` from the same blend shapes; None: use
+            fractions of the ranges of motion.
 
     Raises:
         FormatError: the file is invalid or has no row with a face, or the mapping belongs to another subject.
@@ -325,7 +327,7 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
 
 
 def _by_skin(rig: JawRig, shapes: BlendShapes, source: Path, path: Path) -> Array:
-    """Return d [mm] (F, 3) of all blend shapes of a face capture."""
+    """Return d [mm], shape (F, 3), estimated from all blend shapes of a face capture."""
     from jawusd.base.errors import FormatError
     from jawusd.evaluator.skin import load_skin
 

@@ -1,4 +1,4 @@
-"""Commands from a capture to a rig: builds of one or many captures, and the stages of a build."""
+"""Commands that make a rig from a capture: builds of one or many captures, and the stages of a build."""
 
 from __future__ import annotations
 
@@ -269,7 +269,7 @@ def build_many(
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the folders of the rigs.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Parent folder of the rigs' folders.", show_default=False)],
     model: Annotated[Method, typer.Option(help="Form of the jaw models.")] = Method.anchored,
     cluster: Annotated[
         str | None,

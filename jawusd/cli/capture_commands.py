@@ -111,7 +111,7 @@ def sync(
             else:
                 result = sync_videos(videos, reference or next(iter(videos)), report)
         except SyncError as error:
-            failure = error  # raised after the curves are written, because the curves show the reason
+            failure = error  # raised after the curves are written, because they show why alignment failed
         found = light_curves(videos, report) if curves is not None or plot is not None else {}
         if curves is not None:
             write_light_curves(curves, found)
@@ -123,7 +123,7 @@ def sync(
 
 
 def _named(clips: list[Path]) -> dict[str, Path]:
-    """Return the clips by name, or by path if names are not unique."""
+    """Return the clips by file name, or by path if the names are not unique."""
     short = {clip.stem: clip for clip in clips}
     named = short if len(short) == len(clips) else {str(clip): clip for clip in clips}
     if len(named) < len(clips):
@@ -137,9 +137,9 @@ def segment(
     keys: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of hand-drawn frames: CAMERA/upper/000123.png, CAMERA/lower/000123.png. Finished masks, "
-            "255 on teeth and 0 elsewhere, which also teach your style; "
-            "or strokes, 255 on teeth, 0 on other things, 128 if unknown.",
+            help="Folder of hand-drawn frames: CAMERA/upper/000123.png, CAMERA/lower/000123.png. These are finished "
+            "masks, 255 on teeth and 0 elsewhere, which also teach your style; or strokes, 255 on teeth, 0 on "
+            "other things, and 128 where unknown.",
             show_default=False,
         ),
     ] = None,
@@ -167,7 +167,7 @@ def segment(
 
 
 def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
-    """Check that a folder is empty, unless forced: its masks may be hand-drawn.
+    """Check that a folder for masks is empty, unless forced: it may contain hand-drawn masks.
 
     Raises:
         OutputError: the folder is not empty.
@@ -224,7 +224,7 @@ def plates(
     from jawusd.pipeline.pictures import write_plates
 
     if (rig / "plates").exists() and not force:
-        raise OutputError("exists already.", path=rig / "plates", hint="Overwrite its pictures with --force.")
+        raise OutputError("exists already.", path=rig / "plates", hint="Overwrite its images with --force.")
     frames = load_tracks(rig / "tracks.npz").frames
     opened = open_capture(capture, allow_outside=allow_outside)
     with progress() as report:
@@ -252,8 +252,8 @@ def photos(
 ) -> None:
     """Register two scans in occlusion, from outlines drawn in photographs of the closed bite.
 
-    All photographs must show the same bite and come from one camera, whose focal length may be unknown. Some may be
-    taken through a mirror. Exit code 6 if the scans do not fit the outlines.
+    All photographs must show the same bite and be taken with one camera, whose focal length may be unknown. Some may be
+    taken in a mirror. Exit code 6 if the scans do not fit the outlines.
     """
     from jawusd.base.errors import TrackingError
     from jawusd.cli.text_capture import photograph_lines

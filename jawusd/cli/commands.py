@@ -1,4 +1,4 @@
-"""The commands by name, loaded when first used, and their common behaviour: -h, vectors, and handling of Ctrl+C."""
+"""The commands by name, loaded when first used, and their common behaviour: help, vector options, and Ctrl+C."""
 
 from __future__ import annotations
 
@@ -70,8 +70,9 @@ SUMMARIES = {name: words for group in GROUPS.values() for name, words in group.i
 
 EXIT_CODES = (
     "Exit codes: 0 done, 1 a negative result (invalid poses, something missing, a failed build of many), "
-    "2 wrong usage, 3 a file is invalid, 4 a package is missing, 5 the capture, 6 tracking, 7 fitting, 8 the rig, "
-    "9 the model, 10 the output, 11 a cluster, 12 out of memory or a library crashed, 130 stopped with Ctrl+C."
+    "2 wrong usage, 3 a file is invalid, 4 a package is missing; an error 5 of the capture, 6 in tracking, "
+    "7 in fitting, 8 of the rig, 9 of the model, 10 of the output, 11 of a cluster; 12 out of memory or a library "
+    "crashed, 130 stopped with Ctrl+C."
 )
 
 
@@ -79,17 +80,17 @@ EXIT_CODES = (
 INTERRUPTED = 130
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
-_WORDS = "jawusd.words"  # context key of a command's arguments
+_WORDS = "jawusd.words"  # key under which a command's arguments are stored in the context
 _VECTOR = re.compile(r" *[-+]?[\d.eE+-]+((, *| +)[-+]?[\d.eE+-]+){2} *")
 _VECTORS, _VECTOR_LENGTH = ("--d", "--point", "--target", "--start"), 3
 
-# Messages about the results that interrupted commands keep, and about how to resume; commands not listed write complete
-# files at the end.
+# Messages that state which results an interrupted command keeps, and how to resume it. Commands not listed write their
+# files at the end, complete.
 _KEPT = {
     "build": "finished stages are kept; resume with the same command and --resume, start over with --fresh",
     "build-many": "finished captures and stages are kept; resume with the same command and --resume",
     "segment": "finished frames are kept; resume with the same command and --resume",
-    "plates": "the pictures written so far are kept; start over with --force",
+    "plates": "the images written so far are kept; start over with --force",
     "demo": "the files written so far are kept, but are incomplete without capture.toml; start over with --force",
     "bake": "the files written so far are kept, but the rig is incomplete; start over with --force",
 }
@@ -97,7 +98,7 @@ _ELSE = "no incomplete file was written"
 
 
 class _Parameter(Protocol):
-    """An argument or option of typer."""
+    """A typer argument or option."""
 
     param_type_name: str
 
@@ -105,19 +106,19 @@ class _Parameter(Protocol):
 
 
 class _Formatter(Protocol):
-    """The formatter of typer's help."""
+    """The formatter of typer's help text."""
 
     def section(self, name: str) -> AbstractContextManager[None]: ...
     def write(self, text: str) -> None: ...
     def write_dl(self, rows: Sequence[tuple[str, str]]) -> None: ...
 
 
-# Words for typer's names of types. Options with several values state their own.
+# Names shown in help for typer's types. Options with several values state their own.
 _KINDS = {"path": "PATH", "str": "TEXT", "int": "N", "int range": "N", "float": "NUMBER", "float range": "NUMBER"}
 
 
 def help_row(parameter: _Parameter, ctx: typer.Context) -> tuple[str, str] | None:
-    """Return the names and the meaning of an argument or option for help; None if it is hidden."""
+    """Return the names and the description of an argument or option, as shown in help; None if it is hidden."""
     row = parameter.get_help_record(ctx)
     if row is None:
         return None
@@ -133,7 +134,7 @@ class Command(TyperCommand):
     # typer passes its public Context to all methods; the base class declares that of its private copy of click.
 
     def format_options(self, ctx: typer.Context, formatter: _Formatter) -> None:  # type: ignore[override]  # as above
-        """Write arguments and options, without the names of Python's types."""
+        """Write the help of arguments and options, without names of Python types."""
         for title, kind in (("Arguments", "argument"), ("Options", "option")):
             shown = [help_row(one, ctx) for one in self.get_params(ctx) if one.param_type_name == kind]
             rows = [row for row in shown if row is not None]
@@ -142,14 +143,14 @@ class Command(TyperCommand):
                     formatter.write_dl(rows)
 
     def format_epilog(self, ctx: typer.Context, formatter: _Formatter) -> None:  # type: ignore[override]  # as above
-        """Write the examples, one per line."""
+        """Write the example command lines, one per line."""
         lines = (self.epilog or "").splitlines()
         with formatter.section("Examples" if len(lines) > 1 else "Example"):
             for line in lines:
                 formatter.write(f"  {line}\n")
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]  # click has its own Context
-        """Accept vectors such as `--d 20,2,1`, and store the arguments for `command_line`."""
+        """Split vectors such as `--d 20,2,1`, and store the arguments for `command_line`."""
         ctx.meta[_WORDS] = list(args)
         words = with_vectors_split(args)
         for at, option in enumerate(words):
@@ -176,7 +177,7 @@ def command_line(ctx: typer.Context) -> str:
 
 
 def with_vectors_split(args: list[str]) -> list[str]:
-    """Split the value a,b,c or "a b c" of vector options into three arguments."""
+    """Split the values of vector options, such as 20,2,1 or "20 2 1", into three arguments each."""
     out: list[str] = []
     for word in args:
         option, sign, value = word.partition("=")
@@ -201,16 +202,16 @@ def _check_vector(option: str, values: Sequence[str]) -> None:
 
 
 class _StoppedError(KeyboardInterrupt):
-    """A signal that ends a command like Ctrl+C does."""
+    """A signal that ends a command in the same way as Ctrl+C."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
-        self.exit_code = 128 + number  # as reported by shells
+        self.exit_code = 128 + number  # the exit code that shells report for a signal
 
 
 @contextlib.contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Make SIGTERM and SIGHUP end the block as Ctrl+C does, with its cleanup."""
+    """Make SIGTERM and SIGHUP end the context as Ctrl+C does, so that cleanup runs."""
 
     def stop(number: int, _: FrameType | None) -> NoReturn:
         for other in taken:  # ignore further signals during the cleanup
@@ -229,7 +230,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def interrupted(command: str, exit_code: int = INTERRUPTED) -> NoReturn:
-    """Print that a command was stopped and which results are kept; exit with the signal's code."""
+    """Print that a command was stopped, and which results are kept; exit with the signal's code."""
     say(f"jawusd {command}: stopped; {_KEPT.get(command, _ELSE)}.", err=True)
     raise typer.Exit(exit_code)
 
@@ -260,7 +261,7 @@ class Commands(TyperGroup):
         self.commands = _Loaded()  # type: ignore[assignment]  # a mapping that loads on demand
 
     def list_commands(self, ctx: object) -> list[str]:
-        """Return the names in the order of `jawusd --help`."""
+        """Return the command names in the order of `jawusd --help`."""
         return list(SUMMARIES)
 
     def format_commands(self, ctx: object, formatter: _Formatter) -> None:

@@ -1,6 +1,6 @@
-"""Command lines that the help of each command shows."""
+"""Example command lines shown in the help of each command."""
 
-#: Example command lines by command, of at most 76 characters.
+#: Example command lines by command; each has at most 76 characters.
 EXAMPLES = {
     "doctor": ("jawusd doctor",),
     "demo": ("jawusd demo -o capture", "jawusd demo -o capture --seed 3 --frames 480"),

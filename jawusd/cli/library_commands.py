@@ -1,4 +1,4 @@
-"""Commands on several actors: library; retarget, to another rig or to a subject without one."""
+"""Commands on several actors: `library`, and `retarget` to another rig or to a subject without a rig."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Use(StrEnum):
-    """Ways to use a library."""
+    """Ways to combine the subjects of a library."""
 
     average = "average"
     closest = "closest"

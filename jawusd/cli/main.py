@@ -1,4 +1,4 @@
-"""The program `jawusd`: its commands, and the conversion of errors to messages and exit codes."""
+"""The program `jawusd`: runs its commands, and converts errors to messages and exit codes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _root(
 
         say(f"jawusd {__version__}")
         raise typer.Exit
-    global _verbose  # main prints errors after the context has ended
+    global _verbose  # needed by `main`, which prints errors after the context has ended
     _verbose = verbose
     if verbose:
         import faulthandler
@@ -60,10 +60,12 @@ _verbose = False
 
 def main() -> None:
     """Run the command line and exit: 0 success, 1 negative result, 2 wrong usage, 3 and above by error family."""
-    if "PXR_WORK_THREAD_LIMIT" not in os.environ:  # read when OpenUSD loads; rigs are too small for threads
+    if (
+        "PXR_WORK_THREAD_LIMIT" not in os.environ
+    ):  # read when OpenUSD is loaded; rigs are too small to gain from threads
         os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
-    # Set before numpy is loaded. Multi-threaded sums differ in their last bits between machines, which changes fits by
-    # micrometres. The matrices are too small to gain from threads.
+    # This must be set before numpy is loaded. Multi-threaded sums differ in their last bits between machines, which
+    # changes fits by micrometres. The matrices are too small to gain from threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):  # escape characters that the terminal cannot encode
         if isinstance(stream, io.TextIOWrapper):
@@ -92,14 +94,14 @@ def _report(error: JawusdError, cause: BaseException | None = None) -> int:
 
 
 def _unwritable(error: OSError | RuntimeError) -> int:
-    """Print errors outside any command, such as a full disk behind `>` or an invalid file name; return the exit code.
+    """Print an error raised outside any command, such as a full disk or an invalid file name; return the exit code.
 
     Raises:
-        RuntimeError: any other error.
+        RuntimeError: the error is of another kind.
     """
     if isinstance(error, OSError):
         message = f"{str(error.filename or 'the output'):.200}: {error.strerror or error}."
-    elif str(error).startswith("Symlink loop"):  # raised by Path.resolve
+    elif str(error).startswith("Symlink loop"):  # Path.resolve raises RuntimeError for these
         message = f"{error}."
     else:
         raise error

@@ -26,17 +26,17 @@ if TYPE_CHECKING:
 
 
 _MOVED_MM = 1e-6
-_FINE = 10  # number of samples of a curve per frame
-_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # tolerance and maximum number of refinements of a polyline
+_FINE = 10  # number of samples per frame at which curves are checked against the bound
+_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # tolerance of a polyline, and maximum number of its refinements
 
 
 @dataclass(frozen=True, eq=False)
 class AuthoredMotion:
-    """A motion as read from its source."""
+    """A jaw motion as read from its source file."""
 
     frames: Array  # frame numbers (F,), increasing
-    d: Array  # parameters (F, 3) [mm], NaN in frames without parameters
-    fps: float | None  # frames per second, None if the source does not state it
+    d: Array  # jaw parameters (F, 3) [mm], NaN in frames without parameters
+    fps: float | None  # frame rate [1/s], None if the source does not state it
     keys: Keys | None = None  # keys between which the motion was interpolated
 
     def __post_init__(self) -> None:
@@ -58,7 +58,7 @@ class AuthoredMotion:
 
 
 def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
-    """Read keys, parameters or poses. Keys are interpolated at every whole frame; poses are encoded.
+    """Read a motion given as key frames, d or poses; keys are interpolated at every whole frame, poses encoded as d.
 
     Args:
         source: keys.json, or a CSV or JSON table of d or of poses.
@@ -90,7 +90,7 @@ def _read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
 
 
 def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
-    """Return frames (F,) and poses (F, 4, 4) of a table or of tracks.
+    """Return the frame numbers (F,) and poses (F, 4, 4) of a table or of tracks.
 
     Raises:
         FormatError: the file is invalid.
@@ -105,12 +105,12 @@ def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
 class Changes:
     """Summary of the changes made to a motion."""
 
-    figures: dict[str, float]  # counts, and distances [mm]
-    lines: list[str]  # summary as text; the first line is appended to the line with the file name
+    figures: dict[str, float]  # numbers of frames, and distances [mm]
+    lines: list[str]  # the changes as text; the first line is appended to the line with the file name
 
 
 def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes, as_json: bool) -> None:
-    """Print the motion written, and its changes."""
+    """Print the file written, its frames, and the changes made to the motion."""
     first, last = float(motion.frames[0]), float(motion.frames[-1])
     head, *rest = changes.lines
     result = {"file": str(out), "fps": rate, "frames": [first, last], **changes.figures}
@@ -120,7 +120,7 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
     """Project a motion into the bound (see `JawRig.keep_inside`); frames without parameters are kept.
 
-    For a smooth motion, only the keys are projected if that suffices, so that they remain connected by curves.
+    In a smooth motion, only the keys are projected if that suffices, so that curves still connect them.
     """
     known = np.isfinite(motion.d).all(axis=1)
     lost = int((~known).sum())
@@ -156,7 +156,7 @@ def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Ch
 
 
 def _valid_keys(rig: JawRig, motion: AuthoredMotion) -> Keys | None:
-    """Return the keys of a smooth motion projected into the bound; None if curves through the keys leave the bound."""
+    """Return the keys of a smooth motion, projected into the bound; None if the curves through them leave the bound."""
     if motion.keys is None or motion.keys.interpolation != "smooth":
         return None
     frames, d = motion.keys.arrays()
@@ -172,14 +172,14 @@ def _valid_keys(rig: JawRig, motion: AuthoredMotion) -> Keys | None:
 class Knots(NamedTuple):
     """Knots of a spline: keys where possible, samples elsewhere."""
 
-    frames: Array  # shape (K,)
-    d: Array  # [mm], shape (K, 3)
+    frames: Array  # frame numbers, shape (K,)
+    d: Array  # jaw parameters [mm], shape (K, 3)
     slopes: Array  # tangents [mm per frame], shape (K, 3)
     curved: Mask  # which segments are cubic, shape (K - 1,)
 
 
 def knots_of(rig: JawRig, motion: AuthoredMotion) -> Knots:
-    """Return the keys of a motion with their tangents, and all samples of segments that the bound has changed."""
+    """Return the keys of a motion with their tangents, plus all samples of segments changed by the bound."""
     known = np.isfinite(motion.d).all(axis=1)
     frames, d = motion.frames[known], motion.d[known]
     if motion.keys is None:
@@ -203,7 +203,7 @@ def knots_of(rig: JawRig, motion: AuthoredMotion) -> Knots:
 
 
 def follow_curves(rig: JawRig, motion: AuthoredMotion, knots: Knots) -> AuthoredMotion:
-    """Return the motion with samples added where linear interpolation departs from the curves of its keys."""
+    """Return the motion, with samples added where linear interpolation deviates from the curves through its keys."""
     if motion.keys is None or not knots.curved.any():
         return motion
     key_frames, key_d = motion.keys.arrays()
@@ -228,7 +228,7 @@ def carried_over(
         prim: path of the rig's prim, if the source is a stage with several.
 
     Raises:
-        FormatError: motion or rig cannot be read.
+        FormatError: the motion or a rig cannot be read.
         EvaluatorError: no frame of the motion has parameters.
     """
     from jawusd.pipeline.library import load_any_rig, retarget
@@ -256,7 +256,7 @@ def _lost_line(lost: int) -> list[str]:
 
 
 def _motion_of(rig: JawRig, path: Path, prim: str | None) -> AuthoredMotion:
-    """Return a motion of a rig from a stage, by d or, without d, by its transforms; or from a table."""
+    """Return the motion of a rig in a stage, from d or, if d is missing, from transforms; or the motion in a table."""
     from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
     from jawusd.rig.read import open_stage
 
@@ -271,14 +271,14 @@ def _motion_of(rig: JawRig, path: Path, prim: str | None) -> AuthoredMotion:
 
 
 def resampled(rig: JawRig, motion: AuthoredMotion, source_fps: float, fps: float) -> AuthoredMotion:
-    """Resample a motion at the whole frames of another rate; frame 0 stays frame 0.
+    """Resample a motion at the whole frames of a different frame rate; frame 0 stays frame 0.
 
     Samples are interpolated by cubics with finite-difference slopes; keys are shifted in time and keep their curves.
     A frame is lost if the nearest sample is lost.
 
     Args:
-        source_fps: frame rate of the motion.
-        fps: output frame rate.
+        source_fps: frame rate of the motion [1/s].
+        fps: frame rate of the result [1/s].
     """
     ratio = fps / source_fps
     times = motion.frames * ratio

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Method(StrEnum):
-    """Jaw models."""
+    """Forms of the jaw model."""
 
     anchored = "anchored"
     additive = "additive"
@@ -78,13 +78,13 @@ PrimName = Annotated[
 
 
 def rig_of_folder(rig: Path | None) -> Path | None:
-    """Return the rig's file if the path is the folder of a build; callback of all rig arguments."""
+    """Return the rig's file if the path is the folder of a build, otherwise the path; callback of all rig arguments."""
     from jawusd.rig.layout import actor_in_folder
 
     return None if rig is None else actor_in_folder(rig)
 
 
-_FOLDER = "jawusd.folder"  # context key of the path given for a rig
+_FOLDER = "jawusd.folder"  # key under which the path given for a rig is stored in the context
 
 
 def _noted(context: typer.Context, rig: Path | None) -> Path | None:
@@ -93,7 +93,7 @@ def _noted(context: typer.Context, rig: Path | None) -> Path | None:
 
 
 def changed_in_folder(context: typer.Context) -> list[Finding]:
-    """Return files modified since the build, if the rig was given as the folder of a build."""
+    """Return findings on files modified since the build, if the rig was given as the folder of a build."""
     from jawusd.pipeline.state import changed_files
 
     folder = context.meta[_FOLDER]
@@ -119,7 +119,7 @@ OptionalRigArg = Annotated[
 
 
 def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig:
-    """Load a rig; `--prim` refers to the stage if one is given, otherwise to the rig's own file.
+    """Load a rig; `--prim` is a path in the stage if one is given, otherwise in the rig's own file.
 
     Raises:
         JawusdError: the file is not a rig.
@@ -130,20 +130,23 @@ def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig
     return jawusd.load(rig, prim=None if beside or rig.suffix == ".npz" else prim)
 
 
-# the subject
+# Options that describe the subject.
 CaptureOption = Annotated[Path | None, typer.Option(help="Capture with scans and landmarks.", show_default=False)]
 UpperOption = Annotated[
     Path | None, typer.Option(help="Scan of the upper teeth, instead of a capture.", show_default=False)
 ]
 LowerOption = Annotated[
-    Path | None, typer.Option(help="Scan of the lower teeth, in the same frame, in occlusion.", show_default=False)
+    Path | None,
+    typer.Option(help="Scan of the lower teeth, in the same coordinate frame, in occlusion.", show_default=False),
 ]
-MandibleOption = Annotated[Path | None, typer.Option(help="Mesh of the mandible, same frame.", show_default=False)]
+MandibleOption = Annotated[
+    Path | None, typer.Option(help="Mesh of the mandible, in the same coordinate frame.", show_default=False)
+]
 LandmarksOption = Annotated[
     Path | None, typer.Option(help="Landmarks (JSON), instead of a capture or scans.", show_default=False)
 ]
 
-# conventions of a file of poses
+# Options for the conventions of a file of poses.
 ColumnsOption = Annotated[
     str | None,
     typer.Option(
@@ -152,20 +155,22 @@ ColumnsOption = Annotated[
     ),
 ]
 UnitOption = Annotated[LengthUnit, typer.Option(help="Length unit, if the file does not state it.")]
-InvertOption = Annotated[bool, typer.Option("--invert", help="Invert the poses, because they map skull to mandible.")]
+InvertOption = Annotated[
+    bool, typer.Option("--invert", help="Invert the poses: those of the file map skull to mandible.")
+]
 RestOption = Annotated[
     int | None,
-    typer.Option(help="Frame with the teeth in occlusion; poses are taken relative to it.", show_default=False),
+    typer.Option(help="Frame with the teeth in occlusion; poses are made relative to it.", show_default=False),
 ]
 GroupOption = Annotated[str | None, typer.Option(help="Trajectory of an HDF5 file.", show_default=False)]
 RigidOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="BODY=MARKERS",
-        help="The file contains markers; those fixed to the jaw and, unless the head is still, to the head: numbers or "
-        "names, as jaw=5,6,7,8 or jaw=JL,JR,JF (with --rest-frame), or a marker description, as jaw=jaw.rig. Reads "
-        "C3D, TRC, QTM (TSV), Vicon CSV, plain tables of numbers and ArtiSynth probes, marker%d.txt as one. "
-        "Repeatable.",
+        help="For a file of markers: those fixed to the jaw and, unless the head is still, those fixed to the head. "
+        "Give numbers or names, as jaw=5,6,7,8 or jaw=JL,JR,JF (with --rest-frame), or a marker description, as "
+        "jaw=jaw.rig. Formats: C3D, TRC, QTM (TSV), Vicon CSV, plain tables of numbers, and ArtiSynth probes "
+        "(marker%d.txt). Repeatable.",
         show_default=False,
     ),
 ]
@@ -179,7 +184,7 @@ def trajectory_options(
     group: str | None,
     rigid: list[str] | None,
 ) -> TrajectoryOptions:
-    """Return the options of a file of poses or markers.
+    """Return the conventions, given by options, of a file of poses or markers.
 
     Raises:
         typer.BadParameter: a column map or rigid body is invalid.
@@ -190,10 +195,10 @@ def trajectory_options(
 
 
 def rigid_bodies(given: list[str] | None) -> dict[str, str]:
-    """Return the descriptions of rigid bodies by name.
+    """Return the markers, or the description, of each rigid body by name.
 
     Raises:
-        typer.BadParameter: one is not of the form BODY=MARKERS, or given twice.
+        typer.BadParameter: an option is not of the form BODY=MARKERS, or a body is given twice.
     """
     found: dict[str, str] = {}
     for text in given or ():
@@ -236,7 +241,7 @@ def subject_given(
     landmarks: Path | None,
     allow_outside: bool,
 ) -> Subject:
-    """Return the subject given by a capture, both scans, or landmarks.
+    """Return the subject that the options describe by a capture, both scans, or landmarks.
 
     Args:
         name: name of a subject without a capture.

@@ -1,4 +1,4 @@
-"""Output of commands: results on stdout, as text or JSON, progress on stderr, and the log of a run."""
+"""Output of commands: results on stdout as text or JSON, progress on stderr, and the log file."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def say(line: object, err: bool = False) -> None:
 
 
 def complain(text: object) -> None:
-    """Print the program's name and a message, possibly of several lines, on stderr."""
+    """Print a message, possibly of several lines, on stderr, preceded by the program's name."""
     for line in f"jawusd: {text}".split("\n"):
         say(line, err=True)
 
 
 def plain(value: object) -> object:
-    """Return a value with numpy types turned into JSON's and NaN into null."""
+    """Return a value for JSON, with numpy types converted to Python's and NaN to None."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, dict):
@@ -60,7 +60,7 @@ def plain(value: object) -> object:
 
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of long work on stderr; yields a function (stage, done, total) to call as work proceeds."""
+    """Show the progress of long work on stderr; yields the callback, called with (stage, done, total)."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -94,7 +94,7 @@ def progress() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def _plain_progress(console: Console) -> Callable[[str, int, int], None]:
-    """Return a progress callback for log files: a line per stage and per tenth of a stage."""
+    """Return a progress callback for log files, which writes a line per stage and per tenth of a stage."""
     last: dict[str, int] = {}
 
     def report(stage: str, done: int, total: int) -> None:
@@ -110,7 +110,7 @@ _CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 class RunLog:
-    """A log file; each line starts with the seconds since the start."""
+    """A log file; each line begins with the number of seconds since the file was opened."""
 
     def __init__(self, path: Path, words: list[str]) -> None:
         """Open the file and write the command line and versions.
@@ -148,7 +148,7 @@ class RunLog:
 
 
 class _Copied:
-    """An output stream that also copies its lines to a log."""
+    """An output stream that also writes its lines to a log."""
 
     def __init__(self, stream: TextIO, log: RunLog) -> None:
         self._stream, self._log, self._pending = stream, log, ""
@@ -166,7 +166,7 @@ class _Copied:
 
 @contextmanager
 def logged(path: Path, words: list[str]) -> Iterator[RunLog]:
-    """Copy stdout and stderr of the block to a log file.
+    """Copy everything written to stdout and stderr in the context to a log file.
 
     Raises:
         OutputError: the file cannot be written.

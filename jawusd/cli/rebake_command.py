@@ -1,4 +1,4 @@
-"""The command `rebake`: write one layer that makes d and mandible of the edited jaws in a shot agree."""
+"""The command `rebake`: write a layer in which d and the mandible's transform agree, for all jaws of a shot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _ORIGINS = {"d": "values of d", "mandible": "mandible's transforms"}
 
 
 class Origin(StrEnum):
-    """Sources of a motion."""
+    """Sources from which a motion can be read."""
 
     d = "d"
     mandible = "mandible"
@@ -67,11 +67,11 @@ def rebake(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Make d and mandible of the rigs of a shot agree, after only one of them was edited.
+    """Make d and the mandible's transform agree, for all rigs of a shot, after only one of them was edited.
 
-    The layer contains opinions for all rigs; add it to the sublayers of the shot. Motions are projected into the bound,
-    and samples outside are reported with their margin. A stage without the rig but with copies of its meshes, moved by
-    transforms, bones or point caches, gives a layer over RIG. FBX and glTF are read through Blender.
+    The layer written contains opinions for all rigs; add it to the sublayers of the shot. Motions are projected into
+    the bound, and samples outside it are reported with their margin. If a stage has no rig but copies of its meshes,
+    moved by transforms, bones or point caches, the layer is one over RIG. FBX and glTF are read through Blender.
     """
     shot = stage or rig
     out = out or shot.with_name(f"{shot.stem}_baked.usdc")
@@ -88,7 +88,7 @@ def rebake(
 
 @dataclass(frozen=True)
 class _BakedRig:
-    """Motion of one rig of a shot: as read, as projected into the bound, and the changes."""
+    """The motion of one rig of a shot: as read, as projected into the bound, and the changes made."""
 
     rig: JawRig
     found: StageMotion
@@ -98,9 +98,9 @@ class _BakedRig:
 
 
 def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str | None]:
-    """Return the prims to bake: those given, otherwise all rigs of the shot; None stands for the only rig, or RIG."""
+    """Return the prims to bake: those given, otherwise all rigs of the shot; None stands for the only rig or RIG."""
     if stage is not None and len(prims or ()) > 1:
-        raise typer.BadParameter("RIG STAGE bakes one rig; several are baked with the shot alone.", param_hint="--prim")
+        raise typer.BadParameter("RIG STAGE bakes one rig; to bake several, name only the shot.", param_hint="--prim")
     if prims or stage is not None:
         return [*prims] if prims else [None]
     from jawusd.rig.layout import rig_prims
@@ -129,7 +129,7 @@ def _bake_rig(
 def _write_baked(
     out: Path, rig: Path, shot: Path, taken: Sequence[_BakedRig], root: bool, prim: str | None
 ) -> list[str]:
-    """Write the layer; return stronger opinions in the shot's own layer."""
+    """Write the layer; return the prims for which the shot's own layer has stronger opinions."""
     import numpy as np
 
     from jawusd.rig import write_animation

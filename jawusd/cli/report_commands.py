@@ -67,12 +67,12 @@ def report(
     rest_frame: RestOption = None,
     group: GroupOption = None,
     rigid: RigidOption = None,
-    starts: Annotated[int, typer.Option(min=1, max=64, help="Random starts of the paper's networks.")] = 2,
+    starts: Annotated[int, typer.Option(min=1, max=64, help="Number of random starts of the paper's networks.")] = 2,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing figures, or the page of a solve.")] = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Write the report of a build again, or of a solve; or repeat the paper's experiments on a take."""
+    """Write the report of a build or a solve again, or repeat the paper's experiments on a take."""
     options = trajectory_options(columns, length_unit, invert, rest_frame, group, rigid)
     if not experiments:
         _report_found(source, capture, out, force, allow_outside, as_json)
@@ -167,7 +167,7 @@ def view(
     prim: Prim = None,
     allow: Allow = None,
 ) -> None:
-    """View a rig in the browser and animate it; or a capture's footage, to inspect poses and to set picks."""
+    """View and animate a rig in the browser; or view the footage of a capture, to inspect poses and set picks."""
     import webbrowser
 
     from jawusd.pipeline.state import changed_files
@@ -201,7 +201,7 @@ def view(
 
 
 def _warn_of_host(host: str, capture: bool) -> None:
-    """Warn that an address can be reached from other machines."""
+    """Warn if the viewer's address can be reached from other machines."""
     from jawusd.viewer.server import is_loopback
 
     if not is_loopback(host):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Triple = tuple[float, float, float]
 
-#: Exit code for a negative result: an invalid pose, a rig with errors.
+#: Exit code of a negative result, such as an invalid pose or a rig with errors.
 NO = 1
 
 
@@ -124,7 +124,7 @@ def pose(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Print the jaw pose of parameters d: 4x4 matrix, twist, landmarks, clearance of the teeth, margin to the bound."""
+    """Print the jaw pose of parameters d: 4x4 matrix, twist, landmarks, tooth clearance, and margin to the bound."""
     import jawusd
     from jawusd.evaluator import Reason
     from jawusd.geometry import LANDMARKS, transform_points
@@ -225,7 +225,7 @@ def _verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:
 
 
 def _unbaked(rig: JawRig, path: Path, prim: str | None) -> dict[str, list[str] | dict[str, float]]:
-    """Return the deviation of the mandible of a stage from its d; empty if both agree."""
+    """Return a message if the mandible's transform in a stage deviates from its d; empty if both agree."""
     from jawusd.rig.rebake import deviation
 
     away = deviation(path, rig, prim) if path.suffix.lower() in USD_SUFFIXES else None

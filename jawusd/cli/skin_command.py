@@ -1,4 +1,4 @@
-"""The command that learns the jaw from facial skin."""
+"""The command `skin-fit`, which learns jaw motion from facial skin."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ FaceArg = Annotated[
         show_default=False,
     ),
 ]
-Out = Annotated[Path, typer.Option("-o", "--out", help="What was learned.")]
-Fps = Annotated[float | None, typer.Option(min=0.001, help="Frames per second of the face. Default: of the file.")]
+Out = Annotated[Path, typer.Option("-o", "--out", help="Learned map to write (.npz).")]
+Fps = Annotated[float | None, typer.Option(min=0.001, help="Frames per second of the face. Default: that of the file.")]
 JawFps = Annotated[
-    float | None, typer.Option(min=0.001, help="Frames per second of the jaw. Default: of the tracks or the rig.")
+    float | None, typer.Option(min=0.001, help="Frames per second of the jaw. Default: that of the tracks or the rig.")
 ]
 Offset = Annotated[
     float | None, typer.Option(help="Seconds from the jaw's frame 0 to the face's. Default: estimated from the motion.")
@@ -51,7 +51,7 @@ Rigid = Annotated[
     list[str] | None,
     typer.Option(
         metavar="head=MARKERS",
-        help="Markers fixed to the head, relative to which points are taken: names, numbers, or a "
+        help="Markers fixed to the head, to which points are made relative: names, numbers, or a "
         "marker description. Names and numbers need --rest-frame. Default: the points are stabilised.",
         show_default=False,
     ),
@@ -87,10 +87,10 @@ def skin_fit(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Learn d from facial skin on frames with visible teeth, to find the jaw where lips are closed.
+    """Learn d from facial skin in frames with visible teeth, to estimate the jaw in frames with closed lips.
 
-    Points must be relative to the head: stabilised, or with --rigid head=MARKERS. The take needs exercises, speech with
-    visible teeth, every expression, and some seconds of occlusion (--bite).
+    Points must be relative to the head: stabilised, or with --rigid head=MARKERS. The take must contain the jaw
+    exercises, speech with visible teeth, every expression, and some seconds of occlusion (--bite).
     """
     import math
 

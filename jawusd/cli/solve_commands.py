@@ -1,4 +1,4 @@
-"""Commands on a subject with a rig: solve a performance, or track live video."""
+"""Commands for a subject with a rig: solve a performance, or track live video."""
 
 from __future__ import annotations
 
@@ -140,9 +140,9 @@ def live(
     prim: Prim = None,
     allow: Allow = None,
 ) -> None:
-    """Track the jaw of a subject with a rig in live video; output as a line of JSON per frame, OSC, and a page.
+    """Track the jaw of a subject with a rig in live video; results are one line of JSON per frame, OSC, and a web page.
 
-    Frames are dropped if images arrive too fast; every line contains the latency.
+    Frames are dropped if images arrive faster than they are tracked; every line contains the latency.
     """
     from jawusd.pipeline.live import OscSender
     from jawusd.pipeline.live import live as follow

@@ -1,4 +1,4 @@
-"""Commands on rigs in stages: encode poses of edited stages as d, publish rigs under unique names."""
+"""Commands on rigs in stages: `encode` poses of edited stages as d, and `publish` rigs under unique names."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def publish(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Copy a rig under unique file names, so that actors can be packed together; or pack a shot as .usdz."""
+    """Copy a rig under unique file names, so that several actors can be packed together; or pack a shot as .usdz."""
     from jawusd.rig.publish import publish_rig, write_package
 
     refuse_existing(out, force)
@@ -112,7 +112,7 @@ def publish(
     emit({"files": files}, as_json, lambda: files)
 
 
-_STILL_MM = 0.01  # maximum displacement of a jaw that counts as still; ten times the rounding error in single precision
+_STILL_MM = 0.01  # displacement below which a jaw counts as still; ten times the rounding error of single precision
 
 
 def read_stage_motion(
@@ -124,17 +124,17 @@ def read_stage_motion(
     skull: str | None,
     origin: Literal["d", "mandible"] | None,
 ) -> StageMotion:
-    """Read the motion of a jaw from a stage: from the rig in it or, without a rig, by fitting the rig's meshes.
+    """Read a jaw motion from a stage: from the rig in the stage or, if it has none, by fitting the rig's meshes.
 
     Args:
-        loaded, rig: the rig and its file.
+        loaded, rig: the loaded rig, and its file.
         stage: a stage, or a file that Blender converts to one.
         prim: path of the rig's prim in the stage, or in the rig's file if the stage comes from Blender.
-        mandible, skull: prims above the meshes.
-        origin: which to use if d and mandible disagree; see `motion_of_stage`.
+        mandible, skull: paths of the prims above the meshes of mandible and skull.
+        origin: whether to use d or the mandible's transform if they disagree; see `motion_of_stage`.
 
     Raises:
-        JawusdError: there is no such motion.
+        JawusdError: the stage has no such motion.
     """
     from jawusd.plugins.conversion import SUFFIXES, converted
     from jawusd.rig import describe
@@ -156,7 +156,7 @@ def read_stage_motion(
 
 
 def holds_stage(path: Path) -> bool:
-    """Return whether a file is a stage, or one that Blender converts to a stage."""
+    """Return whether a file is a stage, or can be converted to one by Blender."""
     from jawusd.plugins.conversion import SUFFIXES
 
     return path.suffix.lower() in (*USD_SUFFIXES, *SUFFIXES)
@@ -183,7 +183,7 @@ def _refuse_model(rig: Path) -> None:
 
 
 def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> dict[str, float]:
-    """Return the distances of a motion from the model and from the bound."""
+    """Return statistics of a motion's distances from the model and from the bound."""
     import numpy as np
 
     known = np.isfinite(d).all(axis=1)
@@ -203,7 +203,7 @@ def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> d
 
 
 def moved_mm(rig: JawRig, d: Array) -> float:
-    """Return the largest distance of a landmark from its position in the first pose of a motion d (F, 3) [mm]."""
+    """Return the maximum displacement of a landmark from its position in the first pose of a motion d (F, 3) [mm]."""
     import numpy as np
 
     from jawusd.geometry import transform_points
@@ -213,7 +213,7 @@ def moved_mm(rig: JawRig, d: Array) -> float:
 
 
 def still_lines(largest_mm: float, frames: int) -> list[str]:
-    """Return a warning if the mandible of a stage does not move, as after export of drivers without baking."""
+    """Return a warning if the mandible of a stage does not move, as happens if drivers are exported without baking."""
     if largest_mm > _STILL_MM:
         return []
     return [f"the mandible does not move in {frames} frames: was it exported without baking? Bake it to keys first"]

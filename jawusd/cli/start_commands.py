@@ -1,4 +1,4 @@
-"""Commands to get started: init drafts a capture, doctor checks the installation, cameras converts calibrations."""
+"""Commands to get started: draft a capture, check the installation, convert calibrated cameras."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _print_reference(as_json: bool) -> None:
 
 
 def doctor(as_json: Json = False) -> None:
-    """Check the installation: versions, extras, OpenGL, codecs, cores, the cache of compiled code.
+    """Check the installation: versions, extras, OpenGL, codecs, CPU cores, and the cache of compiled code.
 
     Exit code 1 if something that a build needs is missing.
     """
@@ -83,9 +83,7 @@ def cameras(
         ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help=".toml, .usda, or a folder for COLMAP.", show_default=False)],
-    unit_mm: Annotated[
-        float, typer.Option(min=1e-6, help="Length of the source's unit: 1000 if it is in metres.")
-    ] = 1.0,
+    unit_mm: Annotated[float, typer.Option(min=1e-6, help="Length of the source's unit [mm]: 1000 for metres.")] = 1.0,
     size: Annotated[
         str | None,
         typer.Option(help="Image size, as 1920x1080, if the source does not state it.", show_default=False),
@@ -93,7 +91,7 @@ def cameras(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Convert calibrated cameras between the file formats of programs, in mm."""
+    """Convert calibrated cameras between the file formats of other programs, in mm."""
     from jawusd.cli.text_capture import camera_lines
     from jawusd.pipeline.cameras import convert_cameras
 

@@ -1,4 +1,4 @@
-"""Output of the commands of a build: builds, plans, tracks, models."""
+"""Text output of the build commands: summaries of builds, plans, tracks and models."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jawusd.pipeline.track import FrameTrackSummary, TrackSummary
 
 
-_MOST_TODO = 3  # maximum number of further things to do that a build lists; the report has all
+_MOST_TODO = 3  # maximum number of further recommendations that a build prints; the report lists all
 
 
 def build_lines(summary: BuildSummary, verbose: bool = False) -> list[str]:
@@ -36,7 +36,7 @@ def build_lines(summary: BuildSummary, verbose: bool = False) -> list[str]:
 
 
 def _verdict_lines(report: ReportSummary, verbose: bool) -> list[str]:
-    """Return the verdict of the report, what else to do, and if verbose the reasons."""
+    """Return the verdict of the report, what else should be done and, if verbose, the reasons."""
     if "verdict" not in report:
         return ["No verdict, because there is no report."]
     verdict = report["verdict"]
@@ -53,14 +53,14 @@ def _sync_line(summary: BuildSummary) -> str:
 
 
 def _findings(summary: BuildSummary) -> tuple[list[str], list[str]]:
-    """Return the findings of the check, and those of tracking, as lines; those in both are with tracking."""
+    """Return the findings of the check and of tracking as lines; a finding of both is listed with tracking."""
     tracked = [Finding.from_json(found).line() for found in summary["track"].get("findings", [])]
     checked = [Finding.from_json(found).line() for found in summary.get("findings", [])]
     return [line for line in checked if line not in tracked], tracked
 
 
 def _key_lines(summary: BuildSummary) -> list[str]:
-    """Return the results of a build that matter most, in a few lines."""
+    """Return the key results of a build as a few lines."""
     track, fit = summary["track"], summary["fit"]
     sigma_mm = {name: value for name, value in track["sigma_mm"].items() if value is not None}
     lines = ["the capture names no calibration: one was made from its boards"] if summary["calibrate"] else []
@@ -124,7 +124,7 @@ def rounded_duration(seconds: float) -> str:
 
 
 def outcome_lines(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return outcomes as a text table."""
+    """Return the outcomes of many builds as a text table."""
     width = max(len("capture"), *(len(o.name) for o in outcomes))
     lines = [f"{'capture':<{width}}  status   frames  tracked  model mm  holdout mm  incisor mm  seconds"]
     for o in outcomes:
@@ -224,7 +224,7 @@ def fit_lines(summary: FitSummary) -> list[str]:
 
 
 def contact_words(contact: object) -> str:
-    """Return a `ContactSummary` as text; in files from other programs it may be any value."""
+    """Return a `ContactSummary` as text; values of any type are accepted, because other programs may write the file."""
     found = contact if isinstance(contact, dict) else {}
     closed, error = found.get("closed_mm"), found.get("error_mm")
     if not isinstance(closed, float) or not isinstance(error, float):
@@ -233,7 +233,7 @@ def contact_words(contact: object) -> str:
     return f"{meet} in occlusion; clearances are accurate to {error:.2f} mm"
 
 
-_FARTHEST_MM = 1.5  # maximum distance that `meshes.collision` measures
+_FARTHEST_MM = 1.5  # largest distance that `meshes.collision` measures
 
 
 def joint_words(joints: object) -> str:
@@ -249,7 +249,7 @@ def joint_words(joints: object) -> str:
     )
     if closed <= -_FARTHEST_MM:
         where = f"more than {_FARTHEST_MM:g} mm from the bone of the skull"
-    if error == 0.0:  # no surface is within that distance
+    if error == 0.0:  # no surface of the skull is near enough to be measured
         return f"{where} in occlusion, and not within {NEAR_MM:g} mm of it anywhere inside the bound"
     deeper = f"up to {-limit:.2f} mm into it in captured poses; " if limit < -AUTHORED_MM else ""
     return f"{where} in occlusion; {deeper}clearances are accurate to {error:.2f} mm, and are not used to reject poses"

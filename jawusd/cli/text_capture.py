@@ -1,4 +1,4 @@
-"""Output of the commands on captures and cameras."""
+"""Text output of the commands on captures and cameras."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def calibration_lines(report: CalibrationSummary) -> list[str]:
     lines = [f"calibrated from {report['views']} views of the board"]
     for name, camera in report["cameras"].items():
         line = (
-            f"  {name}: {camera['rms_px']:.3f} px rms, {camera['views']} views, {camera['coverage']:.0%} of the picture"
+            f"  {name}: {camera['rms_px']:.3f} px rms, {camera['views']} views, {camera['coverage']:.0%} of the image"
         )
         lines.append(line + _listed("blurred", camera["blurred"]) + _listed("missed", camera["missed"]))
     shape = report["board_shape"]
@@ -109,7 +109,7 @@ def scans_lines(summary: ScansSummary) -> list[str]:
 
 
 def start_lines(start: CaptureStart) -> list[str]:
-    """Return what was found and what is missing as text."""
+    """Return what a draft capture has found, and what it lacks, as text."""
     folder = start.path.parent
     lines = [f"{start.path}", *(f"  {line}" for line in start.found), *(f"note: {line}." for line in start.notes)]
     if start.missing:
@@ -121,7 +121,7 @@ def start_lines(start: CaptureStart) -> list[str]:
     return [*lines, f"next: jawusd check {folder}"]
 
 
-_LEAST_APART_MM = 10.0  # `capture.camera_checks` rejects captures whose cameras are all closer together
+_LEAST_APART_MM = 10.0  # largest distance between cameras below which `capture.camera_checks` rejects a capture
 
 
 def camera_lines(cameras: list[Camera], files: list[Path]) -> list[str]:
@@ -160,7 +160,7 @@ def examined_lines(found: Examined) -> list[str]:
 
 
 def photograph_lines(found: PhotographFiles) -> list[str]:
-    """Return the result as text."""
+    """Return the result of an alignment of photographs as text."""
     lines = ["photograph           focal [px]  mirrored  outlines rms / median [px at 1440]  alone [mm]"]
     for photo in found.result.photos:
         lines.append(
