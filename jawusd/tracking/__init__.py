@@ -1,6 +1,7 @@
 """Track the poses of both dental arches from masks or images of several cameras.
 
-Subpackages, each importing only those before it: `contour`, `initialization`, `sequence` and `performance`, `region`.
+Each subpackage imports only earlier ones in this order: `contour`; `initialization`; `sequence` and `performance`;
+`region`.
 """
 
 from jawusd.tracking.config import TrackingConfig

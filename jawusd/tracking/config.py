@@ -20,42 +20,43 @@ class Mapper(Protocol):
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Settings of the tracker; px are pixels of the working image unless stated otherwise."""
+    """Settings of the tracker; px are pixels of the undistorted image at working resolution unless stated otherwise."""
 
     # Working resolution at the teeth [px/mm]: hand-drawn masks have no finer detail, and run time grows with the area.
     working_px_per_mm: float = 7.2
-    # Spacing of contour samples [px]: mask noise is correlated over a longer distance.
+    # Spacing of contour samples [px]: less than the distance over which mask noise is correlated.
     sample_step_px: float = 3.0
     # Residual gate of each iteration [px]: narrow at the end, since wider gates also match lip and gum edges 0.5 mm
     # away.
     wide_gates_px: tuple[float, ...] = (14.0, 10.0, 8.0, 6.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0)
-    # First gate if motion is predictable [px]; wider gates are used for fast motion and as fallback.
+    # First residual gate if motion is predictable [px]; wider gates are used for fast motion and as a fallback.
     first_gate_px: float = 6.0
-    # Ratio of the first gate to the recent prediction error [-]: above 1, since the next error may be larger.
+    # Ratio of the first residual gate to the recent prediction error [-]: above 1, since the next error may be larger.
     gate_per_miss: float = 1.5
-    # Minimum and maximum of the final gate [px], which adapts to the spread of the residuals: 2 px for good hand-drawn
-    # masks.
+    # Minimum and maximum of the final residual gate [px], which adapts to the spread of the residuals: it is 2 px for
+    # good hand-drawn masks.
     final_gate_px: tuple[float, float] = (1.2, 4.0)
     # Residual above which a sample adds nothing to the score [px]; the same for all poses, so that scores are
     # comparable.
     score_gate_px: float = 2.5
     # Tukey gate in standard deviations: 95 % efficiency for normal noise (Huber & Ronchetti 2009).
     gate_sigmas: float = 4.685
-    # Weight of contour samples deep inside the mask while gates are wide [-]: pushes out contours that start inside the
-    # mask.
+    # Weight of contour samples deep inside the mask while residual gates are wide [-]: it pushes out contours that
+    # start inside the mask.
     pull: float = 0.3
-    # Gate up to which the weight `pull` is zero [px]: near the solution, it would favour gum over teeth.
+    # Residual gate up to which the weight `pull` is zero [px]: near the solution, this weight would favour gum over
+    # teeth.
     pull_above_px: float = 4.0
     # Minimum cosine between contour and mask normals at a matched edge [-]: lips cross the contour at larger angles.
     normal_cosine: float = 0.7
     # Maximum decrease in depth from a contour point to the pixel just inside it [mm]: a cusp curves by less, and
     # another tooth in front is nearer by more.
     depth_tolerance_mm: float = 1.5
-    # Minimum depth difference for one arch to hide the other [mm]: above the error of the poses.
+    # Minimum depth difference for one arch to hide the other [mm]: larger than the error of the poses.
     overlap_tolerance_mm: float = 0.4
     # Pose update below which iterations stop [mm at the crowns]: a tenth of the attainable accuracy.
     converged_mm: float = 0.004
-    # Pose update below which the intermediate gates are skipped [mm at the crowns]; 0 never skips them.
+    # Pose update below which the intermediate residual gates are skipped [mm at the crowns]; 0 never skips them.
     settled_mm: float = 0.0
     # Last pose update up to which residuals are not recomputed at the final pose [mm at the crowns]; 0 always
     # recomputes them.
@@ -63,13 +64,13 @@ class TrackingConfig:
     # Image motion after which a scan is rendered again [px]: the maximum error of occlusion boundaries.
     redraw_px: float = 1.0
     # Parallax between near and far parts of a scan above which it is rendered again instead of warped [px]: at 4 px,
-    # corrections of knocked cameras become biased.
+    # corrections of the poses of knocked cameras become biased.
     parallax_px: float = 2.0
     # Standard deviation of an arch about its predicted position [mm]: a weak prior on motions that masks do not
     # constrain.
     prediction_mm: float = 0.5
-    # Outline variance times correlation length assumed by the prediction prior [px^3]: 0.4 px squared times 18 px, as
-    # in drawn masks.
+    # Outline variance times correlation length assumed by the prediction prior [px^3]: (0.4 px)^2 times 18 px, as for
+    # drawn masks.
     typical_noise_px3: float = 3.0
     # Assumed correlation length of outline errors along the contour [px], until it is measured on the take.
     correlation_px: float = 18.0
@@ -84,79 +85,79 @@ class TrackingConfig:
     tile_factor: float = 2.2
     # Number of recent good frames that define the usual residual and coverage: about a second.
     history_frames: int = 31
-    # Number of recent good frames that define the usual score: fewer than closing lips take, more than losing a pose
-    # takes.
+    # Number of recent good frames that define the usual score: fewer frames than lips take to close, and more than the
+    # loss of a pose takes.
     score_frames: int = 7
-    # Fraction of the recent median score below which an arch is suspect [-]: closing lips seldom hide so much in a few
-    # frames.
+    # Fraction of the recent median score below which the pose of an arch is suspect [-]: closing lips seldom hide so
+    # much of an arch in a few frames.
     suspect_score: float = 0.6
-    # Fraction of the recent median score [-]: below it, closing lips are not a sufficient explanation of the drop.
+    # Fraction of the recent median score below which closing lips do not sufficiently explain the drop in score [-].
     alarming_score: float = 0.3
-    # Multiple of the recent median residual spread above which an arch is suspect [-].
+    # Multiple of the recent median residual above which the pose of an arch is suspect [-].
     suspect_residual: float = 1.4
     # Excess of a mask's uncovered fraction over its recent median above which the mask or its arch is suspect [-].
     suspect_coverage: float = 0.04
     # Multiple of the arch's recent median residual above which the mask of one view is suspect [-].
     uneven_residual: float = 1.6
-    # Fraction of a mask's recent median score below which it does not show the arch [-].
+    # Fraction of a mask's recent median score below which the mask does not show the arch [-].
     dead_score: float = 0.03
     # Penalty per uncovered mask pixel, in px of contour [1/px]: rejects wrong local minima if few edges are visible.
     uncovered_price: float = 0.5
-    # Minimum gain in the objective of the other masks, relative to their score, for a mask to be excluded as wrong [-].
+    # Minimum gain in the objective of the other masks, relative to their score, for excluding a mask as wrong [-].
     conflict_gain: float = 0.15
-    # Minimum gain in the objective over the first attempt, relative to the score, for a frame to be marked as recovered
-    # [-].
+    # Minimum gain in the objective over the first attempt, relative to the score, for marking a frame as recovered [-].
     recovery_gain: float = 0.05
-    # Offsets of the starts of the multi-start search [mm, rad]: prediction errors in fast chewing, and after an
-    # occlusion.
+    # Offsets of the starts of the multi-start search [mm, rad]: typical prediction errors in fast chewing, and after
+    # the teeth were hidden.
     search_rings: tuple[tuple[float, float], ...] = ((2.0, 0.05), (4.0, 0.12))
     # Residual gates of the short trial alignment from every start [px], and number of starts that are refined fully.
     trial_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4
     # Matched contour length below which an arch is lost [px]: 8 mm of tooth edge.
     least_matched_px: float = 60.0
-    # Multiple of the suspect residual above which an arch is lost [-]; if the score is low too, a suspect residual
-    # suffices.
+    # Multiple of the limit for suspect residuals above which an arch is lost [-]; if the score is low as well, a
+    # suspect residual suffices.
     lost_residual: float = 1.3
     # Uncovered fraction of a mask above which its arch is lost [-]: good poses leave about 0.01.
     lost_coverage: float = 0.12
     # Position uncertainty of the crowns above which an arch is lost [mm].
     lost_sigma_mm: float = 0.5
     # Minimum matched fraction of the visible contour in the first frame [-]: correct poses reach 0.15 with nearly
-    # closed lips, and 0.07 with scans without gum. Wrong poses can exceed it, but are rejected for their uncovered
-    # masks.
+    # closed lips, and 0.07 with scans without gum. Wrong poses can exceed this fraction, but are rejected because they
+    # leave masks uncovered.
     first_share: float = 0.05
-    # Delay between cameras [frames] and mask bias [px] above which all frames are aligned again with both corrected:
+    # Delay between cameras [frames] and mask bias [px] above which all frames are aligned again after correcting them:
     # smaller values matter less than the noise of single frames.
     refine_delay_frames: float = 0.03
     refine_bias_px: float = 0.1
-    # Delay above which it is corrected before camera poses are tested [frames]: more than free-running cameras can
-    # differ.
+    # Delay above which delays are corrected before camera poses are tested [frames]: larger than that between
+    # free-running cameras.
     late_frames: float = 0.6
-    # Maximum number of rounds of realignment: each leaves a tenth of the delay.
+    # Maximum number of rounds in which all frames are aligned again: each round leaves a tenth of the delay.
     refine_rounds: int = 2
-    # Maximum number of rounds while a camera still has a delay, since matches then converge slowly.
+    # Maximum number of such rounds while a camera still has a delay, since matches then converge slowly.
     late_rounds: int = 4
-    # Contour shift by wrong camera poses above which they are corrected [px]: smaller shifts are annotator bias.
+    # Contour shift due to wrong camera poses above which camera poses are corrected [px]: smaller shifts are due to
+    # annotator bias.
     refine_shift_px: float = 0.15
-    # Prior standard deviation of a camera's motion between calibration and take, per axis [rad, mm]: a knock.
+    # Prior standard deviation of a camera's motion between calibration and take, per axis [rad, mm]: that of a knock.
     refine_turn_rad: float = 0.0035
     refine_move_mm: float = 0.5
     # Number of frames on which delays, mask bias and camera poses are iterated before all frames are aligned again;
-    # maximum number of iterations; and fraction of the `refine` limits below which iteration stops.
+    # maximum number of iterations; and fraction of the `refine` limits below which the iteration stops.
     settle_frames: int = 40
     settle_rounds: int = 6
     settled_share: float = 0.2
 
     def gates_after(self, gates_px: tuple[float, ...], moved_mm: float) -> tuple[float, ...]:
-        """Return the remaining gates, given that the step with the first gate moved the arches by `moved_mm`."""
+        """Return the remaining residual gates after a step with the first gate that moved the arches by `moved_mm`."""
         rest = gates_px[1:]
         if rest and gates_px[0] == rest[-1]:
             return () if moved_mm < self.converged_mm else rest
         return rest[-1:] if moved_mm < self.settled_mm else rest
 
     def with_gates_scaled(self, factor: float) -> TrackingConfig:
-        """Return settings with all gates multiplied by a factor, for images with more pixels per mm."""
+        """Return settings with all residual gates multiplied by a factor, for images with more pixels per mm."""
         return replace(
             self,
             wide_gates_px=tuple(factor * gate for gate in self.wide_gates_px),
@@ -167,12 +168,12 @@ class TrackingConfig:
         )
 
     def gates_from(self, reach_px: float) -> tuple[float, ...]:
-        """Return the gates for a start that is off by about reach_px, with a first gate of at least `first_gate_px`."""
+        """Return residual gates for a start that is off by about `reach_px`; the first is at least `first_gate_px`."""
         return tuple(g for g in self.wide_gates_px if g <= max(reach_px, self.first_gate_px))
 
 
-#: Settings for takes of several cameras: scans are rendered half as often. Searches with a single camera need the
-#: default.
+#: Settings for takes of several cameras: scans are rendered half as often as by default. Searches with a single camera
+#: need the default.
 FOR_TAKES = TrackingConfig(redraw_px=2.0)
 
 #: Settings for masks made by jawusd. These masks vary more between frames than hand-drawn ones, and get rougher as lips

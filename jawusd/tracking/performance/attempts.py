@@ -1,4 +1,4 @@
-"""Alignment attempts on one frame, and their acceptance."""
+"""Attempts to align the scans in one video frame, and their acceptance."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from jawusd.tracking.performance.views import Growth
 #: Upper bounds on the standard deviations of head rotation, head translation and jaw after many frames without visible
 #: teeth [rad, mm, mm].
 LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
-# Matched contour below which an arch is rejected [px]: 2 mm of tooth edge. Tracking without a rig requires more.
+# Matched contour below which an arch is rejected [px]: 2 mm of tooth edge. Tracking without a rig requires a longer
+# contour.
 _LEAST_MATCHED_PX = 15.0
 _TYPICAL_PX = 0.4  # typical residual of hand-drawn masks at the working resolution
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """Result of one frame.
+    """Result of aligning one frame.
 
     Attributes:
         pose: measured or extrapolated pose of head and jaw.
         solution: matched outlines at the pose; None without any mask.
-        use: masks used, shape (2, C): available masks of arches that were found.
-        present: available masks, shape (2, C).
-        uncovered: fraction of every mask not covered by the scan, NaN without a mask, shape (2, C).
+        use: whether each mask is used, shape (2, C): true for available masks of arches that were found.
+        present: whether each mask is available, shape (2, C).
+        uncovered: fraction of every mask that is not covered by the scan, NaN without a mask, shape (2, C).
         growth: derivatives of the outlines with respect to unknown focal lengths.
         uncertain: whether less of the contour fits than usual, so that the pose may be wrong.
     """
@@ -50,12 +51,12 @@ class FrameFit:
 
     @property
     def found(self) -> Mask:
-        """Arches that were found, shape (2,)."""
+        """Whether each arch was found, shape (2,)."""
         return np.asarray(self.use.any(1))
 
     @property
     def missed(self) -> Mask:
-        """Arches with masks that were not found, shape (2,)."""
+        """Whether each arch has masks but was not found, shape (2,)."""
         return np.asarray(self.present.any(1) & ~self.found)
 
 
@@ -75,24 +76,24 @@ class Trial:
 
     @property
     def uncovered(self) -> Array:
-        """Return the uncovered fraction of every mask, NaN without one."""
+        """Return the uncovered fraction of every mask; NaN without a mask."""
         return np.where(self.mask_px > 0, self.uncovered_px / np.maximum(self.mask_px, 1), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """Views of one frame and the rendering shared by all attempts."""
+    """Views of one frame, and the rendering shared by all attempts on it."""
 
     views: Sequence[View]
     rendering: Rendering
-    present: Mask  # available masks, shape (2, C)
+    present: Mask  # whether each mask is available, shape (2, C)
 
 
 class Attempts:
     """Aligns single frames, and accepts or rejects results by comparison with the usual residual of the take."""
 
     def __init__(self, instants: InstantSolver, outline_weight: Array, usual_px: Array | None = None) -> None:
-        """Start with a known usual residual per arch, shape (2,), if given.
+        """Prepare the attempts; `usual_px` is the usual residual per arch [px], shape (2,), if known.
 
         `outline_weight` is as for `InstantSolver.align`.
         """
@@ -102,7 +103,7 @@ class Attempts:
             self._residuals.append(usual_px)
 
     def instant(self, views: Sequence[View]) -> Instant:
-        """Prepare the data shared by all attempts at these views."""
+        """Prepare the data shared by all attempts on the frame with these views."""
         return Instant(views, self.instants.solver.rendering(views), present_masks(views))
 
     def remember(self, fit: FrameFit) -> None:
@@ -111,14 +112,14 @@ class Attempts:
             self._residuals.append(residual_px(fit.solution))
 
     def near(self, start: Pose, instant: Instant, sigma: Array = LARGEST_SIGMA) -> FrameFit:
-        """Align a frame near a start with standard deviations of shape (9,); reject arches that do not fit."""
+        """Align a frame near a start pose with given standard deviations (9,); reject arches that do not fit."""
         if not instant.present.any():
             return empty_fit(start, instant)
         expected = Expected(start, sigma**-2.0)
         return self.judged(self.attempt(start, expected, instant, instant.present, self.config.wide_gates_px), instant)
 
     def attempt(self, start: Pose, expected: Expected, instant: Instant, use: Mask, gates: Sequence[float]) -> Trial:
-        """Align with a subset of the masks, shape (2, C), from a start."""
+        """Align from a start pose with a subset of the masks, shape (2, C)."""
         views, rendering = instant.views, instant.rendering
         aligned = self.instants.align(start, views, use, gates, expected, self._weight, rendering)
         uncovered, total = np.zeros(use.shape), np.zeros(use.shape)
@@ -150,7 +151,7 @@ def empty_fit(pose: Pose, instant: Instant) -> FrameFit:
 
 
 def usual_residual_px(fits: Iterable[FrameFit]) -> Array:
-    """Return the median residual over the fits in which an arch was found [px], shape (2,)."""
+    """Return the median residual of each arch over the fits in which it was found [px], shape (2,)."""
     listed = [(residual_px(fit.solution), fit.found) for fit in fits if fit.solution is not None]
     values = [[residual[r] for residual, found in listed if found[r]] for r in ARCHES]
     return np.array([np.median(own) if own else _TYPICAL_PX for own in values])

@@ -1,7 +1,7 @@
-"""The unknowns of a frame, head pose and jaw parameters, and the derivatives of both arches with respect to them.
+"""The unknowns of a frame (head pose and jaw parameters), and derivatives of both arches with respect to them.
 
-The head moves by twists in its own axes about the centre of the upper crowns, the pivot; the jaw parameters
-follow. A frame has nine unknowns: omega [rad], v [mm], d1, d2, d3 [mm].
+A frame has nine unknowns: omega [rad], v [mm], d1, d2, d3 [mm]. The first six are a twist of the head in its own axes
+about the pivot, which is the centre of the upper crowns; the last three are the jaw parameters.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Coordinates:
     """
 
     def __init__(self, jaw: JawRig, scans: Sequence[Scan]) -> None:
-        """Set the pivot to the centre of the upper scan; `scans` are upper and lower."""
+        """Create coordinates with the pivot at the centre of the upper scan; `scans` are upper and lower scan."""
         self.jaw, self.pivot, self._lower_centre = jaw, scans[0].centre, scans[1].centre
         self._to_pivot = make_transform(np.eye(3), -self.pivot)
         self._from_pivot = make_transform(np.eye(3), self.pivot)
@@ -59,9 +59,9 @@ class Coordinates:
         return Pose(arches[0].copy(), self.jaw.encode(se3_inverse(arches[0]) @ arches[1])[0])
 
     def slopes(self, pose: Pose) -> tuple[Array, Array]:
-        """Return d(left world twist about the arch's centre) / d(unknowns) for both arches, shape (6, 9) each.
+        """Return the derivatives of both arches' left world twists with respect to the unknowns, shape (6, 9) each.
 
-        The centres are those of the crowns, as in `Solution.centres`.
+        The twists are about the centres of the crowns, as in `Solution.centres`.
         """
         relative = self.jaw.pose(pose.d)
         turn = np.zeros((6, 6))
@@ -75,7 +75,7 @@ class Coordinates:
         return upper, lower
 
     def moved(self, pose: Pose, step: Array) -> Pose:
-        """Return the pose after a step of the nine unknowns, shape (9,)."""
+        """Return a pose after a step of the nine unknowns, shape (9,)."""
         return Pose(self.turned(pose.head, step[HEAD]), pose.d + step[JAW])
 
     def turned(self, head: Array, twist: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The first pass: frame by frame from predictions, with recovery after losses."""
+"""The first pass: alignment frame by frame from predictions, with recovery of lost teeth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jawusd.tracking.performance.instant import Expected
 from jawusd.tracking.performance.motion import STEADY, Prediction
 
 _KEPT_JAWS = 12  # maximum number of jaw poses remembered as starts after a loss
-# minimum distance of the lower incisal point between remembered poses: the solver converges from this far
+# minimum distance of the lower incisal point between remembered poses: the solver converges from this distance
 _APART_MM = 3.0
 _FINALISTS = 3
 
@@ -27,7 +27,7 @@ class ForwardPass:
     """Aligns frame by frame in one temporal direction."""
 
     def __init__(self, attempts: Attempts, begin: FrameFit, *, fixed_head: bool = False) -> None:
-        """Continue from a frame; with a fixed head, only the jaw moves."""
+        """Continue from the fit of a frame; with a fixed head, only the jaw moves."""
         self._attempts, self._coordinates = attempts, attempts.instants.coordinates
         self._motion = Prediction(self._coordinates, begin.pose, begin.found, head=STEADY if fixed_head else 1.0)
         self._jaws: list[Array] = []
@@ -58,7 +58,7 @@ class ForwardPass:
             return replace(fit, pose=expected.pose)
         if fit.found.all() or not fit.missed.any():
             return fit
-        # Realign without the arch that does not fit, as it would bias the other one.
+        # Align again without the arch that does not fit, since it would bias the other one.
         alone = attempts.attempt(expected.pose, expected, instant, fit.use, config.wide_gates_px)
         return attempts.judged(alone, instant)
 
@@ -77,13 +77,13 @@ class ForwardPass:
         return [expected.pose, self._motion.last, *shifted]
 
     def _score(self, start: Pose, expected: Expected, instant: Instant) -> float:
-        """Return the objective of a start after a few steps [px]."""
+        """Return the objective of a start pose after a few alignment steps [px]."""
         config, around = self._attempts.config, replace(expected, pose=start)
         trial = self._attempts.attempt(start, around, instant, instant.present, config.trial_gates_px)
         return trial.objective(config.uncovered_price)
 
     def _remember(self, fit: FrameFit) -> None:
-        """Update the usual residual, and remember the jaw pose as a start if it differs from those remembered."""
+        """Update the usual residual; keep the jaw pose as a later start if it differs from the poses kept so far."""
         self._attempts.remember(fit)
         if not fit.found.all():
             return

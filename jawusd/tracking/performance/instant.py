@@ -16,7 +16,7 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
 
 # Standard deviation of the rig's soft bound [mm]. The bound is the range of motion in the take that the rig was fitted
-# to; with a hard bound, jaws that exceed this range would be lost.
+# to; with a hard bound, jaws beyond this range would be lost.
 BOUND_MM = 1.0
 _QUICK_FACES, _QUICK_REDRAW_PX = 6_000, 2.0
 
@@ -38,7 +38,7 @@ class Aligned:
 
 
 class InstantSolver:
-    """Gauss-Newton in head pose and jaw parameters; only renderings are kept between frames."""
+    """Gauss-Newton solver for head pose and jaw parameters; between frames, it keeps only renderings."""
 
     def __init__(self, solver: ContourSolver, coordinates: Coordinates) -> None:
         self.solver, self.coordinates = solver, coordinates
@@ -60,9 +60,9 @@ class InstantSolver:
             start: initial pose.
             views, use: one view per camera, and the masks to use, shape (2, C).
             gates_px: residual gate of every step.
-            expected: the prior.
+            expected: prior on the pose.
             outline_weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
-            rendering: rendering of these views; default: a new one.
+            rendering: rendering of these views; default: a new rendering.
         """
         rendering = rendering or self.solver.rendering(views)
         pose, left, moved_mm = start, tuple(gates_px), np.inf
@@ -93,7 +93,7 @@ class InstantSolver:
         return self.solver.linearise(self.coordinates.arches(pose), views, use, gate, rendering, final, matched)
 
     def equations(self, pose: Pose, state: Solution, outline_weight: Array) -> tuple[Array, Array]:
-        """Return the normal matrix (9, 9) and right-hand side (9,) of a step, from outlines and bound."""
+        """Return normal matrix (9, 9) and right-hand side (9,) of a step, from matched outlines and the rig's bound."""
         matrix, right = bound_equations(self.coordinates, pose.d)
         for r, slope in zip(ARCHES, self.coordinates.slopes(pose), strict=True):
             precision, gradient = state.outline.precision[r].sum(0), state.outline.gradient[r].sum(0)
@@ -108,7 +108,7 @@ class InstantSolver:
 
 
 def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
-    """Return the normal matrix (9, 9) and right-hand side (9,) of the soft bound: zero inside, quadratic outside."""
+    """Return normal matrix (9, 9) and right-hand side (9,) of the soft bound, a quadratic penalty outside the bound."""
     matrix, right = np.zeros((LOCAL, LOCAL)), np.zeros(LOCAL)
     margin = float(coordinates.jaw.margin(d))
     if margin < 0:
@@ -119,11 +119,11 @@ def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
 
 
 def quick(solver: ContourSolver) -> ContourSolver:
-    """Return a solver with decimated scans and less frequent redraws, for the many steps of the first pass."""
+    """Return a solver with decimated scans and less frequent rendering, for the many steps of the first pass."""
     scans = [thinned(replace(scan.thin or scan, thin=None), _QUICK_FACES) for scan in solver.scans]
     return ContourSolver(scans, replace(solver.config, redraw_px=_QUICK_REDRAW_PX))
 
 
 def whole(solver: ContourSolver) -> ContourSolver:
-    """Return a solver that always uses all faces."""
+    """Return a solver that always uses all faces of the scans."""
     return ContourSolver([replace(scan, thin=None) for scan in solver.scans], solver.config)

@@ -1,4 +1,4 @@
-"""Motion of head and jaw: prediction of the next frame, and variances for the smoother's prior."""
+"""Motion of head and jaw: prediction of the pose in the next frame, and variances for the smoother's prior."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from jawusd.tracking.performance.attempts import LARGEST_SIGMA
 from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import Expected
 
-# Standard deviations of a prediction of head rotation, head translation and jaw [rad, mm, mm], as in fast chewing at 24
-# frames per second. They only regularise directions that the images do not determine; the smoother uses measured
+# Standard deviations of predicted head rotation, head translation and jaw parameters [rad, mm, mm], for fast chewing at
+# 24 frames per second. They only regularise directions that the images do not determine; the smoother uses measured
 # variances.
 _MISS = np.r_[[0.01] * 3, [0.7] * 3, [0.7] * 3]
-#: Factors on the standard deviations of the head: if it hardly moves relative to the cameras, and if its pose is known.
+#: Factors on the standard deviations of the head: if the head hardly moves relative to the cameras, and if its pose is
+#: known.
 STEADY, KNOWN = 0.05, 1e-4
-_DAMPING = 0.8  # factor on the velocity in every frame
+_DAMPING = 0.8  # factor by which the velocity is damped in every frame
 
 # Ratio of the prior's variance to the measured mean square [-]: above 1, since motion is mostly smooth, but has abrupt
 # changes.
 _LOOSE = 4.0
-# Lower bounds on the variances of second differences [rad, mm].
+# Lower bounds on the variances of second differences [rad^2, mm^2].
 _LEAST_HEAD = np.r_[[1e-4] * 3, [0.01] * 3] ** 2
 _LEAST_JAW = np.full(3, 0.02**2)
-_FEWEST_BENDS = 20  # minimum number of second differences for an estimate
+_FEWEST_BENDS = 20  # minimum number of second differences for estimating their variance
 # default mean squares of second differences, from exercises at 24 frames per second [mm^2]
 _USUAL_JAW = np.array([0.3, 0.2, 0.1]) ** 2
 _USUAL_HEAD = np.r_[[1e-3] * 3, [0.1] * 3] ** 2
@@ -37,7 +38,7 @@ _NOISE_BEND, _NOISE_FOURTH = 6.0, 70.0
 
 
 class Prediction:
-    """Extrapolation of head and jaw with a damped velocity.
+    """Extrapolation of the poses of head and jaw with a damped velocity.
 
     Attributes:
         last: the pose of the last frame.
@@ -45,7 +46,7 @@ class Prediction:
     """
 
     def __init__(self, coordinates: Coordinates, begin: Pose, found: Mask, *, head: float = 1.0) -> None:
-        """Start at rest from the pose of a frame and the arches found in it, shape (2,).
+        """Start at rest from the pose of a frame; `found` is whether each arch was found in it, shape (2,).
 
         Args:
             head: factor on the standard deviations of the head.
@@ -55,7 +56,7 @@ class Prediction:
         self.blind = np.where(found, 0, 1)
 
     def expected(self, frames: float = 1.0) -> Expected:
-        """Return the prediction `frames` ahead; its variance grows while teeth are not visible."""
+        """Return the pose predicted `frames` frames ahead; its variance grows while teeth are not visible."""
         self._frames = frames
         sigma = frames * self._miss * np.sqrt(1.0 + np.r_[[self.blind[0]] * 6, [self.blind.max()] * 3])
         reach = _DAMPING * (1.0 - _DAMPING**frames) / (1.0 - _DAMPING)
@@ -63,7 +64,7 @@ class Prediction:
         return Expected(pose, np.minimum(sigma, LARGEST_SIGMA) ** -2.0)
 
     def take(self, pose: Pose, found: Mask) -> None:
-        """Update with the pose of the next frame and the arches found in it, shape (2,)."""
+        """Update with the pose of the next frame; `found` is whether each arch was found in it, shape (2,)."""
         moved = self._coordinates.step(self.last, pose) / self._frames
         self._velocity = moved if found.all() and not self.blind.any() else np.zeros(LOCAL)
         self.blind = np.where(found, 0, self.blind + 1)
@@ -86,18 +87,18 @@ def head_bends(coordinates: Coordinates, poses: Sequence[Pose]) -> tuple[Array, 
 
 
 def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask, fps: float) -> Motion:
-    """Return the variances of a take's motion, or those of the rig's own take if too few frames are good.
+    """Return the variances of a take's motion; if too few frames are good, those of the take behind the rig.
 
     Args:
         poses: poses of consecutive frames.
-        good: frames in which both arches were found, shape (N,).
+        good: whether both arches were found in each frame, shape (N,).
         fps: frames per second.
     """
     bend, step = head_bends(coordinates, poses)
     d = np.stack([pose.d for pose in poses])
     steps, bends = np.hstack([step, np.diff(d, axis=0)]), np.hstack([bend, np.diff(d, 2, axis=0)])
     least = np.concatenate([_LEAST_HEAD, _LEAST_JAW])
-    runs = good.copy()  # first frames of runs of five good frames
+    runs = good.copy()  # whether a frame is the first of five good frames in a row
     for k in range(1, 5):
         runs[:-k] &= good[k:]
         runs[-k:] = False
@@ -105,14 +106,14 @@ def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask,
         usual = np.concatenate([_USUAL_HEAD, _of_rig(coordinates.jaw, fps)])
         return Motion(bend=_LOOSE * usual, step=25 * usual)
     start = np.flatnonzero(runs)
-    # Fourth differences are dominated by noise, so noise can be separated from motion.
+    # Fourth differences are dominated by noise; they serve to separate noise from motion.
     noise = (np.diff(bends, 2, axis=0)[start] ** 2).mean(0) / _NOISE_FOURTH
     moving = (bends[start + 1] ** 2).mean(0) - _NOISE_BEND * noise
     return Motion(bend=_LOOSE * np.maximum(moving, least), step=np.maximum((steps[start] ** 2).mean(0), least))
 
 
 def _of_rig(jaw: JawRig, fps: float) -> Array:
-    """Return the mean squared second differences of d in the rig's own take, scaled to a frame rate."""
+    """Return the mean squared second differences of d in the take behind the rig, scaled to a frame rate."""
     bend = np.abs(np.diff(jaw.captured_d, 2, axis=0))
     if len(bend) < _FEWEST_BENDS:
         return _USUAL_JAW

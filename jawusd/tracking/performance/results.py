@@ -1,4 +1,4 @@
-"""The result of a solve as a performance, and its conversion to tracks."""
+"""Conversion of the result of a solve to a performance, and of a performance to tracks."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def performance_of(
         pivot: point of the upper scan about which the head rotates [mm], shape (3,).
         frames: frame numbers of the reference camera, in the order of the fits.
         smoothed: the take after the second pass.
-        camera_names: in view order.
+        camera_names: names of the cameras in the order of the views.
         fps: frames per second.
         free_focal: whether focal lengths were estimated, relative to those of the cameras.
     """
@@ -73,16 +73,16 @@ def performance_of(
 
 
 def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
-    """Return the poses of both arches with their covariances.
+    """Return the poses of both arches and their covariances as tracks.
 
-    Every frame has final poses; arches that are not visible count as lost and have no raw poses. The standard
+    Final poses exist for every frame; arches that are not visible count as lost and have no raw poses. The standard
     deviations of the landmarks include the uncertainty of the rig.
     """
     p = performance
     head, relative = p.T_world_upper, jaw.pose(p.d)
     lower = head @ relative
-    # Derivatives of left twists with respect to the nine unknowns: those of the head in the world, those of the
-    # mandible in the skull frame.
+    # Derivatives of left twists with respect to the nine unknowns: of the head in the world, and of the mandible in the
+    # skull frame.
     turn = se3_adjoint(head @ make_transform(np.eye(3), p.pivot))
     by_d = se3_left_jacobian(jaw.twist(p.d)) @ jaw.jacobian(p.d)
     of_upper, of_lower = np.zeros((2, len(p.frames), 6, 9))
@@ -93,7 +93,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     meta = TracksMeta(solver="performance", tolerance_mm=jaw.tolerance_mm)
     meta.update(_known_notes(p))
     moved = jaw.meta.get("registration")
-    if isinstance(moved, dict) and moved.get("applied"):  # the lower scan has the registration of the rig
+    if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is registered as in the rig
         meta["registration"] = cast(Registration, moved)
     count, cameras = len(p.frames), len(p.camera_names)
     raw = {"upper": head.copy(), "lower": lower.copy(), "relative": relative.copy()}

@@ -1,4 +1,4 @@
-"""The solve of a shot: start, first pass in both directions, backward pass into gaps, joint refinement."""
+"""The solve of a shot: start pose, first pass in both directions, backward pass into gaps, and joint refinement."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Shot:
     """Input of a solve.
 
     Attributes:
-        views: source of the views.
+        views: source of the views of each frame.
         camera_names: in view order.
         frames: range of reference-camera frames, end exclusive.
         start_frame, start: initial frame and pose.
@@ -70,13 +70,13 @@ def solve_performance(
 
     Args:
         jaw: the subject's rig.
-        scans: upper and lower teeth, prepared.
+        scans: prepared scans of the upper and lower teeth.
         shot: views, frames and start.
         config: settings of the tracker.
         progress: called after each frame with the number of frames done and the total.
 
     Raises:
-        TrackingError: the teeth do not fit the start.
+        TrackingError: the teeth do not fit the masks of the start frame.
         CaptureError: a mask cannot be read.
     """
     solver = ContourSolver(scans, config or TrackingConfig())
@@ -113,7 +113,7 @@ class _Take:
         begun = attempts.near(self._shot.start, attempts.instant(self._views.at(start)))
         if not begun.found.all():
             raise TrackingError(
-                "the teeth posed by the rig do not fit the masks of the start frame",
+                "the teeth, posed by the rig, do not fit the masks of the start frame",
                 frame=start,
                 hint="Check that the rig is of this subject, and check the masks and calibration at this frame.",
             )
@@ -126,7 +126,7 @@ class _Take:
         self._close_gaps()
 
     def _close_gaps(self) -> None:
-        """Align backwards into each run of frames in which an arch was missed, from the frame after it."""
+        """Align backwards into each run of frames in which an arch was missed, from the frame after the run."""
         usual = usual_residual_px(self.fits.values())
         after: ForwardPass | None = None
         for frame in sorted(self.fits, reverse=True):
@@ -176,13 +176,13 @@ def solve_capture(
 
     Args:
         capture: masks, frame range and optional picks; without picks, the start pose is searched for.
-        cameras: calibrated; world lengths in mm.
-        offsets: reference frame minus own frame number, per camera name.
-        upper, lower: teeth scans in one frame, the same as in the rig [mm].
+        cameras: calibrated cameras; world lengths are in mm.
+        offsets: time offsets by camera name: the reference frame number minus the camera's own frame number.
+        upper, lower: teeth scans in the coordinate frame of the rig's scans [mm].
         jaw: the subject's rig.
         config: settings of the tracker.
         fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
-        free_focal: whether to estimate the focal lengths, starting from those of the calibration.
+        free_focal: whether to estimate the focal lengths, starting from the calibrated ones.
         threads: number of threads of the start search; the result does not depend on it.
         progress: called after each frame with the number of frames done and the total.
 
@@ -216,7 +216,7 @@ def solve_capture(
 
 @dataclass(frozen=True, eq=False)
 class _Begin:
-    """Start of a solve: frame and pose, how they were found, and findings."""
+    """Start of a solve: frame and pose, how both were found, and findings."""
 
     frame: int
     pose: Pose
@@ -233,7 +233,7 @@ def _begin(
     jaw: JawRig,
     map_: Mapper,
 ) -> _Begin:
-    """Return a start from picks or by search; with a single camera, the search uses the rig."""
+    """Return a start from picks or by a search; with a single camera, the search uses the rig."""
     sources = masked_sources(capture.cameras, cameras, offsets, 1)
     if len(sources) > 1:
         start = find_start(capture, cameras, offsets, meshes, solver, map_)

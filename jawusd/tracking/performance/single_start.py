@@ -1,8 +1,8 @@
 """The start of a solve with one camera: a search for head and jaw in its masks.
 
 In a single view, only apparent size and perspective determine the distance, and lips hide an unknown part of the teeth.
-The search therefore tries all distances at which teeth could fill the masks, with all orientations, and then jaw poses
-for the most promising head poses.
+The search therefore tries all distances at which teeth could fill the masks, with all orientations, and then tries jaw
+poses for the most promising head poses.
 """
 
 from __future__ import annotations
@@ -39,10 +39,11 @@ from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
 
 _PX_PER_MM = 2.0
-# initial distance of the teeth along the optical axis, which determines the resolution of the views
+# assumed distance of the teeth along the optical axis, which determines the resolution of the views
 _ANYWHERE_MM = 200.0
 _SURVEYED, _FRAMES_TRIED = 24, 4  # number of frames surveyed for large masks, and maximum number of frames searched
-# Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, each an eighth larger than the last.
+# Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, each an eighth larger than the one
+# before.
 _WIDTHS_MM = 22.0 * 1.125 ** np.arange(10)
 _USUAL_WIDTH_MM = 42.0
 _GRID = Grid(
@@ -52,16 +53,16 @@ _GRID = Grid(
     reach_mm=(9.0, 7.5, 0.1),
 )
 _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
-# Numbers of head poses kept, of jaw poses tried with each, of pairs aligned in a few steps, of pairs aligned fully, and
-# of pairs aligned at the working resolution.
+# Numbers of head poses kept, of jaw poses tried with each of these, of pairs of head and jaw poses aligned in a few
+# steps, of pairs aligned fully, and of pairs aligned at the working resolution.
 _HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 240, 32, 160, 24, 5
-# Penalty per crown pixel outside the mask, in px of contour [1/px]: low, as lips may hide crowns.
+# Penalty per crown pixel outside the mask, in px of contour [1/px]: low, since lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
 _DISTINCT_MM = 3.0  # minimum distance between head poses that are kept, as mean displacement of the teeth
-# Fit of the worse arch above which a start is accepted at once, and fit below which it is rejected [-];
-# `start_causes.CLEAR_FIT` is for several cameras.
+# Fit of the worse arch above which a start is accepted at once, and fit below which it is rejected [-]; the limit for
+# several cameras is `start_causes.CLEAR_FIT`.
 _CLEAR_FIT, _LEAST_FIT = 0.3, 0.1
-_NEARBY = LARGEST_SIGMA / 3.0  # standard deviations of a candidate about its pose [rad, mm, mm]
+_NEARBY = LARGEST_SIGMA / 3.0  # standard deviations of the true pose about a candidate pose [rad, mm, mm]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,7 @@ class FoundPose:
 
 
 class SingleStart:
-    """A search for head and jaw in frames of one camera."""
+    """A search for the poses of head and jaw in frames of one camera."""
 
     def __init__(
         self, meshes: Sequence[Mesh], solver: ContourSolver, jaw: JawRig, T_anatomical_scan: Array, map_: Mapper = map
@@ -82,19 +83,19 @@ class SingleStart:
         """Prepare coarse scans.
 
         Args:
-            meshes: upper and lower teeth scans in one frame [mm].
-            solver: solver with the same scans, prepared.
+            meshes: upper and lower teeth scans in one coordinate frame [mm].
+            solver: solver prepared with the same scans.
             jaw: the subject's rig.
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
-            map_: map function that may run orientations in parallel.
+            map_: map function that may process orientations in parallel.
         """
         solver = solver.exact()
         self._jaw, self._map, self._config = jaw, map_, solver.config
         self._coarse = tuple(coarse_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True))
         self._hinge = hinge_at_front(self._coarse[0].crown_vertices(), T_anatomical_scan)
         weight = np.full(2, 1.0 / solver.config.typical_noise_px3)
-        # Gates scale with the resolution. Otherwise they would be so wide in mm that teeth half hidden by lips would be
-        # fitted to their visible part, as if they were smaller.
+        # Residual gates scale with the resolution. Otherwise, they would be so wide in mm that teeth half hidden by
+        # lips would be fitted to their visible part, as if the teeth were smaller.
         small = self._config.with_gates_scaled(_PX_PER_MM / self._config.working_px_per_mm)
         rough = ContourSolver(self._coarse, small)
         self._rough = Attempts(InstantSolver(rough, Coordinates(jaw, self._coarse)), weight)
@@ -102,10 +103,10 @@ class SingleStart:
         self._jaws = spread_out(jaw, _JAWS)
 
     def find(self, footage: Footage) -> FoundPose:
-        """Return the first start that fits clearly, or the one that fits best.
+        """Return the first start that fits clearly; without one, the start that fits best.
 
         Raises:
-            TrackingError: none of the frames tried fits.
+            TrackingError: the teeth were not found in any of the frames tried.
             CaptureError: a mask cannot be read.
         """
         best: FoundPose | None = None
@@ -126,7 +127,7 @@ class SingleStart:
         return best
 
     def at(self, footage: Footage, frame: int) -> FoundPose | None:
-        """Return the best pose in a frame, or None if nothing fits."""
+        """Return the best start in a frame, or None if no pose fits."""
         camera = footage.cameras[footage.sources[0].name]
         anywhere = camera.centre_world() + _ANYWHERE_MM * camera.T_cam_world[2, :3]
         with footage.views(anywhere, _PX_PER_MM) as masks:
@@ -151,10 +152,10 @@ class SingleStart:
         return None if best is None else FoundPose(frame, best[1].pose, best[0])
 
     def _searched(self, views: Sequence[View], places: Array) -> list[Pose]:
-        """Return the most promising head poses, each with its most promising jaw pose.
+        """Return the most promising head poses, each with the most promising jaw pose for it.
 
-        The upper arch alone hardly constrains the distance, so head poses are ranked after a few steps with both
-        arches.
+        The upper arch alone hardly constrains the distance, so head poses are ranked after a few alignment steps with
+        both arches.
         """
         found: list[Candidate] = []
         for pair in places:
@@ -188,7 +189,7 @@ class SingleStart:
         return kept
 
     def _with_jaws(self, views: Sequence[View], head: Candidate) -> list[tuple[float, Pose]]:
-        """Return the two most promising jaw poses for a head pose, with the objective of both arches."""
+        """Return the two most promising jaw poses for a head pose, with the objectives of both arches together."""
         place = transform_point(head.pose, self._coarse[1].centre)
         correlation = ShiftCorrelation(views[0], 1, _PX_PER_MM, _SHIFTS @ head.pose[:3, :3].T, place)
         poses = head.pose @ self._jaw.pose(self._jaws)
@@ -197,12 +198,12 @@ class SingleStart:
         return [(head.objective + scores[k], Pose(head.pose, self._jaws[k])) for k in np.argsort(scores)[::-1][:2]]
 
     def _outside_price(self, arch: int, pose: Array, view: View) -> float:
-        """Return the penalty for crowns outside the mask; without it, teeth near the camera would cover any mask."""
+        """Return the penalty for crowns outside the mask, without which teeth near the camera would cover any mask."""
         bits = self._coarse[arch].silhouette(view.matrix @ pose, view.masks.shape[1:])
         return _OUTSIDE_PRICE * max(int(count_bits(bits)) - int((view.masks[arch] > 127).sum()), 0)
 
     def _after(self, pose: Pose, instant: Instant, gates: Sequence[float]) -> tuple[float, Pose]:
-        """Return the objective of both arches after some steps [px], and the pose."""
+        """Return the objective of both arches after some alignment steps [px], and the pose reached."""
         expected = Expected(pose, _NEARBY**-2.0)
         trial = self._rough.attempt(pose, expected, instant, instant.present, gates)
         arches = self._rough.instants.coordinates.arches(trial.pose)
@@ -224,7 +225,7 @@ def _descending(entry: tuple[float, Pose]) -> float:
 
 
 def spread_out(jaw: JawRig, count: int) -> Array:
-    """Choose captured jaw parameters, including the bite, by farthest-point sampling, shape (at most count, 3) [mm]."""
+    """Choose captured jaw parameters, including closed teeth, by farthest-point sampling [mm], shape (<= count, 3)."""
     d = np.vstack([np.zeros(3), jaw.captured_d])
     tips = transform_points(jaw.pose(d), jaw.landmarks[:1])[:, 0]
     chosen, distance = [0], np.linalg.norm(tips - tips[0], axis=1)
@@ -236,12 +237,12 @@ def spread_out(jaw: JawRig, count: int) -> Array:
 
 
 def _places(view: View) -> Array:
-    """Return the 3-D centres of both masks for every candidate width of the teeth [mm], shape (W, 2, 3)."""
+    """Return the 3-D centres of both arches [mm], shape (W, 2, 3), for every candidate width of the visible teeth."""
     middles, columns = np.ones((2, 3)), np.flatnonzero((view.masks > 127).any((0, 1)))
     for r, mask in enumerate(view.masks):
         rows, across = np.nonzero(mask > 127)
         middles[r, :2] = across.mean(), rows.mean()
-    # If the third row of the camera matrix has unit length, the scale factor of a ray is its depth.
+    # If the third row of the camera matrix has unit length, the scale factor along a ray is the depth.
     matrix = view.matrix / np.linalg.norm(view.matrix[2, :3])
     rays = np.linalg.solve(matrix[:, :3], middles.T).T
     focal_px = float(np.linalg.norm(np.cross(matrix[0, :3], matrix[2, :3])))

@@ -20,20 +20,20 @@ from jawusd.tracking.performance.system import TakeSystem
 from jawusd.tracking.performance.unknowns import DRAWN, HabitPrior, TakeState, Unknowns
 from jawusd.tracking.performance.views import Views, growth_of
 
-# Number of rounds of rematching; a third round would change less than 0.01 mm.
+# Number of rounds in which outlines are matched again; a third round would change less than 0.01 mm.
 _ROUNDS = 2
-# number of rounds if focal lengths are unknown, as they couple strongly with the distance of the head
+# number of rounds if focal lengths are unknown, since they are strongly coupled with the distance of the head
 _FOCAL_ROUNDS = 6
 #: Ratio of true to computed variance of a frame's unknowns [-]: the equations ignore that outline errors persist over
 #: frames and that the rig deviates from the subject's anatomy.
 WIDER = 1.5**2
-# Standard deviations of the prior for realigning frames in which an arch was missed [rad, mm, mm].
+# Standard deviations of the prior for aligning frames again in which an arch was missed [rad, mm, mm].
 _NEARBY = np.r_[[0.05] * 3, [3.0] * 3, [3.0] * 3]
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A take after the second pass: fits, their covariances (F, 9, 9), and the unknowns of the take."""
+    """A take after the second pass: fits, their covariances (F, 9, 9), and the unknowns shared by all frames."""
 
     fits: list[FrameFit]
     covariance: Array
@@ -62,16 +62,16 @@ class Smoother:
 
         Args:
             instants: solver of single frames.
-            views: source of the views; None if the outlines of the fits are to be used as matched, in which case fits
-                with a fixed head share its pose.
+            views: source of the views; None to use the outlines of the fits as matched. In that case, with a fixed
+                head, all fits must have the same head pose.
             frames: frame numbers in temporal order.
             fps: frames per second.
             cameras: number of cameras.
             fixed_head: whether the head pose is constant.
             free_focal: whether to estimate the focal lengths.
             length_px: correlation length of outline errors; default: estimated from the residuals.
-            habits: prior on the offsets between mask outlines and tooth edges.
-            wider: ratio of true to computed variance of a frame's unknowns.
+            habits: prior on annotator bias, the offsets between mask outlines and tooth edges.
+            wider: ratio of the true to the computed variance of a frame's unknowns.
         """
         self._wider = wider
         self._cameras, self._rounds, self._length_px = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, length_px
@@ -89,7 +89,7 @@ class Smoother:
 
         Args:
             fits: fits of the first pass, in frame order.
-            done: called with the number of frames matched and the total.
+            done: called with the number of frames matched and the total number of frames.
         """
         config, fits = self._instants.config, list(fits)
         state = TakeState.unknown(self._cameras)
@@ -115,7 +115,7 @@ class Smoother:
                 done(round_ * len(fits) + k + 1, total)
             weight = 1.0 / outline_variance(fits, config, self._length_px)
         sigma = np.zeros(self._cameras)
-        # The bound is omitted: as an inequality, it would make the covariance too small.
+        # The bound of the rig is omitted: it is an inequality, and would make the covariance too small.
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, bounded=False))
         if self._unknowns.free_focal:
             sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
@@ -124,7 +124,7 @@ class Smoother:
     def _system(
         self, fits: Sequence[FrameFit], state: TakeState, weight: Array, motion: Motion, *, bounded: bool = True
     ) -> TakeSystem:
-        """Linearise the take at its current state, with or without the bound of the rig."""
+        """Linearise the equations of the take at its current state, with or without the bound of the rig."""
         unknowns = self._unknowns
         system = TakeSystem(len(fits), unknowns.local, unknowns.shared)
         weak = np.zeros(unknowns.local + unknowns.shared)
@@ -136,7 +136,7 @@ class Smoother:
             # The weak prior regularises unknowns without measurements.
             system.add_frame(k, precision + np.diag(1e-3 * weak), right)
         system.add_shared(*unknowns.prior(state))
-        # In gaps, first differences are penalised too, so that the jaw does not drift at constant velocity.
+        # In gaps, first differences are penalised as well, so that the jaw does not drift at constant velocity.
         unseen = np.array([not fit.found.all() for fit in fits])
         gap = (unseen[1:] | unseen[:-1])[:, None]
         poses = [fit.pose for fit in fits]
@@ -150,7 +150,7 @@ class Smoother:
         return system
 
     def _matched(self, fit: FrameFit, frame: int, state: TakeState) -> FrameFit:
-        """Rematch the outlines of a frame at its pose."""
+        """Match the outlines of a frame again at its current pose."""
         if not fit.use.any() or self._views is None:
             return fit
         views = state.corrected(self._views.at(frame))
@@ -162,7 +162,7 @@ class Smoother:
         return replace(fit, solution=solution, growth=growth)
 
     def _found_again(self, fits: list[FrameFit], weight: Array) -> list[FrameFit]:
-        """Realign, from smoothed poses, arches that have masks but were not found."""
+        """Align arches that have masks but were not found again, starting from smoothed poses."""
         if self._views is None:
             return fits
         attempts = Attempts(self._instants, weight, usual_residual_px(fits))
@@ -174,9 +174,9 @@ class Smoother:
         return fits
 
     def _covariance(self, system: TakeSystem) -> tuple[Array, Array]:
-        """Return the covariance of each frame's unknowns, shape (F, 9, 9), and that of the take's unknowns.
+        """Return the covariances of each frame's unknowns, shape (F, 9, 9), and the covariance of the take's unknowns.
 
-        The former include the uncertainty of the take's unknowns.
+        The covariances of the frames include the uncertainty of the take's unknowns.
         """
         found, unknowns = system.covariance(), self._unknowns
         wide = np.sqrt(unknowns.redundancy)
@@ -184,7 +184,7 @@ class Smoother:
         if not unknowns.fixed_head:
             own = self._wider * found.own + found.response @ shared @ np.swapaxes(found.response, 1, 2)
             return np.asarray(own, np.float64), found.shared
-        # The head pose is one of the unknowns of the take.
+        # The fixed head pose is one of the unknowns of the take.
         response = np.zeros((system.frames, LOCAL, unknowns.shared))
         response[:, HEAD, :6] = np.eye(6)
         response[:, JAW] = found.response
@@ -194,7 +194,7 @@ class Smoother:
 
 
 def with_one_head(coordinates: Coordinates, fits: Sequence[FrameFit]) -> list[FrameFit]:
-    """Return the fits with a common head pose, the median over frames with both arches found."""
+    """Return the fits with a common head pose: the median over the frames in which both arches were found."""
     seen = [fit for fit in fits if fit.found.all()] or fits
     first = seen[0].pose.head
     away = np.median([coordinates.head_steps(first, fit.pose.head) for fit in seen], axis=0)
@@ -205,7 +205,7 @@ def with_one_head(coordinates: Coordinates, fits: Sequence[FrameFit]) -> list[Fr
 def outline_variance(fits: Sequence[FrameFit], config: TrackingConfig, length_px: float | None = None) -> Array:
     """Return variance times correlation length of the outline errors of a take, per arch [px^3], shape (2,).
 
-    By default, the length is estimated from the residuals.
+    By default, the correlation length is estimated from the residuals.
     """
     solutions = [(fit.solution, fit.found) for fit in fits if fit.solution is not None and fit.found.any()]
     if length_px is not None:

@@ -1,4 +1,4 @@
-"""Normal equations of a take: a block band of frames coupled by smoothness, bordered by unknowns of the take."""
+"""Normal equations of a take: a block band of frames coupled by smoothness, bordered by the take's unknowns."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class TakeCovariance(NamedTuple):
     """Covariance of the solution.
 
     Attributes:
-        own: covariance of each frame's unknowns, conditional on those of the take, shape (N, L, L).
-        response: derivative of each frame's unknowns with respect to those of the take, shape (N, L, G).
+        own: covariance of each frame's unknowns, conditional on the take's unknowns, shape (N, L, L).
+        response: derivative of each frame's unknowns with respect to the take's unknowns, shape (N, L, G).
         shared: covariance of the unknowns of the take, shape (G, G).
     """
 
@@ -41,14 +41,14 @@ class TakeSystem:
     def __init__(self, frames: int, local: int, shared: int) -> None:
         """Start without equations."""
         self.frames, self.local, self.shared = frames, local, shared
-        # Entry k contains the blocks that couple each frame with the k-th frame after it.
+        # Entry k: blocks that couple each frame with the k-th frame after it.
         self._blocks = [np.zeros((max(frames - k, 0), local, local)) for k in range(3)]
         self._right = np.zeros((frames, local))
         self._cross = np.zeros((frames, local, shared))
         self._corner, self._corner_right = np.zeros((shared, shared)), np.zeros(shared)
 
     def add_frame(self, k: int, precision: Array, right: Array) -> None:
-        """Add the equations of a frame and the take, shapes (L + G, L + G) and (L + G,)."""
+        """Add the normal matrix (L + G, L + G) and right-hand side (L + G,) of a frame and the take."""
         n = self.local
         self._blocks[0][k] += precision[:n, :n]
         self._cross[k] += precision[:n, n:]
@@ -57,22 +57,22 @@ class TakeSystem:
         self._corner_right += right[n:]
 
     def add_shared(self, precision: Array, right: Array) -> None:
-        """Add a diagonal prior on the take's unknowns, shapes (G,) and (G,)."""
+        """Add a prior on the take's unknowns: diagonal precision (G,) and right-hand side (G,)."""
         self._corner += np.diag(precision)
         self._corner_right += right
 
     def add_bends(self, columns: slice[int, int, None], bend: Array, weight: Array) -> None:
-        """Penalise second differences.
+        """Penalise second differences of the frames' unknowns.
 
         Args:
             columns: slice of a frame's unknowns.
             bend: current second differences at frames 1 to N - 2, shape (N - 2, w).
-            weight: their precision, shape (w,) or (N - 2, w).
+            weight: precision of the second differences, shape (w,) or (N - 2, w).
         """
         self._add(_BEND, columns, bend, weight)
 
     def add_steps(self, columns: slice[int, int, None], step: Array, weight: Array) -> None:
-        """Penalise first differences; `step` has shape (N - 1, w), otherwise as `add_bends`."""
+        """Penalise first differences `step`, shape (N - 1, w); other arguments are as for `add_bends`."""
         self._add(_STEP, columns, step, weight)
 
     def _add(self, pattern: tuple[float, ...], columns: slice[int, int, None], value: Array, weight: Array) -> None:
@@ -93,7 +93,7 @@ class TakeSystem:
         return alone - response @ shared, np.asarray(shared, np.float64)
 
     def covariance(self) -> TakeCovariance:
-        """Return the required blocks of the inverse.
+        """Return the blocks of the inverse that are required for the covariances.
 
         The diagonal blocks of a block tridiagonal inverse follow from a second backward sweep (Takahashi et al. 1973).
         """
@@ -109,9 +109,9 @@ class TakeSystem:
         return TakeCovariance(own, -found.sides, np.asarray(shared, np.float64))
 
     def _eliminated(self, sides: Array) -> _Eliminated:
-        """Solve the band for right-hand sides of shape (N, L, S).
+        """Solve the band system for right-hand sides of shape (N, L, S).
 
-        Uses block elimination over pairs of frames: LAPACK's band solvers can be a thousand times slower when their
+        Pairs of frames are eliminated block by block: LAPACK's band solvers can be a thousand times slower if their
         threads compete.
         """
         diagonal, coupling = self._pairs()
@@ -133,7 +133,7 @@ class TakeSystem:
         return _Eliminated(found.reshape(2 * blocks, self.local, count)[: self.frames], inverse, coupling)
 
     def _pairs(self) -> tuple[Array, Array]:
-        """Return the diagonal blocks of pairs of frames, shape (M, 2 L, 2 L), and their coupling with the next pair."""
+        """Return the diagonal blocks of pairs of frames, shape (M, 2 L, 2 L), and the blocks that couple neighbours."""
         width, count = self.local, (self.frames + 1) // 2
         diagonal = np.tile(np.eye(2 * width), (count, 1, 1))
         coupling = np.zeros((count, 2 * width, 2 * width))

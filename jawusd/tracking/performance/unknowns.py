@@ -1,7 +1,7 @@
-"""The unknowns shared by all frames of a take, and the equations of a frame in all unknowns.
+"""The unknowns shared by all frames of a take, and the normal equations of a frame in all unknowns.
 
-The shared unknowns are the offsets of masks from free edges and gum lines, equal in all cameras; the head pose if it is
-fixed; and unknown focal lengths.
+The shared unknowns are the offsets of masks from free edges and gum lines, which are equal in all cameras; the head
+pose, if it is fixed; and unknown focal lengths.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ class HabitPrior:
     """Prior on annotator bias: the offsets between mask outlines and tooth edges.
 
     Attributes:
-        sigma: standard deviations at free edges [px], at the gum line [px], and along the gum surface [mm].
-        frames: number of independent frames with as much information about the bias as a whole take.
+        sigma: standard deviations of the bias at free edges [px], at the gum line [px], and along the crown surface at
+            the gum line [mm].
+        frames: number of independent frames that contain as much information about the bias as a whole take.
     """
 
     sigma: tuple[float, float, float]
@@ -43,28 +44,28 @@ DRAWN = HabitPrior((0.15, 0.15, 0.05), 1.5)
 class TakeState:
     """Current estimate of the unknowns of a take."""
 
-    habits: Array  # mask biases of both arches, shape (2, 3): see `View.habits`
+    habits: Array  # mask biases of both arches, shape (2, 3); see `View.habits`
     log_focal: Array  # logarithm of the ratio of true to calibrated focal length, shape (C,)
 
     @classmethod
     def unknown(cls, cameras: int) -> TakeState:
-        """Return the initial estimate."""
+        """Return the initial estimate of the take's unknowns."""
         return cls(np.zeros((2, _HABITS)), np.zeros(cameras))
 
     def corrected(self, views: Sequence[View]) -> list[View]:
-        """Return the views of a frame, corrected by the estimate."""
+        """Return the views of a frame, corrected by the estimated biases and focal lengths."""
         pairs = zip(views, self.log_focal.tolist(), strict=True)
         return [replace(with_focal(view, log_focal), habits=self.habits) for view, log_focal in pairs]
 
 
 class Unknowns:
-    """Layout of the unknowns of frames and take, and equations in them.
+    """Layout of the unknowns of frames and take, and normal equations in these unknowns.
 
     Attributes:
         local: number of unknowns per frame.
         shared: number of unknowns of the take.
-        jaw: slice of the jaw in a frame.
-        head: slice of the head in a frame, None if it is fixed.
+        jaw: slice of the jaw parameters in the unknowns of a frame.
+        head: slice of the head pose in the unknowns of a frame; None if the head is fixed.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class Unknowns:
         free_focal: int = 0,
         habits: HabitPrior = DRAWN,
     ) -> None:
-        """Lay out the unknowns; `free_focal` is the number of cameras if focal lengths are unknown, else 0."""
+        """Lay out the unknowns; `free_focal` is the number of cameras if focal lengths are unknown, otherwise 0."""
         self._coordinates, self.fixed_head, self.free_focal = coordinates, fixed_head, free_focal
         self._sigma_habits = np.tile(habits.sigma, 2)
         self.local = LOCAL - 6 if fixed_head else LOCAL
@@ -85,7 +86,7 @@ class Unknowns:
         self._habits = slice(6 if fixed_head else 0, (6 if fixed_head else 0) + 2 * _HABITS)
         self.focal = slice(self._habits.stop, self._habits.stop + free_focal)
         self.shared = self.focal.stop
-        # Factor by which the number of frames overstates the information about bias, as frames are not independent.
+        # Factor by which the number of frames overstates the information about bias, since frames are not independent.
         self.redundancy = np.ones(self.shared)
         self.redundancy[self._habits] = max(1.0, frames / habits.frames)
 
@@ -99,10 +100,10 @@ class Unknowns:
         return precision, -precision * off
 
     def frame(self, fit: FrameFit, weight: Array, *, bounded: bool = True) -> tuple[Array, Array]:
-        """Return normal matrix (L + G, L + G) and right-hand side (L + G,) of a frame, from outlines and bound.
+        """Return the normal matrix (L + G, L + G) and right-hand side (L + G,) of a frame, from outlines and bound.
 
         Args:
-            fit: the frame, with outlines matched at its pose.
+            fit: fit of the frame, with outlines matched at its pose.
             weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
             bounded: whether to include the bound of the rig.
         """
@@ -114,7 +115,7 @@ class Unknowns:
             if solution is None or not found[r]:
                 continue
             sums = solution.outline
-            # Rows: six twist components and three biases of the arch.
+            # The rows are the six twist components and the three biases of the arch.
             to_twist, to_habit = np.zeros((6, size)), np.zeros((_HABITS, size))
             to_twist[:, :LOCAL] = slope
             to_habit[:, LOCAL + _HABITS * r : LOCAL + _HABITS * (r + 1)] = np.eye(_HABITS)
@@ -137,7 +138,7 @@ class Unknowns:
     def moved(
         self, poses: Sequence[Pose], state: TakeState, local: Array, shared: Array
     ) -> tuple[list[Pose], TakeState]:
-        """Return poses and take after a step of all unknowns, shapes (N, L) and (G,)."""
+        """Return poses and take state after a step of all unknowns, shapes (N, L) and (G,)."""
         steps = np.zeros((len(poses), LOCAL))
         steps[:, JAW] = local[:, self.jaw]
         steps[:, HEAD] = shared[:6] if self.fixed_head else local[:, HEAD]

@@ -1,4 +1,4 @@
-"""Views of a take: a compressed cache, and the dependence of views on unknown focal lengths."""
+"""Views of a take: a compressed cache of views, and their dependence on unknown focal lengths."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import View
 
-_FAST = 1  # zlib level: even the fastest compresses masks to a fiftieth
+_FAST = 1  # zlib level: even the fastest level compresses masks to a fiftieth of their size
 
 #: Prior standard deviation of the logarithm of a focal length that was guessed from the type of lens [-].
 PRIOR_LOG_FOCAL = 0.1
 
 
 class Views(Protocol):
-    """Source of one view per camera by frame of the reference camera, such as `MaskViews`."""
+    """Source of one view per camera for each frame number of the reference camera, such as `MaskViews`."""
 
     def at(self, frame: int) -> list[View]:
         """Return one view per camera."""
@@ -48,7 +48,7 @@ class _Kept:
 
 
 class KeptViews:
-    """Cache of views: decoding and undistorting are slower than aligning, and a take is processed repeatedly."""
+    """Cache of views: a take is processed repeatedly, and decoding and undistorting masks is slower than aligning."""
 
     def __init__(self, source: Views) -> None:
         self._source = source
@@ -65,9 +65,9 @@ class KeptViews:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Sums like those of `OutlineSums`, with a sample's derivative g with respect to log focal length [px].
+    """Sums like those of `OutlineSums`, for a sample's derivative g with respect to log focal length [px].
 
-    The vector h is the derivative of a sample's outline shift with respect to the annotator's habits.
+    The vector h is the derivative of a sample's outline shift with respect to the components of annotator bias.
 
     Attributes:
         twist: sum w J g, shape (2, C, 6).
@@ -82,12 +82,12 @@ class Growth:
 
 
 def growth_of(matched: Sequence[Matched], poses: Array, centres: Array, views: Sequence[View]) -> Growth:
-    """Return the sums over samples matched at poses (2, 4, 4) of both arches about their centres (2, 3)."""
+    """Return the sums over samples matched at poses (2, 4, 4) of both arches, for twists about their centres (2, 3)."""
     count = len(views)
     out = Growth(np.zeros((2, count, 6)), np.zeros((2, count, 3)), np.zeros((2, count)), np.zeros((2, count)))
     for found in matched:
         r, c = found.arch, found.camera
-        near = np.abs(found.distances) < found.gate_px  # NaN counts as not near
+        near = np.abs(found.distances) < found.gate_px  # samples with NaN distances count as not near
         samples, d = found.samples[near], found.distances[near]
         weight = (1.0 - (d / found.gate_px) ** 2) ** 2 * samples[:, LENGTH]
         growth = ((samples[:, [U, V]] - principal_point(views[c].matrix)) * samples[:, [NX, NY]]).sum(1)
