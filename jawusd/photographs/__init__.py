@@ -1,6 +1,6 @@
 """Estimate the bite from photographs of closed teeth taken with an uncalibrated camera.
 
-Uses scans and contours of `tracking`. Only `pipeline` imports it; it must not import other stages.
+This package uses the scan and contour code of `tracking`. Only `pipeline` imports it; it must not import other stages.
 """
 
 from jawusd.photographs.align import PhotoAlignment, align_photographs

@@ -1,4 +1,4 @@
-"""Align photographs of closed teeth: pose and focal length of each, and the bite they have in common."""
+"""Align photographs of closed teeth: find the pose and focal length of each, and their common bite."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from jawusd.photographs.search import ArchPair, PhotoStart, find_first, find_nex
 from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, match, middle_of, seen_outlines
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan, prepare_scan
 
-# Stages of the coarse-to-fine alignment: image scale, and the gate of each step [mm].
+# Stages of the coarse-to-fine alignment: image scale, and for each step the gate, the maximum residual [mm].
 _STAGES = (
     (0.25, (3.0, 3.0, 2.5, 2.5, 2.0, 2.0, 2.0, 2.0)),
     (0.5, (2.0, 2.0, 1.5, 1.5, 1.2, 1.2, 1.0, 1.0)),
     (1.0, (1.0,) * 8),
 )
-_AT_WIDTH_PX = 1440.0  # reference image width, to which distances in px are scaled
-_TURN_PX = 10.0  # weight of direction when lines are matched to outlines (see `features`), at that width
+_AT_WIDTH_PX = 1440.0  # reference image width, to which distances in pixels are scaled
+_TURN_PX = 10.0  # weight of direction when lines are matched to outlines (see `features`), at the reference width
 _CLEAR_MISFIT = 0.2  # maximum misfit of a photograph whose bite is used to initialise the others
-_GATE_MM, _MOST_MISFIT = 0.5, 0.45  # final misfit: its gate, and its maximum for scans of the same subject
-_SAME_HAND = 1.15  # minimum ratio of misfits with the other and the chosen mirroring; below it, the choice is ambiguous
-_APART_MM = 1.5  # maximum plausible distance between the bite from one photograph and that from all
+_GATE_MM, _MOST_MISFIT = 0.5, 0.45  # gate of the final misfit, and maximum final misfit of scans of the same subject
+_SAME_HAND = 1.15  # minimum ratio of the misfits with the other and the chosen mirroring for a clear choice
+_APART_MM = 1.5  # maximum plausible distance between the bite from one photograph and the bite from all
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoAlignment:
-    """Result of an alignment, with the data needed to render it."""
+    """Result of an alignment, with the data that is needed to render it."""
 
     result: AlignedPhotos
     bite: Bite  # bite and poses for the full-size photographs
@@ -71,7 +71,7 @@ def align_photographs(
 def _starts(
     drawings: Sequence[Drawing], scans: Sequence[Scan], contact: Contact, progress: Callable[[str, int, int], None]
 ) -> list[PhotoStart]:
-    """Return the initial pose of each photograph: of the first with an unknown bite, of the others with its bite."""
+    """Return the initial pose of each photograph; the bite found in the first photograph is used for the others."""
     usual = typical_bites(scans)
     leads: list[tuple[int, PhotoStart]] = []
     for k, drawing in enumerate(drawings):
@@ -89,7 +89,7 @@ def _starts(
 
 
 def _refined(bite: Bite, lines: Sequence[Drawing], rows: ArchPair, contact: Contact) -> Bite:
-    """Return photographs and bite, aligned coarse to fine."""
+    """Return the photographs and the bite after coarse-to-fine alignment."""
     for share, gates in _STAGES:
         photos = []
         for photo, own in zip(bite.photos, lines, strict=True):
@@ -107,7 +107,7 @@ def _refined(bite: Bite, lines: Sequence[Drawing], rows: ArchPair, contact: Cont
 
 
 def _together(alone: Sequence[Bite], lines: Sequence[Drawing], rows: ArchPair, contact: Contact) -> Bite:
-    """Return all photographs aligned to one bite: the best result of starts from the bite of each photograph."""
+    """Return all photographs aligned to one bite: the best result over starts from the bite of each photograph."""
     if len(alone) == 1:
         return alone[0]
     photos = tuple(bite.photos[0] for bite in alone)
@@ -152,9 +152,9 @@ def _result(
 
 
 def _line_distances(photo: Photo, joint: Bite, rows: ArchPair) -> tuple[Array, Array]:
-    """Return distances of all drawn points from the outlines (N,), and of the points not on the gum line (M,).
+    """Return the distances of all drawn points from the outlines (N,), and of those not on the gum line (M,).
 
-    Unit: pixels at an image width of 1440 px.
+    The unit is pixels at an image width of 1440 px.
     """
     to_usual = _AT_WIDTH_PX / photo.drawing.size_px[0]
     found = match(seen_outlines(rows.fine, photo, joint), photo.drawing, _TURN_PX / to_usual)
@@ -163,7 +163,7 @@ def _line_distances(photo: Photo, joint: Bite, rows: ArchPair) -> tuple[Array, A
 
 
 def _lower_incisor(rows: ArchPair) -> Array:
-    """Return the highest point of the lower front teeth, scan coordinates [mm], shape (3,)."""
+    """Return the highest point of the lower front teeth, in scan coordinates [mm], shape (3,)."""
     points = rows.fine[1].scan.crown_vertices()
     _, up, front = transform_points(rows.usual.T_anatomical_lower, points).T
     ahead = np.flatnonzero(front > np.percentile(front, 97))
@@ -175,18 +175,18 @@ def _findings(photos: Sequence[AlignedPhoto]) -> tuple[Finding, ...]:
     out = []
     for photo in photos:
         if photo.misfit > _MOST_MISFIT:
-            message = f"the crowns do not fit the drawn lines (misfit {photo.misfit:.2f}, allowed {_MOST_MISFIT})"
-            hint = "Check that the scans are recent ones of this subject, and that the teeth are closed."
+            message = f"the crowns do not fit the drawn lines (misfit {photo.misfit:.2f}; at most {_MOST_MISFIT})"
+            hint = "Check that the scans are recent and of this subject, and that the teeth are closed."
             out.append(
                 Finding("photo_unfit", "error", message, photo.misfit, _MOST_MISFIT, camera=photo.name, hint=hint)
             )
         elif photo.other_hand < _SAME_HAND:
-            message = f"it fits about equally well {'un' if photo.mirrored else ''}mirrored"
+            message = f"the photograph fits about equally well {'un' if photo.mirrored else ''}mirrored"
             out.append(Finding("photo_hand", "warning", message, photo.other_hand, _SAME_HAND, camera=photo.name))
         if photo.alone_off_mm > _APART_MM:
             message = (
-                f"alone it places the lower incisor {photo.alone_off_mm:.1f} mm from the joint result "
-                f"(allowed {_APART_MM} mm)"
+                f"aligned alone, it places the lower incisor {photo.alone_off_mm:.1f} mm from the joint result "
+                f"(at most {_APART_MM} mm is allowed)"
             )
             hint = "A single view is inaccurate along its line of sight; photographs of different bites also disagree."
             out.append(

@@ -1,4 +1,4 @@
-"""Crowns split into teeth: their renderings, and the outlines visible in a photograph."""
+"""Crowns split into teeth: renderings of the teeth, and the outlines that are visible in a photograph."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SMOOTH_PX = 2.0  # standard deviation of the Gaussian that averages the directi
 
 @dataclass(frozen=True, eq=False)
 class Crowns:
-    """One arch split into pieces: single teeth where the scan separates them, otherwise the whole arch."""
+    """One arch split into connected pieces: single teeth where the scan separates them, otherwise groups of teeth."""
 
     scan: Scan
     teeth: tuple[Faces, ...]  # faces of every tooth or group of connected teeth, each of shape (F, 3)
@@ -39,10 +39,11 @@ class Outlines:
     Attributes:
         points: points on the crowns, scan coordinates of their own arch [mm], shape (N, 3).
         arch: 0 upper, 1 lower, shape (N,).
-        tooth: tooth number, from 1, continuing from the upper to the lower arch, shape (N,); connected teeth share one.
+        tooth: tooth number from 1, continuing from the upper to the lower arch, shape (N,); connected teeth share a
+            number.
         pixels: image positions [px], shape (N, 2).
         normals: unit normals pointing out of the tooth in the image, shape (N, 2).
-        gum: 1 where the outline faces its gum, decreasing to 0 at a right angle [-], shape (N,).
+        gum: 1 where the outline faces the gum of its arch, decreasing to 0 at a right angle [-], shape (N,).
     """
 
     points: Array
@@ -53,7 +54,7 @@ class Outlines:
     gum: Array
 
     def take(self, index: NDArray[np.int64]) -> Outlines:
-        """Return the points at some indices, which may repeat."""
+        """Return the points at given indices, which may repeat."""
         return Outlines(
             self.points[index],
             self.arch[index],
@@ -65,9 +66,9 @@ class Outlines:
 
 
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
-    """Return the crowns of a scan as connected pieces, with a substitute wall if the scan has no gum.
+    """Return the crowns of a scan as connected pieces, with a substitute gum wall if the scan has no gum.
 
-    Without the wall, teeth on the far side would be rendered where gum would hide them.
+    Without the wall, teeth on the far side would be rendered where the gum hides them in reality.
 
     Args:
         scan: one arch.
@@ -87,10 +88,10 @@ def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
 
 
 def _with_wall(scan: Scan, T_anatomical_scan: Array, to_gum: Array) -> Scan:
-    """Return the scan with a wall of gum along the middle of its arch."""
+    """Return the scan with a substitute gum wall along the middle of its arch."""
     points = scan.crown_vertices()
     flat = transform_points(T_anatomical_scan, points)
-    # Seen from inside the arch, teeth are ordered by angle.
+    # The teeth are ordered by their angle as seen from inside the arch.
     angle = np.arctan2(flat[:, 0] - np.median(flat[:, 0]), flat[:, 2] - np.percentile(flat[:, 2], 25))
     bins = np.digitize(angle, np.linspace(angle.min(), angle.max(), _WALL_PARTS + 1)[1:-1])
     height = points @ to_gum
@@ -113,10 +114,10 @@ def _with_wall(scan: Scan, T_anatomical_scan: Array, to_gum: Array) -> Scan:
 def draw_teeth(
     crowns: Sequence[Crowns], matrices: Sequence[Array], shape: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return the inverse depth [1/mm] and the number of the visible tooth (0: none) per pixel, shape (h, w) each.
+    """Return the inverse depth [1/mm] and the number of the visible tooth (0: none) at each pixel, shape (h, w) each.
 
     Args:
-        crowns, matrices: upper and lower, with their projections from scan [mm] to homogeneous px, shape (3, 4).
+        crowns, matrices: upper and lower crowns, with the projections from scan [mm] to homogeneous px, shape (3, 4).
         shape: height and width of the image [px].
     """
     depth, labels = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
@@ -134,7 +135,7 @@ def draw_teeth(
 def outlines_of(
     crowns: Sequence[Crowns], matrices: Sequence[Array], depth: NDArray[np.float32], labels: NDArray[np.uint8]
 ) -> Outlines:
-    """Return the outlines of teeth rendered by `draw_teeth`; they run between pixels and belong to the nearer tooth."""
+    """Return the outlines in renderings of `draw_teeth`; they run between pixels and belong to the nearer tooth."""
     found = [_ends(depth, labels), _ends(depth.T, labels.T)]
     (x, y, inside_x, inside_y), (y2, x2, inside_y2, inside_x2) = found
     pixels = np.column_stack([np.r_[x, x2], np.r_[y, y2]])
@@ -159,7 +160,7 @@ def outlines_of(
 
 
 def _ends(depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[Array, Array, Array, Array]:
-    """Return the ends of teeth along pixel rows: column and row of each end, column and row of its tooth pixel."""
+    """Return the ends of teeth along pixel rows: column and row of the end, and column and row of its tooth pixel."""
     rows, columns = np.nonzero(labels[:, 1:] != labels[:, :-1])
     right_is_near = depth[rows, columns + 1] > depth[rows, columns]
     # If gum, which has number 0, is in front, the outline belongs to the tooth behind it.
@@ -169,7 +170,7 @@ def _ends(depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[Array,
 
 
 def _outward(tooth: NDArray[np.bool_], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Array:
-    """Return unit vectors (x, y) out of a tooth mask (h, w) at pixels, shape (N, 2); 0 where ambiguous."""
+    """Return unit vectors (x, y) that point out of a tooth mask (h, w) at pixels, shape (N, 2); 0 where ambiguous."""
     reach = int(4 * _SMOOTH_PX)
     top, left = max(0, rows.min() - reach), max(0, columns.min() - reach)
     part = tooth[top : rows.max() + reach + 1, left : columns.max() + reach + 1].astype(np.float32)

@@ -1,4 +1,4 @@
-"""Lines drawn by hand along the teeth in a photograph, as points with directions."""
+"""Lines drawn by hand along the teeth in a photograph, represented by points with directions."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 
-_WIDTH_PX = 1.8  # standard deviation of the Gaussian that turns lines a few pixels wide into a single ridge
+_WIDTH_PX = 1.8  # standard deviation of the Gaussian blur, with which lines a few pixels wide form a single ridge
 _FAINT = 0.12  # minimum ridge strength relative to that of the strongest ridges
-_SHORTEST_PX = 60  # minimum length of isolated strokes; shorter ones are ignored
+_SHORTEST_PX = 60  # minimum length of isolated strokes; shorter strokes are ignored
 _FEWEST_POINTS = 300
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """Lines drawn in one photograph.
+    """The lines drawn in one photograph.
 
     Attributes:
         name: name of the photograph, for messages.
-        pixels: points on the lines, about a pixel apart [px], shape (N, 2).
+        pixels: points on the lines [px], about one pixel apart, shape (N, 2).
         normals: unit vectors across the lines, of arbitrary sign, shape (N, 2).
         size_px: width and height of the image.
     """
@@ -35,7 +35,7 @@ class Drawing:
     size_px: tuple[int, int]
 
     def mirrored(self) -> Drawing:
-        """Return the drawing with left and right mirrored."""
+        """Return the drawing with left and right exchanged."""
         flip = np.array([-1.0, 1.0])
         return Drawing(self.name, self.pixels * flip + [self.size_px[0] - 1.0, 0.0], self.normals * flip, self.size_px)
 
@@ -48,7 +48,7 @@ class Drawing:
 
 
 def read_lines(picture: NDArray[np.uint8], name: str) -> Drawing:
-    """Return the centrelines of bright lines in a grey image (h, w).
+    """Extract the centrelines of the bright lines in a grey image (h, w).
 
     A centreline is a maximum of the smoothed image across the direction of strongest curvature, with sub-pixel
     accuracy (Steger, An unbiased detector of curvilinear structures, 1998, section 3).
@@ -78,7 +78,7 @@ def read_lines(picture: NDArray[np.uint8], name: str) -> Drawing:
     keep = lengths[strokes[rows[middle], columns[middle]] - 1] >= _SHORTEST_PX
     if keep.sum() < _FEWEST_POINTS:
         raise TrackingError(
-            f"{name}: {keep.sum()} px of lines are drawn; at least {_FEWEST_POINTS} are needed",
+            f"{name}: the drawn lines cover {keep.sum()} px; at least {_FEWEST_POINTS} px are needed",
             hint="Draw bright lines along the outlines of the teeth on a black background.",
         )
     return Drawing(name, pixels[keep], normals[keep], (picture.shape[1], picture.shape[0]))
@@ -87,13 +87,13 @@ def read_lines(picture: NDArray[np.uint8], name: str) -> Drawing:
 def features(pixels: Array, normals: Array, turn_px: float) -> Array:
     """Return features (x, y, cos 2a, sin 2a), shape (N, 4), whose distances combine position and direction.
 
-    Perpendicular lines have a distance of 2 `turn_px`; the sign of a normal is irrelevant.
+    The distance between perpendicular directions is 2 `turn_px`; the sign of a normal is irrelevant.
     """
     double = np.column_stack([normals[:, 0] ** 2 - normals[:, 1] ** 2, 2 * normals[:, 0] * normals[:, 1]])
     return np.hstack([pixels, turn_px * double])
 
 
 def nearest(these: Array, others: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the distance and index of the nearest of the features `others` for each of the features `these`."""
+    """Return, for each feature in `these`, the distance and index of the nearest feature in `others`."""
     distance, index = cKDTree(others).query(these)
     return distance, index

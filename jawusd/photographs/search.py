@@ -1,4 +1,4 @@
-"""Initial poses of photographs: an exhaustive search over views that correlates outlines with the drawn lines."""
+"""Find initial poses of photographs: search views exhaustively, correlating outlines with the drawn lines."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from jawusd.tracking.contour.scan import Scan, thinned
 
 _PX_PER_MM = 2.5
 _DISTANCE_MM = 200.0  # typical camera distance of dental photographs
-_FRONT_MM = np.array([0.0, 0.0, 15.0])  # position of the front edges relative to the views' centre of rotation
+_FRONT_MM = np.array([0.0, 0.0, 15.0])  # front edges relative to the centre of rotation of the views
 _YAW = np.radians(np.arange(-75, 76, 15.0))
 _PITCH = np.radians(np.arange(-20, 21, 10.0))
 _ROLL = np.radians([-10.0, 0.0, 10.0])
 # Candidate widths of the field of view at the teeth [mm].
 _WIDTHS_MM = 38.0 * 1.1 ** np.arange(9)
 _ROWS_APART_MM = 10.0
-_SECTORS = 4  # number of direction bins; lines match only outlines in the same bin
-_NEAR_PX = 2.0  # distance from an outline at which a line counts half
+_SECTORS = 4  # number of direction bins; a line matches only outlines in the same bin
+_NEAR_PX = 2.0  # distance from an outline at which a line has half weight
 # Typical bite: overjet and overbite of the front teeth [mm].
 _OVERJET_MM, _OVERBITE_MM = 2.5, 2.0
 
 _WIDTH_PX = 360  # image width at which candidates are aligned
-_FACES = 6000  # number of crown faces per arch, sufficient at this resolution
-_CANDIDATES, _FINALISTS = 20, 4  # numbers of mirrored and, equally, of not mirrored views
-# Gates of the steps [mm], with the given bite and with shifted bites: from a tooth width down to half a tooth width.
+_FACES = 6000  # number of crown faces per arch, sufficient at this image width
+_CANDIDATES, _FINALISTS = 20, 4  # number of candidates and of finalists, each for mirrored and for not mirrored views
+# Gates of the alignment steps [mm], with the given bite and with shifted bites; they decrease from step to step.
 _WIDE_GATES, _SLID_GATES = (4.0, 4.0, 3.5, 3.5, 3.0, 3.0, 2.5, 2.5), (3.0, 3.0, 2.5, 2.0, 2.0, 2.0)
 # Shifts of the lower arch from a typical bite: all are scored, and the best `_SLIDES` are aligned.
 _ASIDE_MM, _UP_MM, _AHEAD_MM = (-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-4.0, -2.0, 0.0, 2.0, 4.0)
@@ -45,7 +45,7 @@ _MISFIT_GATE_MM = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A candidate view of a photograph."""
+    """Candidate view of a photograph."""
 
     share: float  # fraction of the drawn lines that are near an outline [-]
     T_cam_upper: Array  # upper scan to camera [mm], shape (4, 4)
@@ -62,17 +62,17 @@ class TypicalBite:
 
     @property
     def frames(self) -> tuple[Array, Array]:
-        """Both frames, upper and lower."""
+        """Anatomical poses of both arches, upper first."""
         return self.T_anatomical_upper, self.T_anatomical_lower
 
     @property
     def T_upper_lower(self) -> Array:
-        """The bite, shape (4, 4)."""
+        """Pose of the lower arch in the upper scan, shape (4, 4)."""
         return se3_inverse(self.T_anatomical_upper) @ self.T_anatomical_lower
 
 
 def typical_bites(scans: Sequence[Scan]) -> list[TypicalBite]:
-    """Return the typical bites in which two arches may meet.
+    """Return typical bites, one for each possible orientation of the two arches.
 
     The plane and forward direction of an arch follow from its shape, and its vertical direction from its gum. Without
     gum, both vertical directions are returned.
@@ -83,7 +83,7 @@ def typical_bites(scans: Sequence[Scan]) -> list[TypicalBite]:
 
 
 def _sides(scan: Scan, arch: int) -> list[float]:
-    """Return the possible signs of an arch's smallest principal axis that let it point up."""
+    """Return the signs with which an arch's smallest principal axis may point up."""
     if len(scan.gum_faces) < len(scan.crown_faces) // 10:
         return [1.0, -1.0]
     gum = scan.vertices[np.unique(scan.gum_faces)].mean(0) - scan.centre
@@ -100,7 +100,7 @@ def _row_frame(scan: Scan, arch: int, side: float) -> Array:
     """Return T_anatomical_scan of one arch, with its origin at the edges of the front teeth, shape (4, 4)."""
     points = scan.crown_vertices(4000)
     up = side * _least_axis(scan)
-    # Computed as the anatomical frame of a bite whose other arch is a shifted copy of this one.
+    # Compute it as the anatomical frame of a bite whose other arch is a shifted copy of this arch.
     T = anatomical_frame(points, points - _ROWS_APART_MM * up)
     x, y, z = (points @ T[:3, :3].T).T
     edge = np.percentile(y[z > np.percentile(z, 90)], 2 if arch == 0 else 98)
@@ -115,9 +115,9 @@ def searched(
     Args:
         drawing: the lines of the photograph.
         crowns: upper and lower, decimated for fast rendering.
-        usual: typical bite, from which the anatomical axes are taken.
+        usual: typical bite, which defines the anatomical axes.
         T_upper_lower: the assumed bite, shape (4, 4).
-        count: number of candidates to return of each kind, mirrored and not mirrored.
+        count: number of mirrored candidates to return, and of not mirrored ones.
     """
     size = next_fast_len(int(1.3 * _PX_PER_MM * _WIDTHS_MM.max()), real=True)
     drawn = list(_drawn_spectra(drawing, size))
@@ -135,7 +135,7 @@ def searched(
             if mirrored in best and share <= best[mirrored].share:
                 continue
             row, column = np.unravel_index(int(overlap.argmax()), overlap.shape)
-            # Shift of the outlines relative to the image centre, as a position of the teeth.
+            # Convert the shift of the outlines relative to the image centre to a position of the teeth.
             shift = [(k + size // 2) % size - size // 2 for k in (column, row)]
             pose = base.copy()
             pose[:2, 3] += np.array(shift) / _PX_PER_MM
@@ -146,14 +146,14 @@ def searched(
 
 
 def _facing(turn: tuple[float, float, float]) -> Array:
-    """Return the rotation from (left, up, front) axes to a camera in front, (right, down, ahead), shape (3, 3)."""
+    """Return the rotation from (left, up, front) to the (right, down, ahead) axes of a camera in front, shape (3, 3)."""
     yaw, pitch, roll = turn
     facing = np.diag([1.0, -1.0, -1.0])
     return np.asarray(so3_exp([0, 0, roll]) @ so3_exp([pitch, 0, 0]) @ facing @ so3_exp([0, yaw, 0]), np.float64)
 
 
 def _drawn_spectra(drawing: Drawing, size: int) -> Iterator[tuple[float, bool, NDArray[np.complex128], float]]:
-    """Yield field of view [mm], whether mirrored, spectra by direction bin, and number of points per candidate."""
+    """Yield per candidate: field of view [mm], whether mirrored, spectra by direction bin, number of points."""
     for mirrored in (False, True):
         lines = drawing.mirrored() if mirrored else drawing
         middle = 0.5 * (np.array(drawing.size_px) - 1.0)
@@ -176,7 +176,7 @@ def _by_sector(pixels: Array, normals: Array, size: int) -> Array:
 def _seen_spectra(
     crowns: Sequence[Crowns], T_cam_upper: Array, T_upper_lower: Array, size: int
 ) -> NDArray[np.complex128]:
-    """Return spectra of images that are 1 on outlines and decrease with distance, shape (_SECTORS, h, w)."""
+    """Return spectra of images that are 1 on outlines and decrease with distance from them, shape (_SECTORS, h, w)."""
     focal = _PX_PER_MM * _DISTANCE_MM
     K = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
     matrices = [K @ T_cam_upper[:3], K @ (T_cam_upper @ T_upper_lower)[:3]]
@@ -214,7 +214,7 @@ class PhotoStart:
     """Initial pose of one photograph."""
 
     misfit: float  # misfit of its lines (see `Aligner.misfit`) [-]
-    other_misfit: float  # misfit with the opposite choice of mirroring
+    other_misfit: float  # smallest misfit with the opposite choice of mirroring
     mirrored: bool
     bite: Bite  # pose and bite from this photograph alone, at reduced size
     rows: ArchPair
@@ -238,7 +238,7 @@ def find_first(drawing: Drawing, scans: Sequence[Scan], usual: Sequence[TypicalB
 
 
 def _slid(bite: Bite, rows: ArchPair, aligner: Aligner) -> list[Bite]:
-    """Return a photograph with its current bite and with the shifted bites that fit best."""
+    """Return a photograph with its current bite, and with each of the shifted bites that fit best."""
     axes = rows.usual.T_anatomical_upper[:3, :3]
     out = []
     for slide in product(_ASIDE_MM, _UP_MM, _AHEAD_MM):
@@ -253,7 +253,7 @@ def _misfit(aligner: Aligner, bite: Bite) -> float:
 
 
 def find_next(drawing: Drawing, rows: ArchPair, T_upper_lower: Array, contact: Contact) -> PhotoStart:
-    """Return the best start of a photograph whose bite is roughly known from another photograph."""
+    """Return the best start of a photograph, given an approximate bite from another photograph."""
     found = _aligned_candidates(drawing, rows, T_upper_lower, _CANDIDATES)
     aligner = Aligner(rows.thin, rows.usual.T_upper_lower, contact)
     ends = []
@@ -266,7 +266,7 @@ def find_next(drawing: Drawing, rows: ArchPair, T_upper_lower: Array, contact: C
 def _aligned_candidates(
     drawing: Drawing, rows: ArchPair, T_upper_lower: Array, count: int
 ) -> list[tuple[float, bool, Bite]]:
-    """Return misfit, mirroring and poses of the most promising views after some steps, best first."""
+    """Return the misfits, mirrorings and poses of the most promising views after some alignment steps, best first."""
     aligner = Aligner(rows.thin, rows.usual.T_upper_lower, None)
     factor = _WIDTH_PX / drawing.size_px[0]
     out = []
@@ -279,7 +279,7 @@ def _aligned_candidates(
 
 
 def _finalists(tried: Sequence[tuple[float, bool, Bite, ArchPair]]) -> list[tuple[float, bool, Bite, ArchPair]]:
-    """Return the best starts, equally many mirrored and not mirrored, so that both are compared fairly."""
+    """Return the best starts, with equal numbers of mirrored and not mirrored starts for a fair comparison."""
     ordered = sorted(tried, key=lambda one: one[0])
     return [one for way in (False, True) for one in [o for o in ordered if o[1] is way][:_FINALISTS]]
 

@@ -1,4 +1,4 @@
-"""Joint alignment of both arches with photographs: one bite for all, and a pose and lens for each.
+"""Joint alignment of both arches with photographs: a common bite, and a pose and a lens for each photograph.
 
 The camera model has one focal length, the principal point at the image centre, and one distortion coefficient.
 """
@@ -25,15 +25,15 @@ from jawusd.tracking.initialization.occlusion import crown_surface
 #: permits large steps.
 UNKNOWNS = 8
 
-_SIGMA_MM = 0.15  # standard deviation of gap or penetration of scanned teeth in contact
-_SHARE = 0.04  # fraction of the lower crown points on each side that are assumed in contact
-_REACH_MM = 3.0  # maximum penetration; deeper points are beyond the base of a crown
+_SIGMA_MM = 0.15  # standard deviation of the gap or penetration between scanned teeth that are in contact
+_SHARE = 0.04  # fraction of the lower crown points on each side that are assumed to be in contact
+_REACH_MM = 3.0  # maximum penetration; deeper points lie beyond the base of a crown
 # Priors: camera distance, standard deviation of its logarithm, and standard deviation of the distortion [-]. Phones are
 # held 80 to 200 mm from the teeth, macro lenses 200 to 400 mm.
 _DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02
-_LOG_FOCAL = 0.05  # standard deviation of the log focal length between photographs of one camera, due to focusing
+_LOG_FOCAL = 0.05  # standard deviation of the log focal length between photographs of one camera (focusing)
 _BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)  # standard deviations of the bite prior [rad, mm]
-# Prior standard deviations of a step [rad, mm, log, -]; damp the unknowns that the lines do not determine.
+# Prior standard deviations of a step [rad, mm, log, -], which damp unknowns that the lines do not determine.
 _LARGEST_STEP = np.array([0.1] * 3 + [3.0, 3.0, 30.0] + [0.2, 0.02])
 # Standard deviations of drawn lines from tooth edges and from gum lines, and correlation length of these errors.
 _LINE_MM, _GUM_LINE_MM, _STRETCH_MM = 0.15, 0.3, 2.0
@@ -46,17 +46,17 @@ class PhotoPose:
     """Pose and lens of a photograph."""
 
     T_cam_upper: Array  # upper scan to camera [mm], shape (4, 4)
-    focal_px: float  # focal length at the size of the image
-    distortion: float  # k1 of x (1 + k1 r^2), with r the distance from the centre over half the image width
+    focal_px: float  # focal length for the image at its current size
+    distortion: float  # k1 in x (1 + k1 r^2), where r is the distance from the image centre over half the image width
 
     def stepped(self, centre: Array, step: Array) -> PhotoPose:
-        """Return the pose after a step (8,) of the unknowns; `centre`: upper teeth in the camera frame [mm]."""
+        """Return the pose after a step (8,) of the unknowns; `centre` of the upper teeth in the camera frame [mm]."""
         pose = orthonormalise(motion_about(centre, step[:6]) @ self.T_cam_upper)
         pose[2, 3] += centre[2] * np.expm1(step[6])
         return PhotoPose(pose, self.focal_px * float(np.exp(step[6])), self.distortion + float(step[7]))
 
     def scaled(self, factor: float) -> PhotoPose:
-        """Return the pose for the image scaled by a factor."""
+        """Return the pose that applies if the image is scaled by a factor."""
         return replace(self, focal_px=self.focal_px * factor)
 
     def opencv_k1(self, size_px: tuple[int, int]) -> float:
@@ -76,9 +76,9 @@ class PhotoPose:
     def slopes(
         self, points: Array, directions: Array, size_px: tuple[int, int], distance_mm: float
     ) -> tuple[Array, Array]:
-        """Return derivatives along image directions with respect to camera point (N, 3) [px/mm] and lens (N, 2).
+        """Return derivatives of pixels along directions with respect to camera point (N, 3) [px/mm] and lens (N, 2).
 
-        The lens columns are log focal length, with the coupled change of distance, and distortion. `directions` are
+        The lens columns are log focal length (with its coupled change of distance) and distortion. `directions` are
         unit vectors, shape (N, 2).
         """
         flat = self.focal_px * points[:, :2] / points[:, 2:]
@@ -93,12 +93,12 @@ class PhotoPose:
 
 
 def middle_of(size_px: tuple[int, int]) -> Array:
-    """Return the centre of an image [px], shape (2,)."""
+    """Return the centre of an image with a given size [px], shape (2,)."""
     return 0.5 * (np.array(size_px, np.float64) - 1.0)
 
 
 def to_camera(pose: PhotoPose, T_upper_lower: Array, points: Array, arch: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return scan points (N, 3) of both arches in upper-scan and in camera coordinates [mm], shape (N, 3) each."""
+    """Transform scan points (N, 3) of both arches to upper-scan and to camera coordinates [mm], shape (N, 3) each."""
     in_upper = np.where(arch[:, None] == 1, transform_points(T_upper_lower, points), points)
     return in_upper, transform_points(pose.T_cam_upper, in_upper)
 
@@ -115,7 +115,7 @@ class Contact:
         self._upper, self._lower = (crown_surface(scan) for scan in scans)
         self._tree = cKDTree(self._upper.points)
         centred = self._lower.points - scans[1].centre
-        # The longest axis of an arch runs from left to right, unless half of the arch is missing.
+        # The longest axis of an arch runs from left to right unless half of the arch is missing.
         across = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
         self._sides = [across > np.percentile(across, 60), across < np.percentile(across, 40)]
 
@@ -138,20 +138,21 @@ class Contact:
         return max(0.0, -float(np.percentile(away, 0.2)))
 
     def _signed(self, points: Array) -> tuple[Array, Array]:
-        """Return signed distances from the upper crowns, negative inside [mm], shape (N,), and their normals (N, 3)."""
+        """Return signed distances of points from the upper crowns [mm], negative inside, (N,), and normals (N, 3)."""
         distance, index = self._tree.query(points)
         normals = self._upper.normals[index]
         off = points - self._upper.points[index]
         behind = np.einsum("ij,ij->i", off, normals)
         inside = (behind < -0.7 * distance) & (distance < _REACH_MM) & ~self._upper.border[index]
-        # Near the surface, the distance from the tangent plane is more accurate than that from the nearest point.
+        # Near the surface, the distance from the tangent plane is more accurate than the distance from the nearest
+        # point.
         away = np.where(distance < 1.0, behind, np.where(inside, -distance, distance))
         return away, normals
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """The lines of one photograph, after undoing any mirroring, and its pose."""
+    """The lines of one photograph, with any mirroring undone, and the photograph's pose."""
 
     drawing: Drawing
     pose: PhotoPose
@@ -163,7 +164,7 @@ class Photo:
 
 @dataclass(frozen=True, eq=False)
 class Bite:
-    """Poses of photographs and the bite they have in common."""
+    """Poses of photographs, and their common bite."""
 
     photos: tuple[Photo, ...]
     T_upper_lower: Array  # lower to upper scan [mm], shape (4, 4)
@@ -172,7 +173,7 @@ class Bite:
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Drawn points matched to outlines.
+    """Drawn points with their matched outline points.
 
     Attributes:
         outlines: the matched outline point of each drawn point.
@@ -186,7 +187,7 @@ class Match:
 
 
 def match(seen: Outlines, drawing: Drawing, turn_px: float) -> Match:
-    """Match each drawn point to the nearest outline of similar direction."""
+    """Match each drawn point to the nearest outline point, in position and direction."""
     drawn, there = (features(one.pixels, one.normals, turn_px) for one in (drawing, seen))
     apart, index = nearest(drawn, there)
     own = seen.take(index)
@@ -206,14 +207,14 @@ def seen_outlines(crowns: Sequence[Crowns], photo: Photo, bite: Bite) -> Outline
 
 
 class Aligner:
-    """Gauss-Newton alignment of both arches with photographs, minimising distances of drawn lines from outlines."""
+    """Gauss-Newton alignment of both arches with photographs, which minimises distances of lines from outlines."""
 
     def __init__(self, crowns: Sequence[Crowns], usual_bite: Array, contact: Contact | None) -> None:
-        """Store both arches, a typical bite as prior, and the contact prior, or None to omit it."""
+        """Store both arches, a typical bite as prior, and the contact prior (None omits it)."""
         self._crowns, self._usual, self._contact = crowns, usual_bite, contact
 
     def aligned(self, bite: Bite, gates_mm: Sequence[float]) -> Bite:
-        """Return photographs and bite after one step per gate, the maximum residual [mm] of the lines used."""
+        """Return photographs and bite after one step per gate; a step uses lines with residuals up to its gate [mm]."""
         for gate_mm in gates_mm:
             bite = self._step(bite, gate_mm)
         return bite
@@ -286,13 +287,13 @@ class Aligner:
 
 
 def _add(H: Array, g: Array, part: NDArray[np.int64], J: Array, residual: Array, weight: Array) -> None:
-    """Add residuals to the normal equations; J are derivatives with respect to the unknowns with indices `part`."""
+    """Add residuals to the normal equations; J: derivatives with respect to the unknowns at indices `part`."""
     H[np.ix_(part, part)] += J.T @ (weight[:, None] * J)
     g[part] -= J.T @ (weight * residual)
 
 
 def _lens_prior(pose: PhotoPose, centre: Array) -> tuple[Array, Array, Array]:
-    """Return derivatives, residuals and weights of the priors on distance and distortion."""
+    """Return derivatives, residuals and weights of the priors on camera distance and lens distortion."""
     J = np.zeros((2, UNKNOWNS))
     J[0, 5], J[0, 6], J[1, 7] = 1.0 / centre[2], 1.0, 1.0
     return (
