@@ -146,7 +146,7 @@ def searched(
 
 
 def _facing(turn: tuple[float, float, float]) -> Array:
-    """Return the rotation from (left, up, front) to the (right, down, ahead) axes of a camera in front, shape (3, 3)."""
+    """Return the rotation from (left, up, front) to the (right, down, ahead) axes of a front camera, shape (3, 3)."""
     yaw, pitch, roll = turn
     facing = np.diag([1.0, -1.0, -1.0])
     return np.asarray(so3_exp([0, 0, roll]) @ so3_exp([pitch, 0, 0]) @ facing @ so3_exp([0, yaw, 0]), np.float64)
