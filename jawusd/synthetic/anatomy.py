@@ -1,4 +1,4 @@
-"""Bones and teeth of a synthetic subject that match the subject's joint; at the identity pose, teeth occlude."""
+"""Bones and teeth that match the joint of a synthetic subject; at the identity pose, the teeth are in occlusion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jawusd.synthetic.dental_arch import ArchShape, DentalArch, build_arch
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.teeth import LOWER, UPPER
 
-# Heights of edges and cusps relative to the edges of the upper central incisors [mm], first incisor to second molar.
+# Heights of upper edges and cusps relative to the upper central incisal edges [mm], first incisor to second molar.
 _UPPER_TIPS_MM = -np.array([0.0, 0.5, 0.2, 0.3, 0.4, 0.6, 1.0])
 # Heights of the lower front teeth relative to the lower central incisors [mm].
 _LOWER_FRONT_MM = np.array([0.0, -0.2, -0.3])
@@ -26,10 +26,10 @@ _SAMPLES_PER_EDGE = 5
 
 
 class Occlusion:
-    """Height map of the occlusal side of the upper crowns, and the vertices of the lower crowns."""
+    """Contact test of the arches: height map of the upper crowns' occlusal side, and vertices of the lower crowns."""
 
     def __init__(self, upper: DentalArch, lower: DentalArch) -> None:
-        """Build the height map; both arches are in the scan frame, in occlusion."""
+        """Build the height map from both arches in the scan frame, in occlusion."""
         samples = _samples(upper)
         self._low = samples[:, [0, 2]].min(0)
         cells = np.floor((samples[:, [0, 2]] - self._low) / _CELL_MM).astype(int)
@@ -65,7 +65,7 @@ class PersonAnatomy:
 
     upper: DentalArch
     lower: DentalArch
-    mandible: Mesh  # mandible bone without teeth
+    mandible: Mesh  # bone of the mandible, without teeth
     skull: Mesh  # sockets of the joint, cheekbones, upper jaw bone
     occlusion: Occlusion  # contact between the two arches
 
@@ -83,7 +83,7 @@ def build_anatomy(person: Person) -> PersonAnatomy:
     upper_shape = ArchShape(quadratic, quartic, 0.0, np.tile(_UPPER_TIPS_MM, (2, 1)), 0.0)
     upper = build_arch(UPPER, upper_shape, cusp_slope, True, person.seed)
     tips = np.tile(np.concatenate([y + _LOWER_FRONT_MM, np.full(4, y - 1.0)]), (2, 1))
-    for _ in range(2):  # the second round accounts for teeth raised in the first
+    for _ in range(2):  # the second round accounts for the teeth raised in the first round
         lower = build_arch(LOWER, ArchShape(quadratic, quartic, -z, tips, x), cusp_slope, False, person.seed)
         gaps = Occlusion(upper, lower).gaps(np.eye(4))
         tips = tips + np.where(np.arange(7) >= 3, gaps - _CONTACT_GAP_MM, np.minimum(gaps - _CONTACT_GAP_MM, 0.0))
@@ -101,7 +101,7 @@ def opened_bite(person: Person, occlusion: Occlusion, controls: Array, extra_mm:
 
 
 def _samples(arch: DentalArch) -> Array:
-    """Sample all crown triangles more densely than the height map's cells, shape (N, 3)."""
+    """Sample points on all crown triangles more densely than the cells of the height map, shape (N, 3)."""
     faces = arch.mesh.faces[arch.tooth[arch.mesh.faces[:, 0]] != 0]
     corners = arch.mesh.vertices[faces]
     n = _SAMPLES_PER_EDGE

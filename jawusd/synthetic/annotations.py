@@ -14,27 +14,27 @@ from jawusd.geometry.points import meet_triangles
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.surfaces import vertex_normals
 
-# Outline jitter: amplitude and cell size [px] at an image height of 1080, fraction of the variance that is constant
-# over time, and frame-to-frame correlation of the rest.
+# Outline jitter: amplitude and cell size [px] at an image height of 1080 px, fraction of the variance that is constant
+# over time, and frame-to-frame correlation of the variable part.
 _WOBBLE_PX, _CELL_PX = 0.7, 36.0
 _REFERENCE_HEIGHT = 1080.0
 _CONSTANT_SHARE = 0.5
 _KEEP = 0.6
 _HOLE_CHANCE, _SPECK_CHANCE = 0.12, 0.08
 _FINE = 4
-# Minimum distance of a pick from the image border, and minimum cosine between ray and normal (about 70 degrees).
+# Minimum distance of a pick from the image border, and minimum cosine between viewing ray and normal (70 degrees).
 _BORDER_PX = 10.0
 _FACING = 0.35
-# A surface occludes a point if it is nearer to the camera by more than this.
+# Minimum distance in front of a point at which a surface occludes it.
 _CLEARANCE_MM = 0.05
 _TIPS_PER_TOOTH = 6
 
 
 class Outline:
-    """Jitter of a mask's outline over time, as a displacement field."""
+    """Jitter of a mask's outline, as a displacement field that varies over time."""
 
     def __init__(self, size_px: tuple[int, int], rng: np.random.Generator) -> None:
-        """Initialise for masks of a width and height."""
+        """Initialise the field for masks of a given width and height."""
         scale = size_px[1] / _REFERENCE_HEIGHT
         self._rng = rng
         cells = tuple(int(np.ceil(s / (_CELL_PX * scale))) + 3 for s in size_px[::-1])
@@ -52,7 +52,7 @@ class Outline:
 
 
 def _refined(field: Array, axis: int) -> Array:
-    """Interpolate along an axis with cosine weights, normalised to keep the variance constant between nodes."""
+    """Interpolate along an axis with cosine weights, normalised to equal variance at and between nodes."""
     t = np.arange(_FINE) / _FINE
     b = 0.5 - 0.5 * np.cos(np.pi * t)
     a = 1.0 - b
@@ -102,7 +102,7 @@ def choose_picks(
     noise_px: float,
     rng: np.random.Generator,
 ) -> list[VisibleVertex]:
-    """Choose `count` well distributed tips and corners of teeth that are visible in at least two cameras.
+    """Choose `count` well-distributed tips and corners of teeth that are visible in at least two cameras.
 
     Args:
         T_world_arch: pose of the arch, shape (4, 4).
@@ -165,7 +165,7 @@ def _seen(camera: Camera, points: Array, normals: Array, occluders: list[Mesh]) 
 
 
 def _hits(point: Array, eye: Array, corners: Array) -> bool:
-    """Return whether any of the triangles (N, 3, 3) lies between a point and the camera."""
+    """Return whether any triangle (N, 3, 3) lies between a point and the camera."""
     direction = eye - point
     u, v, along = meet_triangles(point, direction, corners)
     nearest = _CLEARANCE_MM / np.linalg.norm(direction)

@@ -1,7 +1,7 @@
-"""The mandible and the adjacent parts of the skull: fossa and eminence, cheekbone, upper jaw bone; without teeth.
+"""The mandible and adjacent parts of the skull, without teeth: fossa and eminence, cheekbone, upper jaw bone.
 
 The joint surfaces follow from the subject's kinematics: condyles that slide along them trace the paths of
-`jawusd.synthetic.kinematics`. Everything is in the scan frame [mm], in the closed bite.
+`jawusd.synthetic.kinematics`. All surfaces are in the scan frame [mm], in the closed bite.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _AROUND = 24
 
 
 def build_mandible(joint: Joint) -> Mesh:
-    """Build the mandible without teeth from overlapping closed parts: body, rami, coronoid processes, condyles."""
+    """Build the mandible without teeth from overlapping watertight parts: body, rami, coronoid processes, condyles."""
     parts = [_body(joint)]
     for side, centre in zip((1.0, -1.0), joint.condyles, strict=True):
         parts += [_ramus(joint, side, centre), _condyle(side, centre), _coronoid(side, centre)]
@@ -30,7 +30,7 @@ def build_mandible(joint: Joint) -> Mesh:
 
 
 def build_skull(joint: Joint) -> Mesh:
-    """Build the skull from overlapping closed parts: joint sockets, cheekbones and upper jaw bone."""
+    """Build the skull from overlapping watertight parts: joint sockets, cheekbones and upper jaw bone."""
     parts = [_maxilla(joint)]
     for k, side in enumerate((1.0, -1.0)):
         parts += [_socket(joint, k), _cheekbone(joint, k, side)]
@@ -38,9 +38,9 @@ def build_skull(joint: Joint) -> Mesh:
 
 
 def articular_surface(joint: Joint, side: int, slide_mm: Array) -> Array:
-    """Return points (y, z) of the socket's sagittal section [mm], shape (..., 2), at forward slides (...).
+    """Return points (y, z) of the joint socket's sagittal section [mm], shape (..., 2), at forward slides (...).
 
-    It is the condyle's path offset by the joint space; side 0 is left, 1 right.
+    The section is the condyle's path, offset by the joint space. Side 0 is left, 1 is right.
     """
     step = 1e-4
     slope = (eminence(joint, side, slide_mm + step) - eminence(joint, side, slide_mm - step)) / (2 * step)
@@ -56,7 +56,7 @@ def _mesh(part: tuple[Array, Faces]) -> Mesh:
 
 
 def _ovals(centres: Array, half_x: Array, half_z: Array, squareness: float = 0.8) -> tuple[Array, Faces]:
-    """Loft horizontal rounded rectangles: centres (R, 3), half sizes (R,) [mm]."""
+    """Loft horizontal rounded rectangles with centres (R, 3) and half sizes (R,) [mm]."""
     x, z = superellipse(2 * np.pi * np.arange(_AROUND) / _AROUND, squareness)
     offsets = np.stack([half_x[:, None] * x, np.zeros((len(centres), _AROUND)), half_z[:, None] * z], -1)
     return loft(centres[:, None] + offsets)
@@ -84,9 +84,9 @@ def _spline(knots: Array, values: Array, at: Array) -> Array:
 
 
 def _body(joint: Joint) -> tuple[Array, Faces]:
-    """Return the horseshoe of the body, from ramus to ramus, below the lower gum."""
+    """Return the body of the mandible, a horseshoe from ramus to ramus below the lower gum."""
     x, y, z = joint.incisor
-    # x, y of the middle, z, half width, half height; from the chin to the left ramus
+    # columns: x, y of the middle, z, half width, half height; rows: from the chin to the left ramus
     half = np.array(
         [
             [0.0, y - 24.0, z - 5.5, 5.5, 10.5],
@@ -102,7 +102,7 @@ def _body(joint: Joint) -> tuple[Array, Faces]:
 
 def _ramus(joint: Joint, side: float, centre: Array) -> tuple[Array, Faces]:
     """Return the plate of one ramus, from the angle of the jaw up to the notch."""
-    # height below the condyle, inward shift, forward position of its middle, half thickness, half length
+    # columns: height relative to the condyle, inward shift, forward position of the middle, half thickness, half length
     rows = np.array(
         [
             [-60.0, 7.0, 15.0, 2.0, 6.0],
@@ -119,7 +119,7 @@ def _ramus(joint: Joint, side: float, centre: Array) -> tuple[Array, Faces]:
 
 
 def _condyle(side: float, centre: Array) -> tuple[Array, Faces]:
-    """Return neck and head of one condyle; the head is an ellipsoid about the centre."""
+    """Return the neck and head of one condyle; the head is an ellipsoid about the condyle's centre."""
     neck = np.array([[-24.0, 2.5, 5.5, 2.6, 6.5], [-15.0, 1.5, 1.5, 4.0, 5.0], [-8.0, 0.5, -0.3, 5.5, 4.0]])
     neck = _spline(neck[:, 0], neck, np.linspace(-24.0, -8.0, 9))
     turn = np.linspace(-0.35 * np.pi, 0.499 * np.pi, 13)
@@ -150,13 +150,13 @@ def _coronoid(side: float, centre: Array) -> tuple[Array, Faces]:
 
 
 def _column(centre: Array, side: float, rows: Array, squareness: float = 0.8) -> tuple[Array, Faces]:
-    """Loft upwards near a condyle: rows of height, inward shift, forward position, half thickness, half length."""
+    """Loft upwards near a condyle; rows: height, inward shift, forward position, half thickness, half length."""
     centres = centre + np.stack([-side * rows[:, 1], rows[:, 0], rows[:, 2]], -1)
     return _ovals(centres, rows[:, 3], rows[:, 4], squareness)
 
 
 def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
-    """Return fossa, eminence and the bone in front of it, as a slab above the condyle."""
+    """Return fossa, eminence and the bone in front of the eminence, as a slab above the condyle."""
     slide = np.linspace(-7.0, 22.0, 40)
     section = articular_surface(joint, k, slide)
     behind = np.maximum(-3.0 - slide, 0.0)
@@ -171,7 +171,7 @@ def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
         ],
         -1,
     )
-    # slab thickness: large in the middle, small at the edges, domed over the fossa
+    # thickness of the slab: large in the middle, small at the edges, domed over the fossa
     along = np.linspace(-1.0, 1.0, 40)[:, None]
     thick = np.sqrt((1.0 - along**6) * (1.0 - (across / 12.0) ** 6) + 0.01)
     dome = 3.0 * np.exp(-(((slide[:, None] - 2.0) / 9.0) ** 2)) * np.cos(across / 12.0 * np.pi / 2)
@@ -189,7 +189,7 @@ def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
 
 
 def _cheekbone(joint: Joint, k: int, side: float) -> tuple[Array, Faces]:
-    """Return the arch from the socket forward to the cheek and inward to the upper jaw bone."""
+    """Return the zygomatic arch, from the socket forward to the cheek and inward to the upper jaw bone."""
     x, y, z = joint.condyles[k]
     rows = np.array(
         [
@@ -206,7 +206,7 @@ def _cheekbone(joint: Joint, k: int, side: float) -> tuple[Array, Faces]:
 
 
 def _maxilla(joint: Joint) -> tuple[Array, Faces]:
-    """Return the horseshoe of bone over the upper gum."""
+    """Return the upper jaw bone, a horseshoe above the upper gum."""
     y = 0.5 * joint.condyles[:, 1].mean()
     half = np.array(
         [[0.0, y, -8.0, 4.5, 8.0], [11.0, y, -9.0, 5.0, 9.0], [21.0, y, -19.0, 6.0, 9.5],
@@ -216,7 +216,7 @@ def _maxilla(joint: Joint) -> tuple[Array, Faces]:
 
 
 def _horseshoe(half: Array, midline_x: float, count: int) -> tuple[Array, Faces]:
-    """Sweep ovals along a path given by its left half from the midline: rows of x, y, z, half width, half height."""
+    """Sweep ovals along a symmetric path; rows of its left half: x, y, z, half width, half height."""
     rows = np.concatenate([half[:0:-1] * [-1.0, 1.0, 1.0, 1.0, 1.0], half])
     rows[:, 0] += midline_x
     rows = _spline(np.arange(len(rows), dtype=np.float64), rows, np.linspace(0.0, len(rows) - 1.0, count))

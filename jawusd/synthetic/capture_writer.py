@@ -40,7 +40,7 @@ from jawusd.synthetic.take import (
 
 Progress = Callable[[int, int], None]
 
-# Offset of each camera: its frame k is simultaneous with frame k + offset of the first camera.
+# Offset of each camera; frame k of a camera is simultaneous with frame k + offset of the first camera.
 _OFFSETS = (0, 5, -3)
 _SCANS = ("upper_teeth", "lower_teeth", "mandible", "skull")
 _PICKS = 4
@@ -52,12 +52,12 @@ _SENSOR_NOISE = 1.3
 _NOISE_PATTERNS = 5
 
 
-_IMAGE_S = 0.93  # time per image on two cores without a GPU: 14 minutes for the 900 images of the default
+_IMAGE_S = 0.93  # time per image on two cores without a GPU; 14 minutes for the 900 images of the default capture
 
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Seed, size and quality of a synthetic capture."""
+    """Seed, size and video quality of a synthetic capture."""
 
     seed: int = 0  # seed of the subject and the performance
     frames: int = 240  # number of tracked frames, at 24 per second
@@ -75,19 +75,19 @@ class DemoConfig:
 
     @property
     def images(self) -> int:
-        """Return the number of images of all cameras."""
+        """Return the total number of images of all cameras."""
         return len(build_cameras(self.size_px)) * (LEAD + self.frames + TAIL + self.boards)
 
     @property
     def seconds(self) -> float:
-        """Return about how long rendering takes without a GPU [s]."""
+        """Return the approximate rendering time without a GPU [s]."""
         return self.images * _IMAGE_S
 
 
 def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Progress | None = None) -> Path:
     """Record a synthetic subject to a capture folder, overwriting existing files; return the path of capture.toml.
 
-    Progress is reported as the number of images done and the total.
+    Progress is reported as the number of images done and the total number.
 
     Raises:
         MissingDependencyError: there is no headless OpenGL (EGL).
@@ -96,7 +96,7 @@ def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Pro
     folder = Path(folder)
     person = Person(config.seed)
     cameras = build_cameras(config.size_px)
-    with Renderer(cameras) as renderer:  # fails before any file is written if there is no OpenGL
+    with Renderer(cameras) as renderer:  # raises before any file is written if there is no OpenGL
         anatomy = build_anatomy(person)
         take = perform(person, anatomy.occlusion, config.frames, _OFFSETS, config.seed)
         recorder = _Recorder(folder, config, cameras, renderer, progress)
@@ -113,7 +113,7 @@ def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Pro
 
 
 class _Recorder:
-    """Renders every image of a capture and writes the video files."""
+    """Writer that renders every image of a capture and writes the video files."""
 
     def __init__(
         self, folder: Path, config: DemoConfig, cameras: list[Camera], renderer: Renderer, progress: Progress | None
@@ -155,7 +155,7 @@ class _Recorder:
                     self._count()
 
     def boards(self) -> Array:
-        """Record the calibration board; return T_world_board of each pose, shape (B, 4, 4)."""
+        """Record the calibration board; return its poses T_world_board, shape (B, 4, 4)."""
         self._renderer.add("board", board())
         poses = board_poses(self._config.boards, np.random.default_rng([self._config.seed, 0xB0A2D]))
         with contextlib.ExitStack() as stack:

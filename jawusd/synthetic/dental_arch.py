@@ -1,6 +1,6 @@
 """Dental arches: crowns placed along a curve, and a scalloped gum around their bases.
 
-Everything is built with the occlusal side up (x left, y occlusal, z anterior) and mirrored in y for the upper jaw.
+An arch is built with the occlusal side up (x left, y occlusal, z anterior), and mirrored in y for the upper jaw.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
 
 RED, GREEN, GREY = (215, 45, 40), (40, 190, 60), (150, 150, 150)
-# Depth of the contact points, at which teeth are aligned, behind the incisal edges and buccal cusp tips [mm].
+# Depth of the contact points behind the incisal edges and buccal cusp tips [mm]; teeth are aligned at these points.
 CONTACT_MM = 0.9
 CONTACT_OVERLAP_MM = 0.22
 _BOUNDARY_MM = 2.5
-# Gum cross-section on one side, from the fold to the crest: distance outside the crown and height over the margin.
+# Gum cross-section on one side, from fold to crest: distance outside the crown, height above the gum margin.
 _GUM_SIDE = np.array(
     [[2.6, -9.0], [2.0, -6.2], [1.45, -3.8], [1.0, -2.1], [0.72, -1.0], [0.42, -0.3], [0.05, 0.0], [-0.8, -0.5]]
 )
@@ -30,29 +30,29 @@ COLUMN_MM = 0.55
 
 @dataclass(frozen=True)
 class ArchShape:
-    """Shape and position of one arch."""
+    """Shape and position of one dental arch."""
 
-    quadratic_per_mm: float  # a of the curve z = -(a x^2 + b x^4) outside the edges and buccal cusps [1/mm]
-    quartic_per_mm3: float  # b of the same curve [1/mm^3]
+    quadratic_per_mm: float  # coefficient a of the curve z = -(a x^2 + b x^4) outside the edges and buccal cusps [1/mm]
+    quartic_per_mm3: float  # coefficient b of the curve [1/mm^3]
     setback_mm: float  # distance by which the edges and buccal cusps lie inside the curve
     # height of edge or highest cusp of each tooth, first incisor to second molar, left then right, shape (2, 7)
     tips_mm: Array
-    midline_mm: float  # x coordinate of the midline
+    midline_mm: float  # x coordinate of the midline of the arch
 
 
 @dataclass(frozen=True, eq=False)
 class DentalArch:
-    """One arch with gum in the scan frame."""
+    """One dental arch with gum, in the scan frame."""
 
     mesh: Mesh  # crown vertices, red and green, then gum vertices, grey
-    tooth: NDArray[np.int8]  # tooth of each vertex, 1..7 left and -1..-7 right from the midline, 0 gum, shape (V,)
+    tooth: NDArray[np.int8]  # tooth number of each vertex, 1..7 left, -1..-7 right from the midline, 0 gum, shape (V,)
 
 
 class ArchLine:
-    """Planar curve through the contact points, by signed arc length from the midline, positive to the left."""
+    """Planar curve through the contact points over signed arc length from the midline, positive to the left."""
 
     def __init__(self, shape: ArchShape) -> None:
-        """Compute the curve for an arch shape."""
+        """Compute the curve for the shape of an arch."""
         x = np.linspace(-40.0, 40.0, 8001)
         z = -shape.quadratic_per_mm * x**2 - shape.quartic_per_mm3 * x**4
         slope = -2 * shape.quadratic_per_mm * x - 4 * shape.quartic_per_mm3 * x**3
@@ -90,7 +90,7 @@ def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float
         forms: tooth kinds from the first incisor to the second molar.
         cusp_slope: drop of the cusps per mm.
         upper: whether to mirror the arch downwards.
-        seed: seed of the positions and irregularities of the teeth; they do not depend on the heights of the tips.
+        seed: seed of the positions and irregularities of the teeth, which do not depend on the heights of the tips.
     """
     rng = np.random.default_rng([seed, 0x7EE7, int(upper)])
     line = ArchLine(shape)
@@ -115,7 +115,7 @@ def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float
 
 
 def _centres(forms: tuple[CrownForm, ...]) -> Array:
-    """Return the arc length of the tooth centres on one side."""
+    """Return the arc lengths of the tooth centres on one side."""
     widths = np.array([form.width_mm - CONTACT_OVERLAP_MM for form in forms])
     return np.cumsum(widths) - widths / 2
 
@@ -141,7 +141,7 @@ def crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
 
     Args:
         local: vertices in the crown frame, shape (V, 3).
-        k: tooth, 0 first incisor to 6 second molar.
+        k: index of the tooth, from 0 (first incisor) to 6 (second molar).
     """
     colors = np.tile(np.array(RED, dtype=np.uint8), (len(local), 1))
     if k < 3:
@@ -168,7 +168,7 @@ def gum_ridge(line: ArchLine, s: Array, margin: Array, crowns: Array) -> tuple[A
     """
     crown_s, crown_n = line.coordinates(crowns[:, [0, 2]])
     facial, lingual = _crown_extent(s, margin, crown_s, crown_n, crowns[:, 1])
-    # The gum follows every crown near the crest, and only the arch farther down.
+    # Near the crest, the gum follows every crown; farther down, it follows only the arch.
     follow = np.clip(1.0 + _GUM_SIDE[:, 1] / 5.0, 0.0, 1.0)
     sides = []
     for extent, sign in ((facial, 1.0), (lingual, -1.0)):
@@ -185,7 +185,7 @@ def gum_ridge(line: ArchLine, s: Array, margin: Array, crowns: Array) -> tuple[A
 
 
 def _margin(forms: tuple[CrownForm, ...], shape: ArchShape, s: Array) -> Array:
-    """Return the height of the gum margin: the gum line at each tooth, papillae in between."""
+    """Return the height of the gum margin: the gum line at each tooth, with papillae in between."""
     height = np.array([form.height_mm for form in forms])
     centre = np.concatenate([side * _centres(forms) for side in (1, -1)])
     order = np.argsort(centre)
@@ -212,7 +212,7 @@ def _crown_extent(s: Array, margin: Array, crown_s: Array, crown_n: Array, crown
 
 
 def _averaged(values: Array, width: int) -> Array:
-    """Smooth along the arch with a Hann window and replicated edges."""
+    """Smooth values along the arch with a Hann window and replicated edges."""
     width += 1 - width % 2
     kernel = np.hanning(width + 2)[1:-1]
     return np.convolve(np.pad(values, width // 2, mode="edge"), kernel / kernel.sum(), "valid")

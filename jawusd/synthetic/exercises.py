@@ -1,4 +1,4 @@
-"""Jaw exercises as control curves, and recordings of a subject performing them.
+"""Jaw exercises as control curves, and recordings of a subject who performs them.
 
 Speeds and amplitudes follow chewing and clinical exercise data: chewing cycles of 0.6 to 1 s and 15 to 20 mm, border
 movements of 3 to 4 s, all at 24 frames per second.
@@ -19,7 +19,7 @@ from jawusd.synthetic.person import Person
 
 Kind = Literal["training", "hidden"]
 
-# Orders of the exercises, repeated until the recording is long enough.
+# Sequences of exercises, repeated until the recording is long enough.
 _SCHEDULES: dict[str, tuple[str, ...]] = {
     "training": (
         "open", "lateral", "protrude", "open", "lateral", "sagittal border", "lateral half open",
@@ -36,7 +36,7 @@ _SCHEDULES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Recording:
-    """Recorded exercises of a subject; poses are T_skull_mandible, shape (F, 4, 4)."""
+    """Recorded exercises of a subject; all poses are T_skull_mandible, shape (F, 4, 4)."""
 
     controls: Array  # opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3)
     phase: NDArray[np.str_]  # name of the exercise of each frame, shape (F,)
@@ -72,7 +72,7 @@ def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", no
 def schedule(
     names: tuple[str, ...], n_frames: int, rng: np.random.Generator, tempo: float = 1.0
 ) -> tuple[Array, NDArray[np.str_]]:
-    """Concatenate exercises, repeating them as needed to fill the frames.
+    """Concatenate exercises, repeating them until all frames are filled.
 
     Args:
         tempo: speed factor of all exercises except chewing and speech.
@@ -96,7 +96,7 @@ def schedule(
 
 
 def smooth_noise(rng: np.random.Generator, n_frames: int, frames: float, n: int) -> Array:
-    """Return n random curves of unit variance with a correlation time in frames, shape (n_frames, n)."""
+    """Return n random curves of unit variance with a given correlation time [frames], shape (n_frames, n)."""
     keep = np.exp(-1.0 / frames)
     steps = rng.normal(size=(n_frames, n)) * np.sqrt(1.0 - keep**2)
     curve = np.empty((n_frames, n))
@@ -139,10 +139,10 @@ def _swing(n: int) -> Array:
 
 
 def _border(n: int, turn: float, end: int) -> tuple[Array, Array]:
-    """Trace the border: move to one side while closed, open along that side, cross over, close along the other side.
+    """Trace the border: move to one side with teeth closed, open along it, cross over, close along the other side.
 
-    The mandible crosses over during the fraction `turn` of the closing and returns to the middle in the last `end`
-    frames.
+    The mandible crosses over during the first part of closing (fraction `turn`), and returns to the middle in the last
+    `end` frames.
 
     Returns:
         Opening 0..1 and excursion -1..1, shape (n,) each.

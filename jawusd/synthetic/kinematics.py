@@ -1,6 +1,7 @@
 """Temporomandibular joint: two condyles on curved eminences, driven by opening, lateral and protrusion controls.
 
-Frame: scan frame (x to the subject's left, y up, z anterior, mm), teeth in occlusion at identity. The mandible has four
+Poses are in the scan frame (x to the subject's left, y up, z anterior, mm); at the identity, the teeth are in
+occlusion. The mandible has four
 joint coordinates: the pitch about the condylar axis, the forward slide of each condyle, and the side shift. The heights
 of the condyles follow from the eminences, and their lateral positions from the constant distance between them, so both
 condyles stay on their slopes in every pose. Joint surfaces, guidance and ranges follow textbook TMJ mechanics
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry import make_transform, so3_exp
 
-# Pitch [rad] at which the Gaussian tooth guidance has decreased by a factor of e.
+# Pitch [rad] at which the tooth guidance, a Gaussian of pitch, has decreased by a factor of e.
 _CONTACT_FADE_RAD = np.deg2rad(4.0)
 # Rounding of corners in the tooth guidance [mm], since cusps are blunt.
 _CUSP_ROUNDING_MM = 0.3
@@ -25,7 +26,7 @@ _CUSP_ROUNDING_MM = 0.3
 
 @dataclass(frozen=True)
 class Joint:
-    """Parameters of one subject's joint; pairs are (left, right), lengths mm, angles rad."""
+    """Parameters of one subject's joint; pairs are (left, right), lengths are in mm, angles in rad."""
 
     condyles: Array  # centres of the condyles at rest, shape (2, 3)
     incisor: Array  # lower incisal point at rest, shape (3,)
@@ -33,22 +34,22 @@ class Joint:
     eminence_width_mm: Array  # half width of the slope, shape (2,)
     eminence_start_mm: Array  # forward distance from rest to the steepest point, shape (2,)
     medial_slope: Array  # drop of a condyle per mm towards the midline, shape (2,)
-    bennett_rad: Array  # angle of each condyle's path to the sagittal plane on the balancing side, shape (2,)
+    bennett_rad: Array  # angle between each condyle's path on the balancing side and the sagittal plane, shape (2,)
     side_shift_mm: Array  # immediate side shift towards each working side, shape (2,)
     lateral_max_mm: Array  # maximum difference of the two slides for each working side, shape (2,)
     lateral_shrink: float  # fraction by which `lateral_max_mm` shrinks at full opening
-    working_share: float  # fraction of the difference that is the balancing condyle's slide when closed
+    working_share: float  # fraction of the slide difference that the balancing condyle contributes with closed teeth
     rotation_max_rad: float  # pitch at full opening
     rotation_bend: float  # curvature of pitch over opening (0: proportional)
-    slide_open_mm: float  # forward slide at full opening
+    slide_open_mm: float  # forward slide of the condyles at full opening
     slide_limit_mm: float  # maximum forward slide of a condyle
     slide_early: float  # fraction of the opening slide that starts early; the rest lags behind the rotation
     slide_onset: float  # opening (0..1) around which the early part of the slide becomes proportional to opening
     protrusion_max_mm: float  # forward slide in full protrusion at zero opening
     retrusion_max_mm: float  # backward slide in full retrusion at zero opening
     hinge_share: float  # fraction of the opening slide reversed by retrusion below half opening
-    deviation_mm: Array  # lateral deviation of the opening path: S-shaped and one-sided part, shape (2,)
-    protrusive_guidance: Array  # tooth guidance: initial slope, later slope, transition length [mm], (3,)
+    deviation_mm: Array  # lateral deviation of the opening path: S-shaped part and one-sided part, shape (2,)
+    protrusive_guidance: Array  # protrusive tooth guidance: initial slope, later slope, transition length [mm], (3,)
     lateral_guidance: Array  # lateral tooth guidance, in the same order, shape (3,)
 
     @property
@@ -63,7 +64,7 @@ class Joint:
 
 
 def smoothstep(x: ArrayLike) -> Array:
-    """Return a smooth step from 0 to 1 over x in 0..1 with zero slope at both ends, any shape."""
+    """Return a smooth step from 0 to 1 for x in 0..1, with zero slope at both ends; x has any shape."""
     x = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
@@ -71,12 +72,13 @@ def smoothstep(x: ArrayLike) -> Array:
 def eminence(joint: Joint, side: int, slide_mm: ArrayLike, medial_mm: ArrayLike = 0.0) -> Array:
     """Return the height of a condyle centre relative to rest [mm], negative down the eminence.
 
-    The sagittal section is a closed-form S curve (concave fossa, slope, convex crest), flat far in front and behind.
+    The sagittal section is an S curve in closed form (concave fossa, slope, convex crest), flat far in front and
+    behind.
 
     Args:
         side: 0 left, 1 right.
-        slide_mm: forward distance from rest, any shape.
-        medial_mm: displacement towards the midline, same shape.
+        slide_mm: forward distance of the condyle from rest, any shape.
+        medial_mm: displacement of the condyle towards the midline, same shape.
     """
     slide = np.asarray(slide_mm, dtype=np.float64)
     start, width = joint.eminence_start_mm[side], joint.eminence_width_mm[side]
@@ -101,7 +103,7 @@ def joint_pose(
     distance = joint.condylar_distance_mm
     spread = np.full(pitch.shape, rest_axis[0])
     middle_x = (left[0] + right[0]) / 2 + shift
-    for _ in range(4):  # heights and lateral positions are coupled; each iteration gains two digits
+    for _ in range(4):  # condyle heights and lateral positions are coupled; each iteration gains two digits
         y_left = left[1] + eminence(joint, 0, slides[..., 0], left[0] - middle_x - spread / 2) - lifts[..., 0]
         y_right = right[1] + eminence(joint, 1, slides[..., 1], middle_x - spread / 2 - right[0]) - lifts[..., 1]
         dy, dz = y_left - y_right, rest_axis[2] + slides[..., 0] - slides[..., 1]
@@ -118,14 +120,14 @@ def joint_pose(
 def controlled_pose(
     joint: Joint, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike, extra_mm: ArrayLike | None = None
 ) -> Array:
-    """Return T_skull_mandible (..., 4, 4) for controls, extrapolated smoothly outside their ranges.
+    """Return T_skull_mandible (..., 4, 4) for controls; outside the ranges of the controls, extrapolate smoothly.
 
     Args:
-        opening: 0 closed .. 1 wide open, shape (...).
-        lateral: -1 right .. 1 left, of the range at that opening, shape (...).
-        protrusion: -1 retruded .. 1 protruded, of the range at that opening, shape (...).
-        extra_mm: small movements outside the three controls: side shift, lift of the left and of the right condyle,
-            shape (..., 3); None is zero.
+        opening: from 0 (closed) to 1 (wide open), shape (...).
+        lateral: from -1 (right) to 1 (left), relative to the range at this opening, shape (...).
+        protrusion: from -1 (retruded) to 1 (protruded), relative to the range at this opening, shape (...).
+        extra_mm: small movements outside the three controls: side shift, and lift of the left and of the right condyle,
+            shape (..., 3); None means zero.
     """
     opening, lateral, protrusion = np.broadcast_arrays(
         *(np.asarray(c, dtype=np.float64) for c in (opening, lateral, protrusion))
@@ -145,14 +147,14 @@ def controlled_pose(
 
 
 def _coupling(joint: Joint, opening: Array) -> Array:
-    """Return the fraction of the full slide at an opening; translation starts early but lags behind rotation."""
+    """Return the fraction of the full slide of the condyles at an opening; it starts early but lags behind rotation."""
     onset = joint.slide_onset
     early = opening**2 * (1.0 + onset) / (opening + onset)
     return joint.slide_early * early + (1.0 - joint.slide_early) * smoothstep(opening)
 
 
 def _protrusive_range(joint: Joint, opening: Array, share: Array, protrusion: Array) -> Array:
-    """Return the forward or, for negative protrusion, backward range of both condyles [mm]."""
+    """Return the forward range of both condyles [mm] or, for negative protrusion, the backward range."""
     forward = joint.protrusion_max_mm * (1.0 - 0.85 * np.clip(share, 0.0, 1.1))
     hinge = joint.hinge_share * joint.slide_open_mm * share * (1.0 - smoothstep((opening - 0.3) / 0.5))
     backward = joint.retrusion_max_mm * (1.0 - np.clip(opening, 0.0, 1.0)) + 0.15 + hinge
@@ -160,7 +162,7 @@ def _protrusive_range(joint: Joint, opening: Array, share: Array, protrusion: Ar
 
 
 def _lateral_range(joint: Joint, opening: Array, mean_mm: Array, lateral: Array) -> Array:
-    """Return the largest difference between the slides [mm], also limited by the stop of the balancing condyle."""
+    """Return the maximum difference between the slides [mm], also limited by the stop of the balancing condyle."""
     own = np.where(lateral > 0, joint.lateral_max_mm[0], joint.lateral_max_mm[1])
     own = own * (1.0 - joint.lateral_shrink * np.clip(opening, 0.0, 1.1) ** 1.1)
     room = (joint.slide_limit_mm + 1.2 - mean_mm) / (joint.working_share - 0.45 * smoothstep(opening))
@@ -168,7 +170,7 @@ def _lateral_range(joint: Joint, opening: Array, mean_mm: Array, lateral: Array)
 
 
 def _slides(mean_mm: Array, difference_mm: Array, balancing: Array) -> Array:
-    """Return the slides of the (left, right) condyle; the right one is balancing in a movement to the left."""
+    """Return the slides of the (left, right) condyle; in a movement to the left, the right condyle is balancing."""
     forward, backward = balancing * np.abs(difference_mm), (1.0 - balancing) * np.abs(difference_mm)
     to_left = difference_mm > 0
     left = mean_mm + np.where(to_left, -backward, forward)
@@ -177,9 +179,9 @@ def _slides(mean_mm: Array, difference_mm: Array, balancing: Array) -> Array:
 
 
 def _side_shift(joint: Joint, opening: Array, difference_mm: Array, balancing: Array) -> Array:
-    """Return the left shift of the condylar midpoint [mm]: Bennett movement and deviation of the opening path."""
+    """Return the left shift of the condyles' midpoint [mm]: Bennett movement and deviation of the opening path."""
     size = np.abs(difference_mm)
-    # The Bennett angle belongs to the balancing condyle: the right one in a movement to the left.
+    # The Bennett angle belongs to the balancing condyle, which is the right one in a movement to the left.
     tangent = np.tan(np.where(difference_mm > 0, joint.bennett_rad[1], joint.bennett_rad[0]))
     immediate = np.where(difference_mm > 0, joint.side_shift_mm[0], joint.side_shift_mm[1])
     bennett = tangent * balancing * size + immediate * np.tanh(size / 1.5) * (1.0 - smoothstep(opening / 0.6))
@@ -188,7 +190,7 @@ def _side_shift(joint: Joint, opening: Array, difference_mm: Array, balancing: A
 
 
 def _guided(joint: Joint, pitch: Array, slides: Array, forward_mm: Array, difference_mm: Array) -> Array:
-    """Return the pitch including tooth contact; near closure, guidance alone determines the height of the incisors."""
+    """Return the pitch including tooth contact; near closure, only tooth guidance determines the incisors' height."""
     lateral_mm = difference_mm * joint.lever_mm / joint.condylar_distance_mm
     drop_mm = _glide(joint.protrusive_guidance, _soft_positive(forward_mm))
     drop_mm = drop_mm + _glide(joint.lateral_guidance, np.hypot(lateral_mm, _CUSP_ROUNDING_MM) - _CUSP_ROUNDING_MM)
@@ -198,11 +200,11 @@ def _guided(joint: Joint, pitch: Array, slides: Array, forward_mm: Array, differ
 
 
 def _glide(guidance: Array, distance_mm: Array) -> Array:
-    """Return the drop of the lower incisors over a glide distance [mm]: steep first, flatter towards edge-to-edge."""
+    """Return the drop of the lower incisors over a glide distance [mm]: steep first, flatter up to edge-to-edge."""
     steep, flat, transition_mm = guidance
     return flat * distance_mm + (steep - flat) * transition_mm * -np.expm1(-distance_mm / transition_mm)
 
 
 def _soft_positive(x: Array) -> Array:
-    """Return the positive part with a rounded corner, zero at zero."""
+    """Return the positive part of a value with a rounded corner; it is zero at zero."""
     return (x + np.hypot(x, _CUSP_ROUNDING_MM) - _CUSP_ROUNDING_MM) / 2

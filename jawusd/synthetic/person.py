@@ -26,7 +26,7 @@ PoseFunction = Callable[[Array, Array, Array], Array]
 _LOWER = np.array([0.0, -1.0, -1.0])
 _UPPER = np.array([1.0, 1.0, 1.0])
 _GRID = (13, 9, 9)
-# Number of Gauss-Newton steps, as needed near zero protrusion, where the manifold has a kink.
+# Number of Gauss-Newton steps; so many are needed near zero protrusion, where the manifold has a kink.
 _STEPS = 30
 _DIFFERENCE = 1e-5
 # Damping relative to the scale of each control, since the controls' gradients differ by a factor of ten.
@@ -36,13 +36,13 @@ EnvelopeKind = Literal["box", "competing"]
 
 
 class Envelope:
-    """Set of possible controls of one subject, with projection onto it."""
+    """Set of possible controls of one subject, with projection onto this set."""
 
     def __init__(self, pose: PoseFunction, points: Array, exponent: float | None) -> None:
         """Prepare the grid of start values.
 
         Args:
-            pose: opening, lateral, protrusion (...) to T_skull_mandible (..., 4, 4).
+            pose: maps opening, lateral and protrusion (...) to T_skull_mandible (..., 4, 4).
             points: mandible points [mm], shape (P, 3).
             exponent: None for independent ranges, p for |lateral|^p + max(protrusion, 0)^p <= 1.
         """
@@ -67,7 +67,7 @@ class Envelope:
         return np.stack([controls[..., 0], lateral, protrusion], -1)
 
     def nearest(self, T: Array, bounded: bool) -> tuple[Array, Array]:
-        """Return controls (..., 3) and largest point distance [mm] (...) of the nearest pose on the manifold."""
+        """Return controls (..., 3) of the nearest pose on the manifold, and the largest point distance [mm] (...)."""
         flat = T.reshape(-1, 4, 4)
         parts = [self._nearest(flat[i : i + _CHUNK], bounded) for i in range(0, len(flat), _CHUNK)]
         if not parts:
@@ -76,12 +76,12 @@ class Envelope:
         return controls.reshape(*T.shape[:-2], 3), distance.reshape(T.shape[:-2])
 
     def _moved(self, controls: Array, points: Array) -> Array:
-        """Transform points (P, 3) by the poses of controls (N, 3), shape (N, 3 P)."""
+        """Return points (P, 3) transformed by the poses at controls (N, 3), shape (N, 3 P)."""
         T = self._pose(controls[:, 0], controls[:, 1], controls[:, 2])
         return transform_points(T, points).reshape(len(controls), -1)
 
     def _start(self, T: Array) -> Array:
-        """Return the grid controls nearest to poses (N, 4, 4), shape (N, 3)."""
+        """Return the controls of the grid nodes nearest to poses (N, 4, 4), shape (N, 3)."""
         target = transform_points(T, self._few).reshape(len(T), -1)
         squares = (self._grid_points**2).sum(1) - 2 * target @ self._grid_points.T
         return self._grid[squares.argmin(1)]
@@ -129,12 +129,12 @@ class Envelope:
 
 
 def _asymmetric(rng: np.random.Generator, value: float, relative: float) -> Array:
-    """Draw a left and a right value around a common one."""
+    """Draw a left and a right value around a common value."""
     return value * (1.0 + relative * rng.uniform(-1.0, 1.0, 2))
 
 
 def draw_joint(rng: np.random.Generator) -> Joint:
-    """Sample a random joint for one subject."""
+    """Draw a random joint for one subject."""
     u = rng.uniform
     half_distance, middle_x = u(47.0, 53.0), u(-0.7, 0.7)
     height, depth = u(41.0, 47.0), u(86.0, 92.0)
@@ -174,7 +174,7 @@ def draw_joint(rng: np.random.Generator) -> Joint:
 class Noise:
     """Standard deviations of tracking noise and of movements outside the three controls."""
 
-    tracking_mm: float  # translation at the middle of the dental arch, per axis, independent between frames
+    tracking_mm: float  # translation of the middle of the dental arch, per axis, independent between frames
     tracking_rad: float  # rotation, per axis, independent between frames
     side_mm: float  # side shift outside the three controls, smooth in time
     lift_mm: float  # lift of each condyle off its eminence, smooth in time
@@ -196,7 +196,7 @@ class Person:
                 the protrusive range (|lateral|^1.3 + protrusion^1.3 <= 1).
 
         Raises:
-            ValueError: unknown envelope.
+            ValueError: the envelope is unknown.
         """
         if envelope not in ("box", "competing"):
             raise ValueError(f"envelope must be 'box' or 'competing', got {envelope!r}")
@@ -210,11 +210,11 @@ class Person:
         self._envelope = Envelope(self.pose, self.mandible_points, exponent=1.3 if envelope == "competing" else None)
 
     def pose(self, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike) -> Array:
-        """Return mandible poses (..., 4, 4) on the subject's three-parameter manifold; see `controlled_pose`."""
+        """Return mandible poses (..., 4, 4) on the three-parameter manifold of the subject; see `controlled_pose`."""
         return controlled_pose(self.joint, opening, lateral, protrusion)
 
     def pose_with_extra(self, controls: ArrayLike, extra_mm: ArrayLike) -> Array:
-        """Return poses (..., 4, 4) with movements outside the three controls; see `controlled_pose`.
+        """Return mandible poses (..., 4, 4) that include movements outside the three controls; see `controlled_pose`.
 
         Args:
             controls: opening, lateral, protrusion, shape (..., 3).
@@ -224,11 +224,11 @@ class Person:
         return controlled_pose(self.joint, opening, lateral, protrusion, extra_mm)
 
     def limit(self, controls: ArrayLike) -> Array:
-        """Return controls (..., 3) limited to the envelope; those inside are unchanged."""
+        """Return controls (..., 3) limited to the envelope; controls inside it are unchanged."""
         return self._envelope.limit(np.asarray(controls, dtype=np.float64))
 
     def nearest(self, T_skull_mandible: ArrayLike, bounded: bool = True) -> tuple[Array, Array]:
-        """Find the poses of the manifold nearest to given ones (..., 4, 4), in the rms distance of the mandible points.
+        """Find the poses of the manifold nearest to given poses (..., 4, 4), by the rms distance of mandible points.
 
         Args:
             bounded: whether to stay within the envelope. If not, the distance is a lower limit on the error of any
@@ -258,7 +258,7 @@ def _mandible_points(joint: Joint) -> Array:
     for side, centre in zip((1.0, -1.0), joint.condyles, strict=True):
         from_condyle = np.array(
             [
-                [9, 0, 0], [-9, 0, 0], [0, 4, 0], [0, 0, -4], [0, 0, 5], [0, -18, -3],  # head and neck of the condyle
+                [9, 0, 0], [-9, 0, 0], [0, 4, 0], [0, 0, -4], [0, 0, 5], [0, -18, -3],  # condylar head and neck
                 [-3, 4, 26], [-2, -12, 20],  # points on coronoid process and notch
                 [-4, -45, 0], [-2, -58, 10], [-6, -30, 14], [-14, -62, 35], [-22, -66, 60],  # ramus and lower border
             ]

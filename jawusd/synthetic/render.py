@@ -1,6 +1,6 @@
 """Render the synthetic scene with OpenGL: colour images and exact teeth masks through distorted lenses.
 
-The scene is rendered without distortion at a multiple of the image's size. Every pixel of the image then samples that
+The scene is rendered without distortion at a multiple of the image size. Every pixel of the image then samples this
 rendering along its distorted ray, so that straight edges bend as in a real lens.
 """
 
@@ -33,7 +33,7 @@ class Picture:
     """One rendered image.
 
     Attributes:
-        color: sRGB-like, shape (h, w, 3).
+        color: colour image, sRGB-like, shape (h, w, 3).
         upper, lower: coverage of each pixel by visible upper and lower teeth, 0..255, shape (h, w).
     """
 
@@ -43,14 +43,14 @@ class Picture:
 
 
 class Renderer:
-    """Renderer of named surfaces for cameras of one image size; a context manager that frees the GL context."""
+    """Renderer of named surfaces for cameras of one image size; as a context manager, it frees its GL context."""
 
     def __init__(self, cameras: list[Camera]) -> None:
-        """Open a headless GL context and prepare the cameras, all of the same size.
+        """Open a headless GL context and prepare the cameras, which must have the same image size.
 
         Raises:
             MissingDependencyError: EGL or its driver is missing.
-            ValueError: the cameras differ in size.
+            ValueError: the cameras differ in image size.
         """
         if len({camera.size_px for camera in cameras}) != 1:
             raise ValueError(f"all cameras must have the same image size, got {[camera.size_px for camera in cameras]}")
@@ -76,7 +76,7 @@ class Renderer:
         self._gl.release()
 
     def add(self, name: str, surface: Surface, label: int = OTHER) -> None:
-        """Add or replace a surface in its own frame; the label is `UPPER_TEETH`, `LOWER_TEETH` or `OTHER`."""
+        """Add or replace a surface, given in its own frame; the label is `UPPER_TEETH`, `LOWER_TEETH` or `OTHER`."""
         with self._gl:
             self._parts[name] = _Part(self._gl, self._scene_program, surface, label)
 
@@ -98,10 +98,10 @@ class Renderer:
         Args:
             camera: index of the camera.
             T_world_part: poses of the surfaces to draw, (4, 4) each; other surfaces are hidden.
-            T_world_head: pose of the skull, shape (4, 4); shading uses the depth inside the mouth in its frame.
+            T_world_head: pose of the skull, shape (4, 4); shading uses the depth inside the mouth in the skull frame.
             light: brightness factor.
             jitter_px: displacement fields of the upper and the lower mask [px], shape (gh, gw, 2) each, stretched over
-                the image; None is zero.
+                the image; None means zero.
         """
         with self._gl:
             self._draw_scene(self._cameras[camera], T_world_part, T_world_head, light)
@@ -177,9 +177,9 @@ class Renderer:
         self._lens_quad = gl.vertex_array(self._lens_program, [(corners, "2f", "in_corner")])
 
     def _projection(self, view: Camera) -> Array:
-        """Return the OpenGL clip matrix of the enlarged and padded pinhole image, first row at the top."""
+        """Return the OpenGL clip matrix of the enlarged and padded pinhole image, whose first row is at the top."""
         (width, height), m = self._scene_size, self._margin
-        K = np.diag([_SCALE, _SCALE, 1.0]) @ view.K  # pixel centres coincide with scene pixel centres
+        K = np.diag([_SCALE, _SCALE, 1.0]) @ view.K  # centres of image pixels coincide with centres of scene pixels
         out = np.zeros((4, 4))
         out[0] = [2 * K[0, 0] / width, 2 * K[0, 1] / width, 2 * (K[0, 2] + m + 0.5) / width - 1, 0]
         out[1] = [0, 2 * K[1, 1] / height, 2 * (K[1, 2] + m + 0.5) / height - 1, 0]
@@ -189,10 +189,10 @@ class Renderer:
         return out
 
     def _bend_texture(self, camera: Camera) -> moderngl.Texture:
-        """Return the displacement from recorded to pinhole pixels on a coarse grid, for linear sampling."""
+        """Return the displacement from recorded to pinhole pixels on a coarse grid; shaders interpolate it linearly."""
         width, height = self._size
         columns, rows = -(-width // _BEND_STEP_PX), -(-height // _BEND_STEP_PX)
-        # Texel centres in image pixels.
+        # Centres of the texels, in image pixels.
         x = (np.arange(columns) + 0.5) * width / columns - 0.5
         y = (np.arange(rows) + 0.5) * height / rows - 0.5
         pixels = np.stack(np.meshgrid(x, y), -1)
@@ -210,14 +210,14 @@ class Renderer:
         return self._jitters[name]
 
     def _grain_texture(self) -> moderngl.Texture3D:
-        """Return a cube of periodic smooth noise and its gradient for the texture of skin."""
+        """Return a cube of smooth periodic noise and its gradient, for the skin texture."""
         n = 64
         rng = np.random.default_rng(0x5C1)
         frequency = np.fft.fftfreq(n) * n
         radius = np.sqrt(sum(f**2 for f in np.meshgrid(frequency, frequency, frequency, indexing="ij")))
         spectrum = np.fft.fftn(rng.normal(size=(n, n, n))) * np.exp(-((radius / 14.0) ** 2))
         value = np.fft.ifftn(spectrum).real
-        fields = np.stack([value, *np.gradient(value)[::-1]], -1)  # axes in memory order z, y, x
+        fields = np.stack([value, *np.gradient(value)[::-1]], -1)  # the axes in memory are z, y, x
         fields = 0.5 + 0.16 * fields / fields.std((0, 1, 2))
         texels = (255 * np.clip(fields, 0.0, 1.0)).astype(np.uint8)
         texture = self._gl.texture3d((n, n, n), 4, texels.tobytes())
@@ -253,13 +253,13 @@ class _Part:
         )
 
     def write(self, vertices: Array) -> None:
-        """Upload positions and the corresponding normals."""
+        """Upload vertex positions and the corresponding normals."""
         normals = vertex_normals(vertices, self._faces)
         self._moving.write(_bytes(np.concatenate([vertices, normals], axis=1)))
 
 
 def _write(program: moderngl.Program, name: str, matrix: Array) -> None:
-    """Set a matrix uniform, which GL stores in column-major order."""
+    """Set a matrix uniform; GL expects column-major order."""
     uniform = program[name]
     if isinstance(uniform, moderngl.Uniform):
         uniform.write(_bytes(matrix.T))
@@ -278,5 +278,5 @@ def _context() -> moderngl.Context:
             f"rendering needs OpenGL 3.3 through EGL, which failed to start ({error}).",
             hint="Install it, on Debian or Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri",
         ) from error
-    context.front_face = "cw"  # images are rendered with their first row at the bottom of the target
+    context.front_face = "cw"  # images are rendered with their first row at the bottom of the render target
     return context

@@ -1,4 +1,4 @@
-"""GLSL programs of the renderer: scene, contact shadows, and the image through the lens."""
+"""GLSL programs of the renderer: scene, contact shadows, and resampling through the lens."""
 
 # The alpha channel of the scene stores the label of the surface.
 SCENE_VERTEX = """
@@ -109,7 +109,7 @@ void main() {
 }
 """
 
-# Resamples the undistorted scene to the recorded image: colour, and coverage by upper and lower teeth.
+# Resampling of the undistorted scene to the recorded image: colour, and coverage by upper and lower teeth.
 LENS_FRAGMENT = """
 #version 330
 in vec2 at;

@@ -1,7 +1,7 @@
 """Lips, face, mouth lining, palate and tongue, which surround the teeth and occlude them in images.
 
-The face is a single grid of rings around the mouth, from the throat over cheek lining and lips to the edge of the face.
-It is built in the scan frame for the closed bite and follows the mandible by linear blend skinning.
+The face is a single grid of rings around the mouth, which run from the throat over the cheek lining and the lips to the
+edge of the face. It is built in the scan frame for the closed bite and follows the mandible by linear blend skinning.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _PROFILE = np.array(
         [60.0, 12.0],
     ]
 )  # fmt: skip
-# Rings of the mouth lining: depth, half width, height above and below the centre [mm].
+# Rings of the mouth lining: depth, half width, and heights above and below the centre [mm].
 _LINING_RINGS = ((-78.0, 0.05, 0.05, 0.05), (-60.0, 36.0, 16.0, 16.0), (-24.0, 35.5, 18.0, 18.0))
 
-# Cross-section of a lip, from the wet side to the skin: distance outwards from the edge, height over the plane of the
-# edge [mm], and redness.
+# Cross-section of a lip, from the wet side to the skin: distance outwards from the lip's edge, height over the plane of
+# the edge [mm], and redness.
 _LIP = np.array(
     [
         [4.5, -5.5, 1.0], [2.2, -4.2, 1.0], [0.7, -2.2, 1.0], [0.0, 0.0, 1.0], [0.5, 1.9, 1.0], [1.7, 3.4, 1.0],
@@ -48,7 +48,7 @@ _LIP = np.array(
 
 @dataclass(frozen=True)
 class LipState:
-    """Shape of the lips."""
+    """Shape of the lips in one frame."""
 
     upper_mm: float  # height of the upper lip's midpoint above the upper incisal edge
     lower_mm: float  # distance of the lower lip's midpoint below the lower incisal edge, which moves with the jaw
@@ -65,18 +65,18 @@ class Surface:
     colors: Array  # linear diffuse reflectance, shape (V, 3), 0..1
     gloss: Array  # strength of the highlight, shape (V,), 0..1
     skin: Array  # strength of the skin texture, shape (V,), 0..1
-    inside: Array  # 1 inside the mouth, where light decreases with depth, 0 elsewhere, shape (V,)
+    inside: Array  # 1 inside the mouth, where the light decreases with depth; 0 elsewhere; shape (V,)
 
 
 class Face:
     """Face, lips and mouth lining of one subject as a grid of rings around the mouth."""
 
     def __init__(self, lower_incisor: Array) -> None:
-        """Build the grid for a lower incisal point (3,) in occlusion, scan frame [mm]."""
+        """Build the grid, given the lower incisal point (3,) in occlusion, scan frame [mm]."""
         self._incisor_y = float(lower_incisor[1])
         angle = 2 * np.pi * (np.arange(_COLUMNS) + 0.5) / _COLUMNS
         self._cos, self._sin = np.cos(angle), np.sin(angle)
-        # The lower lip moves with the jaw, the mouth corners by a third of the jaw's motion.
+        # The lower lip moves with the jaw; the mouth corners move by a third of its motion.
         self._follow = smoothstep((0.35 - self._sin) / 0.95)
         lining_rows, lip_rows = 4, len(_LIP)
         self.rows = lining_rows + lip_rows + _SKIN_ROWS
@@ -117,7 +117,7 @@ class Face:
         reach = np.ones(self.rows)
         reach[-_SKIN_ROWS:] = np.linspace(1.0, 0.75, _SKIN_ROWS)
         weight = self._follow * reach[:, None]
-        weight[0] = 0.4  # the throat ring stays closed
+        weight[0] = 0.4  # the ring at the throat stays closed
         weight = weight[..., None]
         moved = transform_points(np.asarray(T_skull_mandible, dtype=np.float64), rest.reshape(-1, 3))
         return (rest + weight * (moved.reshape(rest.shape) - rest)).reshape(-1, 3)
@@ -149,7 +149,7 @@ class Face:
         share = (np.arange(1, _SKIN_ROWS + 1) / _SKIN_ROWS)[:, None, None] ** 1.35
         xy = border[None, :, :2] + share * (far - border[:, :2])
         z = _skin_depth(xy[..., 0], xy[..., 1])
-        # Make the first rows continue the lip smoothly.
+        # Blend the first rows so that they continue the lip smoothly.
         offset = border[:, 2] - _skin_depth(border[:, 0], border[:, 1])
         z = z + offset * np.exp(-((share[..., 0] / 0.10) ** 1.5))
         return np.concatenate([xy, z[..., None]], -1)
@@ -163,8 +163,8 @@ def _rounded(rings: Array) -> Array:
 
 
 def _skin_depth(x: Array, y: Array) -> Array:
-    """Return the depth z of the skin over the frontal plane [mm], any shape."""
-    # Averaging smooths the corners of the polygon.
+    """Return the depth z of the skin relative to the frontal plane [mm], at positions of any shape."""
+    # Average to round the corners of the polygon.
     middle = np.mean([np.interp(y + shift, *_PROFILE.T) for shift in (-4.0, -2.0, 0.0, 2.0, 4.0)], axis=0)
     chin = smoothstep((-22.0 - y) / 20.0)
     z = middle - (0.0138 + 0.0045 * chin) * x**2 - 1.1e-6 * x**4
@@ -179,7 +179,7 @@ def _skin_depth(x: Array, y: Array) -> Array:
 
 
 def palate() -> Surface:
-    """Return the roof of the mouth between the upper teeth, scan frame."""
+    """Return the roof of the mouth between the upper teeth, in the scan frame."""
     z = np.linspace(-56.0, -6.0, 26)
     across = np.linspace(-1.0, 1.0, 25)
     half = 24.0 * np.sqrt(np.clip((-z - 2.0) / 40.0, 0.03, 1.0)) + 0.5
@@ -193,7 +193,7 @@ def palate() -> Surface:
 
 
 def tongue(forward_mm: float, up_mm: float, side_mm: float) -> Surface:
-    """Return the tongue in the mandible frame: moved forward, its tip raised and moved to the left by given lengths."""
+    """Return the tongue in the mandible frame, moved forward, with its tip raised and moved left by given lengths."""
     around, along = 40, 26
     u = 2 * np.pi * np.arange(around) / around
     t = np.linspace(0.0, 1.0, along)

@@ -1,4 +1,4 @@
-"""Primitives for surfaces: grids, lofts, merged meshes, normals."""
+"""Primitives for building surfaces: grids, lofts, merged meshes, normals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 
 
 def loft(rings: Array) -> tuple[Array, Faces]:
-    """Connect stacked rings (R, A, 3) [mm] to a closed mesh with fans at both ends.
+    """Connect stacked rings (R, A, 3) [mm] to a watertight mesh with fans at both ends.
 
     Returns:
         Vertices (R A + 2, 3) and faces (F, 3) with outward winding.
@@ -40,7 +40,7 @@ def loft(rings: Array) -> tuple[Array, Faces]:
 
 
 def outward(vertices: Array, faces: Faces) -> Faces:
-    """Return the faces of a closed mesh, wound so that its signed volume is positive."""
+    """Return the faces of a watertight mesh, wound so that its signed volume is positive."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return faces if np.einsum("ij,ij->", a, np.cross(b, c)) > 0 else faces[:, ::-1].copy()
 

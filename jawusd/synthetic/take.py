@@ -1,6 +1,6 @@
-"""The studio, a performance in front of its cameras, and the scene in any frame.
+"""A studio, a performance in front of its cameras, and the scene in each frame.
 
-A studio has three cameras about 200 mm from the mouth and a chessboard. A take samples jaw, head, lips, tongue and
+A studio has a chessboard, and three cameras about 200 mm from the mouth. A take samples jaw, head, lips, tongue and
 light once per frame; the scene poses the subject's surfaces in a frame and renders them.
 """
 
@@ -26,8 +26,8 @@ from jawusd.synthetic.surfaces import grid_faces
 #: Scan frame to world with the head at rest; the world is the first camera's frame: x right, y down, z forward.
 T_WORLD_SCAN = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, -14.0, 214.0])
 BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM = 9, 6, 8.0
-# Focal length over image width; then, per camera: direction from the mouth [deg left, deg up], radial and tangential
-# distortion, and offsets of principal point and focal length relative to the image width.
+# Focal length relative to the image width; then, for each camera: direction from the mouth [deg left, deg up], radial
+# and tangential distortion, and offsets of principal point and focal length relative to the image width.
 _FOCAL = 1.494
 _CAMERAS = (
     ((0.0, 0.0), (-0.031, 0.012, 0.0003, -0.0004, 0.0), (0.0043, -0.0031), 1.000),
@@ -35,7 +35,7 @@ _CAMERAS = (
     ((-38.0, -6.0), (-0.034, 0.015, 0.0002, 0.0005, 0.0), (0.0026, 0.0048), 0.994),
 )
 FPS = 24.0
-#: Numbers of frames, with flashes, before the first and after the last tracked frame.
+#: Numbers of frames before the first and after the last tracked frame; these contain the flashes.
 LEAD, TAIL = 20, 16
 #: Numbers of frames with the mouth slightly open, then with closed teeth, at the start of the tracked range.
 OPEN_HOLD, REST_HOLD = 10, 12
@@ -54,7 +54,7 @@ _CANINE_TINT = np.array([0.975, 0.955, 0.91])
 
 
 def build_cameras(size_px: tuple[int, int]) -> list[Camera]:
-    """Return the three cameras; the world is the frame of the first one."""
+    """Return the three cameras; the world frame is the frame of the first camera."""
     width, height = size_px
     target = (T_WORLD_SCAN @ [0.0, -14.0, -6.0, 1.0])[:3]
     cameras = []
@@ -78,7 +78,7 @@ def build_cameras(size_px: tuple[int, int]) -> list[Camera]:
 
 
 def board() -> Surface:
-    """Return the chessboard with a white rim, with the origin at its centre, x along the columns, facing -z."""
+    """Return the chessboard with a white rim: its origin is the centre, x runs along the columns, it faces -z."""
     columns, rows = BOARD_COLUMNS + 3, BOARD_ROWS + 3
     vertices, colors = [], []
     for i in range(rows):
@@ -109,23 +109,23 @@ class Take:
     """A performance sampled at the frames of the reference camera."""
 
     first_instant: int  # first sampled frame of the reference camera; negative if another camera started earlier
-    tracked: tuple[int, int]  # first and one past the last tracked frame of the reference camera
-    rest_frame: int  # reference frame with the teeth in occlusion
-    dark: NDArray[np.int64]  # dark intervals [first, last) in reference frames, shape (2, 2)
-    controls: Array  # opening, lateral, protrusion, shape (I, 3)
-    phase: NDArray[np.str_]  # name of the exercise, shape (I,)
+    tracked: tuple[int, int]  # first tracked frame of the reference camera, and one past the last
+    rest_frame: int  # frame of the reference camera in which the teeth are in occlusion
+    dark: NDArray[np.int64]  # dark intervals [first, last) in frames of the reference camera, shape (2, 2)
+    controls: Array  # opening, lateral and protrusion in each frame, shape (I, 3)
+    phase: NDArray[np.str_]  # name of the exercise in each frame, shape (I,)
     T_skull_mandible: Array  # jaw poses [mm], shape (I, 4, 4)
     T_world_skull: Array  # head poses [mm], shape (I, 4, 4)
     lips: list[LipState]  # shape of the lips in each frame
     tongue_mm: Array  # displacement of the tongue forward, up and left, shape (I, 3)
-    light: Array  # brightness factor, shape (I,)
+    light: Array  # brightness factor of each frame, shape (I,)
 
 
 def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[int, ...], seed: int) -> Take:
     """Return a take of a subject performing exercises.
 
     Args:
-        occlusion: tooth contacts, which guide closed movements.
+        occlusion: tooth contacts, which guide movements with closed teeth.
         frames: number of tracked frames, more than `OPEN_HOLD + REST_HOLD`.
         offsets: camera offsets; the take covers the frames of all cameras.
         seed: seed of exercises, head motion, lips and tongue.
@@ -162,7 +162,7 @@ def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[in
 def _controls(
     person: Person, frames: int, start: int, n: int, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.str_], Mask]:
-    """Return controls and phase of every frame, and a weight that is 1 where the jaw is held in the closed bite."""
+    """Return controls and exercise of every frame, and a weight that is 1 where the jaw is held in the closed bite."""
     exercises = frames - OPEN_HOLD - REST_HOLD
     curves, names = schedule(_EXERCISES, exercises, rng, tempo=1.5)
     still = np.array([_HALF_OPEN, 0.0, 0.0])
@@ -194,7 +194,7 @@ def _head(n: int, rng: np.random.Generator) -> Array:
 
 
 def _lips(controls: Array, phase: NDArray[np.str_], rng: np.random.Generator) -> list[LipState]:
-    """Return the lips in every frame: retracted to show the teeth, less so in chewing and speech."""
+    """Return the shape of the lips in every frame: retracted to show the teeth, but less so in chewing and speech."""
     drift = _drift(len(controls), rng, 4)
     relaxed = smoothed(np.isin(phase, ["chew", "speech"]).astype(np.float64)[:, None])[:, 0]
     wide = smoothstep(controls[:, 0])
@@ -205,7 +205,7 @@ def _lips(controls: Array, phase: NDArray[np.str_], rng: np.random.Generator) ->
 
 
 def _tongue(controls: Array, rng: np.random.Generator) -> Array:
-    """Return the tongue position, sometimes raised over the lower front teeth in an open mouth, (n, 3) mm."""
+    """Return the tongue position in every frame (n, 3) [mm], sometimes raised over the lower front teeth."""
     drift = _drift(len(controls), rng, 2)
     room = smoothstep((controls[:, 0] - 0.12) / 0.3)
     raised = smoothstep((drift[:, 0] - 0.5) / 1.2) * room
@@ -271,7 +271,7 @@ def _arch_surfaces(arch: DentalArch) -> tuple[Surface, Surface]:
     for k in np.unique(arch.tooth[:first_gum]):
         own = arch.tooth[:first_gum] == k
         height = np.abs(vertices[:first_gum][own, 1])
-        share = (height - height.min()) / np.ptp(height)  # relative distance from the occlusal end
+        share = (height - height.min()) / np.ptp(height)  # distance from the occlusal end relative to crown height
         colors[own] *= 1.0 - 0.16 * share[:, None] * np.array([0.6, 0.8, 1.3])
         if abs(k) == 3:
             colors[own] *= _CANINE_TINT

@@ -1,4 +1,4 @@
-"""Tooth crowns as closed triangle meshes, from tables of widths, profiles and cusps.
+"""Tooth crowns as watertight triangle meshes, built from tables of widths, profiles and cusps.
 
 Crown frame: x distal, y towards the occlusal side (0 at the gum line), z facial, mm. Sizes are mean crown dimensions
 from textbooks of dental anatomy (Ash and Nelson).
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.synthetic.surfaces import loft, superellipse
 
-#: Part of the crown hidden below the gum line [mm].
+#: Height of the part of the crown that is hidden below the gum line [mm].
 ROOT_MM = 2.5
 _AROUND = 36
 _SIDE_RINGS = 12
@@ -30,7 +30,7 @@ class CrownForm:
 
     width_mm: float  # mesio-distal crown width
     depth_mm: float  # facio-lingual crown depth
-    height_mm: float  # height of the highest cusp or the edge above the gum line
+    height_mm: float  # height of the highest cusp, or of the incisal edge, above the gum line
     torque_deg: float  # tilt of the occlusal end towards the facial side
     # cusps of premolars and molars: x and z relative to half the width and half the depth, and distance below the
     # highest cusp [mm]; empty for incisors and canines
@@ -68,14 +68,14 @@ LOWER = (
     CrownForm(10.5, 10.2, 7.0, -8.0, ((-0.44, 0.50, 0.0), (0.44, 0.50, 0.2), (-0.42, -0.50, 0.2), (0.42, -0.50, 0.3))),
 )  # fmt: skip
 
-# Control values of Bezier profiles from the root end to the occlusal end.
-# Incisors and canines: half width relative to half the crown's width; facial and lingual surface relative to its depth.
+# Control values of Bezier profiles from the root end to the occlusal end. For incisors and canines: half width relative
+# to half the crown's width; facial and lingual surface relative to the crown's depth.
 _FRONT_WIDTH = (0.62, 0.68, 0.80, 1.02, 1.06, 0.95)
 _FRONT_FACIAL = (0.38, 0.46, 0.58, 0.50, 0.42, 0.27)
 _FRONT_LINGUAL = (-0.40, -0.52, -0.56, -0.10, 0.02, 0.11)
 _EDGE_MIDDLE = tuple(0.5 * (f + g) for f, g in zip(_FRONT_FACIAL, _FRONT_LINGUAL, strict=True))
-# Premolars and molars: half width relative to half the crown's width; facial and lingual surface relative to half its
-# depth.
+# For premolars and molars: half width relative to half the crown's width; facial and lingual surface relative to half
+# the crown's depth.
 _BACK_WIDTH = (0.74, 0.80, 0.92, 1.06, 1.04, 0.84)
 _BACK_FACIAL = (0.72, 0.84, 1.06, 1.04, 0.90, 0.66)
 _BACK_LINGUAL = (-0.72, -0.82, -0.98, -1.06, -0.98, -0.68)
@@ -88,12 +88,12 @@ def _bezier(control: tuple[float, ...], t: Array) -> Array:
 
 
 def _relative_width(control: tuple[float, ...], t: Array) -> Array:
-    """Return the width profile scaled to a maximum of 1, so that tabulated widths are those between contact points."""
+    """Return the width profile scaled to a maximum of 1, so that tabulated widths are those at the contact points."""
     return _bezier(control, t) / _bezier(control, np.linspace(0.0, 1.0, 101)).max()
 
 
 def crown(form: CrownForm, cusp_slope: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.int32]]:
-    """Build one crown with small random irregularities; `cusp_slope` is the drop of the cusps of back teeth per mm.
+    """Build one crown with small random irregularities; `cusp_slope` is the drop per mm of the cusps of back teeth.
 
     Returns:
         Vertices (V, 3) in the crown frame [mm] and outward counter-clockwise faces (F, 3) of a closed mesh.
@@ -128,7 +128,7 @@ def _front_rings(form: CrownForm, angle: Array, rng: np.random.Generator) -> Arr
 
 
 def _edge_drop(form: CrownForm, X: Array, rng: np.random.Generator) -> Array:
-    """Return the depth of the edge below its highest point [mm]: rounded corners, canine shoulders, tilt by wear."""
+    """Return the depth of the edge below its highest point [mm]: rounded corners, canine shoulders, wear tilt."""
     relative = X / (0.5 * form.width_mm)
     tilt = 0.15 * rng.uniform(-1.0, 1.0) * relative
     if form.tip_mm:
