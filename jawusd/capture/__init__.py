@@ -1,4 +1,4 @@
 """Synchronise and calibrate the cameras of a capture, and check calibrations and masks.
 
-Reads `media` and `formats`; imports no other stage.
+This package imports `media` and `formats`, but no other stage.
 """

@@ -1,4 +1,4 @@
-"""Calibration boards in single images: reading board clips, corner detection, and edge sharpness."""
+"""Read board clips, detect the corners of calibration boards in single images, and measure edge sharpness."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from jawusd.media.video import Video
 
 Search = Callable[[NDArray[np.uint8]], Array | None]
 
-_TIMES, _FEW_MARKERS = 2, 4  # minimum number of images with the same wrong board, and of markers in each
+_TIMES, _FEW_MARKERS = 2, 4  # minimum number of images that show the same wrong board, and of markers in each of them
 _FEWEST_CORNERS = 8  # minimum number of corners of a ChArUco board; fewer do not determine its pose
-# Refinement window as a fraction of a cell: blur and distortion bias corners in larger windows, noise dominates in
-# smaller ones.
+# Size of the corner refinement window as a fraction of a board cell. Blur and distortion bias corners in larger
+# windows; noise dominates in smaller ones.
 _WINDOW_SHARE, _WINDOW_PX = 0.12, (3, 12)
-_LARGE_PX = 1000  # wider images are first searched at half resolution, which takes a quarter of the time
+_LARGE_PX = 1000  # width above which an image is first searched at half resolution, in a quarter of the time
 _FLAGS = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 
 
@@ -39,7 +39,7 @@ def detector(boards: Boards) -> Search:
 
 
 def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: bool) -> str | None:
-    """Return a description of the board in gray images (h, w) if it differs from that of [boards], otherwise None.
+    """Describe the board in gray images (h, w) if it differs from the board of [boards], otherwise return None.
 
     Args:
         missed: whether the board of [boards] was missed in most images of the clip; only then are absent markers
@@ -63,7 +63,7 @@ def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed:
     count = _marker_count(boards)
     if len(highest) < _TIMES:
         shown = f"a chessboard of {cols} x {rows} inner corners without markers of {boards.dictionary}"
-        return f"the pictures show {shown}" if times >= _TIMES else None
+        return f"the images show {shown}" if times >= _TIMES else None
     beyond = sum(number >= count for number in highest) >= _TIMES
     if beyond or (missed and max(highest) < count - 1):
         return (
@@ -73,7 +73,7 @@ def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed:
 
 
 def corners_and_width(search: Search, image: NDArray[np.uint8], boards: Boards) -> tuple[Array, float]:
-    """Return the corners in an image, shape (N, 2), and the edge width [px]; NaN without a board."""
+    """Return the board corners in an image, shape (N, 2), and the edge width [px]; all NaN if there is no board."""
     corners = search(image)
     if corners is None:
         return np.full((boards.cols * boards.rows, 2), np.nan), np.nan
@@ -103,7 +103,7 @@ def _chessboard(boards: Boards) -> Search:
 
 
 def _refined(image: NDArray[np.uint8], corners_px: Array, boards: Boards) -> Array:
-    """Return corners refined to the saddle points (Förstner & Gülch 1987, in OpenCV), with a third of the scatter."""
+    """Refine corners to saddle points, which reduces their scatter to a third (Förstner & Gülch 1987, in OpenCV)."""
     grid = corners_px.reshape(boards.rows, boards.cols, 2)
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     half = int(np.clip(round(_WINDOW_SHARE * min(sides)), *_WINDOW_PX))
@@ -118,10 +118,10 @@ def _charuco(boards: Boards) -> Search:
     markers, known = _marker_count(boards), len(dictionary.bytesList)
     if markers > known:
         raise CalibrationError(
-            f"[boards] a ChArUco board of {boards.cols} x {boards.rows} inner corners needs {markers} markers; "
-            f"{boards.dictionary} has {known}."
+            f"[boards] a ChArUco board of {boards.cols} x {boards.rows} inner corners has {markers} markers; "
+            f"{boards.dictionary} has only {known}."
         )
-    # Before version 4.6, OpenCV drew boards with an even number of rows with the colours exchanged; these are still
+    # Boards with an even number of rows, drawn by OpenCV before version 4.6, have exchanged colours; they are still
     # sold.
     detectors = [_charuco_detector(boards, size, legacy) for legacy in (False, True)[: 2 - size[1] % 2]]
 
@@ -129,13 +129,13 @@ def _charuco(boards: Boards) -> Search:
         for detector in list(detectors):
             corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(image))
             if ids is not None and len(ids) >= _FEWEST_CORNERS:
-                detectors.sort(key=lambda other: other is not detector)  # the next image probably has the same board
+                detectors.sort(key=lambda other: other is not detector)  # try this detector first in the next image
                 break
         else:
             return None
         out = np.full((boards.cols * boards.rows, 2), np.nan)
         out[np.ravel(ids)] = np.reshape(corners, (-1, 2))
-        # Corners of a single row determine neither the pose nor the cell size.
+        # Corners in a single row determine neither the pose of the board nor the cell size.
         grid = np.isfinite(out[:, 0]).reshape(boards.rows, boards.cols)
         whole = (grid[:, 1:] & grid[:, :-1]).any() and (grid[1:] & grid[:-1]).any()
         return out if whole else None
@@ -154,15 +154,15 @@ def _dictionary(boards: Boards) -> cv2.aruco.Dictionary:
 
 
 def _marker_count(boards: Boards) -> int:
-    """Return the number of white squares, and therefore of markers, of a ChArUco board."""
+    """Return the number of white squares of a ChArUco board, which equals the number of its markers."""
     return (boards.cols + 1) * (boards.rows + 1) // 2
 
 
 def edge_width_px(image: NDArray[np.uint8], corners_px: Array, cols: int) -> float:
-    """Return the 10 to 90 % edge width of a chessboard in a gray image (h, w) from its gradient energy.
+    """Return the 10 to 90 % edge width [px] of a chessboard in a gray image (h, w) from its gradient energy.
 
-    A step of contrast C blurred by a Gaussian of sigma has the gradient energy C^2 / (2 sigma sqrt(pi)) per length of
-    edge; a chessboard with cell sides a and b has (|a| + |b|) / |a x b| of edge per area.
+    An edge of contrast C blurred by a Gaussian of standard deviation sigma has the gradient energy C^2 / (2 sigma
+    sqrt(pi)) per edge length; a chessboard with cell sides a and b has the edge length (|a| + |b|) / |a x b| per area.
 
     Args:
         corners_px: corners row by row, `cols` per row, NaN where hidden, shape (N, 2).
@@ -190,16 +190,16 @@ class BoardClip:
     """Board images of one camera: a video or numbered images.
 
     Attributes:
-        path: video or pattern.
-        numbers: increasing image numbers; in a video, the frames at which the images are shown.
-        size_px: (width, height) of every image.
+        path: the video, or the pattern of the image names.
+        numbers: increasing image numbers; in a video, the numbers of the frames that show an image.
+        size_px: (width, height) of all images.
     """
 
     def __init__(self, path: Path) -> None:
-        """Find the images.
+        """Find the images of a board clip.
 
         Raises:
-            CaptureError: there are no images, or the first cannot be read.
+            CaptureError: there are no images, or the first image cannot be read.
         """
         self.path = path
         self._files: dict[int, Path] = {}
@@ -227,7 +227,7 @@ class BoardClip:
         """Yield (number, gray image) for the given numbers, in order.
 
         Raises:
-            CalibrationError: an image differs in size from the first one.
+            CalibrationError: an image differs in size from the first image.
             CaptureError: an image cannot be read.
         """
         if self._video is None:
@@ -236,7 +236,7 @@ class BoardClip:
                 image = _read(path)
                 if image.shape[::-1] != self.size_px:
                     raise CalibrationError(
-                        f"is {image.shape[1]} x {image.shape[0]} px, but the first picture is {self.size_px[0]} x "
+                        f"is {image.shape[1]} x {image.shape[0]} px, but the first image is {self.size_px[0]} x "
                         f"{self.size_px[1]} px.",
                         path=path,
                     )
@@ -253,14 +253,14 @@ def _read(path: Path) -> NDArray[np.uint8]:
     image = read_picture(path, cv2.IMREAD_GRAYSCALE)
     if image is not None:
         return np.asarray(image, np.uint8)
-    try:  # formats that OpenCV does not read: EXR, DPX
+    try:  # OpenCV does not read EXR and DPX
         stored = read_stored(path)
     except CaptureError as error:
-        raise CaptureError("is not a readable picture.", path=path, hint="Use PNG, JPEG, TIFF, EXR or DPX.") from error
+        raise CaptureError("is not a readable image.", path=path, hint="Use PNG, JPEG, TIFF, EXR or DPX.") from error
     shown = to_display(stored.pixels, stored.largest, read_header(path).colour_space, None)
     return shown if shown.ndim == 2 else np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def sharpness(image: NDArray[np.uint8]) -> float:
-    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000), comparable among images of one camera."""
+    """Return the variance of an image's Laplacian (Pech-Pacheco et al. 2000), to compare images of one camera."""
     return float(cv2.Laplacian(image, cv2.CV_16S).var()) + 1e-9

@@ -15,22 +15,22 @@ from jawusd.capture.board_detection import BoardClip, corners_and_width, detecto
 from jawusd.formats.capture import Boards
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT
 
-MOST_VIEWS = 80  # maximum number of views used; more would take longer without increasing accuracy
-_LOOKED_AT = 6  # number of images searched for a different board
+MOST_VIEWS = 80  # maximum number of views in a calibration; more views would not increase the accuracy
+_LOOKED_AT = 6  # number of images that are searched for a board different from [boards]
 _PER_WINDOW = 2  # number of consecutive video frames of which the sharpest is used
-# An image is blurred if its 10 to 90 % edge width exceeds the camera's median times this ratio, clamped to
-# these limits.
+# Ratio of an image's 10 to 90 % edge width to the camera's median above which the image is blurred; the resulting limit
+# is clamped to a range.
 _BLUR_RATIO, _BLUR_LIMITS_PX = 1.5, (4.0, 8.0)
 
 
 @dataclass(frozen=True, eq=False)
 class BoardDetections:
-    """Detected board corners."""
+    """Board corners detected in V views by C cameras; the board has N corners."""
 
-    names: tuple[str, ...]  # names of the C cameras
-    sizes_px: tuple[tuple[int, int], ...]  # image (width, height) per camera
+    names: tuple[str, ...]  # camera names, length C
+    sizes_px: tuple[tuple[int, int], ...]  # image (width, height) of each camera
     numbers: NDArray[np.int64]  # image number of each view, shape (V,)
-    corners_px: Array  # pixel of each corner, NaN where hidden, shape (C, V, N, 2)
+    corners_px: Array  # pixel coordinates of the corners, NaN where hidden, shape (C, V, N, 2)
     blurred: dict[str, list[int]]  # numbers of the images rejected as blurred, by camera
     missed: dict[str, list[int]]  # numbers of the images in which no board was found, by camera
     notes: tuple[str, ...]  # remarks on the clips for the user
@@ -44,9 +44,10 @@ def board_points(boards: Boards) -> Array:
 
 
 def board_symmetries(boards: Boards) -> list[NDArray[np.int64]]:
-    """Return the orders in which a detector may list the corners of a board, as permutations of shape (N,).
+    """Return the orders in which a detector may list the N corners of a board, as permutations of shape (N,).
 
-    A chessboard has a two-fold symmetry, a square one a four-fold symmetry; ChArUco corners are numbered.
+    A chessboard has a two-fold symmetry, a square chessboard a four-fold one. ChArUco corners are numbered, so that
+    their order is known.
     """
     grid = np.arange(boards.cols * boards.rows).reshape(boards.rows, boards.cols)
     if boards.pattern == "charuco":
@@ -59,7 +60,7 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
     """Select sharp images from each camera's board clip and find the corners in them.
 
     Raises:
-        CalibrationError: the clips share no image number, or show no board or a different one.
+        CalibrationError: the clips have no image number in common, or show no board or a different board.
         CaptureError: a clip cannot be read.
     """
     clips = [BoardClip(path) for path in boards.videos]
@@ -106,11 +107,11 @@ def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], 
     counts = [len(clip.numbers) for clip in clips]
     shared = sorted(set.intersection(*(set(clip.numbers) for clip in clips)))
     if not shared:
-        raise CalibrationError("no picture number occurs in all board clips.", path=clips[0].path)
+        raise CalibrationError("no image number occurs in all board clips.", path=clips[0].path)
     if len(set(counts)) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in zip(names, counts))
         notes.append(
-            f"the board clips have different numbers of pictures ({listed}): {len(shared)} with equal number or time "
+            f"the board clips have different numbers of images ({listed}): {len(shared)} with equal number or time "
             "are assumed simultaneous; a clip trimmed at its start would invalidate the result."
         )
     if not all(clip.is_video for clip in clips):
@@ -120,29 +121,29 @@ def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], 
     with ThreadPoolExecutor(max_workers=min(len(clips), 4)) as pool:
         for values in pool.map(lambda clip: [sharpness(image) for _, image in clip.pictures(shared)], clips):
             sharp.append(np.array(values) / np.median(values))
-    worst = np.min(sharp, axis=0)  # an image must be sharp in all cameras
+    worst = np.min(sharp, axis=0)  # views in which every camera's image is sharp are preferred
     windows = np.array_split(np.arange(len(shared)), min(MOST_VIEWS, -(-len(shared) // _PER_WINDOW)))
     return [shared[window[np.argmax(worst[window])]] for window in windows], notes
 
 
 def _limits_px(widths: Array) -> Array:
-    """Return the edge width above which an image is blurred, for each camera, shape (C,)."""
+    """Return for each camera the edge width [px] above which an image is blurred, shape (C,)."""
     median = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in widths])
     return np.clip(_BLUR_RATIO * median, *_BLUR_LIMITS_PX)
 
 
 def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, found: int) -> None:
-    """Raise an error if the images show no board or a different one."""
+    """Raise an error if the images show no board, or a board different from [boards]."""
     missed = found < len(chosen) / 2
     if missed and clip.is_interlaced:
         raise CalibrationError(
-            f"the board is found in {found} of {len(chosen)} pictures: {INTERLACED}.",
+            f"the board is found in {found} of {len(chosen)} images: {INTERLACED}.",
             camera=name,
             path=clip.path,
             hint=INTERLACED_HINT,
         )
     if not missed and boards.pattern == "chessboard":
-        return  # checked because part of a different ChArUco board may match that of [boards]
+        return  # only a ChArUco board can be detected as part of a different board
     some = [image for _, image in clip.pictures(chosen[:: max(1, len(chosen) // _LOOKED_AT)])]
     if (other := different_board(some, boards, missed)) is not None:
         raise CalibrationError(
@@ -154,8 +155,8 @@ def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, 
     if not found:
         extra = f" of {boards.dictionary}" if boards.pattern == "charuco" else ""
         raise CalibrationError(
-            f"no {boards.pattern}{extra} with {boards.cols} x {boards.rows} inner corners in any of "
-            f"{len(chosen)} pictures.",
+            f"no {boards.pattern}{extra} with {boards.cols} x {boards.rows} inner corners was found in any of "
+            f"{len(chosen)} images.",
             camera=name,
             path=clip.path,
             hint="Check pattern and inner corners in [boards]; a chessboard must be fully in view, sharp, and have a "
@@ -164,12 +165,12 @@ def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, 
 
 
 def _check_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, blurred: Mask) -> None:
-    """Raise an error if all images of the board by a camera are blurred."""
+    """Raise an error if all images in which a camera sees the board are blurred."""
     for name, clip, row, out, limit in zip(names, clips, widths, blurred, _limits_px(widths)):
         seen = np.isfinite(row)
         if seen.any() and out[seen].all():
             raise CalibrationError(
-                f"all {seen.sum()} pictures of the board are blurred: its edges are "
+                f"all {seen.sum()} images of the board are blurred: its edges are "
                 f"{np.median(row[seen]):.1f} px wide (10 to 90 %); the limit is {limit:.1f} px.",
                 camera=name,
                 path=clip.path,

@@ -1,9 +1,9 @@
 """Bundle adjustment of fixed cameras over views of a planar board.
 
-Minimises the robust reprojection error over intrinsics (fx, fy, cx, cy, k1, k2; the other coefficients stay 0, since
-few images of a small board do not determine them), camera poses (the first camera is the world frame) and board poses.
-The Jacobian is analytic and sparse: it is OpenCV's for the lens, and follows Solà et al. 2018 (eq. 143) for the
-rotations.
+The robust reprojection error is minimised over the intrinsics (fx, fy, cx, cy, k1, k2), the camera poses (the first
+camera is the world frame) and the board poses. Other distortion coefficients stay 0, since few images of a small board
+do not determine them. The Jacobian is analytic and sparse; the derivatives are OpenCV's for the lens, and those of Solà
+et al. 2018 (eq. 143) for rotations.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from jawusd.base.errors import CalibrationError
 from jawusd.capture.initial_guess import InitialGuess
 from jawusd.geometry import hat, make_transform, so3_exp, so3_left_jacobian, so3_log
 
-_LENS = 6  # fx, fy, cx, cy, k1, k2
-_POSE = 6  # rotation vector [rad], translation [mm]
+_LENS = 6  # Number of lens parameters per camera: fx, fy, cx, cy, k1, k2.
+_POSE = 6  # Number of pose parameters: rotation vector [rad], translation [mm].
 _HUBER_SIGMAS, _LEAST_SIGMA_PX = 3.0, 0.02
 _MOST_STEPS = 100
-_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # a corner is an outlier if its residual exceeds both limits
-_FEWEST_CORNERS = 6  # minimum number of inliers of a view; views with fewer are dropped
+_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # residual limits; a corner is an outlier if it exceeds both
+_FEWEST_CORNERS = 6  # minimum number of inlier corners of a view; views with fewer are dropped
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Result of the adjustment."""
+    """Result of the bundle adjustment of C cameras over V views of a board with N corners."""
 
     K: Array  # intrinsic matrices [px], shape (C, 3, 3)
     distortion: Array  # k1 and k2, shape (C, 2)
-    T_cam_world: Array  # world (the first camera) to camera [mm], shape (C, 4, 4)
-    T_world_board: Array  # board to world [mm], shape (V, 4, 4)
-    corners_px: Array  # corners used, NaN elsewhere, shape (C, V, N, 2)
-    residuals_px: Array  # projected minus observed, NaN where not used, shape (C, V, N, 2)
-    parameters: Array  # the camera parameters (see `camera_from`), shape (12 C - 6,)
-    covariance: Array  # covariance of the camera parameters, shape (12 C - 6, 12 C - 6)
+    T_cam_world: Array  # transforms from world (the first camera) to camera [mm], shape (C, 4, 4)
+    T_world_board: Array  # transforms from board to world [mm], shape (V, 4, 4)
+    corners_px: Array  # pixels of the corners that were used, otherwise NaN, shape (C, V, N, 2)
+    residuals_px: Array  # projected minus observed pixels, NaN for corners not used, shape (C, V, N, 2)
+    parameters: Array  # Camera parameters (see `camera_from`), shape (12 C - 6,).
+    covariance: Array  # Covariance of the camera parameters, shape (12 C - 6, 12 C - 6).
 
 
 def adjust(start: InitialGuess, points_mm: Array) -> Bundle:
-    """Adjust, discard outlier corners and readjust; `points_mm` (N, 3) are the corners on the board.
+    """Adjust the bundle, discard outlier corners and adjust again; `points_mm` (N, 3) are the corners on the board.
 
     Raises:
         CalibrationError: the adjustment does not converge.
@@ -86,25 +86,25 @@ def camera_from(parameters: Array) -> tuple[Array, Array, Array]:
 
 
 class _Problem:
-    """Residuals and Jacobian over all views with corners in any camera."""
+    """Residuals and Jacobian of all views in which any camera sees corners."""
 
     def __init__(self, corners_px: Array, points_mm: Array) -> None:
         self.views = np.flatnonzero(np.isfinite(corners_px[..., 0]).any((0, 2)))
         self.corners_px, self.points_mm = corners_px[:, self.views], points_mm
         self.cameras = len(corners_px)
         self.seen = np.isfinite(self.corners_px[..., 0])
-        # For each camera, view and corner index of each observed point.
+        # For each camera: the view index and corner index of every observed point.
         self.points = [np.nonzero(seen) for seen in self.seen]
 
     def pack(self, start: InitialGuess) -> Array:
-        """Return the unknowns of an initial guess: lenses, poses of all cameras but the first, poses of boards."""
+        """Return the unknowns of an initial guess: lenses, poses of all cameras but the first, and board poses."""
         lens = np.stack([start.K[:, 0, 0], start.K[:, 1, 1], start.K[:, 0, 2], start.K[:, 1, 2]], axis=1)
         T = np.concatenate([start.T_cam_world[1:], start.T_world_board[self.views]])
         poses = np.concatenate([so3_log(T[:, :3, :3]), T[:, :3, 3]], axis=1)
         return np.concatenate([np.hstack([lens, start.distortion]).ravel(), poses.ravel()])
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Return the camera parameters, and the board parameters (V, 6)."""
+        """Split the unknowns into the camera parameters and the board parameters (V, 6)."""
         own = self.cameras * (_LENS + _POSE) - _POSE
         return x[:own], x[own:].reshape(-1, _POSE)
 
@@ -114,7 +114,7 @@ class _Problem:
         The normal equations are formed from the sparse Jacobian and solved densely. Iterative solvers converge slowly,
         since focal length and distance are strongly correlated.
         """
-        for _ in range(2):  # the second run uses the residual scale of the first
+        for _ in range(2):  # the second run uses the residual scale found in the first run
             scale = _HUBER_SIGMAS * max(_LEAST_SIGMA_PX, 1.4826 * float(np.median(np.abs(self.residuals(x)))))
             x = self._descend(x, scale)
         return x
@@ -136,13 +136,13 @@ class _Problem:
                     break
                 damping *= 10
             else:
-                return x  # no step reduces the error
+                return x  # converged, since no step reduces the error
             if before - cost <= 1e-10 * before:
                 return x
         raise CalibrationError(f"the bundle adjustment did not converge in {_MOST_STEPS} steps.")
 
     def residuals(self, x: Array) -> Array:
-        """Return projected minus observed pixels, shape (R,)."""
+        """Return the residuals, projected minus observed [px], shape (R,)."""
         turns = so3_exp(self.split(x)[1][:, :3])
         return np.concatenate([self._camera(x, turns, c)[0] for c in range(self.cameras)])
 
@@ -153,7 +153,7 @@ class _Problem:
         return out
 
     def jacobian(self, x: Array) -> csr_matrix:
-        """Return d residual / d unknown, sparse, shape (R, U)."""
+        """Return the sparse Jacobian of the residuals with respect to the unknowns, shape (R, U)."""
         boards = self.split(x)[1]
         turns, slopes = so3_exp(boards[:, :3]), so3_left_jacobian(boards[:, :3])
         data, rows, columns, row = [], [], [], 0
@@ -168,21 +168,21 @@ class _Problem:
         return csr_matrix(entries, shape=(row, len(x)))
 
     def covariance(self, x: Array) -> Array:
-        """Return the covariance of the camera parameters, with the board poses marginalised."""
+        """Return the covariance of the camera parameters after marginalising the board poses."""
         J, residual = self.jacobian(x), self.residuals(x)
         sigma = 1.4826 * np.median(np.abs(residual))
         normal = (J.T @ J).toarray()
-        scale = 1 / np.sqrt(np.diag(normal))  # units differ (px, rad, mm): normalise before inverting
+        scale = 1 / np.sqrt(np.diag(normal))  # parameters have different units, so normalise before inverting
         inverse = np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
         own = len(self.split(x)[0])
         return sigma**2 * inverse[:own, :own]
 
     def _camera(self, x: Array, turns: Array, c: int) -> tuple[Array, Array, Array, Array]:
-        """Project the n points of one camera, in the order of the views, at the boards' rotations (V, 3, 3).
+        """Project the n observed points of one camera, in the order of the views, given the board rotations (V, 3, 3).
 
         Returns:
-            Residuals (2n,), OpenCV's derivative of the pixels (2n, ...), and the points rotated by the board and by the
-            camera (n, 3).
+            Residuals (2n,), OpenCV's derivative of the pixels (2n, ...), and the points after the board and the camera
+            rotation, (n, 3) each.
         """
         cameras, boards = self.split(x)
         lens, pose = cameras[c * _LENS : (c + 1) * _LENS], self._pose(x, c)
@@ -197,14 +197,14 @@ class _Problem:
         return residual.ravel(), np.asarray(derived, np.float64), turned, carried
 
     def _parts(self, x: Array, turns: Array, slopes: Array, c: int) -> list[tuple[Array | int, Array]]:
-        """Return blocks (2n, 6) of one camera's Jacobian, each with its first column: one int, or one per row.
+        """Return blocks (2n, 6) of one camera's Jacobian; each has a first column, one for all rows or one per row.
 
         Args:
             turns, slopes: rotations of the boards and their left Jacobians, shape (V, 3, 3).
         """
         pose, views = self._pose(x, c), self.points[c][0]
         _, J, turned, carried = self._camera(x, turns, c)
-        # OpenCV's columns: rotation 0-2, translation 3-5, f 6-7, c 8-9, distortion from 10.
+        # Columns of OpenCV's Jacobian: rotation 0-2, translation 3-5, f 6-7, c 8-9, distortion from 10.
         by_point = J[:, 3:6].reshape(-1, 2, 3)
         parts: list[tuple[Array | int, Array]] = [(c * _LENS, J[:, 6:12])]
         if c:

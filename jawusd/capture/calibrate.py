@@ -1,4 +1,4 @@
-"""Calibrate the cameras of a capture from its boards, and estimate the accuracy of the result."""
+"""Calibrate the cameras of a capture from images of calibration boards, and estimate the accuracy of the result."""
 
 from __future__ import annotations
 
@@ -24,22 +24,23 @@ from jawusd.capture.scale import (
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera
 
-#: Called with the cameras and the failed check of the picks; its `reason` explains why they do not determine the
-#: scale.
+#: Function that measures the scale of the calibration, given the cameras and the failed check of the picked points. The
+#: `reason` in that check explains why the picked points do not determine the scale.
 MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 
-_ENOUGH_VIEWS = 40  # recommended number of views; the shape error is a quarter of that with 20 views
+_ENOUGH_VIEWS = 40  # recommended number of views; the shape error is a quarter of the error with 20 views
 _GOOD_RMS_PX = 0.5
-_FAR_MM = 40.0  # advice is given if even the nearest corner of the board is farther from the centre of the mouth
-_GRID = (8, 5)  # number of image cells (columns, rows) for which coverage is computed
+# Distance between the centre of the mouth and the nearest board corner above which advice is given.
+_FAR_MM = 40.0
+_GRID = (8, 5)  # numbers of columns and rows of image cells for which the board's coverage is computed
 _LITTLE_COVERAGE = 0.5
-_LARGE_EXPECTED_MM = 0.05  # advice is given above this error, half of the typical tracking error of 0.1 mm
+_LARGE_EXPECTED_MM = 0.05  # expected error above which advice is given; half of the typical tracking error of 0.1 mm
 
 
 class CameraFigures(TypedDict):
     """Statistics of one camera's calibration.
 
-    `coverage` is the fraction of the image's cells with corners; `blurred` and `missed` are image numbers.
+    `coverage` is the fraction of image cells that contain corners. `blurred` and `missed` are image numbers.
     """
 
     views: int
@@ -52,17 +53,17 @@ class CameraFigures(TypedDict):
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """Accuracy of a calibration, with advice."""
+    """Accuracy of a calibration, with advice on how to improve it."""
 
     cameras: dict[str, CameraFigures]
     views: int  # number of board poses used
-    board_shape: ShapeError  # error of distances between triangulated corners near the mouth, in the images used
-    expected_shape_mm: float  # expected mean error of distances in the mouth, from the scatter of the corners
-    mouth_mm: tuple[float, float, float]  # centre of the mouth in the world
-    mouth_from: str  # source of that centre
-    scale: ScaleCheck  # the board's square size, checked against the teeth
-    advice: tuple[str, ...]  # possible improvements, one sentence each
-    notes: tuple[str, ...]  # assumptions made, one sentence each
+    board_shape: ShapeError  # error of distances between triangulated corners near the mouth
+    expected_shape_mm: float  # mean error of distances in the mouth that the scatter of the corners implies
+    mouth_mm: tuple[float, float, float]  # centre of the mouth in world coordinates
+    mouth_from: str  # text that names the source of mouth_mm
+    scale: ScaleCheck  # check of the board's square size against the size of the teeth
+    advice: tuple[str, ...]  # possible improvements of the calibration, one sentence each
+    notes: tuple[str, ...]  # assumptions of the calibration, one sentence each
 
     def as_dict(self) -> dict[str, object]:
         """Return the report as plain data."""
@@ -78,18 +79,20 @@ def calibrate_capture(
     """Calibrate the cameras from the boards of a capture.
 
     Args:
-        scans: vertices of the teeth scans [mm] by "upper" and "lower", shape (n, 3); picks refer to them.
-        scale_without_picks: measures the size of the teeth with the calibrated cameras if the picks are insufficient.
+        scans: vertices of the teeth scans [mm] by "upper" and "lower", shape (n, 3); picked points are indices of them.
+        scale_without_picks: measures the size of the teeth with the calibrated cameras if the picked points are too
+            few.
 
     Raises:
-            CalibrationError: there are no boards, or they do not determine the calibration.
+            CalibrationError: there are no boards, or the boards do not determine the calibration.
         CaptureError: a clip cannot be read.
     """
     if capture.boards is None:
         raise CalibrationError(
             "has no [boards] table.",
             path=capture.folder / "capture.toml",
-            hint="Film a chessboard at the position of the teeth and name the clips there, or give a calibration file.",
+            hint="Film a chessboard at the position of the teeth and list the clips in [boards], or set "
+            "a calibration file.",
         )
     names = tuple(camera.name for camera in capture.cameras)
     return calibrate_detections(find_boards(names, capture.boards, progress), capture, scans, scale_without_picks)
@@ -146,7 +149,7 @@ def _camera_figures(c: int, camera: Camera, bundle: Bundle, detections: BoardDet
     cells = np.floor(pixels / camera.size_px * _GRID).astype(int)
     covered = {(x, y) for x, y in cells.tolist()}
     corners = {"top left": (0, 0), "top right": (1, 0), "bottom left": (0, 1), "bottom right": (1, 1)}
-    # A corner region of the image extends over a quarter of its width and height.
+    # A corner region of the image is a quarter as wide and a quarter as high as the image.
     share = pixels / camera.size_px
     empty = [name for name, (right, low) in corners.items() if not ((np.abs(share - [right, low]) < 0.25).all(1)).any()]
     return {
@@ -186,7 +189,7 @@ def _advice(
         if figure["coverage"] < _LITTLE_COVERAGE or figure["empty_corners"]:
             empty = ", ".join(figure["empty_corners"]) or "parts"
             advice.append(
-                f"camera {name}: the board covered {figure['coverage']:.0%} of the picture and left {empty} empty; "
+                f"camera {name}: the board covered {figure['coverage']:.0%} of the image and left {empty} empty; "
                 "the lens model is extrapolated there, so keep the teeth out of that area."
             )
     if expected_mm > _LARGE_EXPECTED_MM:

@@ -1,4 +1,4 @@
-"""Plausibility checks of a calibration: lenses, positions and directions of the cameras."""
+"""Check whether a calibration is plausible: lenses, positions and directions of the cameras."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
 
-# Range of the ratio of focal length to image width: fields of view from 100 down to 3 degrees.
+# Plausible range of the ratio of focal length to image width; fields of view from 100 down to 3 degrees.
 _FOCAL_WIDTHS = (0.4, 20.0)
-_SQUARE = 0.03  # maximum relative difference of fx and fy; current cameras have square pixels
+_SQUARE = 0.03  # maximum relative difference between fx and fy; current cameras have square pixels
 _CENTRE_SHARE = 0.15  # maximum offset of the principal point from the image centre, relative to the image width
 _LEAST_BASELINE_MM, _MOST_BASELINE_MM = 10.0, 5000.0
-_LEAST_ANGLE_DEG = 3.0  # minimum angle between two views of the teeth; below it, depth is poorly determined
+_LEAST_ANGLE_DEG = 3.0  # minimum angle between two viewing directions; smaller angles determine depth poorly
 _NEAREST_MM, _FARTHEST_MM = 40.0, 5000.0
 
 
 def camera_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
-    """Yield findings about calibrated cameras, lengths in mm; `path` is the calibration file."""
+    """Yield findings about calibrated cameras, with lengths in mm; `path` is the calibration file."""
     for camera in cameras:
         yield from _lens_findings(camera, path)
     if len(cameras) < 2:
@@ -72,14 +72,14 @@ def _lens_findings(camera: Camera, path: str) -> Iterator[Finding]:
 
 
 def _fold(camera: Camera) -> float | None:
-    """Return where the distortion folds over, as a fraction of the way to the farthest corner; None if it does not."""
+    """Return the radius at which the distortion folds over, relative to the image corner's; None if it does not."""
     width, height = camera.size_px
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], np.float64)
     centre = camera.K[:2, 2]
     share = np.linspace(0.0, 1.0, 101)[:, None]
     folds = []
     for corner in corners:
-        # Undistorted radii up to that of the corner, which barrel distortion increases.
+        # Barrel distortion increases the undistorted radius of the corner, hence the factor 1.5.
         seen = camera.distort_pixels(centre + 1.5 * share * (corner - centre))
         reach = np.linalg.norm(seen - centre, axis=1)
         turned = np.flatnonzero(np.diff(reach) < 0)
@@ -89,7 +89,7 @@ def _fold(camera: Camera) -> float | None:
 
 
 def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
-    """Yield findings about cameras that do not point at the same target as the others."""
+    """Yield findings about cameras that do not point at the common target of all cameras."""
     target = common_target(cameras)
     for camera in cameras:
         depth = float(camera.depth(target))
@@ -97,13 +97,13 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
             yield Finding(
                 "camera_aim",
                 "warning",
-                f"the cameras' common target is {depth:.0f} mm in front of this camera; the usual range is "
+                f"the common target of the cameras is {depth:.0f} mm in front of this camera; the usual range is "
                 f"{_NEAREST_MM:g} to {_FARTHEST_MM:g} mm",
                 depth,
                 _NEAREST_MM,
                 path=path,
                 camera=camera.name,
-                hint="Check its pose in the calibration, and calibration_unit_mm.",
+                hint="Check the pose of this camera in the calibration, and calibration_unit_mm.",
             )
     views = [(target - camera.centre_world()) / np.linalg.norm(target - camera.centre_world()) for camera in cameras]
     angles = [float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0)))) for a, b in combinations(views, 2)]
@@ -111,7 +111,8 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
         yield Finding(
             "views_alike",
             "warning",
-            f"all viewing directions lie within {max(angles):.1f} degrees; at least {_LEAST_ANGLE_DEG:g} are needed",
+            f"all viewing directions lie within {max(angles):.1f} degrees; expected at least "
+            f"{_LEAST_ANGLE_DEG:g} degrees",
             max(angles),
             _LEAST_ANGLE_DEG,
             path=path,
@@ -120,7 +121,7 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
 
 
 def common_target(cameras: Sequence[Camera]) -> Array:
-    """Return the point closest to the optical axes of all cameras [mm], shape (3,)."""
+    """Return the point that is closest to the optical axes of all cameras [mm], shape (3,)."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for camera in cameras:
         axis = camera.T_cam_world[2, :3]

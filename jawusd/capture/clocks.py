@@ -14,7 +14,7 @@ from jawusd.media.footage import open_clip
 _DAY_S = 86400
 _RATE_TOLERANCE = 1e-3
 _NEARLY_WHOLE = 0.01
-_FASTEST_USUAL = 30.5  # images per second; at higher rates, two or four images often share a time code
+_FASTEST_USUAL = 30.5  # frame rate [Hz] above which two or four images often have the same time code
 
 
 def check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
@@ -27,25 +27,25 @@ def check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
     for name, clip in clips.items():
         if abs(clip.timeline.rate / rate - 1) > _RATE_TOLERANCE:
             raise SyncError(
-                f"camera {name} has {clip.timeline.rate:.6g} frames per second, camera {reference} has {rate:.6g}.",
+                f"camera {name} has {clip.timeline.rate:.6g} frames per second, but camera {reference} has {rate:.6g}.",
                 path=clip.path,
                 hint="Offsets in whole frames need equal frame rates: convert the videos to one rate.",
             )
 
 
 def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ...]]:
-    """Return every camera's offset and notes for the user; the clock is `[sync] method`, "timecode" or "numbers".
+    """Return the offset of each camera, and notes for the user, from the clock in `[sync] method`.
 
     Raises:
-        SyncError: a camera has no video, or its clip has no clock of that kind; the clips do not overlap, or their
-            rates differ.
+        SyncError: a camera has no video or its clip does not have this clock, the clips do not overlap in time, or the
+            frame rates of the clips differ.
         CaptureError: a clip cannot be read.
     """
     path = capture.folder / "capture.toml"
     clips: dict[str, Clip] = {}
     for camera in capture.cameras:
         if camera.clip is None:
-            raise SyncError("has no video, so it has no clock to synchronise by.", camera=camera.name, path=path)
+            raise SyncError("has no video, so there is no clock for synchronisation.", camera=camera.name, path=path)
         clips[camera.name] = open_clip(camera.clip)
     check_frame_rates(clips, capture.reference)
     by_code = capture.sync.method == "timecode"
@@ -56,14 +56,14 @@ def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ..
     for name, start in starts.items():
         offset = start - reference
         if by_code and abs(offset) > day // 2:
-            offset -= day if offset > 0 else -day  # the take was recorded across midnight
+            offset -= day if offset > 0 else -day  # time codes start again at midnight
         if offset >= clips[capture.reference].timeline.count or -offset >= clips[name].timeline.count:
             raise SyncError(
                 f"starts {abs(offset)} frames {'after' if offset > 0 else 'before'} camera {capture.reference} by its "
                 f"{capture.sync.method}: the clips do not overlap in time.",
                 camera=name,
                 path=clips[name].path,
-                hint="Check that the clips belong to one take, synchronise by light flashes, or give [sync] offsets.",
+                hint="Check that the clips belong to one take, synchronise by light flashes, or set [sync] offsets.",
             )
         out[name] = Offset(offset, float(offset), 0.0, 0, 1.0)
     return out, tuple(_notes(clips)) if by_code else ()
@@ -85,17 +85,18 @@ def _notes(clips: Mapping[str, Clip]) -> Iterator[str]:
 
 
 def _frames_of_number(clip: Clip) -> int:
-    """Return the number of images per time code.
+    """Return the number of images that have the same time code.
 
     Raises:
-        CaptureError: this number is not an integer.
+        CaptureError: the number is not an integer.
     """
     ratio = clip.timeline.rate / (clip.timecode_fps or clip.timeline.rate)
     if round(ratio) < 1 or abs(ratio / round(ratio) - 1) > _NEARLY_WHOLE:
         raise CaptureError(
-            f"the time code counts {clip.timecode_fps:.6g} numbers per second, which is not an integer fraction of the "
+            f"the time code has {clip.timecode_fps:.6g} frames per second, which is not an integer fraction of the "
             f"clip's {clip.timeline.rate:.6g} frames per second.",
-            hint="Give the time code of the first frame at the rate of the clip, or synchronise by light.",
+            hint="State the time code of the first frame at the frame rate of the clip, or synchronise "
+            "by light flashes.",
         )
     return round(ratio)
 
@@ -105,10 +106,11 @@ def _timecodes(clips: Mapping[str, Clip]) -> dict[str, int]:
     for name, clip in clips.items():
         if not clip.timecode:
             raise SyncError(
-                "its clip has no time code.",
+                "the clip has no time code.",
                 camera=name,
                 path=clip.path,
-                hint='Give timecode = "HH:MM:SS:FF" of the first frame in its [[camera]], or synchronise by light.',
+                hint='Set timecode = "HH:MM:SS:FF" of the first frame in this [[camera]], or '
+                "synchronise by light flashes.",
             )
         try:
             shared = _frames_of_number(clip)

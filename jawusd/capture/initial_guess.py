@@ -1,8 +1,9 @@
-"""Initial values of a calibration: the kind of board in the clips, intrinsics per camera, then the camera poses.
+"""Initial values of a calibration: the type of board in the clips, the intrinsics of each camera, the camera poses.
 
-A detector may list a symmetric board's corners in a different order in every image. Each order corresponds to the board
-rotated in its plane. The relative pose of two fixed cameras is the same in all views only if both list the same corner
-first, so the pose that most views agree on determines the orders and reveals views that were not simultaneous.
+A detector may list the corners of a symmetric board in a different order in every image. Each order corresponds to the
+board rotated in its plane. The relative pose of two fixed cameras is the same in all views only if the same corner is
+listed first for both. The relative pose that most views agree on therefore determines the orders, and reveals views
+that were not simultaneous.
 """
 
 from __future__ import annotations
@@ -19,26 +20,27 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import CalibrationError
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log
 
-FEWEST_VIEWS = 6  # minimum number of views per camera; with fewer, focal length and distance are ambiguous
-_SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # tolerances for equal relative poses: angle, relative distance
+FEWEST_VIEWS = 6  # minimum number of board views per camera; with fewer, focal length and distance are ambiguous
+# Tolerances for equal relative poses: angle, and distance as a fraction.
+_SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04
 _LEAST_AGREEMENT = 0.5  # minimum fraction of two cameras' shared views that must agree on the relative pose
 _INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-_WIDTH_PX = 960  # images are searched at this width, which suffices for boards that fill a fifth of the image
-_FEWEST_PICTURES = 2  # minimum number of images that must agree on the board
+_WIDTH_PX = 960  # image width of the search for boards; suffices for boards that fill a fifth of the image
+_FEWEST_PICTURES = 2  # minimum number of images that must show the same board
 _FEWEST_MARKERS = 4
 _FAMILIES = ("4X4", "5X5", "6X6", "7X7")
-_SIZES = (50, 100, 250, 1000)  # OpenCV's smaller dictionaries are prefixes of the larger ones
+_SIZES = (50, 100, 250, 1000)  # sizes of OpenCV's marker dictionaries; smaller ones are prefixes of larger ones
 
 
 @dataclass(frozen=True, eq=False)
 class InitialGuess:
-    """Initial values of the bundle adjustment."""
+    """Initial values of the bundle adjustment of C cameras over V views of a board with N corners."""
 
     K: Array  # intrinsic matrices [px], shape (C, 3, 3)
-    distortion: Array  # k1 and k2 per camera, shape (C, 2)
-    T_cam_world: Array  # world (the first camera) to camera [mm], shape (C, 4, 4)
-    T_world_board: Array  # board to world [mm], NaN for inconsistent views, shape (V, 4, 4)
-    corners_px: Array  # corners in a common order, NaN where hidden or inconsistent, shape (C, V, N, 2)
+    distortion: Array  # k1 and k2 of each camera, shape (C, 2)
+    T_cam_world: Array  # transforms from world (the first camera) to camera [mm], shape (C, 4, 4)
+    T_world_board: Array  # transforms from board to world [mm], NaN for inconsistent views, shape (V, 4, 4)
+    corners_px: Array  # corner pixels in a common order, NaN where hidden or inconsistent, (C, V, N, 2)
 
 
 def initial_cameras(
@@ -69,7 +71,7 @@ def initial_cameras(
     for v in range(views):
         seen = [c for c in range(count) if np.isfinite(T_cam_board[c, v, 0, 0])]
         agreed: list[tuple[int, int]] = []
-        for first in seen:  # use the board pose from the camera that most others agree with
+        for first in seen:  # use the board pose from the camera with which most other cameras agree
             T = se3_inverse(T_cam_world[first]) @ T_cam_board[first, v]
             found = [
                 (c, s)
@@ -88,12 +90,12 @@ def initial_cameras(
 def _single_camera(
     name: str, size_px: tuple[int, int], corners_px: Array, points_mm: Array
 ) -> tuple[Array, Array, Array]:
-    """Return K (3, 3), k1 and k2 and T_cam_board (V, 4, 4) of one camera (Zhang 2000, in OpenCV)."""
+    """Calibrate one camera (Zhang 2000, in OpenCV); return K (3, 3), k1 and k2, and T_cam_board (V, 4, 4)."""
     seen = np.isfinite(corners_px[..., 0])
     used = np.flatnonzero(seen.any(1))
     if len(used) < FEWEST_VIEWS:
         raise CalibrationError(
-            f"the board is sharp in {len(used)} pictures; at least {FEWEST_VIEWS} are needed.",
+            f"the board is sharp in {len(used)} images; at least {FEWEST_VIEWS} are needed.",
             camera=name,
             hint="Film the board again: 40 poses at the position of the teeth, tilted up to 30 degrees, held still.",
         )
@@ -117,8 +119,8 @@ def _single_camera(
 
 
 def _turn(points_mm: Array, order: NDArray[np.int64]) -> Array:
-    """Return the rotation of the board about its centre with points[order] = R points."""
-    # The points are planar: least squares for the two in-plane axes; the normal is fixed.
+    """Return the rotation R of the board about its centre for which points[order] = R points."""
+    # The points are planar, so only the two axes in the plane are fitted; the normal stays fixed.
     plane = np.linalg.lstsq(points_mm[:, :2], points_mm[order, :2], rcond=None)[0].T
     R = np.eye(3)
     R[:2, :2] = np.round(plane)
@@ -126,14 +128,14 @@ def _turn(points_mm: Array, order: NDArray[np.int64]) -> Array:
 
 
 def _equal(a: Array, b: Array) -> Mask:
-    """Return whether poses are equal within the tolerance, shape (...)."""
+    """Return whether poses (..., 4, 4) are equal within the tolerances, shape (...)."""
     angle = np.linalg.norm(so3_log(a[..., :3, :3] @ np.swapaxes(b[..., :3, :3], -1, -2)), axis=-1)
     apart = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
     return (angle < _SAME_ANGLE_RAD) & (apart < _SAME_SHARE * np.linalg.norm(b[..., :3, 3], axis=-1))
 
 
 def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array]) -> Array:
-    """Return T_cam_world (C, 4, 4), chained from the first camera over the pairs with the most shared views."""
+    """Return T_cam_world (C, 4, 4), chained from the first camera along the camera pairs with most shared views."""
     seen = np.isfinite(T_cam_board[..., 0, 0])
     T_cam_world = np.full((len(names), 4, 4), np.nan)
     T_cam_world[0] = np.eye(4)
@@ -154,13 +156,14 @@ def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array
 
 
 def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Array]) -> Array:
-    """Return the T_b_a that most shared views agree on, each in any of the orders."""
+    """Return the relative pose T_b_a that most shared views agree on, with the corners of each in any order."""
     both = np.isfinite(T_cam_board[..., 0, 0]).all(0)
     T_a, T_b = T_cam_board[0, both], T_cam_board[1, both]
-    # (orders, views, 4, 4): T_b_a if b lists the corners in that order.
+    # Relative poses T_b_a for each corner order of camera b, shape (orders, views, 4, 4).
     candidates = np.stack([T_b @ turn @ se3_inverse(T_a) for turn in turns])
     flat = candidates.reshape(-1, 4, 4)
-    votes = _equal(flat[:, None, None], candidates[None]).any(1)  # agreement, shape (candidates, views)
+    # Whether views agree with candidates, shape (candidates, views).
+    votes = _equal(flat[:, None, None], candidates[None]).any(1)
     support = votes.sum(1)
     best = int(np.argmax(support))
     if support[best] < _LEAST_AGREEMENT * both.sum():
@@ -169,7 +172,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
             f"{both.sum()} agree on the relative camera pose.",
             hint="The board clips must be synchronous frame by frame, and the cameras must not move.",
         )
-    # Choose the most central of the well-supported poses.
+    # Choose the most central among the poses that many views agree with.
     strong = flat[support >= 0.8 * support[best]]
     near = strong[_equal(strong, flat[best])]
     gap = np.linalg.norm(near[:, None, :3] - near[None, :, :3], axis=(-1, -2)).sum(1)
@@ -178,7 +181,7 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
 
 @dataclass(frozen=True)
 class DetectedBoard:
-    """Board found in clips: the inner corners of a chessboard, or a marker dictionary."""
+    """Calibration board found in clips: number of inner corners of a chessboard, or the marker dictionary."""
 
     pattern: str
     cols: int | None = None
@@ -187,7 +190,7 @@ class DetectedBoard:
 
 
 def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
-    """Return the board found in the most gray images (h, w); None if no two agree."""
+    """Return the board found in the largest number of gray images (h, w), or None if no two images agree."""
     boards: Counter[tuple[int, int]] = Counter()
     markers: Counter[str] = Counter()
     highest: dict[str, int] = {}
@@ -217,7 +220,7 @@ def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _markers(picture: NDArray[np.uint8]) -> Iterable[tuple[str, int]]:
-    """Yield each marker family detected, with its highest marker number."""
+    """Yield each detected marker family and its highest marker number."""
     for family in _FAMILIES:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}_{_SIZES[-1]}"))
         numbers = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)[1]

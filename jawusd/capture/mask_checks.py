@@ -1,7 +1,7 @@
-"""Consistency checks of masks, calibration and offsets before tracking.
+"""Check masks, calibration and time offsets for consistency before tracking.
 
-The mask centres of two cameras must lie on each other's epipolar lines, and masks swapped between two cameras start and
-end at the wrong frames.
+The mask centre of one camera must lie on the epipolar line of another camera's mask centre. Masks that are swapped
+between two cameras start and end at the wrong frames.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera, triangulate
 
-#: First and last frame with a mask of the upper and of the lower teeth, in the camera's own numbers; None if empty.
+#: First and last frame number of a camera with masks, for upper and lower teeth; None if there are no masks.
 Ranges = tuple[tuple[int, int] | None, tuple[int, int] | None]
-#: Centre of all teeth pixels of one frame, by camera [px], shape (2,).
+#: Centre [px] of the teeth pixels of one video frame, shape (2,), by camera.
 MaskCentres = Mapping[str, Array]
 
-# Maximum distance between the rays through two mask centres [mm]; it is not 0, since the visible part of the teeth
-# differs between views. It was at most 10.4 mm in 70 valid synthetic captures, so none raised a false alarm.
+# Maximum distance [mm] between the rays through the mask centres of two cameras. The rays do not meet exactly, since
+# the visible part of the teeth differs between views; in 70 valid synthetic captures the distance was at most 10.4 mm.
 _RAYS_MM = 15.0
-# Plausible width of the teeth in the masks at the triangulated depth [mm]; lips may hide a large part of them.
+# Plausible range of the width [mm] of the masked teeth at the triangulated depth; lips may hide many teeth.
 _SEEN_MM = (10.0, 90.0)
 
 
 def swapped_cameras(
     ranges: Mapping[str, Ranges], offsets: Mapping[str, int], first: int, stop: int
 ) -> list[tuple[str, str]]:
-    """Return pairs of cameras whose masks start and end with the take only if swapped.
+    """Return pairs of cameras whose masks start and end with the take only if they are swapped.
 
     Args:
-        ranges: frames with masks, by camera.
-        offsets: reference frame minus own frame number, by camera.
-        first, stop: first frame of the take and one past the last, of the reference camera.
+        ranges: first and last frame with masks, by camera.
+        offsets: frame number of the reference camera minus that of the camera at the same time, by camera.
+        first, stop: first frame of the take, and one past the last, in frame numbers of the reference camera.
     """
 
     def fits(source: str, camera: str) -> bool:
@@ -52,9 +52,9 @@ def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[Ma
 
     Args:
         cameras: calibrated cameras by name.
-        centres: mask centres in some frames, one entry per candidate offset; the best candidate is used.
+        centres: mask centres in some frames, one entry per candidate time offset; the best candidate is used.
 
-    The camera in most of the inconsistent pairs is reported.
+    The camera that is part of the most inconsistent pairs is reported.
     """
     apart: dict[tuple[str, str], float] = {}
     for pair in combinations(cameras, 2):
@@ -88,7 +88,7 @@ def width_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -
 
     Args:
         cameras: calibrated cameras by name.
-        pixels: some teeth pixels of one frame, by camera, shape (N, 2).
+        pixels: some teeth pixels of one video frame, by camera, shape (N, 2).
     """
     seen = {name: camera for name, camera in cameras.items() if len(pixels.get(name, ()))}
     if len(seen) < 2:

@@ -1,4 +1,4 @@
-"""Accuracy of a calibration: its scale, checked against the teeth, and errors of lengths in the mouth."""
+"""Accuracy of a calibration: check of the scale against the teeth, and errors of lengths in the mouth."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from jawusd.capture.camera_checks import common_target
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, triangulate
 
-_FEWEST_PICKS = 3  # minimum number of picks per arch
-_TOLERANCE = 0.03  # maximum deviation of the size ratio from 1; picks determine the ratio to about 0.5 %
+_FEWEST_PICKS = 3  # Minimum number of picked points per dental arch.
+_TOLERANCE = 0.03  # Maximum deviation of the size ratio from 1; picked points determine the ratio to about 0.5 %.
 _SIGMAS = 4.0
-_MOUTH_RADIUS_MM = 35.0  # radius of a sphere that contains both arches up to an opening of 40 mm
+_MOUTH_RADIUS_MM = 35.0  # radius of a sphere that contains both dental arches up to a mouth opening of 40 mm
 _DRAWS = 40
 _POINTS = 150
 
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """Size of the teeth measured with the cameras, relative to the scan."""
+    """Size of the teeth measured with the cameras, relative to their size in the scan."""
 
-    ratio: float | None  # measured size / scanned size, None if unknown
-    sigma: float | None  # standard error of the ratio
-    reason: str = ""  # reason why the ratio is unknown, otherwise empty
+    ratio: float | None  # Measured size divided by scanned size; None if unknown.
+    sigma: float | None  # Standard error of the ratio; None if the ratio is unknown.
+    reason: str = ""  # reason why the ratio is unknown; empty if it is known
 
 
 def triangulated_picks(
     cameras: list[Camera], bootstrap: Bootstrap | None
 ) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Return the picked vertices (n,) and their triangulated positions (n, 3) [mm], by arch."""
+    """Return the indices of the picked vertices (n,) and their triangulated positions (n, 3) [mm], by arch."""
     known = {camera.name: camera for camera in cameras}
     out = {}
     for jaw in ("upper", "lower"):
@@ -54,7 +54,7 @@ def triangulated_picks(
 def check_scale(
     cameras: list[Camera], bootstrap: Bootstrap | None, scans: Mapping[str, Array], square_mm: float
 ) -> ScaleCheck:
-    """Compare the spread of the triangulated picks with that on the scans (Umeyama 1991).
+    """Compare the spread of triangulated picked points with their spread on the scans (Umeyama 1991).
 
     Args:
         scans: vertices [mm] by "upper" and "lower", shape (n, 3).
@@ -84,14 +84,14 @@ def check_scale(
 
 
 def checked_scale(ratio: float, sigma: float, square_mm: float) -> ScaleCheck:
-    """Check a measured size ratio of the teeth (measured / scanned) against the square size.
+    """Check the square size of the board with a size ratio of the teeth (measured / scanned).
 
     Raises:
         CalibrationError: the measured size of the teeth differs from the scan.
     """
     if abs(ratio - 1) > max(_TOLERANCE, _SIGMAS * sigma):
         raise CalibrationError(
-            f"with these boards the teeth measure {ratio:.3f} times their scan (+-{sigma:.3f}): squares "
+            f"with this board, the teeth measure {ratio:.3f} (+-{sigma:.3f}) times their size in the scan: squares "
             f"of {square_mm:g} mm would have to be {square_mm / ratio:.2f} mm.",
             hint="Measure the printed board and correct [boards] square_mm, or check the picks and the scan's unit.",
         )
@@ -102,16 +102,16 @@ def checked_scale(ratio: float, sigma: float, square_mm: float) -> ScaleCheck:
 
 @dataclass(frozen=True)
 class ShapeError:
-    """Errors of distances between points [mm]."""
+    """Statistics of the errors of distances between points [mm]."""
 
-    mean: float  # mean absolute error
-    p95: float  # 95th percentile of the absolute error
-    max: float  # maximum absolute error
+    mean: float  # mean of the absolute errors
+    p95: float  # 95th percentile of the absolute errors,
+    max: float  # and their maximum
     distances: int  # number of distances compared; 0 if no corner near the mouth was visible to two cameras
 
 
 def mouth_centre(cameras: list[Camera], bootstrap: Bootstrap | None, T_world_board: Array) -> tuple[Array, str]:
-    """Return the centre of the mouth in the world [mm], shape (3,), and its source."""
+    """Return the centre of the mouth in world coordinates [mm], shape (3,), and a text that names its source."""
     picks = triangulated_picks(cameras, bootstrap)
     if picks:
         return np.concatenate([points for _, points in picks.values()]).mean(0), "the picked teeth"
@@ -125,7 +125,7 @@ def board_shape_error(cameras: list[Camera], bundle: Bundle, points_mm: Array, c
 
     Args:
         points_mm: corners on the board, shape (N, 3).
-        centre_mm: centre of the mouth in the world, shape (3,).
+        centre_mm: centre of the mouth in world coordinates, shape (3,).
     """
     errors = []
     for corners in np.moveaxis(bundle.corners_px, 1, 0):
@@ -142,10 +142,10 @@ def board_shape_error(cameras: list[Camera], bundle: Bundle, points_mm: Array, c
 
 
 def expected_shape_error(cameras: list[Camera], bundle: Bundle, centre_mm: Array) -> float:
-    """Return the mean error of distances in the mouth [mm] expected from the cameras' covariance.
+    """Return the mean error of distances in the mouth [mm] that the covariance of the cameras implies.
 
     Points in the mouth are projected with the calibrated cameras and triangulated with cameras drawn from the
-    covariance. Effects outside the model (bent boards, other lens terms, rolling shutter) are not included.
+    covariance. Effects that the model omits (bent boards, other lens terms, rolling shutter) are not included.
     """
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(_POINTS, 3))
@@ -172,8 +172,8 @@ def distance_errors(found: Array, exact: Array) -> Array:
 def _triangulate(cameras: list[Camera], pixels: Array) -> Array:
     """Triangulate points (M, 3) linearly from distorted pixels (C, M, 2), NaN where hidden.
 
-    Inhomogeneous method in normalised coordinates (Hartley & Zisserman, section 12.2). With cameras at similar
-    distances the algebraic error approximates the reprojection error.
+    The method is the inhomogeneous one, in normalised coordinates (Hartley & Zisserman, section 12.2). If the cameras
+    are at similar distances, its algebraic error approximates the reprojection error.
     """
     rows, right = [], []
     for camera, seen in zip(cameras, pixels):

@@ -2,12 +2,12 @@
 
 The mean brightness of an image falls and rises with the room light. The times of these steps, matched between two
 cameras, give their offset in whole frames. A step during an exposure results in an image of intermediate brightness,
-from which the fraction of a frame follows. The step falls into an exposure always if the shutter never closes,
-otherwise only sometimes.
+which gives the fraction of a frame. If the shutter never closes, every step falls into an exposure; otherwise only some
+steps do.
 
 Sounds are matched by generalised cross-correlation (Knapp & Carter 1976) with partial whitening: full whitening (PHAT)
-weights noisy bands as much as the voice, and without whitening hum dominates. The resolution is 1/16000 s, but sound
-takes 3 ms per metre, which is an error for cameras that are metres apart.
+weights noisy bands as much as the voice, while without whitening hum dominates. The resolution is 1/16000 s, but sound
+travels at 3 ms per metre, which causes errors for cameras that are metres apart.
 """
 
 from __future__ import annotations
@@ -24,40 +24,40 @@ from jawusd.base.errors import SyncError
 from jawusd.media.clip import Clip
 from jawusd.media.containers import Sound
 
-_FIRST_WINDOW_S = 4.0  # initial length of the part searched at each end of a video; doubled until a flash is found
-_SPARSE = 8  # subsampling of pixels in both directions for the mean brightness
-_CONTRAST = 0.3  # minimum relative brightness change of a flash; moving people change it by a few per cent
-_ABRUPT_FRAMES = 3  # maximum duration of a light step
-_TOLERANCE_FRAMES = 1.0  # maximum time difference of matched steps
-_DROPPED_S = 0.5  # if unmatched steps match at an offset that differs by less than this, frames were dropped
+_FIRST_WINDOW_S = 4.0  # initial length of the part of a video searched at each end; doubled until a flash is found
+_SPARSE = 8  # pixel step in both directions when the mean brightness of an image is computed
+_CONTRAST = 0.3  # minimum relative brightness change of a flash; moving people cause a few per cent
+_ABRUPT_FRAMES = 3  # maximum duration of a light step [frames]
+_TOLERANCE_FRAMES = 1.0  # maximum time difference of matched light steps [frames]
+_DROPPED_S = 0.5  # maximum offset difference at which unmatched light steps indicate dropped frames
 _FEWEST_STEPS = 2
-_BETWEEN_FRAMES = 0.15  # smaller fractional offsets are noise and are ignored
+_BETWEEN_FRAMES = 0.15  # maximum distance of a step from a frame boundary to be between two exposures
 RATE_HZ = 16000
 _WHITENING = 0.75
-_LOWEST_HZ = 80.0  # lower frequencies, such as mains hum and wind, are ignored
-_APART_S = 0.02  # correlation peaks closer than this count as one
-_LEAST_SIGMAS = 9.0  # minimum height of the correlation peak; the highest of millions of random ones is below 6
-_SECOND_PEAK = 0.7  # maximum height of the second peak relative to the highest; above it, the sound is periodic
+_LOWEST_HZ = 80.0  # minimum frequency of the sound that is used; excludes mains hum and wind
+_APART_S = 0.02  # minimum distance of separate correlation peaks
+_LEAST_SIGMAS = 9.0  # minimum height of the correlation peak [sigma]; random peaks stay below 6
+_SECOND_PEAK = 0.7  # maximum height of the second correlation peak relative to the highest; exceeded by periodic sound
 
 
 @dataclass(frozen=True)
 class Step:
-    """A sudden change of brightness."""
+    """A sudden change of the brightness of a video."""
 
-    time_frames: float  # time in frames of the camera's video; the exposure of frame k starts at time k
-    rising: bool  # True if the light is switched on, False if off
-    slack_frames: float = 0.0  # by how much the step may be earlier, if images before it are missing
+    time_frames: float  # time in frames of the video; the exposure of frame k starts at time k
+    rising: bool  # True if the light is switched on, False if it is switched off
+    slack_frames: float = 0.0  # amount by which the step may be earlier because images before it are missing
 
 
 @dataclass(frozen=True)
 class Offset:
     """Time offset of a camera: its frame k is simultaneous with frame k + `frames` of the reference camera."""
 
-    frames: int  # the offset in whole frames
-    exact_frames: float  # the offset with its estimated fraction
-    spread_frames: float  # maximum deviation of a matched step from exact_frames; 0 for sound
-    matched_steps: int  # number of steps found in both cameras; 0 for sound
-    confidence: float  # fraction of the steps of both cameras that match, or `SoundMatch.confidence`; 0 .. 1
+    frames: int  # offset in whole frames
+    exact_frames: float  # offset with the estimated fraction of a frame
+    spread_frames: float  # maximum deviation of a matched light step from exact_frames; 0 for sound
+    matched_steps: int  # number of light steps found in both cameras; 0 for sound
+    confidence: float  # fraction of matched light steps, or `SoundMatch.confidence`; 0 to 1
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class Flashes:
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
-    """Return the ordered times of light switching; empty if the brightness changes less than in a flash.
+    """Return the light steps in temporal order; none if the brightness changes less than in a flash.
 
     Args:
-        brightness: mean brightness of successive images, 0 .. 255, shape (n,).
+        brightness: mean brightness of successive images, 0 to 255, shape (n,).
     """
     if len(brightness) < 2 or brightness.max() - brightness.min() < _CONTRAST * brightness.max():
         return []
@@ -86,7 +86,7 @@ def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
         around = brightness[first:last]
         low, high = around.min(), around.max()
         if high - low < contrast / 2:
-            continue  # slow change: clouds, a dimmer, automatic exposure
+            continue  # skip slow changes, as by clouds, a dimmer or automatic exposure
         lit = float(((around - low) / (high - low)).sum())
         rising = bool(bright[at])
         steps.append(Step(first_frame + (last - lit if rising else first + lit), rising))
@@ -94,7 +94,7 @@ def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
 
 
 def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
-    """Estimate the offset of a camera from its steps and those of the reference camera.
+    """Estimate the time offset of a camera from its light steps and those of the reference camera.
 
     Raises:
         SyncError: fewer than two steps match, the offset is ambiguous, or frames were dropped.
@@ -103,7 +103,7 @@ def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
     ranked = sorted((_aligned(steps, reference, offset) for offset in candidates), key=lambda a: (-len(a[0]), a[1]))
     if not ranked or len(ranked[0][0]) < _FEWEST_STEPS:
         raise SyncError(
-            f"the light steps at {_listed(steps)} do not match those at {_listed(reference)} of the reference."
+            f"the light steps at frames {_listed(steps)} do not match those of the reference at {_listed(reference)}."
         )
     pairs, spread, exact = ranked[0]
     _check_dropped_frames(steps, reference, pairs, exact, _DROPPED_S * fps)
@@ -117,7 +117,7 @@ def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
 def _check_dropped_frames(
     steps: list[Step], reference: list[Step], pairs: list[tuple[int, int]], exact: float, reach_frames: float
 ) -> None:
-    """Raise an error if unmatched steps would match at a slightly different offset."""
+    """Raise an error if unmatched light steps would match at a slightly different offset."""
     lone_steps, lone_partners = (
         [step for k, step in enumerate(own) if k not in {pair[side] for pair in pairs}]
         for side, own in enumerate((steps, reference))
@@ -135,7 +135,7 @@ def _check_dropped_frames(
 
 
 def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[list[tuple[int, int]], float, float]:
-    """Return the pairs of step indices that match at an offset, their spread and their exact offset [frames]."""
+    """Return index pairs of light steps that match at an offset, and their spread and exact offset [frames]."""
     pairs, differences, slacks = [], [], []
     for i, step in enumerate(steps):
         for j, partner in enumerate(reference):
@@ -148,28 +148,28 @@ def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[lis
                 break
     if not pairs:
         return [], 0.0, float(offset)
-    # Compute the offset from the most precise pairs only.
+    # Only the most precise pairs determine the offset.
     best = np.array(differences)[np.array(slacks) == min(slacks)]
     exact = float(np.median(best))
     return pairs, float(np.abs(best - exact).max()), exact
 
 
 def to_frames(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
-    """Convert the times of steps from image indices to frame numbers; `numbers` (n,) are the frames of the images."""
+    """Convert the times of light steps from image indices to frame numbers; `numbers` (n,) are those of the images."""
     out = []
     for step in steps:
         nearest = round(step.time_frames)
         between = abs(step.time_frames - nearest) < _BETWEEN_FRAMES and 0 < nearest < len(numbers)
         picture = nearest if between else min(int(step.time_frames), len(numbers) - 1)
-        # A step between two exposures may have occurred at any time in the gap between them; the time of a step within
-        # an exposure follows from the brightness of the image.
+        # A light step between two exposures may have occurred at any time in the gap between them. The time of a step
+        # within an exposure is known from the brightness of the image.
         gap = float(numbers[picture] - numbers[picture - 1] - 1) if between else 0.0
         out.append(Step(float(numbers[picture]) + step.time_frames - picture, step.rising, max(0.0, gap)))
     return out
 
 
 def find_flashes(video: Clip) -> Flashes:
-    """Find the light steps near both ends of a video, widening the search until there are enough.
+    """Find the light steps near both ends of a video; widen the search until there are enough.
 
     Raises:
         CaptureError: the video cannot be decoded.
@@ -202,7 +202,7 @@ def _brightness(video: Clip, first: int, last: int) -> Array:
 
 
 def mean_brightness(image: NDArray[np.uint8]) -> float:
-    """Return the mean brightness of an image from every 8th pixel in both directions."""
+    """Return the mean brightness of an image, computed from every 8th pixel in both directions."""
     return float(image[::_SPARSE, ::_SPARSE].mean())
 
 
@@ -211,14 +211,14 @@ def _listed(steps: list[Step]) -> str:
 
 
 class SoundMatch(NamedTuple):
-    """Time offset between two sounds."""
+    """Time offset between two sound recordings."""
 
-    delay_s: float  # time of an event in the reference recording minus that in the other one [s]
-    confidence: float  # 1 minus the height of the second peak over that of the first, 0 .. 1
+    delay_s: float  # time of an event in the reference recording minus its time in the other recording
+    confidence: float  # 1 minus the ratio of the second-highest correlation peak to the highest, 0 to 1
 
 
 def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
-    """Find the delay between two recordings of the sound of one scene.
+    """Find the delay between two sound recordings of one scene.
 
     Raises:
         SyncError: a recording is silent, the sounds do not match, or the delay is ambiguous.
@@ -241,8 +241,8 @@ def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
     second = float(correlation[far].max()) if far.any() else 0.0
     if peak < _LEAST_SIGMAS * sigma:
         raise SyncError(
-            f"the sounds do not match: the correlation peak is {peak / sigma:.1f} sigma high; at least "
-            f"{_LEAST_SIGMAS:g} are needed."
+            f"the sounds do not match: the height of the correlation peak is {peak / sigma:.1f} sigma; at least "
+            f"{_LEAST_SIGMAS:g} sigma are needed."
         )
     if second > _SECOND_PEAK * peak:
         other = lags[far][int(np.argmax(correlation[far]))] / sound.rate_hz

@@ -33,35 +33,35 @@ from jawusd.media.containers import Sound, read_sound
 from jawusd.media.footage import open_clip
 from jawusd.media.video import Video
 
-_FPS_TOLERANCE = 5e-3  # relative tolerance; accepts 24 for 23.976
-_EARLY_S = 2.0  # clips that end earlier than this before the last one are reported
+_FPS_TOLERANCE = 5e-3  # maximum relative difference of equal frame rates; 24 and 23.976 are equal
+_EARLY_S = 2.0  # clips that end more than this before the last clip are reported
 
 
 @dataclass(frozen=True)
 class Alignment:
     """Offsets of all cameras of a capture."""
 
-    reference: str  # the camera whose frame numbers are used
-    cameras: dict[str, Offset]  # offset per camera, in the order of the capture
-    method: str = "light flash"  # "light flash", "sound", "time code" or "picture numbers"
-    notes: tuple[str, ...] = ()  # remarks on the clips for the user
+    reference: str  # camera whose frame numbers are used for all cameras
+    cameras: dict[str, Offset]  # offset of each camera, in the order of the capture
+    method: str = "light flash"  # One of "light flash", "sound", "time code" and "picture numbers".
+    notes: tuple[str, ...] = ()  # Remarks on the clips for the user.
 
     @property
     def offsets(self) -> dict[str, int]:
-        """Return the whole-frame offset per camera."""
+        """Return the offset of each camera in whole frames."""
         return {name: offset.frames for name, offset in self.cameras.items()}
 
     @property
     def confidence(self) -> dict[str, float]:
-        """Return the confidence per camera, 0 .. 1."""
+        """Return the confidence of each camera's offset, 0 to 1."""
         return {name: offset.confidence for name, offset in self.cameras.items()}
 
 
 def estimate_offsets(capture: Capture) -> Alignment:
-    """Synchronise the cameras of a capture by the flashes, sound or clocks of their videos; see `align_videos`.
+    """Synchronise the cameras of a capture by light flashes, sound or clocks of their videos; see `align_videos`.
 
     Raises:
-        SyncError: a camera has no video, or there are neither flashes nor sound.
+        SyncError: a camera has no video, or the videos have neither light flashes nor sound.
         CaptureError: a video cannot be read.
     """
     videos = {camera.name: camera.clip for camera in capture.cameras if camera.clip is not None}
@@ -88,11 +88,11 @@ def estimate_offsets(capture: Capture) -> Alignment:
 def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_light: bool = True) -> Alignment:
     """Synchronise videos with the reference camera by light flashes or sound.
 
-    At first, only the start and end of each video are decoded, then more until flashes are found. If a video has no
-    flash, or if `by_light` is false, sound is used; all videos must then have sound.
+    First, only the start and the end of each video are decoded, then more until flashes are found. If a video has no
+    flash, or if `by_light` is false, sound is used, which all videos must then have.
 
     Raises:
-        SyncError: there are neither flashes nor sound, frame rates differ, or the signals do not match.
+        SyncError: the videos have neither light flashes nor sound, frame rates differ, or the signals do not match.
         CaptureError: a video cannot be read.
     """
     opened = {name: open_clip(clip) for name, clip in videos.items()}
@@ -130,7 +130,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
 
 
 def light_curve(clip: Path | ClipSource) -> LightCurve:
-    """Return the mean brightness of every image of a video, and its sudden changes.
+    """Return the mean brightness of every image of a video, and the times of sudden brightness changes.
 
     Raises:
         CaptureError: the video cannot be read.
@@ -146,14 +146,14 @@ def light_curve(clip: Path | ClipSource) -> LightCurve:
 def _missing_pictures(videos: Mapping[str, Clip]) -> tuple[str, ...]:
     return tuple(
         f"camera {name} has a variable frame rate: {video.timeline.missing} of {video.timeline.count} frames have no "
-        "picture. Frames are counted by time, but masks in PNG files are numbered by the pictures of their video."
+        "image. Frames are counted by time, but masks in PNG files are numbered by the images of their video."
         for name, video in videos.items()
         if video.timeline.missing
     )
 
 
 def _stopped_early(videos: Mapping[str, Clip], offsets: Mapping[str, Offset], rate: float) -> tuple[str, ...]:
-    """Return a note for every clip that ends more than `_EARLY_S` before the clip that ends last."""
+    """Return a note for each clip that ends more than `_EARLY_S` before the last clip ends."""
     ends = {name: offsets[name].frames + video.timeline.count for name, video in videos.items()}
     last = max(ends, key=lambda name: ends[name])
     return tuple(
@@ -175,7 +175,7 @@ def _by_sound(name: str, reference: str, sounds: Mapping[str, Sound], videos: Ma
 def _compared(
     name: str, reference: str, video: Clip, hint: str, work: Callable[[], Offset], before: str = ""
 ) -> Offset:
-    """Compare two cameras; errors name both of them."""
+    """Return the offset between two cameras; errors name both cameras."""
     try:
         return work()
     except SyncError as error:
@@ -185,4 +185,4 @@ def _compared(
 
 
 def _offsets_hint(names: Iterable[str]) -> str:
-    return f"Give whole-frame offsets in capture.toml instead: [sync] offsets = {{ {' = .., '.join(names)} = .. }}."
+    return f"Set whole-frame offsets in capture.toml instead: [sync] offsets = {{ {' = .., '.join(names)} = .. }}."

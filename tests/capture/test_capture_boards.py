@@ -187,9 +187,9 @@ def test_boards_that_are_blurred_throughout_are_refused(tmp_path, sigma):
     images = pictures(board(), T_world_board=POSES[:3])
     images[1] = [cv2.GaussianBlur(image, (0, 0), sigma) for image in images[1]]
     message = (
-        r"c1: all \d pictures of the board are blurred: its edges are \d+\.\d px wide .* limit is 8\.0 px.*in focus"
+        r"c1: all \d images of the board are blurred: its edges are \d+\.\d px wide .* limit is 8\.0 px.*in focus"
         if sigma == 4.0
-        else "c1: no chessboard with 9 x 6 inner corners in any of 3 pictures.*sharp"
+        else "c1: no chessboard with 9 x 6 inner corners was found in any of 3 images.*sharp"
     )
     with pytest.raises(CalibrationError, match=message):
         find_boards(NAMES, board(videos=write_pictures(tmp_path, images)), quiet)
@@ -204,7 +204,7 @@ def test_pictures_without_a_board_are_refused(tmp_path):
     about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 3.0}
     with pytest.raises(CalibrationError, match="no charuco of DICT_4X4_50"):
         find_boards(NAMES, board(**about, videos=videos), quiet)
-    with pytest.raises(CalibrationError, match="of 11 x 9 inner corners needs 60 markers; DICT_4X4_50 has 50"):
+    with pytest.raises(CalibrationError, match="of 11 x 9 inner corners has 60 markers; DICT_4X4_50 has only 50"):
         find_boards(NAMES, board(**about, cols=11, rows=9, videos=videos), quiet)
 
 
@@ -213,7 +213,7 @@ def test_a_clip_cut_short_is_used_and_said(tmp_path):
     images[1] = images[1][:4]
     found = find_boards(NAMES, board(videos=write_clips(tmp_path, images)), quiet)
     assert len(found.numbers) == 4
-    assert "different numbers of pictures (c0 12, c1 8)" in found.notes[0]
+    assert "different numbers of images (c0 12, c1 8)" in found.notes[0]
 
 
 def write_woven(folder, images, order):
@@ -276,12 +276,12 @@ def test_clips_of_variable_rate_are_matched_by_time(tmp_path):
 def test_pictures_that_cannot_be_read_are_named(tmp_path):
     videos = write_pictures(tmp_path, pictures(board(), T_world_board=POSES[:2]))
     (tmp_path / "c0" / "board_0003.png").write_bytes(b"no picture")
-    with pytest.raises(CaptureError, match=r"board_0003\.png: is not a readable picture"):
+    with pytest.raises(CaptureError, match=r"board_0003\.png: is not a readable image"):
         find_boards(NAMES, board(videos=videos), quiet)
     with pytest.raises(CaptureError, match="no file in the folder matches"):
         find_boards(("c0",), board(videos=(tmp_path / "c1" / "bord_%04d.png",)), quiet)
     cv2.imwrite(str(tmp_path / "c0" / "board_0003.png"), np.zeros((100, 100), np.uint8))
-    with pytest.raises(CalibrationError, match="is 100 x 100 px, but the first picture is 640 x 480"):
+    with pytest.raises(CalibrationError, match="is 100 x 100 px, but the first image is 640 x 480"):
         find_boards(NAMES, board(videos=videos), quiet)
 
 

@@ -95,7 +95,7 @@ def test_too_few_views_are_refused_per_camera_and_per_pair(tmp_path):
     apart[0, 12:] = np.nan
     apart[1, :10] = np.nan
     apart[2, 12:] = np.nan
-    with pytest.raises(CalibrationError, match=r"camera c1: .* in 5 pictures; at least 6 .*40 poses"):
+    with pytest.raises(CalibrationError, match=r"camera c1: .* in 5 images; at least 6 .*40 poses"):
         calibrate_detections(altered(found, corners_px=few), capture_of(CAMERAS, boards, tmp_path), {})
     with pytest.raises(CalibrationError, match=r"c1 shares 2 sharp board views with"):
         calibrate_detections(altered(found, corners_px=apart), capture_of(CAMERAS, boards, tmp_path), {})
@@ -126,7 +126,7 @@ def test_a_wrong_square_size_is_told_by_the_teeth(tmp_path):
     _, report = calibrate_detections(found, capture_of(CAMERAS, board(), tmp_path, picks), scans)
     assert report.scale.ratio == pytest.approx(1.0, abs=0.03) and report.mouth_from == "the picked teeth"
     wrong = board(square_mm=6.0)
-    with pytest.raises(CalibrationError, match=r"1\.\d+ times their scan.*of 6 mm would have to be (4\.9|5\.0)"):
+    with pytest.raises(CalibrationError, match=r"1\.\d+ times their size .*of 6 mm would have to be (4\.9|5\.0)"):
         calibrate_detections(found, capture_of(CAMERAS, wrong, tmp_path, picks), scans)
     _, unchecked = calibrate_detections(found, capture_of(CAMERAS, wrong, tmp_path), scans)
     assert any("square_mm alone" in note for note in unchecked.notes)
@@ -147,7 +147,7 @@ def test_advice_names_what_was_done_badly(tmp_path):
     assert "uses 20 views" in advice and "mm from the mouth" in advice
     noisy = detections(CAMERAS, boards, poses(45, rng), rng, noise_px=0.8)
     advice = " ".join(calibrate_detections(noisy, capture, {})[1].advice)
-    assert "px rms (good is below 0.5)" in advice and "% of the picture" in advice
+    assert "px rms (good is below 0.5)" in advice and "% of the image" in advice
 
 
 def test_one_camera_alone_is_calibrated(tmp_path):

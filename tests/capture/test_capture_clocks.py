@@ -109,14 +109,14 @@ def test_clocks_of_clips_of_other_rates_are_not_compared(tmp_path):
         "a": {"video": write_prores(tmp_path / "a.mov", IMAGES, Fraction(50), "00:00:00:00")},
         "b": {"video": write_prores(tmp_path / "b.mov", IMAGES, Fraction(25), "00:00:00:00")},
     }
-    with pytest.raises(SyncError, match="camera b has 25 frames per second, camera a has 50"):
+    with pytest.raises(SyncError, match="camera b has 25 frames per second, but camera a has 50"):
         estimate_offsets(capture(tmp_path, "timecode", clips, 50.0))
 
 
 def test_clocks_that_tell_nothing(tmp_path):
     pattern = write_sequence(tmp_path / "c", IMAGES, "png8")
     clips = {"a": {"video": pattern, "timecode": "00:00:00:00"}, "b": {"video": pattern}}
-    with pytest.raises(SyncError, match="camera b: its clip has no time code") as error:
+    with pytest.raises(SyncError, match="camera b: the clip has no time code") as error:
         raise_with_place(tmp_path, clips)
     assert "timecode = " in error.value.hint
     clips["b"]["timecode"] = "00:00:09:00"

@@ -100,7 +100,7 @@ def test_different_rates_are_refused(tmp_path: Path) -> None:
         "a": film(tmp_path / "a.mp4", exposures(60, 0)),
         "b": film(tmp_path / "b.mp4", exposures(60, 0), fps=25),
     }
-    with pytest.raises(SyncError, match=r"b\.mp4: camera b has 25 frames per second, camera a has 24"):
+    with pytest.raises(SyncError, match=r"b\.mp4: camera b has 25 frames per second, but camera a has 24"):
         align_videos(videos, "a")
 
 

@@ -68,7 +68,7 @@ def test_clips_of_one_name_are_told_apart_by_their_folders(tmp_path):
 def test_rates_that_differ_are_refused(tmp_path):
     result = run("sync", film(tmp_path / "a.mp4", 0), film(tmp_path / "b.mp4", 0, fps=30.0))
     assert isinstance(result.exception, CaptureError)
-    assert "camera b has 30 frames per second, camera a has 24" in str(result.exception)
+    assert "camera b has 30 frames per second, but camera a has 24" in str(result.exception)
 
 
 CAPTURE = """
