@@ -1,4 +1,4 @@
-"""Conversions between numpy arrays and Gf and Vt values; no other module converts them.
+"""Conversions between numpy arrays and Gf and Vt values; other modules do not convert these types themselves.
 
 numpy side: column vectors (`p_a = T_a_b @ p_b`), quaternions (w, x, y, z), C-contiguous. USD side: row vectors.
 """
@@ -53,7 +53,7 @@ def rotations(T: ArrayLike) -> list[Gf.Quatd]:
 
 
 def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
-    """Return `rotations` as samples of a one-joint animation, each a Vt.QuatfArray of length one."""
+    """Return the result of `rotations` as samples of a one-joint animation, each a Vt.QuatfArray of length one."""
     return [Vt.QuatfArray([Gf.Quatf(w, x, y, z)]) for w, x, y, z in continuous_wxyz(np.asarray(T)[:, :3, :3]).tolist()]
 
 

@@ -1,8 +1,8 @@
-"""Animation layers: samples of d for tools that know the rig, and a baked translation and quaternion for all others.
+"""Animation layers: samples of d for tools that support the rig, and baked translations and quaternions for others.
 
 All readers interpolate d linearly between samples; the baked ops follow the model along that motion. Interpolated
-matrix samples would shear, and a product of one transform per parameter is millimetres off if several parameters are
-not 0.
+matrix samples would shear, and a product of one transform per parameter would be wrong by millimetres if several
+parameters are not 0.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ def write_animation(
 
     Args:
         out: File to write, `.usdc` or `.usda`.
-        actor: The `actor.usda` it animates.
+        actor: The `actor.usda` that the layer animates.
         frames: Increasing frame numbers (F,), possibly fractional: all frames, or only those of the keys.
         d: Parameters (F, 3) [mm]. Rows with NaN are lost frames, which are interpolated linearly and listed in the
             layer's `customLayerData["lostFrames"]`.
         rig: The evaluator; read from `actor` if None.
         carried: Frames whose d was not measured but interpolated from neighbouring frames; listed in
             `customLayerData["carriedFrames"]`.
-        skinned: Paths of meshes that `actor_skel.usdc`, in the same folder and with the same motion, binds. If not
-            empty, a variant is added; see `add_skeleton_variant`.
+        skinned: Paths of the meshes that are bound by `actor_skel.usdc`, a file in the same folder with the same
+            motion. If there are any, a variant is added; see `add_skeleton_variant`.
 
     Raises:
         RigError: The actor is missing, frames do not increase, no frame has d, or the frame rate is not positive.
@@ -87,7 +87,7 @@ def write_animation(
         raise RigError(f"{fps} frames per second; the rate must be greater than 0.", path=out)
     if frames[-1] - frames[0] > _MAX_FRAMES or np.abs(frames).max() > _FARTHEST_FRAME:
         raise RigError(
-            f"frames {frames[0]:g} to {frames[-1]:g}; an animation has at most {_MAX_FRAMES} frames within "
+            f"has frames {frames[0]:g} to {frames[-1]:g}; an animation has at most {_MAX_FRAMES} frames within "
             f"+-{_FARTHEST_FRAME:g}.",
             path=out,
         )
@@ -106,7 +106,7 @@ def write_animation(
 
 
 def root_prim_of(actor: Path) -> str:
-    """Return the name of the root prim that is the rig in an actor's file.
+    """Return the name of the root prim with the rig in an actor's file.
 
     Raises:
         RigError: Not exactly one root prim is a rig.
@@ -194,7 +194,7 @@ def _as_shown_by_usd(T_a: Array, T_b: Array, share: float) -> Array:
 
     OpenUSD interpolates quaternions by slerp (Shoemake 1985). Nearly equal ones (GfSlerp: cosine above 1 - 1e-5) are
     interpolated linearly without normalising, and the angle is then taken from the real part alone (GfRotation). For
-    rotations near the identity, as those of a closed jaw, the error is up to 0.4 mm.
+    rotations near the identity, such as those of a closed jaw, this causes errors up to 0.4 mm.
     """
     q_a, q_b = wxyz_from_matrix(T_a[:, :3, :3]), wxyz_from_matrix(T_b[:, :3, :3])
     cosine = np.einsum("ij,ij->i", q_a, q_b)
@@ -220,7 +220,7 @@ def write_splines(
     slopes: ArrayLike | None = None,
     curved: ArrayLike | None = None,
 ) -> Path:
-    """Write a layer with the keys of an animation as splines; the layer sublayers the animation.
+    """Write a layer over an animation layer that contains the keys of the animation as splines.
 
     The splines interpolate the animation's samples. Other layers of a rig contain no splines, because OpenUSD before
     25.05 ignores them or cannot parse them, and other readers reject the whole file.
@@ -230,7 +230,8 @@ def write_splines(
         frames: Increasing key frames (F,).
         d: Keys (F, 3) [mm].
         slopes: Tangents at the keys (F, 3) [mm per frame]; zero if None.
-        curved: Mask (F - 1,) of segments that are cubic, with these tangents; the others are linear. None: all linear.
+        curved: Mask (F - 1,) of segments that are cubic, with these tangents; the other segments are linear. If None,
+            all segments are linear.
 
     Raises:
         RigError: The frames do not increase, or keys are not finite.

@@ -16,7 +16,7 @@ from jawusd.rig.motion_read import mandible_of, prims_between, skull_of
 from jawusd.rig.skel import bones_of
 
 _UNEVEN = 1e-3  # maximum relative difference of the three scales: 0.1 mm at jaw size, far above rounding
-_SIZES = 0.5, 2.0  # smallest and largest plausible scale of a head; others come from wrong units
+_SIZES = 0.5, 2.0  # smallest and largest plausible scale of a head; scales outside this range come from wrong units
 _MM = 0.001  # a millimetre in metres
 _FIRST = Usd.TimeCode.EarliestTime()
 
@@ -30,7 +30,7 @@ class Fault(NamedTuple):
 
 
 def faults_of_assembly(actor: Usd.Prim) -> Iterator[Fault]:
-    """Yield the faults of a rig in its stage that the other rules do not find."""
+    """Yield those faults of a rig in its stage that the other rules do not find."""
     yield from _muted(actor)
     yield from _units(actor)
     yield from _shape(actor)
@@ -56,7 +56,7 @@ def _muted(actor: Usd.Prim) -> Iterator[Fault]:
 
 
 def _units(actor: Usd.Prim) -> Iterator[Fault]:
-    """Find units and axes of the stage that differ from the rig's layer and are not corrected by a transform."""
+    """Find units and axes of the stage that differ from those of the rig's layer without a correcting transform."""
     stage, root = actor.GetStage(), actor.GetStage().GetRootLayer()
     stack = actor.GetAttribute("jaw:formatVersion").GetPropertyStack()
     own = stack[-1].layer if stack else root
@@ -90,7 +90,7 @@ def _shape(actor: Usd.Prim) -> Iterator[Fault]:
     axes = np.array([_axes(actor, time) for time in times])
     scales = np.linalg.svd(axes, compute_uv=False)
     uneven = scales[:, 0] - scales[:, 2] > _UNEVEN * scales[:, 0]
-    mirrored = np.linalg.det(axes) < 0  # meaningless if a scale is zero
+    mirrored = np.linalg.det(axes) < 0  # not meaningful if a scale is zero
     if uneven.any():
         first = int(np.argmax(uneven))
         listed = ", ".join(f"{scale:.4g}" for scale in scales[first])

@@ -1,7 +1,7 @@
 """Files that a layer refers to, and the checksums that `actor.usda` records for the binary layers of a rig.
 
-Asset paths are reduced to files: format arguments and paths inside packages are dropped. Checksums are compared before
-OpenUSD parses a file, which may crash on a damaged one.
+Only the file of an asset path counts: format arguments and paths inside packages are dropped. Checksums are compared
+before OpenUSD parses a file, which may crash on a damaged one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def is_layer(asset: str) -> bool:
 def target_of(layer: Sdf.Layer, asset: str) -> str | None:
     """Return the full path of an asset of a layer, as resolved by OpenUSD, or the expected path of a missing file.
 
-    None if it is not a path on this machine, such as one with a drive letter, or a URL whose scheme no resolver
+    Return None for paths of another system, such as one with a drive letter, and for URLs whose scheme no resolver
     supports. The resolver context of the stage must be bound.
     """
     path, arguments = Sdf.Layer.SplitIdentifier(layer.ComputeAbsolutePath(asset))
@@ -50,7 +50,7 @@ def target_of(layer: Sdf.Layer, asset: str) -> str | None:
 
 
 def with_variables(layer: Sdf.Layer, variables: Mapping[str, object]) -> Sdf.Layer:
-    """Return a copy of a layer with these variables, in which `asset_paths` evaluates expressions.
+    """Return a copy of a layer with the given variables, with which `asset_paths` evaluates expressions.
 
     The variables of referring layers are stronger than the layer's own. Without variables, return the layer itself.
     """

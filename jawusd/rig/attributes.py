@@ -104,7 +104,7 @@ def value_of(attribute: Usd.Attribute, where: object, time: Usd.TimeCode | None 
     """Return the value of an attribute at a time, or its default value; None if there is none.
 
     Raises:
-        FormatError: It is an array of more than `MAX_VALUES`.
+        FormatError: The value is an array of more than `MAX_VALUES` elements.
     """
     value = attribute.Get(Usd.TimeCode.Default() if time is None else time)
     if hasattr(value, "__len__") and len(value) > MAX_VALUES:
@@ -129,13 +129,13 @@ def key_times(attribute: Usd.Attribute) -> list[float]:
 
 
 def values_at(attribute: Usd.Attribute, times: Iterable[float]) -> list[float | None]:
-    """Return the values of an attribute at times. Evaluates splines itself: OpenUSD 25.02 only reads them."""
+    """Return the values of an attribute at times, evaluating splines here, because OpenUSD 25.02 only reads them."""
     spline = _spline_of(attribute)
     return [attribute.Get(time) if spline is None else spline.Eval(time) for time in times]
 
 
 def _spline_of(attribute: Usd.Attribute) -> Ts.Spline | None:
-    """Return the spline of an attribute; None if it has none, or if samples or a default value are stronger."""
+    """Return the spline of an attribute; None if it has none, or if time samples or a default value are stronger."""
     if not hasattr(attribute, "HasSpline") or not attribute.HasSpline():  # OpenUSD 24.11 has no splines
         return None
     for spec in attribute.GetPropertyStack():
@@ -169,7 +169,7 @@ def _upgrade_1_to_2(prim: Usd.Prim) -> None:
     """
     limit = read_value(prim, "jaw:thresholds:margin", prim.GetStage().GetRootLayer().identifier)
     if not isinstance(limit, float):
-        raise FormatError(f"jaw:thresholds:margin is {limit!r}, expected a number.", path=str(prim.GetPath()))
+        raise FormatError(f"jaw:thresholds:margin is {limit!r}; expected a number.", path=str(prim.GetPath()))
     tolerance = prim.CreateAttribute("jaw:thresholds:tolerance", Sdf.ValueTypeNames.Double)
     tolerance.Set(-limit)
 
@@ -188,10 +188,10 @@ def upgrade_rig(prim: Usd.Prim, where: object) -> None:
     """
     version = read_value(prim, "jaw:formatVersion", where)
     if not isinstance(version, int) or version < 1:
-        raise FormatError(f"jaw:formatVersion is {version!r}, expected a positive integer.", path=str(where))
+        raise FormatError(f"jaw:formatVersion is {version!r}; expected a positive integer.", path=str(where))
     if version > FORMAT_VERSION:
         raise VersionError(
-            f"the rig has format version {version}; this version of jawusd reads up to {FORMAT_VERSION}.",
+            f"the rig has format version {version}; this version of jawusd reads versions up to {FORMAT_VERSION}.",
             path=str(where),
             hint="Update jawusd.",
         )

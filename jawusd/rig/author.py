@@ -38,10 +38,10 @@ _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "
 def proxy_layer(
     proxies: Mapping[str, Mesh], meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str | None
 ) -> Sdf.Layer:
-    """Build `proxy.usdc`: `geo.usdc` with proxies in place of their meshes, and a class that adds the proxies.
+    """Build `proxy.usdc`: the content of `geo.usdc` with proxies in place of meshes, and a class that adds them.
 
     Args:
-        proxies: Proxies for some of the meshes, by the same names, in the same frames [mm].
+        proxies: Proxies for some of the meshes, with the same names and coordinate frames [mm].
         meshes, T_rest, placeholder: As for `build_geometry`.
 
     Raises:

@@ -64,7 +64,7 @@ def bake_rig(
         frames: Increasing numbers of the captured frames (F,).
         d: Parameters of the captured frames (F, 3) [mm], NaN where lost.
         table_size: Knots per axis of the sampled decoder: 17, 33 or 65.
-        proxies: Low-polygon proxies of some of the meshes, by the same names; each adds variants.
+        proxies: Low-polygon proxies of some of the meshes, with the same names; each adds variants.
         prim_name: Name of the actor's prim, and prefix of the joint names.
 
     Returns:

@@ -53,8 +53,8 @@ def write_cameras(
     """Write the take: one `UsdGeom.Camera` per camera, and the actor moved by the tracked head.
 
     The cameras are pinholes, which match undistorted images. `jaw:plate` is the printf pattern of these images,
-    numbered by time code, relative to the take. `jaw:distortion` has OpenCV's coefficients of the distorted footage,
-    `jaw:imageSize` its size. The head's motion is written to a binary layer that the take sublayers.
+    numbered by time code, relative to the take. `jaw:distortion` contains OpenCV's coefficients of the distorted
+    footage, and `jaw:imageSize` its size. The head's motion is written to a binary layer that the take sublayers.
 
     Args:
         out: File to write, `.usda`; the motion goes to `<name>_motion.usdc` beside it.
@@ -62,15 +62,15 @@ def write_cameras(
         frames: Increasing frame numbers (F,).
         T_world_skull: Poses of the skull (F, 4, 4) [mm], NaN where lost.
         fps: Frames per second.
-        light: Names of cameras whose plates are EXR.
+        light: Names of cameras whose plates are EXR files in linear light.
 
     Returns:
-        The motion's file and the take's, in the order written.
+        The files of the motion and of the take, in the order written.
 
     Raises:
         RigError: No cameras, cameras of equal names, skewed pixels, or no frame with a pose.
         OutputError: The file cannot be written.
-        ValueError: Poses of another shape.
+        ValueError: The shape of the poses is not (F, 4, 4).
     """
     out = Path(out)
     frames, T_world_skull = np.asarray(frames, dtype=np.float64), np.asarray(T_world_skull, dtype=np.float64)
@@ -145,7 +145,7 @@ def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -
 
 @raises_format_error(0)
 def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, tuple[int, int]]]) -> list[Camera]:
-    """Read the perspective cameras in a stage, named after their prims, in mm, with OpenCV axes and pixels.
+    """Read the perspective cameras in a stage as OpenCV cameras in mm, named after their prims.
 
     Prims of equal names are named after their paths. The image spans the aperture, shifted by its offsets. Its size
     [px] is `jaw:imageSize` or that of the footage; `jaw:distortion` contains OpenCV's coefficients. Moving cameras are
@@ -157,13 +157,13 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
 
     Raises:
         RigError: The stage cannot be opened, refers to files outside its folder, or has no perspective camera.
-        CalibrationError: An image size is unknown, or a lens such as a fisheye is not described by OpenCV's
+        CalibrationError: An image size is unknown, or a lens, such as a fisheye, is not described by OpenCV's
             coefficients.
         FormatError: A value has an unexpected type.
     """
     if Path(path).suffix.lower() == ".abc" and Sdf.FileFormat.FindByExtension("abc") is None:
         raise RigError(
-            "is Alembic, which needs OpenUSD's plugin usdAbc; it is not installed.",
+            "is an Alembic file; reading it needs OpenUSD's plugin usdAbc, which is not installed.",
             path=path,
             hint="Export the cameras as USD from the program that wrote them (Blender, Houdini and Maya read Alembic "
             "and write USD), or use a build of OpenUSD with Alembic.",

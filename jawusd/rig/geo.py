@@ -184,7 +184,7 @@ def _define_mesh(
     prim.CreateFaceVertexCountsAttr(_gf.int_array(np.full(len(mesh.faces), 3)))
     prim.CreateExtentAttr(_gf.vec3f_array(extent(mesh.vertices)))
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    prim.CreateDoubleSidedAttr(True)  # scans are open surfaces
+    prim.CreateDoubleSidedAttr(True)  # necessary because scans are open surfaces
     prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     gum = ~crown_face_mask(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
@@ -235,7 +235,7 @@ def read_geometry(
         coordinates are included if the scan had them.
 
     Raises:
-        RigError: Not a USD file, or a mesh with faces other than triangles.
+        RigError: The file is not USD, or a mesh with faces other than triangles.
     """
     stage = open_stage(path)
     found = {}
@@ -263,7 +263,7 @@ def read_gum(path: str | os.PathLike[str], prim_path: str | None = None) -> dict
     Meshes without a gum subset are omitted.
 
     Raises:
-        RigError: Not a USD file.
+        RigError: The file is not USD.
     """
     stage = open_stage(path)
     found = {}

@@ -132,7 +132,7 @@ def set_attribute(
 ) -> None:
     """Write an attribute with its default value, uniform unless animated.
 
-    All attributes are `custom`: Blender imports no others.
+    All attributes are `custom`, because Blender imports no others.
     """
     variability = Sdf.VariabilityVarying if animated else Sdf.VariabilityUniform
     attribute = Sdf.AttributeSpec(spec, name, type_name, variability, declaresCustom=True)
@@ -148,7 +148,7 @@ def set_relationship(spec: Sdf.PrimSpec, name: str, targets: Iterable[str]) -> N
 def add_pose(prim: Usd.Prim, T: Array) -> None:
     """Add translate and orient ops to a prim, with a pose (4, 4) as default value.
 
-    A matrix op would shear between frames: USD interpolates matrix samples entry by entry.
+    A matrix op would shear between video frames, because USD interpolates matrix samples entry by entry.
     """
     xform = UsdGeom.Xformable(prim)
     xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.translations(T[None])[0])
@@ -175,7 +175,7 @@ def without_warning(words: str) -> Iterator[None]:
 
 
 def write_layer(layer: Sdf.Layer, path: Path) -> Path:
-    """Write a layer to a file atomically and reload the file's layer if this process has it open.
+    """Write a layer to a file atomically, and reload the file's layer if it is open in this process.
 
     Raises:
         OutputError: The file cannot be written, or OpenUSD does not support its path.

@@ -38,7 +38,7 @@ MOTION, TRANSFORMS, SKELETON = "motion", "transforms", "skeleton"  # variant set
 
 PARAMETERS = ("jaw:d1", "jaw:d2", "jaw:d3")
 ONNX_ATTRIBUTES = ("jaw:onnx", "jaw:onnx:encode")
-MODEL_HASH_KEY = "modelHash"  # custom data key of animated parameters: hash of the model they were made with
+MODEL_HASH_KEY = "modelHash"  # custom data key of animated parameters: hash of the model with which they were made
 SIDECAR_HASH_KEY = "sha256"  # custom data key of the ONNX attributes: checksum of the file
 
 
@@ -82,7 +82,7 @@ def actor_in_folder(path: Path) -> Path:
 
 
 def register_schema() -> bool:
-    """Register the schema with OpenUSD and return whether this process knows it; may be called repeatedly.
+    """Register the schema with OpenUSD and return whether that succeeded; may be called repeatedly.
 
     OpenUSD builds its schema registry when a process first opens a stage. Plugins registered later are ignored (OpenUSD
     issue 3596); in that case a warning is issued.
@@ -99,12 +99,12 @@ def register_schema() -> bool:
 
 
 def schema_is_live() -> bool:
-    """Return whether this process knows JawRigAPI. The call freezes the process's schema registry."""
+    """Return whether JawRigAPI is registered in this process. The call freezes the process's schema registry."""
     return Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(SCHEMA_NAME) is not None
 
 
 def has_jaw_api(prim: Usd.Prim) -> bool:
-    """Return whether JawRigAPI is applied to a prim, even if this process does not know the schema."""
+    """Return whether JawRigAPI is applied to a prim, even if the schema is not registered in this process."""
     applied = prim.GetMetadata("apiSchemas")
     return applied is not None and SCHEMA_NAME in applied.GetAddedOrExplicitItems()
 

@@ -1,6 +1,7 @@
 """Read the motion of the mandible in a stage, from transforms, bones or samples of d.
 
-Also determine at which times and how closely a baked mandible must match its d, and how far the skull is moved.
+The module also determines at which times and how closely a baked mandible must match its d, and how far the skull is
+moved.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from jawusd.rig.skel import SAME_MOTION, bones_of, transform_in_actor
 from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
-#: Maximum landmark distance [mm] of a baked pose from the pose given by d.
+#: Maximum landmark distance [mm] of a baked pose from the pose that d gives.
 BAKED_MM = 0.01
-_RIGID = 1e-5  # maximum rigidity defect; single-precision quaternions, as written by DCCs, stay below it
+_RIGID = 1e-5  # maximum rigidity defect; single-precision quaternions written by DCC programs stay below it
 
 
 @raises_format_error(0)
@@ -41,7 +42,7 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
         Frame numbers (F,) and T_skull_mandible (F, 4, 4) [mm], relative to the actor.
 
     Raises:
-        RigError: Not a stage.
+        RigError: The file is not a stage.
         FormatError: No rig or several rigs, no mandible, no time range, or a motion that is not rigid.
     """
     stage = open_stage(path)
@@ -70,7 +71,8 @@ def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object
     if not defect.max() <= _RIGID:
         worst = int(np.argmax(np.where(np.isfinite(defect), defect, np.inf)))
         raise FormatError(
-            f"the mandible is not rigid at frame {codes[worst]} (defect {defect[worst]:.2g}, allowed {_RIGID:g}).",
+            f"the mandible is not rigid at frame {codes[worst]}: "
+            f"its defect is {defect[worst]:.2g}; the maximum is {_RIGID:g}.",
             path=str(path),
             hint="Matrix samples shear when interpolated: key translate and orient instead.",
         )
@@ -91,7 +93,7 @@ def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode
     for k, time in enumerate(times):
         cache = UsdGeom.XformCache(time)
         for i, mover in enumerate(movers):
-            moved[i, k] = np.array(transform_in_actor(actor, mover, cache)).T  # USD has row vectors
+            moved[i, k] = np.array(transform_in_actor(actor, mover, cache)).T  # USD uses row vectors
     if not np.abs(moved - moved[:1]).max() <= SAME_MOTION:
         raise FormatError(
             f"the meshes below {prim.GetPath()} move differently.",
@@ -103,7 +105,7 @@ def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode
 
 
 def moving_attributes(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Attribute]:
-    """Return the attributes that move a prim in its actor: those of joints, or the ops of the prims up to the actor."""
+    """Return the attributes that move a prim in its actor: of joints, or transform ops of the prims up to the actor."""
     bones = bones_of(prim)
     if bones is not None:
         return bones.animated_attributes()
@@ -139,7 +141,7 @@ def read_parameters_of_stage(
         the motion is given by transforms only.
 
     Raises:
-        RigError: Not a stage.
+        RigError: The file is not a stage.
         FormatError: No rig or several rigs, or parameters that are not finite.
     """
     stage = open_stage(path)
@@ -150,7 +152,7 @@ def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] |
     """Read the samples of d of a rig prim, as `read_parameters_of_stage` does.
 
     Raises:
-        FormatError: Parameters that are not finite, or too many.
+        FormatError: There are too many parameters, or some are not finite.
     """
     stage = actor.GetStage()
     attributes = [actor.GetAttribute(name) for name in PARAMETERS]
@@ -180,7 +182,9 @@ def mandible_of(actor: Usd.Prim, path: object) -> Usd.Prim:
 
 
 def skull_of(actor: Usd.Prim, path: object) -> Usd.Prim | None:
-    """Return the skull prim of a rig; None if it is not set or inactive: the skull frame is then the actor's frame.
+    """Return the skull prim of a rig; None if it is not set or inactive.
+
+    Without a skull prim, the skull frame is the actor's frame.
 
     Raises:
         FormatError: jaw:skull has several targets, or its target is missing.
@@ -197,7 +201,7 @@ def _relationship_target(actor: Usd.Prim, name: str, path: object) -> Usd.Prim:
     relationship, stage = actor.GetRelationship(name), actor.GetStage()
     targets = relationship.GetTargets() if relationship else []
     if len(targets) != 1:
-        raise FormatError(f"{name} of {actor.GetPath()} has {len(targets)} targets, expected 1.", path=str(path))
+        raise FormatError(f"{name} of {actor.GetPath()} has {len(targets)} targets; expected 1.", path=str(path))
     existing = [prim for prim in map(stage.GetPrimAtPath, targets[0].GetPrefixes()) if prim]
     prim = stage.GetPrimAtPath(targets[0])
     if existing and not existing[-1].IsActive():
@@ -221,7 +225,7 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
     """
     if not stage.HasAuthoredTimeCodeRange():
         raise FormatError(
-            "has no start and end time code; they determine the frames to read.",
+            "has no start and end time codes, which determine the frames to read.",
             path=str(path),
             hint="Give an animation layer, or set both in the shot.",
         )

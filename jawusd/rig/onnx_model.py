@@ -1,9 +1,9 @@
 """The exact jaw model and its inverse as ONNX operators.
 
-The encoder is an ONNX loop: Newton's method, damped, from the nearest of many starts. The distance of two poses is that
-of `jawusd.evaluator.encoding`: four homogeneous vectors represent all landmarks. The time of a runtime depends on the
-number of operators more than on that of rows. Each iteration therefore evaluates the model once, at a stencil of points
-around each d, whose differences are its first and second derivatives.
+The encoder is an ONNX loop: damped Newton's method from the nearest of many starting points. The distance of two poses
+is that of `jawusd.evaluator.encoding`: four homogeneous vectors represent all landmarks. The running time depends more
+on the number of operators than on the number of rows. Each iteration therefore evaluates the model once, at a stencil
+of points around each d, whose differences are its first and second derivatives.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ from jawusd.rig.onnx_graph import Graph, Value
 from jawusd.rig.table import grid_points, valid_box
 
 _ITERATIONS = 40
-_FIRST_NEWTON = 5  # iteration from which the full Hessian is used: farther from the minimum it often misleads
-# Step length below which a row has converged. The loop ends when all rows have; their last steps, which double the
-# correct digits, are taken without evaluating the model again.
+_FIRST_NEWTON = 5  # first iteration with the full Hessian, which is often misleading farther from the minimum
+# Step length below which a row has converged. The loop ends when all rows have converged; their last steps, which
+# double the number of correct digits, are taken without another evaluation of the model.
 _CONVERGED_MM = 1e-5
 _STARTS = (19, 11, 11)  # number of starts along d1, d2, d3
 _START_MARGIN_MM = 3.0  # extension of the grid beyond the bounds, for poses slightly outside
 _STEP_MM = 1e-3  # step of the differences in d
 _START_DAMPING = 1e-6
 _MIN_DAMPING = 1e-12
-# Columns of a point of the search: d, its cost (squared distance), half the gradient of the cost, and half its Hessian,
-# as Gauss-Newton approximates it and in full; see `_PAIRS`.
+# Numbers of columns for a point of the search: d, its cost (squared distance), half the gradient of the cost, and half
+# its Hessian, once in the Gauss-Newton approximation and once in full; see `_PAIRS`.
 _POINT = {"d": 3, "cost": 1, "slope": 3, "gauss_newton": 6, "newton": 6}
-_LOOP_STATE = {"point": sum(_POINT.values()), "trial": 3, "damping": 1}  # numbers of columns passed on by iterations
+# numbers of columns that an iteration passes to the next one
+_LOOP_STATE = {"point": sum(_POINT.values()), "trial": 3, "damping": 1}
 _PAIRS = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]  # stored entries of a symmetric matrix
-_PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of the entries of a symmetric matrix in its stored form
+_PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # place of each entry of a symmetric matrix in its stored form
 
 
 def decode_motion(g: Graph, rig: JawRig, d: Value) -> RigidMotion[Value]:
@@ -93,7 +94,7 @@ def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> No
     target = f.op("MatMul", flat, f.constant(_images_of_pose(vectors)), name="target")
     start = _nearest_start(f, rig, vectors, target)
     unknown = np.array([[np.inf, *[0.0] * 15]])  # the start is evaluated in the first iteration
-    point = f.concat([start, target @ np.zeros((12, 16)) + f.constant(unknown)])  # NaN of the pose stays NaN
+    point = f.concat([start, target @ np.zeros((12, 16)) + f.constant(unknown)])  # keeps NaN of the pose
     damping = start @ np.zeros((3, 1)) + _START_DAMPING
     some = f.op("Greater", f.op("Size", target), f.constant(0, np.int64))
     state = [f.constant(_ITERATIONS, np.int64), some, point, start, damping]
@@ -137,10 +138,10 @@ def _nearest_start(g: Graph, rig: JawRig, vectors: Array, target: Value) -> Valu
 
 
 def _body(rig: JawRig, vectors: Array) -> onnx.GraphProto:
-    """Return the loop body: a damped step of Newton's method, accepted if it is better.
+    """Return the loop body: a damped step of Newton's method, accepted if it reduces the cost.
 
-    In the first iterations, and where the Hessian is not positive definite, the approximation of Gauss and Newton
-    replaces it (Nocedal and Wright 2006, section 10.3).
+    In the first iterations, and where the Hessian is not positive definite, the Gauss-Newton approximation replaces it
+    (Nocedal and Wright 2006, section 10.3).
     """
     b = Graph(np.float64, "b_")
     point, trial, damping = (Value(b, f"b_{name}") for name in _LOOP_STATE)
@@ -180,7 +181,7 @@ def _body(rig: JawRig, vectors: Array) -> onnx.GraphProto:
 
 
 def _measured(g: Graph, rig: JawRig, vectors: Array, d: Value) -> Value:
-    """Return the columns of `_POINT` after d at points d (n, 3), from central and mixed differences of the images."""
+    """Return the columns of `_POINT` that follow d, at points d (n, 3), by central and mixed differences."""
     unit = np.eye(3)
     mixed = [unit[i] + unit[j] for i, j in _PAIRS if i != j]
     shifts = _STEP_MM * np.array([np.zeros(3), *unit, *-unit, *mixed])

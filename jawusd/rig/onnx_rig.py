@@ -29,18 +29,19 @@ _NEAR_MM = 1e-3
 
 
 def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
-    """Load the rig of an ONNX file; the file evaluates it.
+    """Load the rig of an ONNX file, to be evaluated with the graphs in ONNX files.
 
     `X.onnx` decodes and contains the rig; `X_encode.onnx` in the same folder, if it exists, encodes. Files of older
-    versions contain no rig: `X.usda` or `model.npz` in the same folder then provides it, `prim` as for `load_rig`.
+    versions contain no rig: `X.usda` or `model.npz` in the same folder then provides it; `prim` is as for `load_rig`.
 
     Raises:
-        FormatError: Not a decoder of jawusd, no rig in it or in the folder, or made from another model.
+        FormatError: The file is not a decoder of jawusd or was made from another model, or there is no rig in the file
+            or its folder.
     """
     path = Path(path)
     decode = read_sidecar(path)
     if [entry.name for entry in decode.graph.input] != ["d"]:
-        raise FormatError('is an encoder; the decoder, with the input "d", is needed.', path=path)
+        raise FormatError('is an encoder; expected the decoder, which has the input "d".', path=path)
     rig = rig_in(decode, path) or _rig_beside(path, prim)
     check_made_from(decode, rig, path)
     encoder = path.with_name(f"{path.stem}_encode.onnx")

@@ -1,11 +1,11 @@
-"""The ONNX sidecars of a rig: graphs of the exact model, d -> pose, twist, margin and pose -> d, residual.
+"""The ONNX sidecars of a rig: graphs that map d to pose, twist and margin, and a pose to d and residual, exactly.
 
 Decoder and encoder are separate files: the decoder needs only arithmetic, which every runtime supports, but the encoder
 needs a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is installed, otherwise by the reference
 evaluator of the package onnx, which is slower.
 
 The metadata of the decoder contain the whole rig as JSON, so that poses can be judged from this file alone: `arrays`,
-by the names in `jawusd.evaluator.schema` (landmarks, limits, contact field, ...), and `header`.
+named as in `jawusd.evaluator.schema` (landmarks, limits, contact field, ...), and `header`.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def _model(
     outputs: Shapes,
     more: Mapping[str, str] = MappingProxyType({}),
 ) -> onnx.ModelProto:
-    """Make a checked model from a graph, with metadata and more of them."""
+    """Return a checked ONNX model made from a graph, with the metadata of the rig and those in ``more``."""
 
     def declared(shapes: Shapes) -> list[onnx.ValueInfoProto]:
         return [helper.make_tensor_value_info(key, g.elem_type, shape) for key, shape in shapes.items()]
@@ -195,11 +195,11 @@ def check_written(path: str | os.PathLike[str], rig: JawRig) -> None:
     """Check that a written sidecar reproduces the results of its model.
 
     Raises:
-        RigError: Its results are too far from those of the model.
+        RigError: The results deviate too far from those of the model.
     """
     error_mm = onnx_error_mm(path, rig, sample_valid(rig, PROBES))
     if not error_mm <= ALLOWED_MM:
-        raise RigError(f"is {error_mm:.3f} mm from the model; allowed {ALLOWED_MM} mm.", path=path)
+        raise RigError(f"is {error_mm:.3f} mm from the model; the maximum is {ALLOWED_MM} mm.", path=path)
 
 
 def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded: str | None = None) -> float:
@@ -214,7 +214,7 @@ def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded:
             the check: rigs baked before 0.1.0 record no checksum.
 
     Raises:
-        FormatError: Not the recorded file, not an ONNX file of jawusd, or made from another model.
+        FormatError: The file is not the recorded one, is not an ONNX file of jawusd, or was made from another model.
     """
     model = load_sidecar(path, rig, recorded)
     try:
@@ -254,7 +254,7 @@ def check_made_from(model: onnx.ModelProto, rig: JawRig, path: str | os.PathLike
     """Check that a graph was made from the model of a rig.
 
     Raises:
-        FormatError: It was made from another one.
+        FormatError: It was made from another model.
     """
     if _properties(model).get("rig_hash") != rig.model_hash:
         raise FormatError("was made from another model (rig_hash differs); bake the rig again.", path=path)
@@ -264,7 +264,7 @@ def read_sidecar(path: str | os.PathLike[str], recorded: str | None = None) -> o
     """Read a graph.
 
     Raises:
-        FormatError: Not the recorded file, or not an ONNX file of jawusd.
+        FormatError: The file is not the recorded one, or is not an ONNX file of jawusd.
     """
     check_input(path)
     try:
@@ -276,12 +276,12 @@ def read_sidecar(path: str | os.PathLike[str], recorded: str | None = None) -> o
     try:
         model = onnx.load_from_string(content)
         onnx.checker.check_model(model)
-        convert_model_from_external_data(model)  # fails if weights are in other files: a runtime would read those
+        convert_model_from_external_data(model)  # fails if weights are in other files, which a runtime would read
     except Exception as error:  # the exceptions of protobuf and onnx have no common base class
         raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error
-    if model.functions or model.graph.sparse_initializer:  # the check above does not look for other files in these
+    if model.functions or model.graph.sparse_initializer:  # the check above does not look for external data in these
         raise FormatError("has functions or sparse weights; graphs written by jawusd have neither.", path=path)
     found = _properties(model).get("format")
     if found != FORMAT:
-        raise FormatError(f"has the format {found!r}, expected {FORMAT!r}.", path=path)
+        raise FormatError(f"has the format {found!r}; expected {FORMAT!r}.", path=path)
     return model

@@ -1,9 +1,9 @@
 """A placeholder for a missing mandible mesh: a tube swept below the lower scan and up to the condyles.
 
-It indicates roughly where bone may be; it is not anatomy, and is marked as a placeholder. The condyles are taken from
-the landmarks, or from the motion if the landmarks are only mean adult positions. In opening and in protrusion the
-condyle slides along the same path, the eminence, so its trajectories form a thinner band than those of nearby points
-(the kinematic condylar centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
+It indicates roughly where bone may be; it does not show the anatomy, and is marked as a placeholder. The condyles are
+taken from the landmarks, or from the motion if the landmarks are only mean adult positions. In opening and in
+protrusion the condyle slides along the same path, the eminence, so its trajectories form a thinner band than those of
+nearby points (the kinematic condylar centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _REACH_MM = 18.0
 _STEP_MM = 1.5
 _PATH_DEGREE = 3
 # Minimum travel of the condyles [mm], and maximum thickness of their band of trajectories as a fraction of the
-# thickness at the mean position; otherwise the motion is not used.
+# thickness at the mean position; outside these limits, the motion is not used.
 _LEAST_TRAVEL_MM = 5.0
 _CLEARLY_THINNER = 0.85
 _FEWEST_POSES = 30
@@ -92,7 +92,7 @@ def find_condyles(rig: JawRig) -> tuple[Array, str]:
 
 
 def _thinnest(poses: Array, mean: Array) -> Array | None:
-    """Return the point near a mean position with the thinnest sagittal band; None if the motion is too small."""
+    """Return the point near a mean position whose sagittal trajectories form the thinnest band; None without one."""
     offsets = np.arange(-_REACH_MM, _REACH_MM + 0.5 * _STEP_MM, _STEP_MM)
     grid = np.stack(np.meshgrid([0.0], offsets, offsets, indexing="ij"), axis=-1)[0] + mean
     thickness = np.array([[_thickness(poses, point) for point in row] for row in grid])

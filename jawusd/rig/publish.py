@@ -41,7 +41,7 @@ _ZIP_EPOCH = 315_619_200
 _OP = "xformOp:"
 _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 _LAYERS, _COPIED = (".usda", ".usdc", ".usd"), (".onnx",)
-_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # each before files that use it
+_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # each file before those that refer to it
 _NAMES_INSIDE = "actor.usdc", "shot.usdc"
 # Offset that turns integers into other numbers: binary layers compress vectors of small integers, which three.js (r187)
 # decodes as NaN.
@@ -133,15 +133,15 @@ def publish_rig(
     Args:
         folder: The rig's folder.
         out: The folder to write.
-        prefix: Prefix of all file names; None: the actor's name, with characters replaced that are not allowed in file
-            names.
+        prefix: Prefix of all file names; None: the actor's name, in which characters that are not allowed in file names
+            are replaced.
         prim_name: Name of the actor's prim and prefix of its joints; None: derived from the actor's name.
 
     Returns:
         The files, in the order written.
 
     Raises:
-        RigError: No rig, an invalid prefix, or the output is the rig's own folder.
+        RigError: There is no rig, the prefix is invalid, or the output is the rig's own folder.
         OutputError: A file cannot be written.
     """
     folder, out = Path(folder), Path(out)
@@ -177,11 +177,11 @@ def _check_own(path: Path) -> None:
     """
     check_input(path, RigError)
     if not is_allowed(path) and not path.resolve().is_relative_to(path.parent.resolve()):
-        raise RigError("links to a file outside its own folder.", path=path, hint="Replace the link by a copy.")
+        raise RigError("links to a file outside its own folder.", path=path, hint="Replace the link with a copy.")
 
 
 def _prefixed(prefix: str, name: str) -> str:
-    """Return a file name with the prefix, which replaces a leading "actor"."""
+    """Return a file name with the prefix, which replaces "actor" at its start."""
     return prefix + (name.removeprefix("actor") if name.startswith("actor") else f"_{name}")
 
 

@@ -1,4 +1,4 @@
-"""Read rigs from USD by attribute name, whether or not this process knows the schema."""
+"""Read rigs from USD by attribute name, whether or not the schema is registered."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def open_stage(path: PathArg) -> Usd.Stage:
     if not path.is_file():
         raise RigError("there is no such file.", path=path)
     if path.suffix == ".npz":
-        raise RigError("is an npz file; a USD file is needed.", path=path, hint="Give the rig's actor.usda.")
+        raise RigError("is an npz file; expected a USD file.", path=path, hint="Give the rig's actor.usda.")
     check_path(path, RigError)
     try:
         return open_checked(path)
@@ -86,7 +86,7 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
 
     Raises:
         FormatError: The metadata are not JSON or state another model kind, a package mixes files of several actors, or
-            as for `load_rig`.
+            any error of `load_rig`.
     """
     upgrade_rig(prim, where)
     check_units(prim, where)
@@ -117,7 +117,7 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
 
 
 def recorded_hashes(prim: Usd.Prim) -> tuple[object, object]:
-    """Return the recorded hash of a rig's model and that of the model with which its motion was made; None if missing.
+    """Return the hash of a rig's model and that of the model with which its motion was made; None if not recorded.
 
     Both are None for a rig of an older format version, because upgraded arrays have another hash.
     """
@@ -137,7 +137,7 @@ def check_units(prim: Usd.Prim, where: object) -> None:
     for name, wanted in (("jaw:lengthUnit", "mm"), ("jaw:angleUnit", "rad"), ("jaw:twistOrder", ["omega", "v"])):
         found = np.array(read_value(prim, name, where)).tolist()
         if found != wanted:
-            raise UnitsError(f"{name} is {found}, expected {wanted}.", path=str(where))
+            raise UnitsError(f"{name} is {found}; expected {wanted}.", path=str(where))
 
 
 @raises_format_error(1)
@@ -154,11 +154,14 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     axes, counts = (d1, d2, d3), [len(d1), len(d2), len(d3)]
     found = _numbers(prim, "jaw:decoder:shape", where).tolist()
     if found != counts or min(counts) < 2 or any((np.diff(axis) <= 0).any() for axis in axes):
-        raise FormatError(f"jaw:decoder:shape is {[int(n) for n in found]}; the knots are {counts}.", path=str(where))
+        raise FormatError(
+            f"jaw:decoder:shape is {[int(n) for n in found]}; expected {counts}, the numbers of knots.",
+            path=str(where),
+        )
     twists = _numbers(prim, "jaw:decoder:twists", where).astype(np.float32)
     shape = (*counts, 6) if stored_as == "grid" else (sum(counts), 6)
     if twists.size != math.prod(shape):
-        raise FormatError(f"jaw:decoder:twists has {twists.size} numbers, expected {shape}.", path=str(where))
+        raise FormatError(f"jaw:decoder:twists has {twists.size} numbers; expected {shape}.", path=str(where))
     if not np.isfinite(twists).all() or not all(np.isfinite(axis).all() for axis in axes):
         raise FormatError("jaw:decoder has values that are not finite.", path=str(where))
     error_mm, samples = (_numbers(prim, f"jaw:decoder:{name}", where) for name in ("maxError", "errorSamples"))

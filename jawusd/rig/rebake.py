@@ -1,4 +1,4 @@
-"""Make d and the mandible of a stage consistent again after one of them was edited."""
+"""Make d and the mandible in a stage consistent again after one of them was edited."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def deviation(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None =
     """Return the deviation of a stage's mandible from the pose given by d; None if d has no keys.
 
     Raises:
-        RigError: Not a stage.
+        RigError: The file is not a stage.
         FormatError: No rig or several rigs, no mandible, or parameters that are not finite.
     """
     stage = open_stage(path)
@@ -112,7 +112,7 @@ def motion_of_stage(
             stronger layer.
 
     Raises:
-        RigError: Not a stage, or d and mandible disagree and are in the same layer.
+        RigError: The file is not a stage, or d and mandible disagree and are in the same layer.
         FormatError: No rig or several rigs, no mandible, or a motion that is not rigid or not finite.
     """
     stage = open_stage(path)
@@ -163,17 +163,17 @@ def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -
 
 
 def _constant_motion(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array, float]:
-    """Return a d that is not animated as a constant motion: first and last frame, d at both [mm], frames per second."""
+    """Return the constant motion of a d without animation: first and last frame, d at both [mm], frames per second."""
     frames = frames_of_stage(stage, path)[[0, -1]]
     d = np.array([actor.GetAttribute(name).Get() for name in PARAMETERS], dtype=np.float64)
     if not np.isfinite(d).all():
-        raise FormatError("its d is not finite.", path=str(path))
+        raise FormatError("its d has values that are not finite.", path=str(path))
     times = np.unique(frames).astype(np.float64)
     return times, np.tile(d, (len(times), 1)), float(stage.GetTimeCodesPerSecond())
 
 
 def _rank(stage: Usd.Stage, attributes: list[Usd.Attribute]) -> float:
-    """Return the number of layers stronger than the layer with the strongest opinion about any of the attributes."""
+    """Return the number of layers that are stronger than all layers with opinions about any of the attributes."""
     layers = stage.GetLayerStack(includeSessionLayers=False)
     strongest = [stack[0].layer for stack in (attribute.GetPropertyStack() for attribute in attributes) if stack]
     return min((float(layers.index(layer)) for layer in strongest if layer in layers), default=np.inf)
@@ -240,13 +240,14 @@ def write_rebaked(
         Paths on which the stage's root layer has its own opinions, which are stronger than those of a sublayer.
 
     Raises:
-        RigError: Not a stage, the output is the stage itself, or a mandible would not move to the pose of its d.
+        RigError: The file is not a stage, the output is the stage itself, or a mandible would not have
+            the pose of its d.
         FormatError: No rig or several rigs, or no mandible.
         OutputError: The file cannot be written.
     """
     out = Path(out)
     if out.resolve() == Path(shot).resolve():
-        raise RigError("the output is a layer over the stage and cannot replace it.", path=out)
+        raise RigError("the output is a layer over the stage, so it cannot replace the stage.", path=out)
     stage = open_stage(shot)
     layer = _layer_over(stage, np.concatenate([motion.times for motion in motions]))
     if len(np.atleast_1d(carried)):
@@ -277,7 +278,8 @@ def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) ->
     mandible = mandible_of(actor, shot)
     if not (away_mm := skull_displacement_mm(actor, motion.rig, shot)) <= BAKED_MM:
         raise RigError(
-            f"the skull of {actor.GetPath()} is moved by {away_mm:.2f} mm: a baked mandible would be off by as much.",
+            f"the skull of {actor.GetPath()} is moved by {away_mm:.2f} mm; "
+            "a baked mandible would be displaced by as much.",
             path=str(shot),
             hint="Move the actor instead of its skull, or animate it: jawusd encode, then jawusd animate.",
         )
@@ -313,7 +315,7 @@ def _check_moves(layer: Sdf.Layer, prims: list[str], motions: Sequence[Rebaked],
         away = _deviation(composed.GetPrimAtPath(prim), motion.rig, shot)
         if away is not None and away.frames:
             raise RigError(
-                f"the mandible of {prim} would still be {away.largest_mm:.2f} mm from its pose by d.",
+                f"the mandible of {prim} would still be {away.largest_mm:.2f} mm from the pose given by d.",
                 path=str(shot),
                 hint="Prims above or below the mandible move it as well: `jawusd validate` lists them.",
             )

@@ -53,7 +53,7 @@ def load_separately(path: Path, prim: str | None = None) -> JawRig:
 
 
 def _python() -> str:
-    """Return a Python interpreter; in programs that embed Python, such as Maya, `sys.executable` may be none."""
+    """Return a Python interpreter; in programs that embed Python, such as Maya, `sys.executable` may not be one."""
     own = Path(sys.executable or sys.prefix)
     known = ("python", "mayapy", "hython")
     for program in (own, own.with_name("mayapy"), own.with_name("hython"), Path(sys.prefix, "bin", "python3")):

@@ -115,7 +115,7 @@ def add_skeleton_variant(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -
 def joint_poses(rig: JawRig, d: Array) -> Array:
     """Return the transforms of the joint `skull/jaw` in skull coordinates, shape (n, 4, 4), for parameters (n, 3) [mm].
 
-    The joint moves by D = pose rest^-1, because a vertex bound at rest then moves to D rest p = pose p.
+    The joint moves by D = pose rest^-1, because a vertex p bound at rest then moves to D rest p = pose p.
     """
     moved = rig.pose(d) @ se3_inverse(rig.T_rest)
     return make_transform(moved[:, :3, :3], (moved @ _hinge(rig))[:, :3, 3])

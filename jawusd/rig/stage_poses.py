@@ -60,7 +60,7 @@ def carries_rig(path: str | os.PathLike[str], prim_path: str | None = None) -> b
         prim_path: The rig's prim, if the stage has several rigs.
 
     Raises:
-        RigError: Not a stage.
+        RigError: The file is not a stage.
         FormatError: The prim is not a rig, although others are.
     """
     stage = open_stage(path)
@@ -89,7 +89,7 @@ def fit_poses_of_stage(
         rig_prim: The rig's prim, if the file has several rigs.
 
     Raises:
-        RigError: Not a stage.
+        RigError: The file is not a stage.
         FormatError: No mesh with matching vertices, a mesh that does not fit, or no time range.
     """
     stage = open_stage(path)
@@ -122,7 +122,7 @@ def _spread(points: Array) -> float:
 
 
 class _StageMesh:
-    """A mesh of the rig in a stage."""
+    """A mesh of a stage that was identified as a mesh of the rig."""
 
     def __init__(self, prim: Usd.Prim, source: Array, in_rig: NDArray[np.int64], in_stage: NDArray[np.int64]) -> None:
         self.path, self.source, self._chosen = str(prim.GetPath()), source[in_rig], in_stage
@@ -151,7 +151,7 @@ class _StageMesh:
 def _find(
     stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below: str | None, path: object
 ) -> _StageMesh:
-    """Return the mesh of the stage that matches one of the named meshes of the rig; teeth take precedence over bone."""
+    """Return the mesh of the stage that matches one of the named meshes of the rig, preferring teeth to bone."""
     if below is not None and not (Sdf.Path.IsValidPathString(below) and stage.GetPrimAtPath(below)):
         raise FormatError(f"has no prim {below}.", path=str(path))
     meshes = meshes_below(stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot())
@@ -175,7 +175,7 @@ def _find(
     sizes = " or ".join(f"{len(mesh.vertices)} ({name})" for name, mesh in wanted.items())
     where = f" below {below}" if below is not None else ""
     raise FormatError(
-        f"has no mesh{where} with {sizes} vertices, like the rig.",
+        f"has no mesh{where} with as many vertices as in the rig: {sizes}.",
         path=str(path),
         hint="Choose the prims of skull and mandible with --skull and --mandible. Export without merging vertices.",
     )

@@ -1,4 +1,4 @@
-"""The sampled decoder: a table of twists for readers without the exact model, its error, and samples of d.
+"""The sampled decoder (a table of twists for readers without the exact model), its error, and random samples of d.
 
 The error of linear interpolation over a step h is h^2 / 8 times the second derivative. A grid whose density is the
 square root of the curvature therefore spreads the error evenly (de Boor, A Practical Guide to Splines, chapter XII).
@@ -28,7 +28,7 @@ _PROBES_PER_AXIS = 41  # number of values per axis of the grid that finds the bo
 _FINE = 161  # number of values per axis at which the curvature is measured
 _COARSE = 13  # number of values along each of the two other axes
 _NEAR_BOUND_MM = -0.5  # minimum margin of points whose curvature counts; negative, as cells extend beyond the bound
-_SMOOTHING = 9  # width of the window that smooths the curvature, in fine steps
+_SMOOTHING = 9  # width of the window that smooths the curvature, in steps of the fine grid
 _FLOOR = 0.05  # lower limit of the curvature, as a fraction of its maximum
 _POINTS = 40  # number of mandible points at which the curvature is measured
 

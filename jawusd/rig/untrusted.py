@@ -94,7 +94,7 @@ def open_checked(path: Path) -> Usd.Stage:
     """Open a stage after checking the files it refers to.
 
     Raises:
-        RigError: It is not USD, or refers to files that `check_file_access` rejects.
+        RigError: The file is not USD, or refers to files that `check_file_access` rejects.
     """
     note_input(path)
     try:
@@ -159,7 +159,7 @@ def _checked_layers(path: Path) -> list[Sdf.Layer]:
             rig_folder = file_of(name).resolve().parent
         if rig_folder is None and ref.user is not None:
             raise RigError(
-                f"refers to the file {name:.200}, outside its own folder and not a rig.",
+                f"refers to the file {name:.200}, which is outside its own folder and not a rig.",
                 path=ref.user,
                 hint=_ALLOW,
             )
@@ -172,7 +172,7 @@ def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
     """Check that a stage is composed only of layers returned by `check_file_access`.
 
     Raises:
-        RigError: It has other layers.
+        RigError: It is composed of other layers.
     """
     known = {file_of_layer(layer).resolve() for layer in checked}
     for layer in stage.GetUsedLayers():
@@ -192,7 +192,8 @@ def _referenced_layers(layer: Sdf.Layer, rig_folder: Path | None, variables: Map
     folder = rig_folder or file_of_layer(layer).resolve().parent
     read = with_variables(layer, variables)
     found: list[_LayerRef] = []
-    for template in clip_templates(read):  # before asset_paths, in which OpenUSD lists the folders of clips
+    # checked before `asset_paths` runs, because OpenUSD lists the folders of clips there
+    for template in clip_templates(read):
         pattern = _checked_file(layer, template, folder)
         for file in files_of_template(pattern):
             _checked_file(layer, str(file), folder)
@@ -252,7 +253,7 @@ def _is_intact(layer: Sdf.Layer) -> bool:
     """Return whether a layer contains all prims and properties it lists; OpenUSD aborts the process if one is missing.
 
     Raises:
-        RigError: It exceeds the limits.
+        RigError: The layer exceeds the limits.
     """
     missing, count = [], 0
 
@@ -266,7 +267,7 @@ def _is_intact(layer: Sdf.Layer) -> bool:
         samples = layer.GetNumTimeSamplesForPath(path) if path.IsPropertyPath() else 0
         if count > MAX_SPECS or samples > MAX_SAMPLES:
             found = f"{MAX_SPECS} prims and properties" if count > MAX_SPECS else f"{MAX_SAMPLES} samples of {path}"
-            raise RigError(f"has more than {found:.200}, the limit.", path=layer.identifier)
+            raise RigError(f"has more than {found:.200}, the maximum.", path=layer.identifier)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     return not missing

@@ -216,7 +216,7 @@ def test_what_was_written_is_checked_by_either_runtime(kind, tmp_path, monkeypat
     bite[0, 9] += 0.02  # mm, to the left
     weights.CopyFrom(onnx.numpy_helper.from_array(bite, weights.name))
     write_onnx(path, model)
-    with pytest.raises(RigError, match=r"actor.onnx: is 0\.020 mm from the model; allowed 0.01 mm"):
+    with pytest.raises(RigError, match=r"actor.onnx: is 0\.020 mm from the model; the maximum is 0.01 mm"):
         check_written(path, rig)
 
 

@@ -84,7 +84,7 @@ def test_description_is_that_of_the_rig(folder, kind):
 def test_a_newer_rig_is_refused(anchored_folder):
     actor = anchored_folder / "actor.usda"
     edit(actor, set_value("jaw:formatVersion", 3))
-    with pytest.raises(VersionError, match="version 3; this version of jawusd reads up to 2"):
+    with pytest.raises(VersionError, match="version 3; this version of jawusd reads versions up to 2"):
         load_rig(actor)
 
 
@@ -194,7 +194,7 @@ def test_what_uses_a_rig_may_reach_out_for_it_only(anchored_folder):
     shot.subLayerPaths.append("../other.usda")
     shot.Save()
     del other, shot
-    with pytest.raises(RigError, match="other.usda, outside its own folder and not a rig"):
+    with pytest.raises(RigError, match="other.usda, which is outside its own folder and not a rig"):
         load_rig(away / "shot.usda")
 
 

@@ -245,7 +245,7 @@ def test_a_search_path_leads_to_rigs_alone(anchored_folder, tmp_path):
         command = [sys.executable, "-c", code, f"{name}.usda"]
         said[name] = subprocess.check_output(command, cwd=tmp_path / "shots", env=environment, text=True)
     assert said["rig"] == "anchored\n"
-    assert "evil.usda, outside its own folder and not a rig" in said["other"]
+    assert "evil.usda, which is outside its own folder and not a rig" in said["other"]
 
 
 def test_a_path_that_is_found_beside_the_shot_is_read(anchored_folder):

@@ -72,7 +72,7 @@ def test_a_version_after_the_present_one_is_refused(older):
     layer = Sdf.Layer.OpenAsAnonymous(str(older / "actor.usda"))
     layer.GetAttributeAtPath("/Actor.jaw:formatVersion").default = NEXT + 1
     layer.Export(str(older / "actor.usda"))
-    with pytest.raises(VersionError, match=f"version {NEXT + 1}; this version of jawusd reads up to {NEXT}"):
+    with pytest.raises(VersionError, match=f"version {NEXT + 1}; this version of jawusd reads versions up to {NEXT}"):
         load_rig(older / "actor.usda")
 
 

@@ -46,7 +46,7 @@ def test_a_part_of_a_mesh_has_only_the_vertices_it_uses():
 
 def test_what_is_no_rig_is_refused(tmp_path):
     (tmp_path / "model.npz").write_bytes(b"PK\x03\x04")
-    with pytest.raises(RigError, match="is an npz file; a USD file is needed"):
+    with pytest.raises(RigError, match="is an npz file; expected a USD file"):
         viewed_actor(tmp_path / "model.npz")
     with pytest.raises(RigError, match="no such file"):
         viewed_actor(tmp_path)
