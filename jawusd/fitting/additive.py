@@ -1,11 +1,11 @@
-"""Models that sum three curves in se(3), each parametrised by millimetres at the lower incisal point.
+"""Models that are a sum of three curves in se(3), each parametrised by millimetres at the lower incisal point.
 
 The additive model is log M = Phi1(d1) + Phi2(d2) + Phi3(d3), fitted jointly to the captured poses. The twist is taken
-about the incisal point p, (omega, s = omega x p + v), and one component of s of each curve is its parameter t itself
-(-s_y of Phi1, s_x of Phi2, s_z of Phi3), which makes the sum unique. All other components are smoothing splines, fitted
-jointly by least squares, in alternation with the projection of the poses onto the sum.
+about the incisal point p, (omega, s = omega x p + v). In each curve, one component of s is the parameter t itself (-s_y
+in Phi1, s_x in Phi2, s_z in Phi3), which makes the sum unique. All other components are smoothing splines; their joint
+least-squares fit alternates with the projection of the poses onto the sum.
 
-The linear baseline, PCA of the twists under the mandible metric, is the same sum with straight curves.
+The linear baseline, a PCA of the twists under the mandible metric, is the same sum with straight lines as curves.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 # Fraction of the mandible's rms speed below which the incisal point counts as standing still or reversing.
 _SLOWEST = 0.2
-_SHORTEST_MM = 0.01  # minimum motion of the incisal point along a curve; less is due to a collapsed network
+_SHORTEST_MM = 0.01  # minimum motion of the incisal point along a curve; less motion indicates a collapsed network
 
 _PIECES = (8, 6, 6)  # number of polynomial pieces of each of the three curves
 _ROUNDS = 8
 _SMOOTHING = 10.0 ** np.arange(-4.0, 5.0)
 _TAIL_RIDGE = 1e-4  # penalty that keeps coefficients finite in intervals without frames
-_HIDDEN_RIDGE = 1e9  # penalty that keeps coefficients at zero for parameters that the data do not exercise
-_TRIM_FLOOR_MM = 0.8  # smaller residuals count as model error, not as tracking failures
+_HIDDEN_RIDGE = 1e9  # penalty that keeps the coefficients of parameters that the data do not excite at zero
+_TRIM_FLOOR_MM = 0.8  # maximum residual that counts as model error and not as a tracking failure
 _CV_BLOCK, _CV_FOLDS, _CV_CAP_MM = 25, 5, 1.0
 _LARGEST_CONDITION = 1e3
 
@@ -52,7 +52,7 @@ def in_millimetres(
     """Reparametrise a curve by d, the displacement of the incisal point along the curve's own axis [mm].
 
     Where the incisal point stands still or reverses, d increases by a fifth of the mandible's rms displacement instead,
-    so that every point of the curve has a parameter.
+    so that every point on the curve has a parameter.
 
     Args:
         limits: range of t in the data, containing 0.
@@ -90,7 +90,7 @@ def in_millimetres(
 
 
 def straight(direction: Array, knots: Array) -> HermiteCurve:
-    """Return the straight curve d -> d * direction, twists per mm (6,), between two knots (2,) [mm]."""
+    """Return the straight line d -> d * direction between two knots (2,) [mm]; the direction is a twist per mm (6,)."""
     return HermiteCurve(knots, knots[:, None] * direction, np.stack([direction, direction]))
 
 
@@ -109,7 +109,7 @@ def _incisal_advance(twist: Array, rate: Array, incisor: Array, direction: Array
 
 
 class _Basis:
-    """B-spline regression columns of one parameter, zero at zero, extrapolated linearly, with their bending energy."""
+    """B-spline regression columns of one parameter, with bending energy; zero at zero and extrapolated linearly."""
 
     def __init__(self, values: Array, pieces: int) -> None:
         low, high = min(float(values.min()), -1.0), max(float(values.max()), 1.0)
@@ -117,7 +117,7 @@ class _Basis:
         knots = np.concatenate([[low] * 3, np.linspace(low, high, pieces + 1), [high] * 3])
         self._splines = BSpline(knots, np.eye(pieces + 3), 3)
         sites = np.linspace(low, high, 20 * pieces)
-        bend = self._splines(sites, nu=2) * (high - low) ** 1.5  # makes the energy independent of the range
+        bend = self._splines(sites, nu=2) * (high - low) ** 1.5  # makes the energy independent of the range of t
         self.energy = bend.T @ bend * (sites[1] - sites[0])
 
     def columns(self, t: Array) -> Array:
@@ -134,7 +134,7 @@ def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
     """Fit the sum of three curves.
 
     Args:
-        shown: which parameters the data excite, shape (3,); the curves of the others are pure translations.
+        shown: which parameters the data excite, shape (3,); the curves of the other parameters are pure translations.
         trim_mad: see `FittingConfig`.
     """
     u = data.displacement()
@@ -150,7 +150,7 @@ def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
 
 
 def _own(curve: HermiteCurve, d: Array, incisor: Array, axis: int) -> Array:
-    """Return the parameter t of a curve, one of its own twist components, at d (n,)."""
+    """Return the parameter t of a curve, which is one of its twist components, at d (n,)."""
     twist = curve.value(d)
     return (np.cross(twist[:, :3], incisor) + twist[:, 3:]) @ MEASURED[axis]
 
@@ -162,7 +162,7 @@ def _regress(data: TrainingData, t: Array, kept: Mask, shown: Mask) -> tuple[Add
     bases = [_Basis(t[:, i], _PIECES[i]) for i in range(3)]
     columns = [basis.columns(t[:, i]) for i, basis in enumerate(bases)]
     root = data.metric.twist_root()
-    # Residuals in mm: rotations are scaled by the displacement of the mandible, translations are unchanged.
+    # The residuals are in mm: rotations are scaled by the displacement of the mandible, translations are unchanged.
     L = np.linalg.cholesky(data.metric.about(data.incisor))
     turning = twists[:, :3] @ L
     gliding = (np.cross(twists[:, :3], data.incisor) + twists[:, 3:]) @ MEASURED.T - t
@@ -189,7 +189,7 @@ def _regress(data: TrainingData, t: Array, kept: Mask, shown: Mask) -> tuple[Add
 def _assembled(
     columns: list[Array], bases: list[_Basis], shown: Mask, which: tuple[int, ...]
 ) -> tuple[Array, Array, Array]:
-    """Return the stacked columns of some parameters, their bending energy, and the constant part of the penalty."""
+    """Return the stacked columns of given parameters, their bending energy, and the constant part of the penalty."""
     sizes = [columns[i].shape[1] for i in which]
     energy = np.zeros((sum(sizes), sum(sizes)))
     tail = np.zeros_like(energy)
@@ -226,14 +226,14 @@ def _curve(basis: _Basis, turn: Array, glide: Array, incisor: Array, axis: int) 
 def fit_pca(data: TrainingData, shown: Mask) -> FittedForm:
     """Fit a linear subspace of se(3) through the closed bite to all frames.
 
-    The subspace is spanned by the first principal components of log M, one per shown parameter, not centred, so that
-    d = 0 is the closed bite. Its basis follows from the incisal velocity: to first order, d2 and d3 move the incisal
-    point purely sideways and forward, and d1 along the mean opening direction of the take.
+    The subspace is spanned by the first principal components of log M, one per shown parameter. The data are not
+    centred, so that d = 0 is the closed bite. The basis follows from the incisal velocity: to first order, d2 and d3
+    move the incisal point purely sideways and forward, and d1 along the mean opening direction of the take.
 
     The note `singular_values_mm` lists the singular values of the weighted twists, as rms displacement of the mandible.
 
     Args:
-        shown: parameters that the data excite, shape (3,); the others become pure translations.
+        shown: parameters that the data excite, shape (3,); the other parameters become pure translations.
 
     Raises:
         FittingError: the components do not move the incisal point in independent directions.
@@ -263,7 +263,7 @@ def _semantic_directions(basis: Array, twists: Array, weights: Array, incisor: A
     directions = np.stack([translation(axis) for axis in range(3)], axis=1)
     directions[:, shown] = basis @ np.linalg.inv(to_mm)
     if shown[0]:
-        # Along the habitual path: the mean motion per millimetre of opening over the take.
+        # Direction of d1, along the habitual path: the mean motion per millimetre of opening over the take.
         d = to_mm @ np.linalg.lstsq(basis, twists.T, rcond=None)[0]
         habit = (d * weights) @ d[0] / ((weights * d[0]) @ d[0])
         directions[:, 0] = directions[:, shown] @ habit

@@ -1,19 +1,18 @@
 """The default model: rotation as a smooth function of the position of the lower incisal point.
 
-On the three-dimensional set of reachable poses the displacement u of the incisal point is itself a coordinate system,
-so omega = f(u), t = u + p - R(omega) p with f(0) = 0 describes any smooth three-parameter jaw. f is a smoothing
-polyharmonic spline. Refitting it alternates with projecting the captured poses onto it, so that noise in u does not
-bias f.
-Where no poses were captured, predictions from the condylar paths guide the spline with a low weight.
+On the three-dimensional set of reachable poses, the displacement u of the incisal point p is itself a coordinate
+system, so omega = f(u), t = u + p - R(omega) p with f(0) = 0 describes any smooth three-parameter jaw. f is a smoothing
+polyharmonic spline. Fitting f alternates with projecting the captured poses onto it, so that noise in u does not bias
+f. Where no poses were captured, the spline follows predictions from the condylar paths, which have a low weight.
 
-Condylar paths: a condyle slides on its eminence, so its height is a function of its forward slide at any opening;
-its sideways movement is a function of the difference of the two slides (Bennett) and the opening. These three
-equations, learned from the captured poses, determine the rotation at every position of the incisal point. They are less
-accurate than the spline where there are poses, but they extrapolate to combinations that few takes contain, such as a
-wide opening with the jaw to one side, because other exercises cover the same parts of the eminence.
+Condylar paths: a condyle slides on its eminence, so its height is a function of its forward slide at any opening; its
+sideways movement is a function of the difference of the two slides (Bennett) and the opening. These three equations,
+learned from the captured poses, determine the rotation at every position of the incisal point. Near captured poses,
+they are less accurate than the spline, but they extrapolate to combinations that few takes contain, such as a wide
+opening with the jaw to one side, because other exercises cover the same parts of the eminence.
 
-The kinematic centre, the point of the condyle that deviates least from one path (Yatabe et al. 1995, J Dent Res
-74:2006), is estimated near the landmark, which therefore need not be exact.
+The kinematic centre, which is the point of the condyle that deviates least from a single path (Yatabe et al. 1995, J
+Dent Res 74:2006), is estimated near the condyle landmark; the landmark therefore need not be exact.
 """
 
 from __future__ import annotations
@@ -32,20 +31,20 @@ from jawusd.fitting.gauge_fit import fit_gauge, fit_path
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve, within
 from jawusd.geometry import make_transform, so3_exp, so3_log
 
-_SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # lengths that normalise the polynomials' arguments
+_SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # lengths that normalise the arguments of the polynomials
 _DEGREE = 4
 _RIDGE = 1e-3
 _RANGE_PERCENTILES = (0.5, 99.5)  # slide percentiles outside which the eminence is extrapolated linearly
 _LANDMARK_SIGMA_MM = 10.0  # prior standard deviation of the kinematic centre about the landmark
-_PATH_SIGMA_MM = 0.3  # standard deviation of the kinematic centre about its path
+_PATH_SIGMA_MM = 0.3  # standard deviation of the kinematic centre from its path
 _FRAMES_ALIKE = 25  # number of consecutive frames (one second) that count as one independent observation
 _NEWTON_STEPS, _LARGEST_STEP_RAD, _SETTLED_MM = 15, 0.1, 1e-6
 _FARTHER_MM = 4.0  # maximum extrapolation beyond the captured slides
 
 CENTRES = 80
 _ROUNDS = 4
-_SCALES_MM = np.array([10.0, 7.0, 5.0])  # length scales of f along opening, sideways and forward
-# Length scale for parameters that the data do not excite, so large that f does not depend on them.
+_SCALES_MM = np.array([10.0, 7.0, 5.0])  # length scales of the fitted function f along opening, sideways and forward
+# Length scale for parameters that the data do not excite, so large that the fitted function f does not depend on them.
 _HIDDEN_SCALE_MM = 1e9
 _SMOOTHING = 10.0 ** np.arange(-6.0, 4.0)
 _CV_BLOCK, _CV_FOLDS = 25, 5  # number of frames held out together (one second), and number of folds
@@ -53,13 +52,13 @@ _CV_CAP_MM = 1.0
 _TAIL_RIDGE = 1e-6  # penalty that keeps the linear coefficients finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
 _TRIM_FLOOR_MM = 0.5
-_GUIDED_GRID = (9, 7, 7)  # numbers of grid points (opening, sideways, forward) at which condylar paths predict
-_GUIDED_SHARE = 0.08  # total weight of these points relative to that of the frames, for paths without misfit
+_GUIDED_GRID = (9, 7, 7)  # numbers of grid points (opening, sideways, forward) at which the condylar paths predict
+_GUIDED_SHARE = 0.08  # total weight of the predictions relative to that of the frames, for paths without misfit
 
 
 @dataclass(frozen=True)
 class CondylarGuidance:
-    """Learned paths of the left and right condyle, anatomical frame."""
+    """Learned paths of the left and right condyle, in the anatomical frame."""
 
     incisor: Array  # lower incisal point at rest [mm], shape (3,)
     centres: Array  # kinematic centres at rest [mm], shape (2, 3)
@@ -90,7 +89,8 @@ class CondylarGuidance:
             start: rotation vectors to start from [rad], shape (N, 3).
 
         Returns:
-            Rotation vectors (N, 3) [rad], and which of them converged with slides near the captured ones, shape (N,).
+            Rotation vectors (N, 3) [rad], and a mask of those that converged with slides near the captured slides,
+            shape (N,).
         """
         R = so3_exp(start)
         for _ in range(_NEWTON_STEPS):
@@ -110,7 +110,7 @@ class CondylarGuidance:
         """
         arms = np.einsum("nij,kj->nki", R, self.centres - self.incisor)
         moved = arms + (u + self.incisor)[:, None] - self.centres
-        # A spatial rotation w moves a condyle by w x arm, so its coordinate i by (arm x e_i) . w.
+        # A spatial rotation w moves a condyle by w x arm, and therefore its coordinate i by (arm x e_i) . w.
         by_w = np.cross(arms[:, :, None, :], np.eye(3))
         slides = moved[:, :, 2]
         height, slope = self._eminence(slides)
@@ -122,7 +122,7 @@ class CondylarGuidance:
         return residual, np.concatenate([heights_by_w, middle_by_w[:, None]], axis=1), slides
 
     def _eminence(self, slides: Array) -> tuple[Array, Array]:
-        """Return the eminence's height and slope at slides (N, 2), extrapolated linearly beyond the captured ones."""
+        """Return height and slope of the eminences at slides (N, 2), extrapolated linearly beyond captured slides."""
         inside = np.clip(slides, self.slide_range[:, 0], self.slide_range[:, 1])
         powers = np.arange(1, _DEGREE + 1)
         s = (inside / _SLIDE_SCALE_MM)[..., None]
@@ -131,7 +131,7 @@ class CondylarGuidance:
 
 
 def _kinematic_centre(motion: Array, weights: Array, condyle: Array) -> Array:
-    """Return the point near a condyle landmark whose height follows its slide most closely [mm], shape (3,).
+    """Return the point near a condyle landmark whose height is best explained by its slide [mm], shape (3,).
 
     The search varies only its vertical and anterior coordinates, since all points on the condylar axis move alike.
     """
@@ -155,7 +155,7 @@ def _powers(slide: Array) -> Array:
 
 
 def _shift_columns(difference: Array, opening: Array) -> tuple[Array, Array]:
-    """Return regressors (N, 5) of the sideways movement, and their derivatives with respect to the slide difference."""
+    """Return regressors (N, 5) of the sideways movement, and derivatives with respect to the slide difference."""
     d, o = difference / _SLIDE_SCALE_MM, opening / _OPENING_SCALE_MM
     zero, one = np.zeros_like(d), np.ones_like(d)
     columns = np.stack([d, d * np.abs(d), d * o, o, o * o], axis=1)
@@ -173,7 +173,7 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
 
     Args:
         shown: which of opening, laterotrusion and protrusion the data excite, shape (3,); the fitted function f does
-            not depend on the others.
+            not depend on the other parameters.
         trim_mad: see `FittingConfig`.
     """
     u = data.displacement()
@@ -201,7 +201,7 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
 class _Chart:
     """Map from incisal displacements u (N, 3) [mm] to spline arguments q (N, 3).
 
-    It is a shear along the habitual path followed by a scaling.
+    The map is a shear along the habitual path, followed by a scaling.
     """
 
     path: Gauge
@@ -218,9 +218,9 @@ class _Chart:
 
 
 def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bool) -> tuple[AnchoredModel, float]:
-    """Fit f to the best rotation of each frame with its incisal point fixed at u.
+    """Fit f to the rotation that best explains each frame's pose with the incisal point fixed at u.
 
-    The smoothing factor is chosen anew in every call, since f may be less stiff once outliers are trimmed.
+    The smoothing factor is chosen again in every call, since f may be less stiff once outliers are trimmed.
     """
     rotation = data.metric.best_rotation(data.motion, data.incisor, u + data.incisor)[kept]
     omega, q, weights = so3_log(rotation), chart.of(u[kept]), data.weights[kept]
@@ -230,7 +230,7 @@ def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bo
         more = _guided_rows(data, motion, weights, chart)
         omega, q, weights = (np.concatenate(pair) for pair in zip((omega, q, weights), more, strict=True))
         folds = np.append(folds, np.full(len(q) - len(folds), -1))
-    # In units of mm: |L^T domega|^2 is the mean squared displacement of the mandible about the incisal point.
+    # The values are in mm: |L^T domega|^2 is the mean squared displacement of the mandible about the incisal point.
     L = np.linalg.cholesky(data.metric.about(data.incisor))
     values = omega @ L
     count = min(CENTRES, max(4, int(kept.sum()) // _FRAMES_PER_CENTRE))
@@ -248,8 +248,8 @@ def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bo
 def _guided_rows(data: TrainingData, motion: Array, weights: Array, chart: _Chart) -> tuple[Array, Array, Array]:
     """Return rotation vectors (G, 3), spline arguments (G, 3) and weights (G,) predicted from the condylar paths.
 
-    The predictions fill the box around the captured poses. Together they have a few percent of the poses' total weight,
-    so that they matter only where there are no poses.
+    The predictions fill the box around the captured poses. Their total weight is a few percent of the total weight of
+    the poses, so that they matter only where there are no poses.
     """
     guidance = CondylarGuidance.of_motion(motion, weights, data.incisor, data.landmarks[-2:])
     q = chart.of(motion[:, :3, :3] @ data.incisor + motion[:, :3, 3] - data.incisor)

@@ -1,14 +1,14 @@
 """The bounds of captured parameters: the paper's alpha shapes, and the slice hull, which is the default.
 
-Alpha shapes of (d1, d2) and (d1, d3): a Delaunay triangle belongs to the shape when its circumradius is at most alpha,
-after both axes were divided by the captured range (Edelsbrunner, Kirkpatrick & Seidel 1983 with r = alpha). The paper's
-alpha of 0.12 is in units of its network's components, whose ranges it does not print.
+Alpha shapes of (d1, d2) and (d1, d3): a Delaunay triangle belongs to the shape if its circumradius is at most alpha
+after both axes have been divided by the captured range (Edelsbrunner, Kirkpatrick & Seidel 1983 with r = alpha). The
+paper's alpha of 0.12 is in units of its network's components, whose ranges are not published.
 
 Slice hull: a convex section in (laterotrusion, protrusion), in mm, for every opening. A tight alpha shape in three
-dimensions would be hollow, since captured border movements leave the inside of the envelope empty. Sections of the
-envelope at one opening are nearly convex, so the support function of the captured poses near that opening, smoothed
-over the opening, describes them with few parameters. The hull is tight around the captured poses, so that every pose a
-slider reaches is anatomical; the tolerance for measured poses is estimated by cross-validation.
+dimensions would be hollow, since border movements leave the inside of the envelope empty. Sections of the envelope at
+one opening are nearly convex, so the support function of the captured poses near that opening, smoothed over the
+opening, describes them with few parameters. The hull is tight around the captured poses, so that every pose a slider
+reaches is anatomical; the tolerance for measured poses is estimated by cross-validation.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from jawusd.evaluator.bounds import SliceHull
 #: Planes of the alpha shapes: their names, and their columns of d.
 PLANES = {"polygon_d1d2": [0, 1], "polygon_d1d3": [0, 2]}
 
-_SMALLEST_RANGE_MM = 0.5  # minimum range used for normalisation; smaller ranges are noise, which would be amplified
-_SLIVER = 1e-12  # triangles with twice their area below this [normalised units] are degenerate
+_SMALLEST_RANGE_MM = 0.5  # minimum range used for normalisation; a smaller range is noise, which would be amplified
+_SLIVER = 1e-12  # twice the area of a triangle below which it is degenerate [normalised units]
 _THIN = 0.02  # distance by which the hull of collinear points is widened [normalised units]
 
 DIRECTIONS = 16
@@ -36,15 +36,16 @@ SOFTNESS_MM = 0.1
 
 _PROTRUSION_STRETCH = 1.6  # factor that stretches protrusion, the shorter axis, before directions are spaced evenly
 _WINDOW_MM = 3.5  # maximum difference in opening between a section and the frames it is built from
-_FEWEST_IN_WINDOW = 12  # minimum number of frames per section: the nearest are used if the window contains fewer
+_FEWEST_IN_WINDOW = 12  # minimum number of frames per section; if the window has fewer, the nearest are used
 _TAPER = 0.35  # fraction by which a frame at the edge of the window is moved towards the section's median
 _KERNEL_KNOTS = 1.0  # standard deviation of the smoothing kernel over the opening, in knots
-_FOLDS, _BLOCK = 5, 50  # number of folds, and length of their blocks [frames], which is about that of an exercise
-# The soft maximum over all half-spaces is up to SOFTNESS_MM * log(DIRECTIONS + 2) = 0.29 mm above the largest one. With
-# a smaller margin, a section without extent (a parameter that the data do not exercise) would be empty.
+_FOLDS, _BLOCK = 5, 50  # number of folds, and length of their blocks [frames], about that of one exercise
+# Margin of the hull. The soft maximum over all half-spaces exceeds the maximum by up to SOFTNESS_MM * log(DIRECTIONS +
+# 2) = 0.29 mm; with a margin below that, a section without extent (a parameter that the data do not excite) would be
+# empty.
 _MARGIN_MM = 0.38
 _CONTACT_TOLERANCE_MM = 0.05  # extension of the hull below the captured openings
-_FRAMES_PER_SLIP = 400  # noise may place one in this many frames beyond closed teeth
+_FRAMES_PER_SLIP = 400  # number of frames of which noise may place one beyond closed teeth
 _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
 
@@ -83,7 +84,7 @@ def alpha_shape(points: Array, alpha: float) -> tuple[Array, Array]:
 
 
 def _circumradius(corners: Array) -> Array:
-    """Return the circumradii of triangles, shape (T, 3, 2) -> (T,): product of the sides over four times the area."""
+    """Return the circumradii (T,) of triangles (T, 3, 2): product of the sides over four times the area."""
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     doubled_area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
@@ -94,12 +95,13 @@ def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, 
     """Build the slice hull of captured parameters (N, 3) [mm] in temporal order.
 
     Args:
-        closed_mm: d1 of closed teeth, where the hull ends; default: the smallest captured d1, apart from noise.
+        closed_mm: d1 with closed teeth, where the hull ends; default: the smallest captured d1, apart from noise.
 
     Returns:
         The `slice_*` arrays of a model; and its `tolerance_mm` and `held_out_*` arrays. The tolerance for measured
         poses is the 95 % quantile of the distance of held-out frames outside the hull, since other exercises reach
-        slightly farther than those captured, but at most 1 mm: a larger one would accept poses that no frame shows.
+        slightly farther than those captured, but at most 1 mm, since a larger tolerance would accept poses that no
+        frame shows.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
     excess = [
@@ -128,7 +130,7 @@ def _hull(d: Array, closed_mm: float | None) -> dict[str, Array]:
     angle = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     directions = np.stack([np.cos(angle), np.sin(angle) * _PROTRUSION_STRETCH], axis=-1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    # The margin also extends the hull beyond closed teeth: subtract it there.
+    # The margin also extends the hull beyond closed teeth, so subtract it there.
     closed = float(np.sort(d[:, 0])[len(d) // _FRAMES_PER_SLIP]) if closed_mm is None else closed_mm
     low, high = closed + _MARGIN_MM - _CONTACT_TOLERANCE_MM, float(d[:, 0].max())
     knots = np.linspace(low, max(high, low + _SHORTEST_RANGE_MM), KNOTS)

@@ -25,38 +25,38 @@ _ROTATION_MAX_DEG = 57.0
 _CONDYLE_MAX_MM = 32.0
 _CONDYLES_APART_MM = (70.0, 140.0)
 _QUANTILE = 99.5
-_SAME_FRAME = 0.01  # maximum difference of rotation matrices if the frame was derived from the landmarks
+_SAME_FRAME = 0.01  # maximum difference of rotation matrices if the coordinate frame came from the landmarks
 
 _UNITS = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 1e-3}  # length of each unit in mm
 
-# Ranges below which a take should be repeated; nearly all adults exceed them (Hirsch 2006, Zawawi 2003).
+# Ranges of motion below which a take should be repeated; nearly all adults exceed them (Hirsch 2006, Zawawi 2003).
 _SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
-_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # wide open: fraction of the largest opening, minimum number of frames
+_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # minimum fraction of the largest opening in wide frames, and their minimum number
 _HALF_OPEN = (0.25, 0.65)  # fractions of the largest opening between which the mouth counts as half open
 _HALF_OPEN_SHARE = 0.35  # minimum fraction of the full range that should be reached with the mouth half open
-# With the mouth half open: number of directions in the plane of laterotrusion and protrusion, distance from the median,
-# as a fraction of the range, beyond which a frame covers its direction, and minimum number of directions that should be
-# covered.
+# Movements with the mouth half open: number of directions in the plane of laterotrusion and protrusion, distance from
+# the median (as a fraction of the range) beyond which a frame covers its direction, and minimum number of directions to
+# be covered.
 _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
-#: A point of the bound lies in a gap if it is farther than this from all captured poses, per parameter [mm].
+#: Distance per parameter from all captured poses beyond which a point of the bound lies in a gap [mm].
 FAR_MM = np.array([3.0, 2.0, 2.0])
-_MOST_GAPS = 0.15  # if a larger fraction of the bound lies in gaps, more should be recorded
+_MOST_GAPS = 0.15  # maximum fraction of the bound in gaps; beyond it, more should be recorded
 # Ranges (1st to 99th percentile) below which a parameter counts as not excited [mm].
 _SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
-# Movements that excite each parameter. Sentences on what a take lacks end in ": record" and a movement.
+# Movements that excite each parameter. Sentences on missing movements end in ": record" and a movement.
 _MOVEMENTS = ("opening as wide as possible, three times", "full slides to both sides", "a full protrusion")
 
 
 @dataclass(frozen=True)
 class AnatomyWarning:
-    """A value outside the human range: a short code, and a message with the normal range."""
+    """Warning about a value outside the human range: a short code, and a message with the normal range."""
 
     code: str
     message: str
 
 
 def check_anatomy(data: TrainingData, anatomy: SubjectAnatomy) -> list[AnatomyWarning]:
-    """Compare landmarks and motions with human ranges; if one common mistake explains the result, report only that."""
+    """Compare landmarks and motions with human ranges; if one common mistake explains the result, report only it."""
     mistake = _frame_mistake(data) or _unit_mistake(data, anatomy) or _swap_mistake(data)
     return [mistake] if mistake else _out_of_range(data)
 
@@ -105,7 +105,7 @@ def _unit_mistake(data: TrainingData, anatomy: SubjectAnatomy) -> AnatomyWarning
 
 
 def _condyle_travel(data: TrainingData, anatomy: SubjectAnatomy, factor: float) -> float:
-    """Return how far the midpoint of the condyles moves [mm] if the translations are scaled by a factor."""
+    """Return the distance that the midpoint of the condyles moves [mm] if the translations are scaled by a factor."""
     T = anatomy.poses(data.motion)
     T[:, :3, 3] *= factor
     moved = displacement(anatomy.motion(T), data.landmarks[3:].mean(0))
@@ -155,7 +155,7 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
 
 
 def shown_parameters(data: TrainingData) -> tuple[Mask, list[str]]:
-    """Return which parameters (3,) the poses exercise, and a sentence for each one that they do not."""
+    """Return which parameters (3,) the poses excite, and a sentence for each parameter that they do not excite."""
     u = data.displacement()
     gx, gz, _, _ = fit_path(u, data.weights).path(-u[:, 1])
     side, front = u[:, 0] - gx, u[:, 2] - gz
@@ -184,7 +184,7 @@ def missing_movements(d: Array, shown: Mask) -> list[str]:
 
     Args:
         d: parameters of the captured poses [mm], shape (N, 3).
-        shown: parameters that the data excite, shape (3,); `shown_parameters` reports the others.
+        shown: parameters that the data excite, shape (3,); `shown_parameters` reports the other parameters.
     """
     widest = float(d[:, 0].max())
     found = []
@@ -203,11 +203,11 @@ def missing_movements(d: Array, shown: Mask) -> list[str]:
 
 
 def bound_not_reached(gaps: tuple[Array, Array], shares: tuple[float, float]) -> list[str]:
-    """Return a sentence for each plane in which too much of the bound is far from every captured pose.
+    """Return a sentence for each plane in which too large a fraction of the bound is far from all captured poses.
 
     Args:
         gaps: points (d1, d2) and (d1, d3) in gaps [mm], each (G, 2).
-        shares: fraction of the bound's points in each plane that lie in gaps.
+        shares: fraction of the points of the bound that lie in gaps, for each plane.
     """
     found = []
     for name, far, places, share in zip(PARAMETERS[1:], FAR_MM[1:], gaps, shares, strict=True):
@@ -221,7 +221,7 @@ def bound_not_reached(gaps: tuple[Array, Array], shares: tuple[float, float]) ->
 
 
 def _missing_half_open(d: Array) -> list[str]:
-    """Return sentences for movements missing between a quarter and two thirds of the opening."""
+    """Return sentences on movements that are missing between a quarter and two thirds of the opening."""
     low, high = (share * d[:, 0].max() for share in _HALF_OPEN)
     half = d[(d[:, 0] > low) & (d[:, 0] < high), 1:]
     where = f"between {low:.0f} and {high:.0f} mm of opening"

@@ -15,24 +15,25 @@ from jawusd.fitting.metric import MandibleMetric
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, so3_log, transform_points
 
-#: Tracks, or frame numbers (F,) and poses T_skull_mandible (F, 4, 4) with NaN where the pose is unknown.
+#: Tracks, or frame numbers (F,) and poses T_skull_mandible (F, 4, 4), which are NaN where unknown.
 Source = Tracks | tuple[ArrayLike, ArrayLike]
 
 #: Names of d1, d2 and d3.
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
 #: Typical deviation of real jaws from a three-parameter model [mm]; smaller tracking errors hardly matter.
 MODEL_SIGMA_MM = 0.3
-_LARGEST_SIGMA_MM = 2.0  # maximum standard deviation of a frame (rms over the mandible); others are discarded
+_LARGEST_SIGMA_MM = 2.0  # maximum standard deviation of a pose (rms over the mandible); other poses are discarded
 _RIGID = 1e-3
 _FEWEST_POSES = 15
 _SMALLEST_MOTION_MM = 1.0  # minimum 95 % quantile of the mandible's rms displacement from the first pose
 
 _FEWEST = 60  # minimum number of poses for outlier screening
-_TRIALS, _SAMPLE = 300, 15  # number and size of the random samples; each output component has ten unknowns
-_CONSENSUS = 0.75  # minimum fraction of the poses that must agree
+_TRIALS, _SAMPLE = 300, 15  # number of random samples, and size of a sample; each output component has ten unknowns
+_CONSENSUS = 0.75  # minimum fraction of the poses that must agree with the map
 _REFITS = 3
-# Outlier thresholds: relative to the majority's spread, and absolute [mm, rms over the mandible]. A jaw deviates from
-# the quadratic by one or two millimetres at its borders; the smooth models trim smaller failures themselves.
+# Outlier thresholds: relative to the majority's spread, and absolute [mm, rms over the mandible]. A real jaw deviates
+# from the quadratic map by one or two millimetres at its borders; smaller failures are trimmed by the smooth models
+# themselves.
 _TIMES, _FLOOR_MM = 8.0, 6.0
 REASON = "far from the other poses' smooth motion"
 
@@ -54,7 +55,7 @@ class SubjectAnatomy:
         mandible_vertices: ArrayLike | None,
         T_rest: ArrayLike | None,
     ) -> SubjectAnatomy:
-        """Check the arrays; by default the points are the landmarks and the closed bite is the identity.
+        """Check the arrays; by default, the points are the landmarks and the closed bite is the identity.
 
         Raises:
             ValueError: an array has a wrong shape or is not finite.
@@ -73,24 +74,24 @@ class SubjectAnatomy:
         return transform_points(self.T_anatomical_skull @ self.T_rest, points)
 
     def motion(self, T_skull_mandible: Array) -> Array:
-        """Return motions away from the closed bite, anatomical frame, of poses; both of shape (..., 4, 4)."""
+        """Convert poses to motions away from the closed bite in the anatomical frame; both have shape (..., 4, 4)."""
         return motions_of_poses(T_skull_mandible, self.T_anatomical_skull, self.T_rest)
 
     def poses(self, motion: Array) -> Array:
-        """Return the poses T_skull_mandible of motions; both of shape (..., 4, 4)."""
+        """Convert motions to poses T_skull_mandible; both have shape (..., 4, 4)."""
         return poses_of_motions(motion, self.T_anatomical_skull, self.T_rest)
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Poses to which a model is fitted."""
+    """Captured poses to which a model is fitted."""
 
     frames: NDArray[np.int64]
     motion: Array  # motions away from the closed bite, anatomical frame, shape (N, 4, 4)
     weights: Array  # weight of each pose, 0 .. 1, shape (N,)
     incisor: Array  # lower incisal point in the closed bite, anatomical frame [mm], shape (3,)
     landmarks: Array  # all landmarks in the closed bite, anatomical frame [mm], shape (5, 3)
-    metric: MandibleMetric  # in the anatomical frame
+    metric: MandibleMetric  # metric of pose differences, in the anatomical frame
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -100,7 +101,7 @@ class TrainingData:
         return displacement(self.motion, self.incisor)
 
     def select(self, rows: Mask) -> TrainingData:
-        """Return the selected frames only."""
+        """Return the training data of the selected frames."""
         return replace(self, frames=self.frames[rows], motion=self.motion[rows], weights=self.weights[rows])
 
 
@@ -111,7 +112,7 @@ class Selection:
     frames: NDArray[np.int64]
     T_skull_mandible: Array
     data: TrainingData
-    used: Mask  # captured frames contained in the data, shape (F,)
+    used: Mask  # mask of the captured frames that the data contain, shape (F,)
     excluded: dict[str, list[int]]  # excluded frame numbers, by reason
 
 
@@ -121,15 +122,15 @@ def displacement(motion: Array, point: Array) -> Array:
 
 
 def select(source: Source, anatomy: SubjectAnatomy) -> Selection:
-    """Select the frames of a source that can train a model, by `select_tracks` or `select_poses`, with their errors."""
+    """Select the frames of a source that can train a model, using `select_tracks` or `select_poses`."""
     return select_tracks(source, anatomy) if isinstance(source, Tracks) else select_poses(*source, anatomy)
 
 
 def select_tracks(tracks: Tracks, anatomy: SubjectAnatomy) -> Selection:
-    """Select the frames of a take that can train a model: measured without a prior, with a small covariance.
+    """Select the frames of a take that can train a model: those measured without a prior and with a small covariance.
 
     Raises:
-        FittingError: too few frames or no motion.
+        FittingError: there are too few frames, or there is no motion.
     """
     T = tracks.raw_T_upper_lower
     finite = np.all(np.isfinite(T), axis=(1, 2))
@@ -150,8 +151,8 @@ def select_poses(frames: ArrayLike, T_skull_mandible: ArrayLike, anatomy: Subjec
     """Select the poses (F, 4, 4) of frames (F,) that can train a model; poses with NaN count as lost.
 
     Raises:
-        ValueError: wrong shapes.
-        FittingError: too few frames, no motion, or a pose that is not rigid.
+        ValueError: an array has a wrong shape.
+        FittingError: there are too few frames, there is no motion, or a pose is not rigid.
     """
     T = np.asarray(T_skull_mandible, dtype=np.float64)
     frames = np.asarray(frames, dtype=np.int64)
@@ -201,7 +202,7 @@ def _exclude(used: Mask, mask: Mask, reason: str, frames: NDArray[np.int64], exc
 
 
 def _repeats(rows: NDArray[np.int64] | Array, used: Mask) -> Mask:
-    """Return which used rows repeat an earlier used row, shape (F,)."""
+    """Return a mask of the used rows that repeat an earlier used row, shape (F,)."""
     index = np.flatnonzero(used)
     repeats = np.zeros(len(rows), dtype=bool)
     if index.size:
@@ -220,7 +221,7 @@ def _check(frames: NDArray[np.int64], T: Array) -> None:
     if defect.max() > _RIGID:
         worst = int(defect.argmax())
         raise FittingError(
-            f"the pose of frame {frames[worst]} is not rigid (off by {defect[worst]:.2g}, allowed {_RIGID:g}).",
+            f"the pose of frame {frames[worst]} is not rigid (off by {defect[worst]:.2g}; at most {_RIGID:g} allowed).",
             hint="Poses must be 4x4 rotation and translation without scale or mirroring.",
         )
 
@@ -236,7 +237,7 @@ def _check_motion(data: TrainingData) -> None:
 
 
 def _mandible_sigma(T: Array, covariance: Array, anatomy: SubjectAnatomy) -> Array:
-    """Return the rms standard deviation of the mandible's points [mm], shape (F,).
+    """Return the rms standard deviation of the position of mandible points [mm], shape (F,).
 
     The covariance Sigma is that of the twist xi in T_true = exp(xi) T, skull frame, about the skull origin. A point y
     moves by omega x y + v, so its variance is the trace of J Sigma J^T with J = [-hat(y), I]; the result averages the
@@ -258,16 +259,16 @@ class FittedForm:
     """A fitted decoder: the result of every fitting method."""
 
     model: JawModelForm
-    kept: Mask  # training frames that were not trimmed as outliers, shape (N,)
-    notes: dict[str, object]  # JSON-serialisable facts about the fit, for the header
+    kept: Mask  # mask of the training frames that were not trimmed as outliers, shape (N,)
+    notes: dict[str, object]  # JSON-serialisable facts about the fit, for the header of the model file
 
 
 def screened(selection: Selection) -> Selection:
     """Return the selection without gross outliers: isolated tracking failures of centimetres.
 
     A spline would interpolate such poses. A quadratic map from the incisal displacement to the rotation is too stiff to
-    do so: fitted by random sample consensus (Fischler & Bolles 1981), it follows the majority, and the residual of an
-    outlier is its error.
+    do so: if it is fitted by random sample consensus (Fischler & Bolles 1981), it follows the majority of the poses,
+    and the residual of an outlier is its error.
     """
     outliers = gross_outliers(selection.data)
     if not outliers.any():
@@ -279,12 +280,12 @@ def screened(selection: Selection) -> Selection:
 
 
 def gross_outliers(data: TrainingData) -> Mask:
-    """Return which poses lie centimetres off the majority's quadratic map, shape (N,); none of under 60 poses."""
+    """Return a mask (N,) of poses centimetres off the majority's quadratic map; all false for less than 60 poses."""
     count = len(data)
     if count < _FEWEST:
         return np.zeros(count, dtype=bool)
     columns = _quadratic(data.displacement())
-    # |values|^2 is the mean squared displacement of the mandible by the rotation about the incisal point [mm^2].
+    # |values|^2 is the mean squared displacement of the mandible due to the rotation about the incisal point [mm^2].
     values = so3_log(data.motion[:, :3, :3]) @ np.linalg.cholesky(data.metric.about(data.incisor))
     rng = np.random.default_rng(0)
     agreeing, best = np.ones(count, dtype=bool), np.inf

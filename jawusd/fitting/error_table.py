@@ -1,4 +1,4 @@
-"""Error tables: distances of mandible and landmarks between model and captured poses, on training and held-out data."""
+"""Error tables: distances of mandible and landmarks between model and capture, on training and held-out data."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Refit = Callable[[TrainingData], FittedForm]
 #: Mean, median, p95, max [mm] and number of frames, by landmark or "mandible".
 ErrorTable = dict[str, dict[str, float]]
 
-_INSIDE_TWO_SD = 0.97  # more than 95 %, since other exercises are farther from training poses
-_SLOWEST_GROWTH = 0.01  # minimum growth of errors with distance [mm/mm], even if those of held-out frames do not grow
+_INSIDE_TWO_SD = 0.97  # fraction of errors below two sd; above 95 % because other exercises are farther away
+_SLOWEST_GROWTH = 0.01  # minimum growth of errors with distance [mm/mm], used even if held-out errors do not grow
 
 
 def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
     """Return the errors of every frame for the motions (N, 4, 4) of a model.
 
     Returns:
-        Distances [mm], shape (N,), by landmark; "mandible" is the distance of the farthest vertex.
+        Distances [mm], shape (N,), by landmark; "mandible" is the distance of the vertex that is farthest off.
     """
     errors = {"mandible": data.metric.largest(model, data.motion)}
     for name, point in zip(LANDMARKS, data.landmarks, strict=True):
@@ -50,7 +50,7 @@ def summarise(errors: dict[str, Array]) -> ErrorTable:
 
 
 def seen_errors(data: TrainingData, form: FittedForm) -> dict[str, ErrorTable]:
-    """Return the error tables "train", over the kept frames, and "trimmed", over the others if there are any."""
+    """Return the error tables "train", over the kept frames, and "trimmed", over the other frames if there are any."""
     tables = {"train": summarise(_errors(data.select(form.kept), form))}
     if not form.kept.all():
         tables["trimmed"] = summarise(_errors(data.select(~form.kept), form))
@@ -60,10 +60,10 @@ def seen_errors(data: TrainingData, form: FittedForm) -> dict[str, ErrorTable]:
 def unseen_errors(
     data: TrainingData, kept: Mask, folds: int, refit: Refit, notify: Callable[[int], None]
 ) -> tuple[ErrorTable, dict[str, dict[str, float]], Array]:
-    """Cross-validate: hold out contiguous parts of a take in turn, refit, and measure the error on them.
+    """Cross-validate: hold out contiguous parts of a take in turn, refit, and measure the error on the held-out parts.
 
     Args:
-        kept: frames whose errors count, shape (N,): those that the fit to all frames did not trim.
+        kept: frames whose errors count, shape (N,); these are the frames that the fit to all frames did not trim.
         notify: called with the index of each part before it is processed.
 
     Returns:
@@ -99,11 +99,11 @@ def _distance(model: JawModelForm, seen: TrainingData, unseen: TrainingData) -> 
 
 
 def _growth(distance: Array, errors: Array) -> dict[str, float]:
-    """Fit half the 97 % quantile of errors as an increasing linear function of distance (Koenker & Bassett 1978)."""
+    """Fit half the 97 % quantile of errors by an increasing linear function of distance (Koenker & Bassett 1978)."""
     count = len(errors)
     above, below = np.full(count, _INSIDE_TWO_SD), np.full(count, 1 - _INSIDE_TWO_SD)
     cost = np.concatenate([[0.0, 0.0], above, below])
-    # Sparse, since two dense identity matrices for a take of 20,000 frames would need 6 GB.
+    # The matrices are sparse, since two dense identity matrices for 20,000 frames would need 6 GB.
     one = eye_array(count, format="csc")
     equal = hstack([np.column_stack([np.ones(count), distance]), one, -one], format="csc")
     limits = [(0, None), (_SLOWEST_GROWTH, None)] + [(0, None)] * (2 * count)

@@ -1,4 +1,4 @@
-"""Mapping from the ARKit jaw weights of a face capture to one subject's jaw, learned from a simultaneous jaw take."""
+"""Learn a mapping from the ARKit jaw weights of a face capture to one subject's jaw, given a simultaneous jaw take."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.arkit import ArkitMapping, FaceCapture, moved_terms, shares_of
 from jawusd.geometry import transform_points
 
-_REST_SHARE = 0.1  # fraction of the frames that determine the neutral weights: those nearest to the closed bite
+_REST_SHARE = 0.1  # fraction of the frames, nearest to the closed bite, from which the neutral weights are determined
 _DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # candidate dead zones of each weight
 _ROUNDS = 2
 COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offset search: coarse step, fine step, fine steps to each side
 _BLOCKS = 5  # number of contiguous blocks in cross-validation
 _LEAST_SECONDS = 10.0
 _LEAST_REACH = 0.4  # minimum fraction of the subject's range that a take must reach in each direction
-_LEAST_FOLLOWING = 0.7  # minimum correlation of JawOpen with the opening; mismatched takes stay below it
+_LEAST_FOLLOWING = 0.7  # minimum correlation of JawOpen with the opening; takes of different motion stay below it
 _DIRECTIONS = ("opening", "movement to the left", "movement to the right", "movement forward")
 
 
 @dataclass(frozen=True)
 class ArkitFit:
-    """A mapping and its cross-validation error."""
+    """A learned mapping, and its cross-validation error."""
 
     mapping: ArkitMapping
     error_mm: float  # mean error of the incisal point on held-out parts
-    shares_error_mm: float  # the same error if weights are used as fixed fractions of the subject's ranges
-    offset_s: float  # jaw time minus face time, each counted from its first frame
+    shares_error_mm: float  # error if the weights are used as fixed fractions of the subject's ranges
+    offset_s: float  # jaw time minus face time, each counted from its own first frame
     frames: int  # number of jaw frames from which the mapping was learned
 
 
@@ -43,11 +43,12 @@ def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s
     Args:
         times_s: times of d [s] from an arbitrary start, shape (N,).
         d: jaw parameters [mm], NaN where unknown, shape (N, 3).
-        offset_s: added to the face's times, counted from its first row, to obtain the times of d; default: estimated
-            by correlating the weights with opening and laterotrusion.
+        offset_s: offset added to the times of the face capture, counted from its first row, to obtain the times of d;
+            default: estimated by correlating the weights with opening and laterotrusion.
 
     Raises:
-        FittingError: the takes overlap too little, some direction is not exercised, or fixed fractions are as accurate.
+        FittingError: the takes overlap too little, some direction is not exercised, or fixed fractions of the ranges
+            are as accurate as the mapping.
     """
     known = np.isfinite(d).all(axis=1)
     times_s, d = times_s[known], d[known]
@@ -70,7 +71,7 @@ def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s
         raise FittingError(
             f"the mapping learned from this take has an error of {error:.2f} mm on held-out parts; fixed "
             f"fractions of the ranges have {shares_error:.2f} mm. It would not be an improvement.",
-            hint="Check that both takes show the same performance; without a mapping, `animate --arkit` uses these.",
+            hint="Check that both takes show the same performance, or use `animate --arkit` without a mapping.",
         )
     return ArkitFit(mapping, error, shares_error, offset_s, len(d))
 
@@ -108,10 +109,10 @@ def columns_at(face_s: Array, weights: Array, times_s: Array) -> Array:
 
 
 def offsets_between(face_s: Array, times_s: Array) -> Array:
-    """Return the offsets [s] to be tried between the clocks of a face and a jaw, with half a take of overlap.
+    """Return the candidate offsets [s] between the clocks of a face capture and a jaw take that overlap by half a take.
 
     Raises:
-        FittingError: a take is too short.
+        FittingError: one of the takes is too short.
     """
     shorter = min(face_s[-1] - face_s[0], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
     if shorter < _LEAST_SECONDS:
@@ -122,9 +123,9 @@ def offsets_between(face_s: Array, times_s: Array) -> Array:
 
 
 def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
-    """Return the offset [s], with half a take of overlap, at which weights best correlate with opening and side.
+    """Return the offset [s] at which the weights best correlate with opening and laterotrusion.
 
-    The opening alone is ambiguous if the subject opens rhythmically.
+    The takes overlap by at least half a take. The opening alone would be ambiguous if the subject opens rhythmically.
     """
     tried = offsets_between(face_s, times_s)
     every = max(int(COARSE_S / np.median(np.diff(times_s))), 1)
@@ -136,8 +137,8 @@ def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> flo
     best = int(np.argmax(following.sum(axis=1)))
     if following[best, 0] < _LEAST_FOLLOWING:
         raise FittingError(
-            f"JawOpen does not correlate with the opening of the jaw at any clock offset (correlation "
-            f"{following[best, 0]:.2f} at best, {_LEAST_FOLLOWING:g} required).",
+            f"JawOpen does not correlate with the opening of the jaw at any clock offset; the best correlation is "
+            f"{following[best, 0]:.2f}, but at least {_LEAST_FOLLOWING:g} is required.",
             hint="Use a face capture and a jaw take of the same performance, or set their offset with --offset.",
         )
     return float(tried[best])
@@ -156,7 +157,7 @@ def refined_offset(offset_s: float, face_s: Array, weights: Array, times_s: Arra
     best = int(np.argmin(left))
     if not 0 < best < len(tried) - 1:
         return float(tried[best])
-    before, low, after = left[best - 1 : best + 2]  # vertex of the parabola through three values
+    before, low, after = left[best - 1 : best + 2]  # refine by the vertex of the parabola through three values
     bend = before - 2 * low + after
     return float(tried[best] + (0.5 * _FINE_S * (before - after) / bend if bend > 0 else 0.0))
 
@@ -169,7 +170,7 @@ def _correlation(a: Array, b: Array) -> float:
 
 
 def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
-    """Reject a take that is too short or does not contain motion in every direction."""
+    """Check that a take is long enough and contains motion in every direction."""
     step = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     if len(d) * step < _LEAST_SECONDS:
         raise FittingError(
@@ -191,7 +192,7 @@ def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
 
 
 def incisal_error(rig: JawRig, found: Array, d: Array) -> float:
-    """Return the mean distance [mm] of the incisal point between two sets of d (N, 3) [mm], inside the bound."""
+    """Return the mean distance [mm] of the incisal point between two sets of d (N, 3) [mm], clamped to the bound."""
     incisor = rig.landmarks[:1]
     positions = [transform_points(rig.pose(x), incisor) for x in (rig.project(found), d)]
     return float(np.linalg.norm(positions[0] - positions[1], axis=-1).mean())

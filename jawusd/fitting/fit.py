@@ -1,4 +1,4 @@
-"""Fit a jaw model to captured poses: selection, model, bounds, error tables, warnings."""
+"""Fit a jaw model to captured poses: select poses, fit model and bounds, compute error tables and warnings."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from jawusd.formats.model import JawModel
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-#: Called with the number of steps done and the total.
+#: Function that is called with the number of steps done and the total number of steps.
 Progress = Callable[[int, int], None]
 Method = Literal["anchored", "additive", "paper", "pca"]
 #: Fitter of one method; the mask (3,) selects the parameters that the data excite.
@@ -46,7 +46,7 @@ _MOST_CAPTURED = 2000  # maximum number of captured poses whose parameters a mod
 # Percentiles of the training and of the hold-out residuals. The larger value is the limit beyond which a measured pose
 # counts as off the model; 99.5 % of the take's own poses are within both this limit and the bound.
 _TRAINED_QUANTILE, _UNSEEN_QUANTILE = 99.8, 99.5
-_SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # otherwise, noise-free training poses would put all measured poses off the model
+_SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # minimum residual limit, for noise-free training poses
 _FEW_POSES = 100
 
 #: Fitters by method; `jawusd.paper.model.FORMS` adds the paper's own, which needs torch.
@@ -55,7 +55,7 @@ FORMS: Mapping[str, FormFitter] = {
     "additive": lambda data, shown, config: fit_additive(data, shown, config.trim_mad),
     "pca": lambda data, shown, config: fit_pca(data, shown),
 }
-_FASTEST_MM_S2 = 3e4  # maximum plausible acceleration, three times gravity; larger values are jumps of the poses
+_FASTEST_MM_S2 = 3e4  # maximum plausible acceleration, three times gravity; larger accelerations are jumps of the poses
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,13 @@ class FittingConfig:
 
     method: Method = "anchored"
     literal: bool = False  # for method "paper": whether to keep the paper's fixed grouping of components
-    # number of contiguous parts of the take held out in turn to measure the error on unseen poses; 0 to skip
+    # number of contiguous parts of the take that are held out in turn to measure the error on unseen poses; 0 to skip
     holdout_folds: int = 5
-    # frames whose residual exceeds the median by this many normalised median absolute deviations count as tracking
-    # failures and are discarded
+    # number of normalised median absolute deviations by which a frame's residual may exceed the median; frames beyond
+    # it count as tracking failures and are discarded
     trim_mad: float = 4.5
     alpha: float = 0.23  # maximum triangle circumradius in the paper's alpha shapes [range-normalised units]
-    starts: int = 4  # number of random initialisations of the networks of method "paper"; the best is kept
+    starts: int = 4  # number of random initialisations of the networks of method "paper"; the best result is kept
     seed: int = 0  # seed of the first initialisation
 
     def __post_init__(self) -> None:
@@ -87,7 +87,7 @@ class FittingConfig:
 def one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Limit BLAS (OpenBLAS, MKL or BLIS) to one thread while a function runs.
 
-    The matrices of a fit are too small to gain from threads, and threaded sums differ in their last digits, which moves
+    The matrices of a fit are too small to benefit from threads; threaded sums differ in the last digits, which changes
     a fit by micrometres. Apple's Accelerate has no such setting.
     """
 
@@ -115,21 +115,22 @@ def fit_model(
     """Fit a subject's jaw model.
 
     Args:
-        source: tracks, whose raw poses are used, or frame numbers and poses.
+        source: tracks, of which the raw poses are used, or frame numbers and poses.
         T_anatomical_skull: skull (scan) frame to anatomical frame, shape (4, 4).
         landmarks: `geometry.LANDMARKS` in mandible coordinates [mm], shape (5, 3).
         mandible_vertices: points whose motion is measured, mandible coordinates [mm], shape (V, 3); default: the
             landmarks.
         T_rest: T_skull_mandible of the closed bite, shape (4, 4); default: the scans are in occlusion.
-        forms: the fitter of each method.
+        forms: the fitter for each method.
 
     Returns:
-        The model. Its `d` and `residual_mm` are those of the raw poses; `meta` contains the error tables [mm], the
-        excluded and trimmed frames, warnings, and the parameters that the poses do not exercise.
+        The model. Its `d` and `residual_mm` are those of the raw poses; its `meta` contains the error tables [mm], the
+        excluded and trimmed frames, warnings, and the parameters that the poses do not excite.
 
     Raises:
-        FittingError: too few poses, no motion, poses that are not rigid, or parameters outside what a rig allows.
-        ValueError: arrays of wrong shapes.
+        FittingError: there are too few poses, there is no motion, poses are not rigid, or parameters exceed what a rig
+            allows.
+        ValueError: an array has a wrong shape.
     """
     anatomy = SubjectAnatomy.of(T_anatomical_skull, landmarks, mandible_vertices, T_rest)
     steps = config.holdout_folds + 2
@@ -188,11 +189,11 @@ def _errors(
     forms: Mapping[str, FormFitter],
     notify: Callable[[int], None],
 ) -> tuple[dict[str, ErrorTable], dict[str, dict[str, float]], Array]:
-    """Return the error tables of a fit by name, and the other results of `unseen_errors`, empty without hold-out."""
+    """Return the error tables of a fit by name, and the other results of `unseen_errors` (empty without hold-out)."""
     tables = seen_errors(data, form)
     if not config.holdout_folds:
         return tables, {}, np.zeros(0)
-    # In the folds, method "paper" trains one network only, with the seed of the best network of the full fit.
+    # In the folds, method "paper" trains only one network, with the seed of the best network in the full fit.
     seed = form.notes.get("seed")
     again = replace(config, starts=1, seed=seed if isinstance(seed, int) else config.seed)
     tables["holdout"], uncertainty, rms_mm = unseen_errors(

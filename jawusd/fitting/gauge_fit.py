@@ -1,8 +1,9 @@
 """The semantic gauge: a choice of d1, d2, d3 for which moving each slider alone stays anatomical.
 
 d1 follows the habitual opening path, the most frequent position of the incisal point at each opening. A plain lateral
-slide at closed teeth moves the incisal point forward (gothic arch) and down (tooth guidance). Path, arch and guidance
-are learned from the captured poses and stored in the gauge; the regression of the poses does not depend on them.
+slide at closed teeth moves the incisal point forward (gothic arch) and down (tooth guidance). Habitual path, gothic
+arch and tooth guidance are learned from the captured poses and stored in the gauge; the regression of the poses does
+not depend on them.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ SOFTNESS_MM = 2.0  # radius of the fillet at the apex of the gothic arch, d2 = 0
 FADE_MM = 14.0  # opening at which tooth guidance has decreased to 1/e
 
 _PATH_DEGREE, _PATH_ITERATIONS, _PATH_RIDGE = 5, 40, 1e-5
-_SMALLEST_SPREAD_MM = 0.3  # lower limit of the scale of the path's residuals
-#: Minimum range of openings (1st to 99th percentile) for fitting a path; in a smaller range, closed teeth glide [mm].
+_SMALLEST_SPREAD_MM = 0.3  # minimum scale s of the residuals of the habitual path
+#: Minimum range of openings (1st to 99th percentile) for fitting a path [mm]; in a smaller range, closed teeth glide.
 SMALLEST_OPENING_MM = 5.0
 
 _ROUNDS = 3
@@ -27,13 +28,13 @@ _ITERATIONS = 60
 _RESIDUAL_FLOOR_MM = 0.08  # minimum residual in the reweighting of the quantile regressions, which keeps weights finite
 _ARCH_QUANTILE, _ARCH_RIDGE, _ARCH_MIN_SIDE_MM = 0.5, 1e-3, 1.0
 _DROP_QUANTILE, _DROP_RIDGE, _DROP_MAX_OPENING_MM = 0.1, 3e-2, 1.2 * FADE_MM
-_UNKNOWN = 1e6  # additional ridge penalty of terms without data
+_UNKNOWN = 1e6  # additional ridge penalty on terms without data
 _FEWEST_FRAMES = 20
 
 #: Minimum principal minor of the Jacobian of an invertible gauge; it is 1 for an undistorted gauge.
 SMALLEST_MINOR = 0.25
 _STIFFNESSES = 4.0 ** np.arange(8)
-_WIDER_MM = 3.0  # margin of the checked box around the captured poses, as large as the largest margin of a bound
+_WIDER_MM = 3.0  # margin around the captured poses of the box that is checked, equal to the largest margin of a bound
 _GRID = 33
 
 
@@ -48,16 +49,16 @@ class GaugeFit:
 
 
 def path_gauge(coefficients: Array, scale_mm: float, limits: tuple[float, float]) -> Gauge:
-    """Return a gauge with a habitual path and no glide surface; arguments as in `Gauge`."""
+    """Return a gauge with a habitual path but no glide surface; arguments as in `Gauge`."""
     return Gauge(coefficients, scale_mm, limits, np.zeros(7), np.zeros(4), SOFTNESS_MM, FADE_MM)
 
 
 def fit_path(u: Array, weights: Array) -> Gauge:
     """Fit x and z of the incisal displacement u (N, 3) [mm] as polynomials of the opening through the origin.
 
-    Iteratively reweighted least squares with the weight (1 + (r/s)^2)^-2, which follows the most frequent path
-    instead of the mean of all exercises; s is 1.4826 times the median absolute residual. Without opening in the data
-    the path is a straight line down.
+    Iteratively reweighted least squares with the weight (1 + (r/s)^2)^-2, which follows the most frequent path instead
+    of the mean of all exercises; s is 1.4826 times the median absolute residual. Without opening in the data, the path
+    is a straight line downwards.
 
     Returns:
         The gauge of the path alone.
@@ -84,7 +85,7 @@ def _robust_fit(basis: Array, values: Array, weights: Array) -> Array:
 
 
 def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
-    """Fit arch and glide surface to incisal displacements u (N, 3) [mm], stiffening them until the gauge is invertible.
+    """Fit gothic arch and glide surface to incisal displacements u (N, 3) [mm], stiffer until the gauge is invertible.
 
     Args:
         path: the gauge of the habitual path alone.
@@ -124,7 +125,7 @@ def smallest_minor(gauge: Gauge, box: Array) -> float:
 
 
 def _fit(u: Array, weights: Array, gauge: Gauge, shown: Mask, stiffness: float) -> Gauge:
-    """Alternate between inverting the gauge for d and fitting arch and drop to these d."""
+    """Alternate between inverting the gauge for d and fitting the gothic arch and the drop to d."""
     for _ in range(_ROUNDS):
         gauge = _with_arch(gauge, u, weights, shown, stiffness)
         gauge = _with_drop(gauge, u, weights, shown, stiffness)

@@ -1,8 +1,9 @@
 """Align d1 = 0 with tooth contact: measure the glide surface of a gauge on the scans, and adapt the bounds.
 
 The gauge fitted to captured poses approximates the glide surface by a smooth bowl. The true surface is rough: this
-module measures the opening at which the scans touch over a grid of d2 and d3, and builds an upper envelope of it with
-limited slopes, so that the gauge stays invertible. The poses of the model do not change, only their parameters.
+module measures, on a grid of d2 and d3, the opening at which the scans touch. It then builds an upper envelope of these
+openings with limited slopes, so that the gauge remains invertible. The poses of the model do not change, only their
+parameters.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from jawusd.geometry.se3 import make_transform
 from jawusd.meshes.contact import Teeth
 
 _STEP_MM = 0.5  # knot spacing; cusps and fossae are a few times wider
-_BEYOND_MM = 1.5  # contact is measured this far beyond the captured parameters
+_BEYOND_MM = 1.5  # distance beyond the captured parameters up to which contact is measured
 _HIGHEST_MM, _LOWEST_MM = 5.0, -2.5  # range of drops within which contact is searched
-_HALVINGS = 4  # number of bisections of the search step, down to 0.03 mm
+_HALVINGS = 4  # number of bisections of the search step, which reduce it to 0.03 mm
 _SMOOTHING = 0.7  # standard deviation of the Gaussian filter, in knots
 _RAISES = 3  # number of iterations that restore the height lost in smoothing
 _REST_MM = 2.0  # radius around the closed bite, the bottom of the fossae, within which the surface is blended to 0
@@ -38,7 +39,7 @@ _GAUGE_ROOM_MM = 3.0  # margin around the captured parameters within which the g
 
 
 def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
-    """Return an anchored model whose d1 is measured from tooth contact, with bounds that end there.
+    """Return an anchored model whose d1 is measured from tooth contact, with bounds that end at contact.
 
     Returns:
         The unchanged model if it has no gauge, or if the gauge would not be invertible with any surface.
@@ -92,13 +93,13 @@ def _carried(old: Gauge, new: Gauge, d: Array) -> Array:
 
 
 def _axis(values: Array) -> Array:
-    """Return knots [mm] that cover the captured values and contain 0."""
+    """Return knots [mm] that cover the captured values and include 0."""
     low, high = min(values.min(), 0.0) - _BEYOND_MM, max(values.max(), 0.0) + _BEYOND_MM
     return _STEP_MM * np.arange(np.floor(low / _STEP_MM), np.ceil(high / _STEP_MM) + 1)
 
 
 def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captured: Array) -> Array:
-    """Return the drop of the incisal point at which the teeth just touch [mm], shape (n2, n3)."""
+    """Return the drop of the incisal point at which the teeth just touch [mm], on a grid (n2, n3)."""
     side, front = (x.ravel() for x in np.meshgrid(d2, d3, indexing="ij"))
     wanted = _near(np.stack([side, front], axis=1), captured[:, 1:])
     ahead = front + form.gauge.arch(np.zeros_like(side), side)[0]
@@ -125,7 +126,7 @@ def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captu
 
 
 def _near(points: Array, captured: Array) -> Mask:
-    """Return which points (n, 2) are within about `_BEYOND_MM` of a captured one (m, 2) or of 0, by grid cells."""
+    """Return which points (n, 2) are within about `_BEYOND_MM` of a captured point (m, 2) or of 0, by grid cells."""
     reach = int(np.ceil(_BEYOND_MM / _STEP_MM)) + 1
     cells = {(int(a), int(b)) for a, b in np.round(np.vstack([captured, [[0.0, 0.0]]]) / _STEP_MM)}
     around = [(a, b) for a in range(-reach, reach + 1) for b in range(-reach, reach + 1)]
@@ -134,7 +135,7 @@ def _near(points: Array, captured: Array) -> Mask:
 
 
 def _hull(d2: Array, d3: Array, down: Array, slopes: tuple[float, float]) -> Array:
-    """Return a smooth surface (n2, n3) [mm] on or above the contact, with limited slopes; 0 at the closed bite."""
+    """Return a smooth surface (n2, n3) [mm] on or above contact, with limited slopes; 0 at the closed bite."""
     limited = _dilated(down, slopes)
     surface = gaussian_filter(limited, _SMOOTHING, mode="nearest")
     for _ in range(_RAISES):
@@ -146,7 +147,7 @@ def _hull(d2: Array, d3: Array, down: Array, slopes: tuple[float, float]) -> Arr
 
 
 def _dilated(surface: Array, slopes: tuple[float, float]) -> Array:
-    """Return the lowest surface on or above a given one (n2, n3) [mm] with limited slopes [mm/mm] along both axes."""
+    """Return the lowest surface on or above a surface (n2, n3) [mm] with limited slopes [mm/mm] along both axes."""
     out = surface
     for axis, slope in enumerate(slopes):
         n = surface.shape[axis]

@@ -1,7 +1,8 @@
 """Distances between jaw poses, in mm on the mandible.
 
-Two rigid motions differ at a point x by (R_a - R_b) x + (t_a - t_b), which is affine in x. Its mean square over a set
-of points therefore needs only their mean and covariance, and its maximum is reached at a vertex of their convex hull.
+Two rigid motions differ at a point x by (R_a - R_b) x + (t_a - t_b), which is affine in x. The mean square over a set
+of points therefore depends only on their mean and covariance, and the maximum is reached at a vertex of their convex
+hull.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ _EVERY = 32  # stride through the hull vertices in `largest_at_least`
 
 @dataclass(frozen=True)
 class MandibleMetric:
-    """Pose differences measured by the displacement of a set of mandible points."""
+    """Metric of pose differences: the displacement of a set of mandible points."""
 
-    # four homogeneous columns equivalent to the points, the mean last (see `evaluator.encoding`), shape (4, 4)
+    # four homogeneous columns equivalent to the points, with the mean last (see `evaluator.encoding`), shape (4, 4)
     vectors: Array
-    extremes: Array  # vertices of the points' convex hull [mm], shape (H, 3)
+    extremes: Array  # vertices of the convex hull of the points [mm], shape (H, 3)
 
     @classmethod
     def of_points(cls, points: Array) -> MandibleMetric:
@@ -60,7 +61,7 @@ class MandibleMetric:
 
         Args:
             incisor: incisal point at rest [mm], shape (3,).
-            at: its fixed positions [mm], shape (N, 3).
+            at: fixed positions of the incisal point [mm], shape (N, 3).
         """
         R, t = _parts(target)
         mean, root = self.vectors[:3, 3], self.vectors[:3, :3]
@@ -85,7 +86,7 @@ class MandibleMetric:
 
 
 def _farthest(difference: Array, points: Array) -> Array:
-    """Return the largest distance [mm] (N,) between images of points (H, 3), for differences of motions (N, 4, 4)."""
+    """Return the largest displacement [mm] (N,) of points (H, 3), given differences of motions (N, 4, 4)."""
     found = np.empty(len(difference))
     for first in range(0, len(found), _TOGETHER):
         D = difference[first : first + _TOGETHER]

@@ -1,7 +1,7 @@
 """Learn one subject's jaw from facial skin, on frames with visible teeth.
 
-As in Zoss et al. 2019 ("Accurate Markerless Jaw Tracking for Facial Performance Capture"), the jaw is regressed
-on the skin in frames in which it is known. Here, a Gaussian process predicts the three parameters of the rig, with
+As in Zoss et al. 2019 ("Accurate Markerless Jaw Tracking for Facial Performance Capture"), the jaw pose is regressed on
+the skin in frames in which it is known. Here, a Gaussian process predicts the three parameters of the rig, with
 covariances.
 """
 
@@ -24,22 +24,23 @@ from jawusd.fitting.face import COARSE_S, columns_at, incisal_error, offsets_bet
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_points
 
-#: Default root mean square shift [mm] and rotation [rad] of the head that remain in later frames, in addition to
-#: those in the training frames.
+#: Default root mean square shift [mm] and rotation [rad] of the head that remain in later frames after stabilisation,
+#: in addition to those in the training frames.
 HEAD_ERROR = (0.3, 0.0026)
-_LEAST_FRAMES, _FRAMES = 60, 300  # minimum number of seen frames, and maximum number of training frames
+_LEAST_FRAMES, _FRAMES = 60, 300  # minimum number of frames with visible teeth, and maximum number of training frames
 _BLOCKS = 6  # number of contiguous blocks that are held out in turn
-_COMPONENTS, _SMOOTH, _INSIDE = 120, 14, 30  # components: all, smooth part, test of familiarity
-_LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames; 12 subjects have 1.4
-_START = (2.0, 3.0, 0.3, 0.001)  # initial length, smooth, linear and noise; typical of the result
+_COMPONENTS, _SMOOTH, _INSIDE = 120, 14, 30  # numbers of components: all, smooth part, familiarity test
+_LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames; 12 subjects have 1.4 mm
+_START = (2.0, 3.0, 0.3, 0.001)  # initial kernel: length, smooth part, linear part, noise; typical of the result
 _LOW, _HIGH = np.log([0.2, 0.01, 0.001, 1e-5]), np.log([20.0, 100.0, 100.0, 3.0])
 _STEPS, _MOST_TRIALS = np.log([3.0, 1.7]), 80
 _FALSE_ALARMS = 0.01  # fraction of held-out frames that are flagged as unfamiliar
-_TINY = 1e-9  # minimum limit of the squared distance, for faces of one column
+_TINY = 1e-9  # minimum limit of the squared distance, needed for faces with a single column
 _CHIN_POINTS = 3
-# Maximum error relative to each guess: at most 0.4 for 12 subjects; 1.0 and more for faces of other frames.
+# Maximum error relative to that of each guess; 12 subjects have at most 0.4, faces that belong to other frames at least
+# 1.0.
 _MOST_SHARE = 0.65
-_CLOCK_COMPONENTS = 12  # number of components from which the offset of the face's clock is estimated
+_CLOCK_COMPONENTS = 12  # number of components from which the clock offset of the face is estimated
 _LEAST_EXPLAINED = 0.5  # minimum fraction of the variance of opening and laterotrusion explained by them
 _NAMES = ("opening", "laterotrusion", "protrusion")
 
@@ -54,30 +55,31 @@ def fit_skin(
     head_error: tuple[float, float] = HEAD_ERROR,
     names: Sequence[str] = (),
 ) -> Skin:
-    """Learn d from facial skin.
+    """Learn the jaw parameters d from facial skin.
 
-    The take must contain exercises and speech with the teeth visible, every expression that occurs later, and some
-    seconds of closed lips with the teeth in occlusion, where d is 0.
+    The take must contain exercises and speech with visible teeth, every expression that occurs later, and some seconds
+    with closed lips and the teeth in occlusion, where d is 0.
 
     Args:
         rig: The subject's rig.
         X: Columns in one unit, such as blendshape weights, shape (F, K); or points on the skin [mm], shape (F, N, 3),
-            in any frame fixed to the head. Frames with a NaN are left out.
+            in any frame fixed to the head. Frames with a NaN are ignored.
         d: Jaw parameters [mm], shape (F, 3).
         seen: Frames in which d was measured, shape (F,).
         sigma_d: Standard deviation of d [mm], shape (), (3,) or (F, 3).
         head_error: For points, the additional error of head stabilisation in later frames, compared with the training
-            frames: root mean square shift [mm] and rotation about the points' centre [rad]. The covariances include it.
+            frames: root mean square shift [mm] and rotation about the points' centre [rad]. The predicted covariances
+                include this error.
         names: Names of the columns or points, stored in the file.
 
     Returns:
-        The map; its meta has the mean held-out errors at the incisal point, "errors_mm": of "skin", and of the guesses
-        "carried" (the last d before a held-out block), "mean" (of all d), and for points "chin" (inverse kinematics of
-        three points taken as rigid with the bone).
+        The map. In its meta, "errors_mm" contains the mean held-out errors at the incisal point: that of the map
+        ("skin") and those of simple guesses, "carried" (the last d before a held-out block), "mean" (the mean of all d)
+        and, for points, "chin" (inverse kinematics of three points assumed to be rigid with the bone).
 
     Raises:
         ValueError: wrong shapes.
-        FittingError: too few frames, too little motion, or an error above 65 % of a guess's error.
+        FittingError: there are too few frames or too little motion, or the error exceeds 65 % of the error of a guess.
     """
     X, d = np.asarray(X, dtype=np.float64), np.asarray(d, dtype=np.float64)
     points = X.ndim == 3
@@ -113,7 +115,7 @@ def fit_skin(
 
 
 def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
-    """Return the offset [s] between a face and a jaw at which the face best explains opening and laterotrusion.
+    """Return the clock offset [s] of a face and a jaw at which the face best explains opening and laterotrusion.
 
     Args:
         face_s: times of the face [s], shape (F,).
@@ -122,10 +124,10 @@ def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
         d: jaw parameters [mm], all known, shape (N, 3).
 
     Returns:
-        What must be added to the face's times.
+        Offset to be added to the times of the face.
 
     Raises:
-        FittingError: the takes are too short, or do not fit at any offset.
+        FittingError: the takes are too short, or do not match at any offset.
     """
     known = X[np.isfinite(X).all(axis=1)]
     if not len(known):
@@ -205,9 +207,9 @@ def _check_errors(errors: dict[str, float]) -> None:
 
 
 def _process(flat: Array, d: Array, sigma: Array, blocks: list[Indices]) -> tuple[dict[str, Array], Array, Array]:
-    """Return the arrays of the process, and predictions (M, 3) and variances (M,) of held-out blocks.
+    """Return the arrays of the Gaussian process, and predictions (M, 3) and variances (M,) for held-out blocks.
 
-    The kernel maximises the likelihood of held-out blocks, by a coordinate search on its logarithms.
+    The kernel maximises the likelihood of held-out blocks; a coordinate search varies the logarithms of its parameters.
     """
     mean = flat.mean(axis=0)
     basis = np.linalg.svd(flat - mean, full_matrices=False)[2][:_COMPONENTS]
@@ -257,12 +259,12 @@ def _process(flat: Array, d: Array, sigma: Array, blocks: list[Indices]) -> tupl
 
 
 def _inside(flat: Array) -> int:
-    """Return the number of components in the test of familiarity: at most half of the available ones."""
+    """Return the number of components in the familiarity test: at most half of the available components."""
     return max(min(_INSIDE, min(flat.shape) // 2), 1)
 
 
 def _outside(flat: Array, blocks: list[Indices], scale: float) -> Array:
-    """Return squared distances of held-out frames from the components of the other frames, over scale, shape (M,)."""
+    """Return squared distances of held-out frames from the subspace of the others, relative to scale, shape (M,)."""
     found = np.empty(len(flat))
     for b in blocks:
         others = np.delete(flat, b, axis=0)
@@ -273,7 +275,7 @@ def _outside(flat: Array, blocks: list[Indices], scale: float) -> Array:
 
 
 def _head_motions(points: Array, head_error: tuple[float, float], arrays: dict[str, Array]) -> Array:
-    """Return how features change by one sigma of shift and rotation per axis of mean points (N, 3), shape (6, C)."""
+    """Return how features change if mean points (N, 3) shift or rotate by one sigma per axis, shape (6, C)."""
     arms = points - points.mean(axis=0)
     shifts = np.repeat(np.eye(3)[:, None], len(points), axis=1) * head_error[0]
     turns = np.cross(np.eye(3)[:, None], arms) * head_error[1]
@@ -282,7 +284,7 @@ def _head_motions(points: Array, head_error: tuple[float, float], arrays: dict[s
 
 
 def _carried(d: Array, blocks: list[Indices]) -> Array:
-    """Return d of the last frame before each block, shape (M, 3); for the first block, of the first frame after it."""
+    """Return d of the last frame before each block, shape (M, 3); before the first block, of the frame after it."""
     held = [d[b[0] - 1] if b[0] else d[b[-1] + 1] for b in blocks]
     return np.concatenate([np.repeat(each[None], len(b), axis=0) for each, b in zip(held, blocks, strict=True)])
 
@@ -306,7 +308,8 @@ def _on_bone(rig: JawRig, X: Array, poses: Array) -> tuple[Array, Array, Indices
     """
     swing = transform_points(poses, rig.landmarks[:1])[:, 0]
     moved = X.mean(axis=1)
-    # The skin follows the incisal point: the rotation between the two clouds (Kabsch 1976) starts the search.
+    # The skin follows the incisal point, so the search starts from the rotation between the two point clouds (Kabsch
+    # 1976).
     U, _, Vt = np.linalg.svd((swing - swing.mean(axis=0)).T @ (moved - moved.mean(axis=0)))
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     start = make_transform(R, rig.landmarks[0] - R @ X.mean(axis=(0, 1)))

@@ -1,4 +1,4 @@
-"""Smoothing polyharmonic splines (r^3 kernels on spread-out centres plus a linear tail) and their regression.
+"""Smoothing polyharmonic splines (r^3 kernels on spread-out centres, plus a linear tail), and regression with them.
 
 s(q) = sum_i w_i |q - c_i|^3 + L q - (the same at q = 0), with sum_i w_i = 0 and sum_i w_i c_i = 0, so that w^T K w is
 the bending energy of s (Duchon 1977; Wahba, Spline Models for Observational Data, 1990, section 2.4).
@@ -15,18 +15,18 @@ from jawusd.base.arrays import Array, Indices, Mask
 
 _RANK = 1e-9  # relative threshold below which singular values count as zero
 _TIE_DIGITS = 9
-_SAME_CENTRE = 1e-6  # points closer than this normalised distance count as one centre
+_SAME_CENTRE = 1e-6  # normalised distance below which two points count as one centre
 
 
 def farthest_points(points: Array, count: int) -> Array:
     """Return `count` of the points (N, D) by farthest-point sampling (Gonzalez 1985).
 
-    The first is the one nearest to the origin; fewer are returned if points repeat.
+    The first point is the one nearest to the origin. Fewer points are returned if points repeat.
     """
     chosen = [int(np.argmin((points**2).sum(1)))]
     distance = ((points - points[chosen[0]]) ** 2).sum(1)
     while len(chosen) < min(count, len(points)):
-        # Rounding makes ties, which occur on grids, break the same way in every coordinate frame.
+        # Round, so that ties, which occur on grids, break the same way in every coordinate frame.
         farthest = int(np.argmax(np.round(distance, _TIE_DIGITS)))
         if distance[farthest] < _SAME_CENTRE**2:
             break
@@ -37,11 +37,11 @@ def farthest_points(points: Array, count: int) -> Array:
 
 @dataclass(frozen=True)
 class SplineBasis:
-    """Regression basis on normalised points whose bending energy is a quadratic form."""
+    """Regression basis on normalised points, with the bending energy as a quadratic form."""
 
     centres: Array  # spline centres, shape (m, 3)
-    null_space: Array  # maps free coefficients to kernel weights that meet the side conditions, shape (m, k)
-    energy: Array  # bending energy of the free coefficients, zero rows for the linear tail, shape (k + 3, k + 3)
+    null_space: Array  # maps free coefficients to kernel weights that satisfy the side conditions, shape (m, k)
+    energy: Array  # bending energy of the free coefficients, with zeros for the linear tail, shape (k + 3, k + 3)
     at_zero: Array  # kernel values at q = 0, shape (m,)
 
     @classmethod
@@ -67,7 +67,7 @@ class SplineBasis:
 
 
 def ridge_solve(normal: Array, right: Array, penalty: Array) -> Array:
-    """Solve (normal + penalty) x = right for symmetric positive definite sums."""
+    """Solve (normal + penalty) x = right, where the sum of the matrices is symmetric positive definite."""
     return cho_solve(cho_factor(normal + penalty, lower=True), right)
 
 
@@ -95,7 +95,7 @@ def choose_smoothing(
         tail: constant part of the penalty, shape (k, k).
         grid: smoothing factors to try, ascending.
         folds: fold number of each frame, shape (N,): contiguous blocks, since neighbouring frames are nearly equal;
-            rows with a negative number are never held out.
+            rows with a negative fold number are never held out.
         cap: cap on the error of a row [mm], so that outliers do not determine the smoothness.
     """
     weighted = columns * weights[:, None]
