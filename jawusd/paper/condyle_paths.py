@@ -1,4 +1,4 @@
-"""Paper Fig. 5: the paths of the condyles as the jaw opens, for the first principal component and for the models."""
+"""Paper Fig. 5: paths of the condyles as the jaw opens, for the first principal component and for the models."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ EXPERIMENT = "condyle path"
 PRINCIPAL = "principal component 1"
 
 _STEPS = 121
-_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # fractions of the path at which the condyle's outline is drawn
+_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # fractions of a path at which the outline of the condyle is drawn
 _AROUND_MM = 24.0  # radius around the condyle's centre within which bone is drawn
 _NEAR_CLOSED_MM = 5.0
 _HABITUAL_MM = 1.5  # maximum |d2| and |d3| of captured poses that count as plain opening
-_BESIDE_MM = 0.75  # maximum difference in z of captured condyles that limit the height of a condyle
+_BESIDE_MM = 0.75  # maximum difference in z of the captured condyles that limit the height of a path point
 _FEWEST_BESIDE = 3
 
 
@@ -33,7 +33,7 @@ def condyle_paths(
     """Sweep the first principal component, then the opening d1 of each model up to `widest_mm`.
 
     Args:
-        mandible: mesh for outlines of the condyle, mandible frame; None draws none.
+        mandible: mesh for outlines of the condyle, mandible frame; with None, no outlines are drawn.
     """
     sweeps = {PRINCIPAL: principal_opening(data)}
     d = np.zeros((_STEPS, 3))
@@ -44,7 +44,7 @@ def condyle_paths(
 
 
 def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], captured: Array) -> tuple[ParameterPath, ...]:
-    """Sweep each parameter of each model alone, from the closed bite over its captured range.
+    """Sweep each parameter of each model alone, from the closed bite over the parameter's captured range.
 
     Args:
         captured: parameters of the captured poses in the default model [mm], shape (N, 3).
@@ -66,8 +66,8 @@ def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], capture
 def principal_opening(data: TrainingData) -> Array:
     """Return the motions log M = w p1 for w between the captured extremes, shape (K, 4, 4), from closed to open.
 
-    p1 is the first principal component of the captured twists under the mandible metric. It is not centred, so that the
-    sweep passes through the closed bite like those of the models (w1 p1 in the paper).
+    p1 is the first principal component of the captured twists under the mandible metric. The twists are not centred, so
+    that the sweep (w1 p1 in the paper) passes through the closed bite like those of the models.
     """
     root = data.metric.twist_root()
     points = se3_log(data.motion) @ root * np.sqrt(data.weights)[:, None]
@@ -105,7 +105,8 @@ def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
         return np.empty((0, 2, 2))
     height = cut[:, :, 0] - centre[0]
     above = height > 0
-    # One of the three corners is alone on its side of the plane; the cut connects points on that corner's two edges.
+    # One of the three corners of a face is alone on its side of the plane; the cut connects points on this corner's
+    # edges.
     alone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
     rows = np.arange(len(cut))
     ends = []
@@ -125,8 +126,8 @@ def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[
         d: parameters of the captured poses in the default model [mm], shape (N, 3).
 
     Returns:
-        For each path, the distances of its points from the nearest captured condyle of plain opening, and their heights
-        above the highest nearby captured condyle, which are anatomically impossible if positive.
+        For each path, the distances of its points from the nearest captured condyle centre during plain opening, and
+        their heights above the highest captured condyle centre nearby; positive heights are anatomically impossible.
     """
     habitual = captured[:, np.all(np.abs(d[:, 1:]) < _HABITUAL_MM, axis=1)]
     found = []
@@ -140,10 +141,10 @@ def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[
 
 
 def _above(path: Array, captured: Array) -> Array:
-    """Return how far path points (K, 3) lie above the highest captured point with nearly the same z [mm].
+    """Return the heights of path points (K, 3) above the highest captured point with nearly the same z [mm].
 
-    The result is 0 for path points that lie lower. Path points with few captured points (N, 3) near their z are left
-    out.
+    The height is 0 for path points that lie lower. Path points with few captured points (N, 3) near their z are
+    omitted.
     """
     beside = np.abs(path[:, None, 2] - captured[None, :, 2]) < _BESIDE_MM
     highest = np.where(beside, captured[None, :, 1], -np.inf).max(1)

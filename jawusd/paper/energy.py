@@ -1,4 +1,4 @@
-"""The energy of the paper, eqs. 6 to 9: the number of pixels in which a projected scan and its masks disagree."""
+"""The paper's energy, eqs. 6 to 9: the number of pixels in which a projected scan and the masks disagree."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from jawusd.meshes.meshio import winding
 from jawusd.meshes.raster import Bits, Singles, count_and_not, draw_silhouette, pack_bits, project
 from jawusd.tracking.contour.views import View
 
-_MARGIN_PX = 48  # margin of the screen buffer around the initial scan: 7 mm, more than any search moves it
-_FARTHEST_PX = 1024  # maximum extent of the buffer beyond the masks
+_MARGIN_PX = 48  # margin of the screen buffer around the initial scan; 7 mm, more than any search moves it
+_FARTHEST_PX = 1024  # maximum extent of the screen buffer beyond the masks
 
 _MATRICES = types.Array(types.float32, 3, "C", readonly=True)
 _SCREENS = types.Array(types.uint64, 3, "C", readonly=True)
@@ -31,7 +31,7 @@ _COUNTS = types.Array(types.int64, 2, "C")
 
 
 class PixelCounter(Protocol):
-    """Renderer of a scan that counts pixels: `RasterCounter` or `paper.gl.GlCounter`."""
+    """Protocol of renderers that count the pixels of a scan: `RasterCounter` and `paper.gl.GlCounter`."""
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
         """Set the masks of one frame: matrices (C, 3, 4), masks and free (C, h, w)."""
@@ -42,7 +42,7 @@ class PixelCounter(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PaperScan:
-    """Regions of a teeth scan as drawn in the paper (fig. 8)."""
+    """Regions of a teeth scan, coloured as in the paper (fig. 8)."""
 
     vertices: Array  # scan coordinates [mm], shape (V, 3)
     plain_faces: NDArray[np.int32]  # red: parts of teeth that only have to cover the mask, shape (F, 3)
@@ -89,11 +89,11 @@ def _is_consistent(mesh: Mesh) -> bool:
 
 
 class PaperEnergy:
-    """Energy of the pose of one arch.
+    """Energy of poses of one arch.
 
-    Every view is rendered into its own screen buffer around the teeth, undistorted and at the working resolution. There
-    is no depth buffer: a pixel is red or green if any triangle of that colour covers its centre. With back-face
-    culling, the counts differ by about ten pixels from those with a depth buffer.
+    Every view is rendered into a separate screen buffer around the teeth, undistorted and at the working resolution.
+    There is no depth buffer; a pixel counts as red or green if any triangle of this colour covers its centre. With
+    back-face culling, the counts differ by about ten pixels from counts with a depth buffer.
     """
 
     def __init__(self, counter: PixelCounter, scan: PaperScan, boundary_weight: float) -> None:
@@ -131,7 +131,7 @@ class PaperEnergy:
         self._counter.show(matrices, masks, free)
 
     def _box(self, view: View, start: Array) -> NDArray[np.int64]:
-        """Return x0, y0, x1, y1 [px] around a view's masks and the initial scan; x0 and y0 are at most 0."""
+        """Return the box x0, y0, x1, y1 [px] around a view's masks and the initial scan; x0 and y0 are at most 0."""
         vertices = self._scan.vertices[np.unique(self._scan.boundary_faces)]
         h = transform_points(start, vertices) @ view.matrix[:, :3].T + view.matrix[:, 3]
         seen = h[:, :2] / h[:, 2:]
@@ -170,7 +170,7 @@ def _count(
     width: int,
     counts: NDArray[np.int64],
 ) -> None:
-    """Write the counts (T, 2) of renderings first .. first + T; renderings are numbered pose by pose, then by view."""
+    """Write the counts (T, 2) of the T renderings from number `first`; numbers run pose by pose, then by view."""
     points = np.empty((vertices.shape[0], 3), np.float32)
     bits = np.empty((masks.shape[1], masks.shape[2]), np.uint64)
     for t in range(counts.shape[0]):
@@ -184,7 +184,7 @@ def _count(
 
 
 class RasterCounter:
-    """CPU pixel counter based on the bit-row rasteriser; use as a context manager, or close it."""
+    """CPU pixel counter based on the bit-row rasteriser; use it as a context manager, or close it."""
 
     def __init__(
         self,
@@ -203,7 +203,7 @@ class RasterCounter:
             boundary_faces: the boundary of interest (green), shape (B, 3).
             cull: whether to cull back faces, which halves the time; all faces must be counter-clockwise seen from
                 outside.
-            threads: number of worker threads; the counts do not depend on it.
+            threads: number of worker threads; the counts do not depend on this number.
         """
         used, index = np.unique(np.concatenate([plain_faces, boundary_faces]), return_inverse=True)
         faces = np.ascontiguousarray(index.reshape(-1, 3), np.int32)
@@ -218,8 +218,8 @@ class RasterCounter:
         Args:
             matrices: world [mm] to homogeneous px, per view, shape (C, 3, 4).
             masks: the segmented teeth, shape (C, h, w).
-            free: where boundary pixels are not counted: the masks, and anything else that may hide the boundary;
-                shape (C, h, w).
+            free: pixels where the boundary is not counted, shape (C, h, w): the masks, and anything else that may hide
+                the boundary.
 
         Raises:
             ValueError: the shapes do not agree.
@@ -264,10 +264,12 @@ def checked_screens(matrices: Array, masks: Mask, free: Mask) -> None:
     """Check that matrices are (C, 3, 4) and masks and free (C, h, w) with C, h, w > 0.
 
     Raises:
-        ValueError: they are not.
+        ValueError: a shape is different.
     """
     views = len(matrices)
     if np.shape(matrices) != (views, 3, 4) or np.ndim(masks) != 3 or len(masks) != views or 0 in np.shape(masks):
-        raise ValueError(f"needs matrices (C, 3, 4) and masks (C, h, w), got {np.shape(matrices)}, {np.shape(masks)}")
+        raise ValueError(
+            f"matrices and masks must have shapes (C, 3, 4) and (C, h, w), got {np.shape(matrices)} and {np.shape(masks)}"
+        )
     if np.shape(free) != np.shape(masks):
-        raise ValueError(f"free has shape {np.shape(free)}, masks have {np.shape(masks)}")
+        raise ValueError(f"free has shape {np.shape(free)}, but masks has shape {np.shape(masks)}")

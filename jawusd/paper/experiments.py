@@ -1,4 +1,4 @@
-"""The experiments of Yang et al. (2019) on any take: paper Figs. 5, 12 and 13, and the coverage of the envelope."""
+"""The experiments of Yang et al. (2019) for any take: paper Figs. 5, 12 and 13, and coverage of the envelope."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from jawusd.paper.model import COMPONENTS, PaperFit, fit_paper
 from jawusd.paper.synthesis import Bounds, captured_reference, distance_to_nearest
 
 if TYPE_CHECKING:
-    from jawusd.paper.nlpca import Nlpca  # only for type checkers, since it imports torch
+    from jawusd.paper.nlpca import Nlpca  # imported only for type checkers, since it imports torch
 
 #: Configurations of the compared models, by label.
 MODELS: dict[str, FittingConfig] = {
@@ -71,13 +71,13 @@ def run_experiments(
         source: tracks, whose raw poses without a prior are used, or frame numbers and poses.
         bones: meshes "mandible" and "skull" for outlines, scan frame [mm]; either may be missing.
         config: starts and seed of the networks, trimming, alpha, folds; `method` is ignored.
-        quick: whether to skip the networks and the paper's model, and draw random poses of the default model only.
+        quick: whether to skip the networks and the paper's model, and to draw random poses of the default model only.
 
     Returns:
         The results. Models that cannot be fitted to the take are omitted and listed in `notes`.
 
     Raises:
-        FittingError: too few poses or no motion.
+        FittingError: there are too few poses, or there is no motion.
     """
     wanted = QUICK if quick else tuple(MODELS)
     notify, steps = progress or (lambda done, total: None), len(wanted) + (0 if quick else COMPONENTS)
@@ -127,7 +127,7 @@ def _fit_all(
         start = time.perf_counter()
         try:
             chosen = replace(config, method=MODELS[name].method, literal=MODELS[name].literal)
-            if chosen.method == "paper":  # both variants share their networks
+            if chosen.method == "paper":  # both variants of the paper's model share their networks
                 form: FittedForm = fit_paper(data, shown, chosen.literal, chosen.starts, chosen.seed, nets)
             else:
                 form = FORMS[chosen.method](data, shown, chosen)
@@ -152,7 +152,7 @@ def _fit_all(
 def _networks(
     data: TrainingData, config: FittingConfig, paper: FittedForm | None, notify: Callable[[int], None]
 ) -> list[Nlpca]:
-    """Return networks of 1 to 5 components; the last is taken from the paper's model if it was fitted."""
+    """Return networks with 1 to 5 components; the last network is taken from the paper's model if it was fitted."""
     from jawusd.paper.nlpca import train_nlpca  # imported late, since it imports torch
 
     points = se3_log(data.motion) @ data.metric.twist_root()
@@ -168,7 +168,7 @@ def _networks(
 
 
 def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> list[Distances]:
-    """Paper Fig. 12: error of the reconstruction of every captured pose by each model, including trimmed frames."""
+    """Return the errors of paper Fig. 12: reconstruction of all captured poses, also trimmed ones, by each model."""
     root = data.metric.twist_root()
     points = se3_log(data.motion) @ root
     rebuilt = {
@@ -180,7 +180,7 @@ def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> l
     rebuilt |= fitted.nearest
     found = []
     for name, motion in rebuilt.items():
-        known = np.all(np.isfinite(motion), axis=(1, 2))  # gross outliers may not converge
+        known = np.all(np.isfinite(motion), axis=(1, 2))  # the encoding of gross outliers may not converge
         errors = data.metric.largest(motion[known], data.motion[known])
         found.append(Distances(RECONSTRUCTION, name, _LARGEST, errors))
     return found
@@ -189,7 +189,7 @@ def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> l
 def _synthesis(
     data: TrainingData, fitted: _Fitted, bounds: dict[str, Bounds], config: FittingConfig
 ) -> list[Distances]:
-    """Paper Fig. 13: distance of random poses of each model to the nearest captured pose."""
+    """Return the distances of paper Fig. 13, from random poses of each model to the nearest captured pose."""
     folds = max(config.holdout_folds, 2)
     reference = captured_reference(data.metric, data.motion, folds)
     found = [Distances(SYNTHESIS, "captured hold-out poses", f"{folds} contiguous parts", reference)]
@@ -214,7 +214,7 @@ def _coverage(d: Array, bounds: Bounds, sentences: tuple[str, ...]) -> Coverage:
 
 
 def _gaps(d: Array, bounds: Bounds, axis: int) -> tuple[Array, float]:
-    """Return the points (d1, d_axis) of the slice hull that are far from every pose, and their fraction."""
+    """Return the points (d1, d_axis) of the slice hull that are far from all captured poses, and their fraction."""
     first, second = (np.arange(low, high, _GRID_MM) for low, high in bounds.slices_box[[0, axis]])
     grid = np.zeros((len(first) * len(second), 3))
     grid[:, 0], grid[:, axis] = (part.ravel() for part in np.meshgrid(first, second))

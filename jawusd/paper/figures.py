@@ -1,4 +1,4 @@
-"""Figures of the paper's experiments, and the coverage plot."""
+"""Draw the figures of the paper's experiments, and the coverage plot."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from jawusd.report.style import (
 
 FIGURES = ("fig5_condyle_path", "fig12_reconstruction", "fig13_synthesis", "coverage")
 
-_HEADS = (PALE, SKY, BLUE, BLACK)  # colours of the condyle outlines from closed to wide open
+_HEADS = (PALE, SKY, BLUE, BLACK)  # colours of the condyle outlines, from closed to wide open
 _BINS = 40
-_SCALE_QUANTILE = 0.8  # the histograms' shared axis ends at this quantile of the models' 95 % quantiles
-_BONES_MM, _CLOSE_MM = 12.0, 1.5  # margins around the paths, with bones and enlarged
-_ADVICE_LETTERS = 140  # characters per line of advice above the coverage plot
-_FEW_MM = 1.0  # minimum range of the histograms' axis
-_MANY = 2500  # more points than this are rasterised to limit the file size
+_SCALE_QUANTILE = 0.8  # quantile of the models' 95 % quantiles at which the shared axis of the histograms ends
+_BONES_MM, _CLOSE_MM = 12.0, 1.5  # margins around the paths, in the row with bones and in the enlarged row
+_ADVICE_LETTERS = 140  # maximum number of characters per line of advice above the coverage plot
+_FEW_MM = 1.0  # minimum range of the shared axis of the histograms
+_MANY = 2500  # maximum number of points drawn as vectors; more are rasterised to limit the file size
 _MOVES = ("opening d1", "laterotrusion d2", "protrusion d3")
 
 
@@ -103,7 +103,7 @@ def _draw_path(axis: Axes, path: CondylePath, captured: Array) -> None:
 
 
 def _frame(axis: Axes, found: Experiments, around_mm: float) -> None:
-    """Set the same square limits in every panel, which contain the captured condyles and all paths with a margin."""
+    """Set the same square limits in every panel; they contain the captured condyles and all paths, with a margin."""
     drawn = [found.captured_condyles[0], *(path.points[0] for path in found.condyle_paths)]
     points = np.concatenate(drawn)[:, [2, 1]]
     middle = 0.5 * (points.min(0) + points.max(0))
@@ -117,7 +117,7 @@ def _frame(axis: Axes, found: Experiments, around_mm: float) -> None:
 def parameter_figure(found: Experiments) -> Figure:
     """Draw the path of the left condyle as each parameter varies alone, for the linear and the default model.
 
-    After paper Figs. 5 and 6; above seen from the side, below from above, one column per parameter.
+    The figure follows paper Figs. 5 and 6: upper row from the side, lower row from above, one column per parameter.
     """
     if not found.parameter_paths:
         return _nothing_to_draw(f"{found.actor}: no model moves by single parameters")
@@ -181,7 +181,7 @@ def _histograms(
     columns = min(columns, len(samples))
     rows = -(-len(samples) // columns)
     figure, axes = new_figure(11.0, 1.9 * rows + 0.6, rows, columns, sharex=True, sharey=True)
-    # The long tail of one model must not dominate the shared scale; values beyond its end are counted.
+    # The long tail of one model must not dominate the shared scale; a text states the number of values beyond its end.
     end = max(_FEW_MM, float(np.quantile([np.percentile(one.values_mm, 95) for one in samples], _SCALE_QUANTILE)))
     bins = np.linspace(0.0, end, _BINS + 1).tolist()
     for axis, one, label in zip(axes, samples, labels, strict=False):
@@ -209,7 +209,7 @@ def _histograms(
 
 
 def _nothing_to_draw(why: str) -> Figure:
-    """Return an empty figure with an explanation."""
+    """Return a figure that contains only an explanation."""
     figure, (axis,) = new_figure(11.0, 1.0, 1, 1)
     axis.set_axis_off()
     axis.text(0.5, 0.5, why, ha="center", va="center")
@@ -221,7 +221,7 @@ def _shares(values: Array) -> Array:
 
 
 def coverage_figure(coverage: Coverage, actor: str) -> Figure:
-    """Draw which openings, laterotrusions and protrusions were captured, the bounds, and the gaps."""
+    """Draw the captured openings, laterotrusions and protrusions, the bounds, and the gaps."""
     figure, axes = new_figure(10.0, 5.0, 1, 2)
     names = ("laterotrusion d2 [mm], + to the left", "protrusion d3 [mm], + forward")
     for index, axis in enumerate(axes):

@@ -1,7 +1,7 @@
-"""GPU pixel counter: renders many poses and views into one layered texture and counts pixels on the GPU.
+"""GPU pixel counter, which renders many poses and views into one layered texture and counts their pixels.
 
-Needs OpenGL 4.3 through EGL, but no display; a software driver (llvmpipe) is sufficient. Counts may differ slightly
-from the CPU's, where a pixel centre lies within rounding error of a triangle's edge.
+It needs OpenGL 4.3 through EGL, but no display; a software driver (llvmpipe) is sufficient. Counts may differ slightly
+from those of the CPU where a pixel centre lies within rounding error of a triangle's edge.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ except ModuleNotFoundError as error:
 
 _LAYER_EXTENSION = "GL_ARB_shader_viewport_layer_array"
 _MOST_PIXELS = 1 << 26  # maximum number of pixels in one layered texture, 64 MB
-_TILE_PX = 64  # side of the tile in which one work group of 16 x 16 counts pixels
-_ROUND_PX = 64  # texture sizes are rounded up to a multiple of this, so that frames can share textures
+_TILE_PX = 64  # side of the square tile in which one work group of 16 x 16 threads counts pixels
+_ROUND_PX = 64  # divisor of the texture sizes; they are rounded up to a multiple, so that frames can share textures
 
 _VERTEX = f"""#version 430
 #extension {_LAYER_EXTENSION} : require
@@ -136,7 +136,7 @@ class _Target:
 
 
 class GlCounter:
-    """Pixel counter on the GPU; use as a context manager, or close it.
+    """Pixel counter on the GPU; use it as a context manager, or close it.
 
     Counters may share a context. All calls must come from the thread that opened it.
     """
@@ -150,7 +150,7 @@ class GlCounter:
         *,
         cull: bool = False,
     ) -> None:
-        """Upload the scan to a context of `open_context`; other arguments as for `RasterCounter`."""
+        """Upload the scan to a context opened by `open_context`; the other arguments are those of `RasterCounter`."""
         self._gl = context
         self._flags = moderngl.CULL_FACE if cull else moderngl.NOTHING
         self._stack = contextlib.ExitStack()
@@ -174,7 +174,7 @@ class GlCounter:
         return resource
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
-        """Set the masks of one frame; arguments as for `RasterCounter.show`.
+        """Set the masks of one frame; the arguments are those of `RasterCounter.show`.
 
         Raises:
             ValueError: the shapes do not agree, or the masks are too large for the device.
@@ -183,7 +183,7 @@ class GlCounter:
         views, height, width = masks.shape
         size = (-(-width // _ROUND_PX) * _ROUND_PX, -(-height // _ROUND_PX) * _ROUND_PX)
         if size[0] * size[1] * views > _MOST_PIXELS or views > self._most_layers:
-            raise ValueError(f"{views} masks of {width} x {height} px exceed the size of one texture")
+            raise ValueError(f"{views} masks of {width} x {height} px exceed the maximum size of a texture")
         if self._masks is None or self._masks.size != (*size, views):
             self._drop_textures()
             self._masks = self._gl.texture_array((*size, views), 1, dtype="u1")
@@ -238,7 +238,7 @@ class GlCounter:
         target.texture.use(0)
 
     def _target(self, layers: int) -> _Target:
-        """Return a target of at least this many layers; several sizes are cached, since clearing takes time."""
+        """Return a render target with at least `layers` layers; cache several sizes, since clearing takes time."""
         width, height, views = self._shown().size
         room = min(1 << (layers - 1).bit_length(), self._most_layers)
         if room not in self._targets:

@@ -1,15 +1,15 @@
 """The model of Yang et al. (2019): hierarchical NLPCA with five components, reduced to a sum of three curves.
 
-Phi_gen is the decoder of a network trained on the twists. Phi1 is Phi_gen with the first component alone. For two
+Phi_gen is the decoder of a network trained on the twists. Phi1 is Phi_gen restricted to the first component. For two
 groups of components, the points that Phi_gen generates (D23, D45) are each reduced to one dimension by another network,
 Phi2 and Phi3; and
 
     Phi(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)                                                       (paper eq. 5)
 
-Taken literally, the sum contains Phi_gen(0) three times; here it contains it once. What a component represents varies
-between trainings, so components are grouped by how they move the incisal point unless the paper's fixed groups are
-requested.
-Twists are given in mandible-metric coordinates, which makes the result independent of units and origin.
+Taken literally, the sum contains Phi_gen(0) three times; here, Phi_gen(0) is contained once. The motion that a
+component represents varies between trainings. Therefore, components are grouped by the motion of the incisal point
+unless the paper's fixed groups are requested. Twists are expressed in mandible-metric coordinates, which makes the
+result independent of units and origin.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from jawusd.fitting.fit import FormFitter
 from jawusd.geometry import se3_exp, se3_log
 
 if TYPE_CHECKING:
-    from jawusd.paper.nlpca import Nlpca  # only for type checkers, since it imports torch
+    from jawusd.paper.nlpca import Nlpca  # imported only for type checkers, since it imports torch
 
 Groups = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
@@ -46,7 +46,7 @@ _ALL_STAGES, _SEARCH_STAGES = 7, 4  # number of training stages of the one-dimen
 
 @dataclass(frozen=True)
 class _Part:
-    """One summand: the components of a group, reduced to one dimension if there are several."""
+    """One summand of the model: the components of a group, reduced to one dimension if there are several."""
 
     group: tuple[int, ...]
     reduced: Nlpca | None
@@ -68,7 +68,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Sum:
-    """The sum of three parts in metric coordinates, containing Phi_gen(0) once."""
+    """The sum of three parts in metric coordinates; it contains Phi_gen(0) once."""
 
     net: Nlpca
     parts: tuple[_Part, _Part, _Part]
@@ -99,13 +99,13 @@ class _Sum:
 
 @dataclass(frozen=True, eq=False)
 class PaperFit(FittedForm):
-    """A fitted model of the paper with its networks; no frames are trimmed."""
+    """A fitted model of the paper, with its networks; its fit trims no frames."""
 
     network_sum: _Sum
-    root: Array  # L (6, 6) of the metric coordinates log(M) @ L
+    root: Array  # matrix L (6, 6) that defines the metric coordinates log(M) @ L
 
     def reconstruct_as_published(self, motion: Array) -> Array:
-        """Return motions (N, 4, 4) encoded and decoded by the networks, without projection and rest offset."""
+        """Return motions (N, 4, 4) after encoding and decoding by the networks, without projection and rest offset."""
         return _rebuilt(self.network_sum, motion, self.root)
 
 
@@ -124,7 +124,7 @@ def fit_paper(
     Raises:
         FittingError: the data do not excite a parameter, or no component moves the incisal point in its direction.
     """
-    from jawusd.paper.nlpca import train_nlpca  # imported late: it imports torch, which takes two seconds
+    from jawusd.paper.nlpca import train_nlpca  # imported late, since importing torch takes two seconds
 
     if not shown.all():
         raise FittingError(
@@ -174,7 +174,7 @@ def _part(net: Nlpca, components: Array, group: tuple[int, ...], seed: int, stag
 
 
 def _groups_by_incisal_motion(net: Nlpca, points: Array, root: Array, incisor: Array) -> Groups:
-    """Return the components that open, shift and protrude the jaw most when swept alone, chosen in that order."""
+    """Return the components that, swept alone, open, shift and protrude the jaw most; they are chosen in this order."""
     components = net.encode(points)
     reach = np.zeros((net.components, 3))
     for index in range(net.components):
@@ -191,7 +191,7 @@ def _groups_by_incisal_motion(net: Nlpca, points: Array, root: Array, incisor: A
 
 
 def _with_leftovers(base: _Sum, points: Array, error: Callable[[_Sum], float]) -> _Sum:
-    """Return the best sum over assignments of the remaining components to one of the three groups or to none."""
+    """Return the best sum over all assignments of the remaining components to one of the three groups or to none."""
     used = {part.group[0] for part in base.parts}
     left = [index for index in range(base.net.components) if index not in used]
     components = base.net.encode(points)
@@ -226,7 +226,7 @@ def _curves(found: _Sum, points: Array, root: Array, data: TrainingData) -> tupl
 
 
 def _shifted(part: _Part, net: Nlpca, rest: float, root: Array) -> Curve:
-    """Return the part as a curve of twists, zero at t = 0, the closed bite."""
+    """Return the part as a curve of twists that is zero at t = 0, the closed bite."""
 
     def curve(t: Array) -> tuple[Array, Array]:
         value, rate = part.value(net, t + rest)
@@ -237,7 +237,7 @@ def _shifted(part: _Part, net: Nlpca, rest: float, root: Array) -> Curve:
 
 
 def _rebuilt(found: _Sum, motion: Array, root: Array) -> Array:
-    """Return motions (N, 4, 4) encoded and decoded by a sum."""
+    """Return motions (N, 4, 4) after encoding and decoding by a sum."""
     return _motions(found.value(found.encode(se3_log(motion) @ root)), root)
 
 
@@ -250,7 +250,7 @@ def _twists(points: Array, root: Array) -> Array:
 
 
 def _only(components: Array, group: tuple[int, ...]) -> Array:
-    """Return the components with all but a group set to zero."""
+    """Return the components with all components outside a group set to zero."""
     kept = np.zeros_like(components)
     kept[:, group] = components[:, group]
     return kept

@@ -21,9 +21,9 @@ from jawusd.base.arrays import Array
 
 _SCALED_SD = 0.1
 _WEIGHT_DECAY = 1e-3
-_WITHOUT_FIRST = 0.01  # weight of the error of the reconstruction from components 2..k
+_WITHOUT_FIRST = 0.01  # weight of the error of the reconstruction from components 2 to k
 _START = 0.1
-_STAGES = (60, 100, 150, 200, 300, 400, 1800)  # iterations between reorderings of the components, 3010 in all
+_STAGES = (60, 100, 150, 200, 300, 400, 1800)  # numbers of iterations between reorderings of components; 3010 in all
 _MEMORY = 20
 _GRADIENT_TOLERANCE, _COST_TOLERANCE = 1e-7, 1e-12
 Values = TypeVar("Values", Array, torch.Tensor)
@@ -45,12 +45,12 @@ class Nlpca:
         return self.layers[2].shape[1]
 
     def encode(self, data: Array) -> Array:
-        """Return the components (N, k) of data (N, D)."""
+        """Encode data (N, D); return the components (N, k)."""
         W1, b1, W2, b2 = self.layers[:4]
         return np.tanh((data - self.centre) * self.scale @ W1 + b1) @ W2 + b2
 
     def decode(self, components: Array) -> Array:
-        """Return the data (N, D) generated from components (N, k): Phi_gen of the paper."""
+        """Decode components (N, k), by Phi_gen of the paper; return the data (N, D)."""
         W3, b3, W4, b4 = self.layers[4:]
         return (np.tanh(components @ W3 + b3) @ W4 + b4) / self.scale + self.centre
 
@@ -62,12 +62,12 @@ class Nlpca:
 
 
 def train_nlpca(data: Array, components: int, seed: int, *, centre: bool = False, stages: int = len(_STAGES)) -> Nlpca:
-    """Train a network with L-BFGS, deterministically for a given seed.
+    """Train a network with L-BFGS; the result is deterministic for a given seed.
 
     Args:
-        data: shape (N, D).
-        components: size k of the bottleneck.
-        centre: whether to subtract the mean first, unlike the toolbox.
+        data: training data, shape (N, D).
+        components: number k of bottleneck components.
+        centre: whether to subtract the mean of the data first, which the toolbox does not do.
         stages: number of training stages; 4 of 7 reach a cost within a few percent in a tenth of the time.
     """
     mean = data.mean(0) if centre else np.zeros(data.shape[1])
@@ -134,7 +134,7 @@ def _cost(
 
 
 def _split(flat: Values, shapes: list[tuple[int, ...]]) -> list[Values]:
-    """Split a flat vector into layers."""
+    """Split a flat vector of parameters into layers."""
     parts, start = [], 0
     for shape in shapes:
         size = int(np.prod(shape))
@@ -144,7 +144,7 @@ def _split(flat: Values, shapes: list[tuple[int, ...]]) -> list[Values]:
 
 
 def _ordered(flat: Array, shapes: list[tuple[int, ...]], data: Array) -> Array:
-    """Return the weights with components reordered greedily by the remaining variance that each explains."""
+    """Return the weights with the components reordered greedily by the remaining variance that each explains."""
     W1, b1, W2, b2, W3, b3, W4, b4 = _split(flat, shapes)
     components = np.tanh(data @ W1 + b1) @ W2 + b2
     order: list[int] = []

@@ -1,6 +1,6 @@
 """The optimiser of the paper (section 4): descent with finite differences, then a dense local search.
 
-It exists for comparison; `tracking.contour.solver` is faster and more accurate.
+This solver exists for comparison; `tracking.contour.solver` is faster and more accurate.
 """
 
 from __future__ import annotations
@@ -25,30 +25,31 @@ Line = Callable[[list[float]], Array]
 class PaperConfig:
     """Settings of the paper's method. The paper specifies lambda and the order of the steps only.
 
-    The other values were tuned on a synthetic take; none of them changes the error by a factor of two.
+    The other values were tuned on a synthetic take; changing one of them affects the error by less than a factor of
+    two.
     """
 
-    # Weight of the boundary term, lambda of eq. 7.
+    # Weight of the boundary term: lambda in eq. 7.
     boundary_weight: float = 0.4
     # Resolution at the teeth [px/mm]: about that of the paper's 940 x 480 buffer and of the default solver.
     working_px_per_mm: float = 7.2
-    # Half step of the finite differences: smaller steps are dominated by pixel quantisation, larger ones by curvature.
+    # Half step of the finite differences; smaller steps are dominated by pixel quantisation, larger steps by curvature.
     difference_rad: float = radians(0.3)
     difference_mm: float = 0.15
-    # Length of the line search: about the motion between two frames of an exercise.
+    # Length of the line search: about the motion between two video frames of an exercise.
     reach_rad: float = radians(1.0)
     reach_mm: float = 1.0
     # Interval length at which the golden-section search stops: a motion of a tenth of a pixel.
     tolerance_rad: float = radians(0.01)
     tolerance_mm: float = 0.01
-    # Maximum number of rounds of rotation and translation; typical frames need fewer than ten.
+    # Maximum number of rounds of rotation and translation steps; typical frames need fewer than ten.
     most_rounds: int = 40
     # Dense search: number of samples per degree of freedom (odd), and their spacing.
     dense_samples: int = 3
     dense_rad: float = radians(0.2)
     dense_mm: float = 0.1
     # Whether to ignore boundary pixels inside the mask of the other arch. The paper counts them, which biases the lower
-    # arch out from behind the upper one when the teeth are closed.
+    # arch away from its position behind the upper arch when the teeth are closed.
     other_row_hides: bool = False
 
 
@@ -57,8 +58,8 @@ class PaperSolution:
     """Result for one arch in one frame."""
 
     pose: Array  # T_world_scan, shape (4, 4)
-    energy: float  # E of eq. 6 at this pose [px]
-    rounds: int  # number of rounds of rotation and translation
+    energy: float  # energy E of eq. 6 at the pose [px]
+    rounds: int  # number of rounds of rotation and translation steps
 
 
 def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig) -> PaperSolution:
@@ -97,7 +98,7 @@ def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig
 
 
 def _descend(at: Energy, best: Array, lowest: float, rotation: bool, config: PaperConfig) -> tuple[Array, float]:
-    """Take one step in rotation or in translation; return the better of start and end with its energy."""
+    """Take one step in rotation or in translation; return the better of start and end, and its energy."""
     block = slice(0, 3) if rotation else slice(3, 6)
     step = config.difference_rad if rotation else config.difference_mm
     nudges = np.zeros((6, 6))

@@ -17,12 +17,12 @@ from jawusd.fitting.metric import MandibleMetric
 POSES = 1000
 BOX, POLYGONS, SLICES = "static: box", "dynamic: two polygons", "dynamic: slice hull"
 
-_BATCH, _BATCHES = 4000, 50  # rejection sampling; bounds that fill less than 0.5 % of their box give fewer than `POSES`
+_BATCH, _BATCHES = 4000, 50  # size and number of batches; bounds that fill < 0.5 % of their box give fewer than `POSES`
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Bounds of one model."""
+    """Bounds of one model's parameters."""
 
     box: Array  # captured range of each parameter [mm], shape (3, 2)
     polygons: PolygonBound  # alpha shapes as in the paper
@@ -75,7 +75,7 @@ def distance_to_nearest(metric: MandibleMetric, motion: Array, captured: Array) 
 
 
 def captured_reference(metric: MandibleMetric, captured: Array, folds: int) -> Array:
-    """Return the distance of each captured motion (N, 4, 4) to the nearest one of another part of the take [mm].
+    """Return the distance [mm] of each captured motion (N, 4, 4) to the nearest motion in another part of the take.
 
     The motions are in temporal order; the take is split into `folds` contiguous parts.
     """

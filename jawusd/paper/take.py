@@ -1,4 +1,4 @@
-"""Track a whole take with the paper's method: outwards from the picks, each frame starts at its neighbour's pose."""
+"""Track a whole take with the paper's method, outwards from the picks; each frame starts at its neighbour's pose."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.initialization.bootstrap import pose_from_picks
 
-_FEWEST_MASKS = 2  # minimum number of masks of an arch; depth is ambiguous in one view
+_FEWEST_MASKS = 2  # minimum number of masks of an arch; from a single view, depth is ambiguous
 
 Backend = Literal["cpu", "gl"]
 
 
 @dataclass(frozen=True, eq=False)
 class _Record:
-    """Result of one frame: poses (2, 4, 4), status (2,), coverage error (2, C)."""
+    """Result in one frame: poses (2, 4, 4), status (2,), coverage error (2, C)."""
 
     poses: Array
     status: NDArray[np.int8]
@@ -51,7 +51,7 @@ def track_capture_paper(
 ) -> Tracks:
     """Track both arches through a capture with the paper's method.
 
-    The method neither detects failure nor estimates uncertainty: an arch with at least two masks counts as tracked
+    The method neither detects failures nor estimates uncertainty: an arch with at least two masks counts as tracked,
     however badly it fits. Covariances, sigmas, residuals and matched lengths are NaN, meaning unknown, and models
     fitted to these tracks weight all frames equally. The only quality measure is `coverage_error`.
 
@@ -60,11 +60,11 @@ def track_capture_paper(
         cameras, offsets: as for `track_capture`.
         upper, lower: teeth scans in one frame [mm], with the boundary of interest painted green.
         backend: where pixels are rendered and counted.
-        threads: worker threads of the CPU backend; the result does not depend on it.
+        threads: number of worker threads of the CPU backend; the result does not depend on this number.
         progress: called after each frame with the number of frames done and the total.
 
     Raises:
-        TrackingError: there are no picks, only one camera, or a scan has no boundary of interest.
+        TrackingError: there are no picks, there is only one camera, or a scan has no boundary of interest.
         CaptureError: a mask cannot be read.
         MissingDependencyError: the GL backend is chosen and OpenGL is unavailable.
     """
@@ -124,7 +124,7 @@ def _start_poses(bootstrap: Bootstrap, cameras: Mapping[str, Camera], meshes: tu
 def _energies(
     scans: Sequence[PaperScan], config: PaperConfig, backend: Backend, threads: int, stack: ExitStack
 ) -> list[PaperEnergy]:
-    """Return the energies of both arches; closing the stack frees their resources."""
+    """Return the energies of both arches; closing the exit stack frees their resources."""
     counters: list[PixelCounter]
     if backend == "gl":
         # Imported here because the module requires moderngl, which the CPU backend does not need.
@@ -153,7 +153,7 @@ def _instant(
     last: Array,
     views: Sequence[View],
 ) -> _Record:
-    """Align both arches independently; an arch with too few masks keeps its previous pose and counts as lost."""
+    """Align both arches independently; an arch with too few masks retains its previous pose and counts as lost."""
     poses, status = last.copy(), np.full(2, LOST, np.int8)
     coverage = np.full((2, len(views)), np.nan)
     for r in ARCHES:

@@ -132,7 +132,7 @@ def test_opengl_splits_what_is_too_much_for_one_drawing(context, monkeypatch) ->
         monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192 * 2 * VIEWS)  # two poses at a time
         np.testing.assert_array_equal(counter.counts(poses), whole)
         monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192)
-        with pytest.raises(ValueError, match="exceed the size of one texture"):
+        with pytest.raises(ValueError, match="exceed the maximum size of a texture"):
             counter.show(P, masks, free)
 
 
