@@ -269,7 +269,7 @@ def checked_screens(matrices: Array, masks: Mask, free: Mask) -> None:
     views = len(matrices)
     if np.shape(matrices) != (views, 3, 4) or np.ndim(masks) != 3 or len(masks) != views or 0 in np.shape(masks):
         raise ValueError(
-            f"matrices and masks must have shapes (C, 3, 4) and (C, h, w), got {np.shape(matrices)} and {np.shape(masks)}"
+            f"matrices and masks need shapes (C, 3, 4) and (C, h, w), got {np.shape(matrices)} and {np.shape(masks)}"
         )
     if np.shape(free) != np.shape(masks):
         raise ValueError(f"free has shape {np.shape(free)}, but masks has shape {np.shape(masks)}")
