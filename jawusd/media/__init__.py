@@ -1,4 +1,4 @@
-"""Read and write the images of a capture: clips by presentation time, masks, overlays, videos.
+"""Read and write the images of a capture: clips by presentation time, masks, overlays and videos.
 
-The only package that may import PyAV; imports `meshes` only to draw overlays.
+Only this package may import PyAV. It imports `meshes` only to draw overlays.
 """

@@ -1,4 +1,4 @@
-"""Background behind drawn scans: a camera's footage, or its masks if there is none."""
+"""Background images for drawing scans: the footage of a camera, or its masks if there is no footage."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ _UPPER, _LOWER, _NEITHER = 150, 105, 25
 
 
 class Backdrop:
-    """Images of one camera, by frame of the reference camera; thread-safe.
+    """Background images of one camera, by frame number of the reference camera; thread-safe.
 
     Attributes:
         size_px: (width, height) of the images.
-        count: one past the camera's own last frame.
-        is_footage: whether the images are footage, not masks.
+        count: one past the last frame number of the camera itself.
+        is_footage: whether the images are footage instead of masks.
     """
 
     def __init__(self, source: CameraSource, offset: int) -> None:
-        """Open the footage or masks; frame k is simultaneous with frame k + offset of the reference camera.
+        """Open the footage or masks; their frame k is simultaneous with frame k + offset of the reference camera.
 
         Raises:
-            CaptureError: it has neither video nor masks, or they cannot be decoded.
+            CaptureError: the camera has neither a video nor masks, or they cannot be decoded.
         """
         self._offset = offset
         self._lock = threading.Lock()
@@ -52,7 +52,7 @@ class Backdrop:
         """Return the image at a frame of the reference camera, (h, w, 3) RGB, read-only, or None.
 
         Raises:
-            CaptureError: it cannot be decoded.
+            CaptureError: the image cannot be decoded.
         """
         own = frame - self._offset
         if self.is_footage:
@@ -68,7 +68,7 @@ class Backdrop:
         return np.repeat(out[:, :, None], 3, axis=2)
 
     def close(self) -> None:
-        """Stop decoding ahead."""
+        """Stop decoding in the background."""
         if not self.is_footage:
             for masks in self._masks:
                 masks.close()

@@ -1,4 +1,4 @@
-"""The interface of clips, implemented by videos and image sequences."""
+"""Interface of clips; videos and image sequences implement it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jawusd.media.pixels import Colour, ColourPicture, Slices
 from jawusd.media.timeline import Timeline
 
 #: Message and hint for interlaced clips.
-INTERLACED = "its pictures are marked as interlaced: each combines two fields, half a frame apart"
+INTERLACED = "its images are marked as interlaced: each combines two fields, half a frame apart"
 INTERLACED_HINT = (
     "Record progressive video; or convert every field to a frame and double fps, for all clips: "
     "ffmpeg -i IN -vf bwdif=mode=send_field -c:v libx264 -crf 12 OUT.mp4."
@@ -25,30 +25,30 @@ INTERLACED_HINT = (
 
 @dataclass(frozen=True, eq=False)
 class VideoFrame:
-    """One decoded image."""
+    """One decoded image of a clip."""
 
-    index: int  # index in presentation order, from 0
-    time_s: float  # presentation time, relative to the first image [s]
-    image: NDArray[np.uint8]  # (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, 0..255, read-only
+    index: int  # index of the image in presentation order, from 0
+    time_s: float  # presentation time relative to the first image [s]
+    image: NDArray[np.uint8]  # pixels (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, read-only
 
 
 class Clip(ABC):
-    """A clip. It keeps no file open, so threads may share it.
+    """A video or image sequence. No file stays open, so threads may share a clip.
 
     Attributes:
-        path: the file, or the pattern of the files.
+        path: the video file, or the pattern of the image files.
         count: number of images.
-        times_s: presentation times, relative to the first image [s], shape (count,), increasing.
+        times_s: increasing presentation times relative to the first image [s], shape (count,).
         timeline: maps frames to images.
         keys: indices of key frames, shape (n,).
         start_s: presentation time of the file's first image, on the same clock as its sound [s].
-        fps: average images per second.
+        fps: average number of images per second.
         rotation_deg: counter-clockwise rotation stored in the file: 0, 90, 180 or 270. It is applied to every image.
         size_px: (width, height) after rotation.
-        pixel_aspect: width of a pixel over its height, after rotation, from the file; images are not resampled.
+        pixel_aspect: width of a pixel divided by its height, after rotation, as stated in the file; images are not
         timecode: time code of the first image, as HH:MM:SS:FF; "" if there is none.
-        timecode_fps: frames per second of the time code; None if unknown.
-        is_interlaced: whether a decoded image was marked as interlaced.
+        timecode_fps: frame rate of the time code [Hz]; None if unknown.
+        is_interlaced: whether any image decoded so far was marked as interlaced.
         has_alpha: whether the images have an alpha channel.
         is_gray: whether the images are stored as one channel.
         is_rgb: whether the images are stored as RGB.
@@ -80,16 +80,16 @@ class Clip(ABC):
         region: tuple[int, int, int, int] | None = None,
         threads: int = 0,
     ) -> Iterator[VideoFrame]:
-        """Return an iterator over the images first, first + 1, ..., last - 1.
+        """Return an iterator over the images with indices first to last - 1.
 
-        Gray is the luma at full range (black 0, white 255); for gray and full-range files it is the decoder's own
-        buffer, without a copy.
+        Gray images are the luma at full range (black 0, white 255); for gray and full-range files, they are the
+        decoder's own buffer, without a copy.
 
         Args:
             first: number of the first image.
-            last: one after the last image; None = to the end.
+            last: one past the number of the last image; None for the end of the clip.
             colour: format of the images.
-            region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the rotated image; None = all of it.
+            region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the rotated image; None for the whole image.
             threads: decoder threads; 0 lets the codec choose.
 
         Raises:
@@ -101,17 +101,17 @@ class Clip(ABC):
         width, height = self.size_px
         x0, y0, x1, y1 = region or (0, 0, width, height)
         if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
-            raise ValueError(f"region {region} must be inside the picture of {width} x {height} px")
+            raise ValueError(f"region {region} is not inside the image of {width} x {height} px")
         window = (slice(y0, y1), slice(x0, x1))
         return self._converted(first, last, colour, window, threads)
 
     def pictures(
         self, wanted: Sequence[int | None], *, colour: Colour = "gray", threads: int = 0
     ) -> Iterator[NDArray[np.uint8] | None]:
-        """Yield the image at each index, and None for None; every image is decoded at most once.
+        """Yield the image at each wanted index, and None where the index is None; no image is decoded twice.
 
         Args:
-            wanted: indices of images, increasing, or None.
+            wanted: increasing indices of images, or None.
             colour: format of the images.
             threads: decoder threads; 0 lets the codec choose.
 
@@ -124,7 +124,7 @@ class Clip(ABC):
             yield None if number is None else next(frame.image for frame in decoded if frame.index == number)
 
     def colour_pictures(self, wanted: Sequence[int | None], *, threads: int = 0) -> Iterator[ColourPicture | None]:
-        """Yield RGB images like `pictures`; videos convert only the parts that are accessed.
+        """Yield RGB images like `pictures`; for videos, only the accessed parts of an image are converted.
 
         Raises:
             CaptureError: an image lies outside the file or cannot be decoded.
@@ -141,4 +141,4 @@ class Clip(ABC):
 
     @abstractmethod
     def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
-        """Yield the images first to last - 1."""
+        """Yield the images with indices first to last - 1."""

@@ -1,4 +1,4 @@
-"""Quick checks of clips: decoding errors, frozen images, and frame rates."""
+"""Check clips quickly for decoding errors, frozen images and unequal frame rates."""
 
 from __future__ import annotations
 
@@ -15,35 +15,36 @@ from jawusd.formats.finding import Finding
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT, Clip
 from jawusd.media.picture_sequence import PictureSequence
 
-# Maximum drift between cameras over a take that is not reported [frames].
+# Maximum drift between cameras over a take [frames]; larger drifts are reported.
 _DRIFT_FRAMES = 0.5
-# Relative tolerance of frame rates: accepts rounding to three digits and 23.976 for 24, but not 25 [1].
+# Relative tolerance of frame rates [-]; accepts rounding to three digits, and 23.976 for 24, but not 25 for 24.
 _RATE_TOLERANCE = 0.005
-_DECODED_PX = 1.5e9  # maximum number of pixels decoded per clip: 700 images of full HD, a few seconds
-_ENDS_S = 4.0  # duration decoded at either end, which `sync` reads first
+_DECODED_PX = 1.5e9  # maximum number of pixels decoded per clip; 700 full HD images, which takes seconds
+_ENDS_S = 4.0  # duration that is decoded at each end of a clip; `sync` reads these parts first
 _PART = 48  # number of images per decoded part
-_SPARSE = 4  # subsampling step: every 4th pixel in both directions
+_SPARSE = 4  # pixel step in both directions when images are compared
 _LISTED = 5
-# Thresholds for repeated images are relative to the usual change: this percentile of the changes within this number of
-# images before and after. Chosen with `tests/benchmarks/frozen.py`, which measures false positives in static and noisy
-# scenes.
+# Percentile that defines the usual change between images, and number of images before and after an image over which it
+# is computed. Thresholds for repeated images are relative to the usual change. `tests/benchmarks/frozen.py` measures
+# false positives in static and noisy scenes.
 _MOST, _AROUND = 75, 48
-_FEWEST = 12  # minimum number of images for estimating the usual change
-_LEAST_CHANGE = 0.1  # minimum change that counts as noise or motion [of 255 levels]
-# Maximum change in a long run, and in a run of one or two images, which a reversal of motion resembles.
+_FEWEST = 12  # minimum number of images from which the usual change is estimated
+_LEAST_CHANGE = 0.1  # minimum change [of 255 levels] that counts as noise or motion
+# Maximum change, relative to the usual change, in a run of repeated images, and in a run of only one or two images;
 _SAME, _ALIKE = 0.05, 0.03
-# Run lengths [images]: maximum of a short run, minimum for comparing with noise, minimum at the end of a clip.
+# Lengths of runs of repeated images: maximum of a short run, minimum for comparison with noise, minimum at a clip's
+# end.
 _SHORT, _SOME, _LONG = 2, 5, 12
 _STOPS, _FARTHER = (0.5, 4.0), 1.25
-_FAR_BELOW = 0.2  # maximum change within a run, as a fraction of the 25th percentile of changes around it
-_REGULAR = 0.15  # fraction of repeated images above which repetition counts as regular
-_MISSING_SHARE = 0.01  # maximum fraction of frames without an image at a constant rate
+_FAR_BELOW = 0.2  # maximum change in a run relative to the 25th percentile of the changes around the run
+_REGULAR = 0.15  # fraction of repeated images above which the repetition counts as regular
+_MISSING_SHARE = 0.01  # maximum fraction of frames without an image for a rate to count as constant
 
 
 def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
-    """Decode a clip, or parts of a long one; yield errors for undecodable images, and warnings about the content.
+    """Decode a clip, or parts of a long clip; yield errors for undecodable images, and warnings about the content.
 
-    Kinds: "clip_damaged", "interlaced", "pictures_repeated".
+    The kinds of findings are "clip_damaged", "interlaced" and "pictures_repeated".
     """
     repeated: list[tuple[int, int]] = []
     for first, last in _parts(video):
@@ -69,7 +70,7 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
         yield Finding(
             "pictures_repeated",
             "warning",
-            f"frames {listed}{more} repeat the previous picture: the camera froze, or pictures were duplicated",
+            f"frames {listed}{more} repeat the previous image: the camera froze, or images were duplicated",
             sum(end - start + 1 for start, end in repeated),
             0,
             path=str(video.path),
@@ -80,7 +81,7 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
 
 
 def _parts(video: Clip) -> list[tuple[int, int]]:
-    """Return the ranges of images to decode: all, or both ends of a long clip, which `sync` uses, and parts between."""
+    """Return the ranges of images to decode: all images, or the ends of a long clip and parts in between."""
     most = int(_DECODED_PX / (video.size_px[0] * video.size_px[1]))
     if video.count <= most:
         return [(0, video.count)]
@@ -90,7 +91,7 @@ def _parts(video: Clip) -> list[tuple[int, int]]:
 
 
 def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
-    """Return the mean difference [of 255 levels] of each gray image (h, w) from its predecessor; NaN for the first."""
+    """Return the mean difference [of 255 levels] between each gray image (h, w) and the previous one; NaN first."""
     before, changes = None, []
     for picture in pictures:
         shown = picture[::_SPARSE, ::_SPARSE].astype(np.int16)
@@ -100,11 +101,11 @@ def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
 
 
 def repeated_runs(changes: Array) -> list[tuple[int, int]]:
-    """Return the indices of the first and last image of each run of images that repeat their predecessor.
+    """Return the indices of the first and last image of each run of images that repeat the previous image.
 
-    Encoders also repeat images of static scenes, but there the changes fade out and in. In a freeze they stop and
-    resume abruptly, and after one or two repeated images the next change is larger than usual. If a light was switched
-    off instead, the change before the run is larger. Scenes that hardly change are skipped.
+    Encoders also repeat images of static scenes, but the changes then fade out and in. In a freeze they stop and
+    resume abruptly, and after one or two repeated images the next change is larger than usual. If instead the change
+    before the run is larger, a light was switched off. Scenes that hardly change are skipped.
 
     Args:
         changes: result of `picture_changes`, shape (n,).
@@ -119,20 +120,20 @@ def repeated_runs(changes: Array) -> list[tuple[int, int]]:
     short = [
         run for run in runs if run[1] - run[0] < _SHORT and known[run[0] : run[1] + 1].max() <= _ALIKE * usual[run[0]]
     ]
-    regular = len(short) > _REGULAR * len(known)  # regular repetition, as by frame rate conversion
+    regular = len(short) > _REGULAR * len(known)  # frame rate conversion repeats images regularly
     found = [run for run in runs if (run in short and regular) or _stands_out(known, *run)]
     return [(first + 1, last + 1) for first, last in found]
 
 
 def _stands_out(changes: Array, first: int, last: int) -> bool:
-    """Tell whether changes stop and resume abruptly around a run."""
+    """Return whether changes stop abruptly before a run of repeated images and resume abruptly after it."""
     outside = np.concatenate([changes[max(0, first - _AROUND) : first], changes[last + 1 : last + 1 + _AROUND]])
     if first == 0 or len(outside) < _FEWEST:
-        return False  # many takes begin without motion
+        return False  # many takes begin without motion, so a run at the start is no freeze
     little, usual = np.percentile(outside, (100 - _MOST, _MOST))
     before = changes[max(0, first - 2) : first].max()
     length, most = last - first + 1, changes[first : last + 1].max()
-    # If even the most static images change, by noise or motion, repeated images do not come from the encoder.
+    # If even the most static images change (by noise or motion), the encoder did not cause the repeated images.
     restless = length >= _SOME and little > _LEAST_CHANGE and most <= _FAR_BELOW * little
     least = _STOPS[0] * (little if restless else usual)
     if usual <= _LEAST_CHANGE or not least <= before <= _STOPS[1] * usual:
@@ -148,12 +149,12 @@ def _stands_out(changes: Array, first: int, last: int) -> bool:
 
 
 def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator[Finding]:
-    """Compare the rates of clips with that of the capture [frames per second] and with one another.
+    """Compare the frame rates of clips with the capture's frame rate [Hz] and with one another.
 
     Args:
         videos: clips by camera.
-        fps: frame rate in the capture.
-        path: path of the capture, for the findings.
+        fps: frame rate stated in the capture.
+        path: path of the capture, named in the findings.
     """
     for name, video in videos.items():
         rate = video.timeline.rate
@@ -161,7 +162,7 @@ def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator
             yield Finding(
                 "fps_differs",
                 "warning",
-                f"fps is {fps:g} in the capture, but the clip has {rate:.3f} pictures per second",
+                f"fps is {fps:g} in the capture, but the clip has {rate:.3f} frames per second",
                 rate,
                 fps,
                 path=path,
@@ -172,7 +173,7 @@ def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator
             yield Finding(
                 "pictures_missing",
                 "warning",
-                f"pictures {gaps(video.numbers.tolist())} are missing",
+                f"images {gaps(video.numbers.tolist())} are missing",
                 video.timeline.missing / video.timeline.count,
                 path=str(video.path),
                 camera=name,
@@ -182,7 +183,8 @@ def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator
             yield Finding(
                 "pictures_missing",
                 "warning",
-                f"{video.timeline.missing} of {video.timeline.count} frames have no picture: dropped or variable rate",
+                f"{video.timeline.missing} of {video.timeline.count} frames have no image: dropped "
+                "frames or a variable rate",
                 share,
                 _MISSING_SHARE,
                 path=str(video.path),
@@ -198,8 +200,8 @@ def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator
             yield Finding(
                 "rates_differ",
                 "warning",
-                f"the clip has {video.timeline.rate:.3f} pictures per second, that of the first camera "
-                f"{reference.timeline.rate:.3f}: they drift apart by {drift:.1f} frames",
+                f"the clip has {video.timeline.rate:.3f} frames per second, but the clip of the first camera has "
+                f"{reference.timeline.rate:.3f}: the clips drift apart by {drift:.1f} frames",
                 drift,
                 _DRIFT_FRAMES,
                 path=str(video.path),

@@ -1,13 +1,13 @@
 """Convert images of any bit depth to 8-bit display values, which the trackers use.
 
-Colour spaces, by name:
+Names of colour spaces:
 
-- "display": display-referred; more than 8 bits are rounded. Default for integers.
-- "linear": proportional to light, 1 is white. Encoded by the sRGB curve, IEC 61966-2-1; clipped at 1. Default for
-  floating point (EXR).
-- "cineon": printing density of film scans, 10 bits: 685 is white, 95 is black, 0.002 density per step, gamma 0.6
-  (Kodak, "Conversion of 10-bit Log Film Data To 8-bit Linear or Video Data", 1995); then as "linear".
-- any other name is a colour space of an OpenColorIO config, converted to its default display and view.
+- "display": display-referred values; more than 8 bits are rounded. This is the default for integers.
+- "linear": values proportional to light, where 1 is white. They are clipped at 1 and encoded by the sRGB curve
+  (IEC 61966-2-1). This is the default for floating point (EXR).
+- "cineon": printing density of film scans with 10 bits: 685 is white, 95 is black, 0.002 density per step, gamma 0.6
+  (Kodak, "Conversion of 10-bit Log Film Data To 8-bit Linear or Video Data", 1995). The result is treated as "linear".
+- Any other name is a colour space of an OpenColorIO config, converted to the config's default display and view.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ _WHITE, _BLACK, _DENSITY, _GAMMA, _STEPS = 685.0, 95.0, 0.002, 0.6, 1023.0
 
 
 def to_display(stored: Stored, largest: int, space: str | None, config: Path | None) -> NDArray[np.uint8]:
-    """Return a display-referred image, (h, w) or (h, w, 3) uint8, 0 .. 255.
+    """Convert an image to a display-referred one, (h, w) or (h, w, 3) uint8, 0 to 255.
 
     Args:
-        stored: pixels as stored: integers 0 .. largest, or floating point.
-        largest: white of integers, 255, 1023, 4095 or 65535.
-        space: its colour space; None is "display" for integers and "linear" for floating point.
-        config: OpenColorIO config that defines other names.
+        stored: pixels as stored in the file: integers 0 to `largest`, or floating point.
+        largest: integer value of white: 255, 1023, 4095 or 65535.
+        space: colour space of the pixels; None for "display" (integers) or "linear" (floating point).
+        config: OpenColorIO config that defines other colour spaces.
 
     Raises:
         CaptureError: the colour space is unknown.
-        MissingDependencyError: it needs OpenColorIO.
+        MissingDependencyError: the colour space needs OpenColorIO, which is not installed.
     """
     fractions = stored.dtype.kind == "f"
     space = space or ("linear" if fractions else "display")
@@ -47,7 +47,7 @@ def to_display(stored: Stored, largest: int, space: str | None, config: Path | N
         return _by_config(values if fractions else values / np.float32(largest), space, config)
     if stored.dtype == np.float32:
         return _curve(np.asarray(stored, np.float32), space)
-    # 16-bit types have 65536 values: a lookup table is fastest.
+    # 16-bit types have only 65536 values, so a lookup table is the fastest method.
     codes = stored.view(np.uint16) if stored.dtype == np.float16 else stored
     return _table(stored.dtype.name, largest, space)[codes]
 
@@ -61,7 +61,7 @@ def _table(kind: str, largest: int, space: str) -> NDArray[np.uint8]:
 
 
 def _curve(values: NDArray[np.float32], space: str) -> NDArray[np.uint8]:
-    """Return values, with 1 as white, as 8 bits; NaN becomes black."""
+    """Convert values, where 1 is white, to 8 bits; NaN becomes black."""
     with np.errstate(over="ignore", invalid="ignore"):
         light = np.nan_to_num(values.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
         if space == "cineon":
@@ -75,7 +75,7 @@ def _curve(values: NDArray[np.float32], space: str) -> NDArray[np.uint8]:
 
 
 class _Processor(Protocol):
-    """The interface of OpenColorIO that is used here, for type checkers: its package lacks stubs."""
+    """Part of OpenColorIO's interface, declared for type checkers because its package has no stubs."""
 
     def applyRGB(self, pixels: NDArray[np.float32]) -> None: ...
 
@@ -84,8 +84,7 @@ class _Processor(Protocol):
 def _by_config(values: NDArray[np.float32], space: str, config: Path | None) -> NDArray[np.uint8]:
     if config is None:
         raise CaptureError(
-            f'the colour space "{space}" is unknown; it must be {", ".join(SPACES)}, or a name in an OpenColorIO '
-            "config.",
+            f'the colour space "{space}" is unknown; expected {", ".join(SPACES)}, or a name in an OpenColorIO config.',
             hint='Set the config at the top of capture.toml: colour_config = "config.ocio".',
         )
     shown = np.ascontiguousarray(np.broadcast_to(values[..., None], (*values.shape, 3)) if values.ndim == 2 else values)

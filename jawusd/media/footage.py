@@ -1,4 +1,4 @@
-"""Open the clip of a camera, a video or an image sequence, and read single frames of it."""
+"""Open the clip of a camera (a video or an image sequence), and read single frames from it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from jawusd.media.clip import Clip, VideoFrame
 from jawusd.media.picture_sequence import PictureSequence
 from jawusd.media.video import Video
 
-_AHEAD = 24  # maximum number of images for which decoding forward is faster than seeking
-_BACK = 8  # number of images decoded together when stepping backwards
+_AHEAD = 24  # maximum number of images to decode forward; seeking is faster for more
+_BACK = 8  # number of images decoded together when images are read backwards
 _KEPT_BYTES = 128 << 20
 
 
@@ -31,7 +31,7 @@ def open_clip(source: ClipSource | Path) -> Clip:
     source = source if isinstance(source, ClipSource) else ClipSource(source)
     if source.path.is_dir():
         raise CaptureError(
-            "is a folder.", path=source.path, hint=f'Name the pictures in it, such as "{source.path.name}/*.png".'
+            "is a folder.", path=source.path, hint=f'Name the images in the folder, such as "{source.path.name}/*.png".'
         )
     clip: Clip = (
         PictureSequence(source)
@@ -45,14 +45,14 @@ def open_clip(source: ClipSource | Path) -> Clip:
 
 
 class FrameReader:
-    """Random access to images of one video; thread-safe.
+    """Random access to the images of one video; thread-safe.
 
-    The decoder stays at the last image, so that the next one is cheap; recent images are cached. Jumps seek to the
-    previous key frame.
+    The decoder stays at the last image, so that reading the next one is fast. Recent images are cached. For other
+    images, the reader seeks to the previous key frame.
     """
 
     def __init__(self, video: Clip) -> None:
-        """Read from a clip."""
+        """Prepare to read images from a clip."""
         self.video = video
         width, height = video.size_px
         self._most = max(2, min(64, _KEPT_BYTES // (3 * width * height)))
@@ -65,7 +65,7 @@ class FrameReader:
         """Return image number `index`, (h, w, 3) RGB uint8, read-only.
 
         Raises:
-            CaptureError: it lies outside the video or cannot be decoded.
+            CaptureError: the image lies outside the video or cannot be decoded.
         """
         if not 0 <= index < self.video.count:
             raise CaptureError(
@@ -81,7 +81,7 @@ class FrameReader:
 
     def _read_to(self, index: int) -> None:
         running = self._running
-        self._running = None  # if decoding fails, the next read reopens the file
+        self._running = None  # if decoding fails, the next read opens the file again
         if running is None or not self._next <= index < self._next + _AHEAD:
             walks_back = self._last - _BACK <= index < self._last
             first = max(0, index - min(_BACK, self._most - 1)) if walks_back else index

@@ -1,4 +1,4 @@
-"""The clock of live images; replaced in tests."""
+"""Clock for live images; tests replace it."""
 
 from __future__ import annotations
 

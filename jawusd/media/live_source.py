@@ -1,4 +1,4 @@
-"""Live images of a camera: from a device, a network stream, or a file played at its own rate."""
+"""Read live images of a camera from a device, a network stream, or a file played at its own frame rate."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from jawusd.media.pixels import ColourPicture, DecodedPicture
 from jawusd.media.video import Video
 
 _WAIT_S = 0.1
-_KEPT = 8  # number of buffered images, more than can wait for processing
-# PyAV's input format for local devices, by address prefix.
+_KEPT = 8  # number of buffered images; more than ever wait for processing
+# Address prefix of local devices, and PyAV's input format for them, by platform.
 _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
 
 
 @dataclass(frozen=True, eq=False)
 class LivePicture:
-    """An image with its time on the common clock [s], and RGB pixels uint8 (H, W, 3), converted on first access."""
+    """A live image: its time on the common clock [s], and RGB pixels uint8 (H, W, 3), converted on first access."""
 
     time_s: float
     rgb: ColourPicture
 
 
 class LiveSource:
-    """Reader of one camera in its own thread, with a buffer of the most recent images."""
+    """Reader of one live camera, in its own thread, with a buffer of the most recent images."""
 
     def __init__(self, where: str, size_px: tuple[int, int], early_s: float = 0.0) -> None:
-        """Prepare to read from an address.
+        """Prepare to read images from an address.
 
         Args:
             where: a file, a URL (rtsp://, http://, ...), or a device (/dev/video0 on Linux).
             size_px: width and height for which the camera was calibrated.
-            early_s: how much earlier the recording in a file begins than those of the other sources [s].
+            early_s: time by which the recording in a file begins before those of the other sources [s].
         """
         self.where, self._size_px, self._early_s = where, size_px, early_s
         self._kept: deque[LivePicture] = deque(maxlen=_KEPT)
@@ -51,7 +51,7 @@ class LiveSource:
         self.ended = False
 
     def open(self, from_s: float = 0.0) -> None:
-        """Open the source in its thread; files start `from_s` [s] after the beginning of the recordings; see `play`."""
+        """Open the source in a thread; files start `from_s` [s] after the recordings begin; see `play`."""
         self._heard_s = live_clock.now_s()
         threading.Thread(target=self._read, args=(from_s,), daemon=True).start()
 
@@ -65,16 +65,16 @@ class LiveSource:
             self.refuse_silence(silence_s)
 
     def refuse_silence(self, silence_s: float) -> None:
-        """Check that a device or stream has sent an image within a time [s].
+        """Check that a device or stream has sent an image within `silence_s` [s].
 
         Raises:
-            CaptureError: it has not.
+            CaptureError: it has not sent an image.
         """
         if self._streams and not self.ended and live_clock.now_s() - self._heard_s > silence_s:
             raise CaptureError(
-                f"has sent no picture for {silence_s:g} s.",
+                f"has sent no image for {silence_s:g} s.",
                 path=self.where,
-                hint="Check that the camera is on and sending. --silence sets the time limit.",
+                hint="Check that the camera is switched on and sending images. --silence sets the time limit.",
             )
 
     def play(self, begin_s: float) -> None:
@@ -99,12 +99,12 @@ class LiveSource:
             return [picture.time_s for picture in self._kept]
 
     def at(self, time_s: float) -> LivePicture | None:
-        """Return the buffered image nearest to a time, None before the first one."""
+        """Return the buffered image nearest to a time, or None before the first image has arrived."""
         with self._changed:
             return min(self._kept, key=lambda picture: abs(picture.time_s - time_s), default=None)
 
     def wait(self, after_s: float, timeout_s: float) -> bool:
-        """Wait for an image newer than a time; return whether there is one."""
+        """Wait for an image that is newer than a time; return whether one has arrived."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: self.ended or self._error is not None or (bool(self._kept) and self._kept[-1].time_s > after_s),
@@ -118,7 +118,7 @@ class LiveSource:
                 if picture.rgb.shape[1::-1] != self._size_px:
                     found, wanted = "{} x {}".format(*picture.rgb.shape[1::-1]), "{} x {}".format(*self._size_px)
                     raise CaptureError(
-                        f"pictures have {found} px, but the calibration is for {wanted} px.", path=self.where
+                        f"images have {found} px, but the calibration is for {wanted} px.", path=self.where
                     )
                 with self._changed:
                     self._kept.append(picture)
@@ -134,7 +134,7 @@ class LiveSource:
                 self._changed.notify_all()
 
     def _file(self, from_s: float) -> Iterator[LivePicture]:
-        """Yield the images of a file at their recorded times."""
+        """Yield each image of a file at the time at which it was recorded."""
         video = Video(self.where)
         first = int(np.searchsorted(video.times_s, from_s + self._early_s))
         numbers = range(first, video.count)
@@ -160,5 +160,5 @@ class LiveSource:
             raise CaptureError(
                 f"cannot be read ({error}).",
                 path=self.where,
-                hint="Give a file, a device such as /dev/video0, or a stream such as rtsp://host/camera.",
+                hint="Name a file, a device such as /dev/video0, or a stream such as rtsp://host/camera.",
             ) from error

@@ -1,4 +1,4 @@
-"""Sources of masks: numbered PNG files and videos, converted to coverage."""
+"""Read masks from numbered PNG files or videos, converted to coverage."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from jawusd.media.mask_source import SourceLevels, load_png, mask_video, png_lev
 from jawusd.media.pictures import read_palette_numbers
 from jawusd.media.pixels import Colour
 
-#: Gray values of the requested and the other arch in label images; all other pixels must be 0.
+#: Gray value of the requested arch and gray value of the other arch in label images; all other pixels must be 0.
 LabelValues = tuple[int, int]
 
 _NUMBER = re.compile(r"%(0(\d+))?d")
-_FEW = 6  # maximum number of label values listed in messages
+_FEW = 6  # maximum number of label values that a message lists
 
 
 class PngMasks:
-    """Masks as numbered PNG files.
+    """Masks stored as numbered PNG files.
 
     Attributes:
         count: one past the highest number.
-        odd: rejected images read so far, by number, with the reason; they count as not segmented.
+        odd: reasons why images read so far were rejected, by number; rejected images count as not segmented.
     """
 
     def __init__(
@@ -42,17 +42,17 @@ class PngMasks:
         """Find the files of a pattern with one %d or %06d.
 
         Args:
-            pattern: pattern of the files.
-            size_px: (width, height) of all of them, if known.
+            pattern: path of the files, with the number as %d or %06d.
+            size_px: (width, height) of all files, if known.
             labels: see `LabelValues`.
-            is_other: detects images that are not masks; they are not used to find the levels.
+            is_other: detects images that are not masks; these are not used to find the levels.
 
         Raises:
-            CaptureError: the folder is missing or has no such file.
+            CaptureError: the folder is missing, or contains no file of this pattern.
         """
         self._pattern, self._size_px, self._labels, self._is_other = pattern, size_px, labels, is_other
         self.odd: dict[int, str] = {}
-        # Names, not paths, to save memory: hours of several cameras are a hundred thousand files.
+        # File names take less memory than paths; hours of several cameras are a hundred thousand files.
         self._names = self._found(pattern) if "%" in pattern.name else _names(numbered_files(pattern))
         self.count = max(self._names) + 1
 
@@ -66,7 +66,9 @@ class PngMasks:
         number = _NUMBER.search(pattern.name)
         if number is None or pattern.name.count("%") != 1:
             raise CaptureError(
-                "the mask pattern needs one number such as %06d.", path=pattern, hint="Correct it in capture.toml."
+                "the mask pattern must contain one number such as %06d.",
+                path=pattern,
+                hint="Correct it in capture.toml.",
             )
         if not pattern.parent.is_dir():
             raise CaptureError(
@@ -85,7 +87,7 @@ class PngMasks:
 
     @cached_property
     def levels(self) -> SourceLevels:
-        """Find the meaning of the values from samples of the whole take.
+        """Find out which values are teeth and background, from samples of the whole take.
 
         Raises:
             CaptureError: the images have the wrong size or are not masks.
@@ -97,7 +99,7 @@ class PngMasks:
         return found
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
-        """Yield the masks from a number on, (h, w) uint8, None without a file or segmentation.
+        """Yield the masks from a number on, (h, w) uint8, or None if there is no file or nothing is segmented.
 
         Raises:
             CaptureError: a file cannot be decoded or has the wrong size, or the images are not masks.
@@ -141,12 +143,12 @@ class PngMasks:
 
 
 class VideoMasks:
-    """Masks as a video: black and white, or its alpha channel.
+    """Masks stored as a video: its black and white images, or its alpha channel.
 
     Attributes:
         count: number of images.
         timeline: maps frames to images.
-        odd: rejected images read so far, by number, with the reason; they count as not segmented.
+        odd: reasons why images read so far were rejected, by number; rejected images count as not segmented.
     """
 
     def __init__(self, path: Path, size_px: tuple[int, int], labels: LabelValues | None = None) -> None:
@@ -162,19 +164,19 @@ class VideoMasks:
 
     @cached_property
     def levels(self) -> SourceLevels:
-        """Find the meaning of the values; see `PngMasks.levels`."""
+        """Find out which values are teeth and background; see `PngMasks.levels`."""
         return video_levels(self._video.path)[0]
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
-        """Yield the masks from an image on, (h, w) uint8, None where nothing is segmented.
+        """Yield the masks from an image number on, (h, w) uint8, or None if nothing is segmented.
 
         Raises:
             CaptureError: an image cannot be decoded, or the images are not masks.
         """
-        if self._labels is not None:  # luma where possible, because conversions change values
+        if self._labels is not None:  # luma where possible, because colour conversions change values
             colour: Colour = "rgb" if self._video.is_rgb else "gray"
             for frame in self._video.frames(first, colour=colour, threads=1):
-                yield _labelled(frame.image, self._labels, self._video.path, f"picture {frame.index}: ")
+                yield _labelled(frame.image, self._labels, self._video.path, f"image {frame.index}: ")
             return
         found, colour = video_levels(self._video.path)
         if found.levels is None:
@@ -183,7 +185,7 @@ class VideoMasks:
         for frame in self._video.frames(first, colour=colour, threads=1):
             mask, odd = found.levels.coverage(frame.image)
             if odd:
-                self.odd[frame.index] = f"picture {frame.index} {odd}"
+                self.odd[frame.index] = f"image {frame.index} {odd}"
             yield mask
 
 
@@ -194,27 +196,27 @@ def _names(files: Mapping[int, Path]) -> dict[int, str]:
 def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) -> None:
     if tuple(found) != tuple(allowed):
         raise CaptureError(
-            f"the mask is {found[0]} x {found[1]} px, but the camera's pictures are {allowed[0]} x {allowed[1]} px.",
+            f"the mask is {found[0]} x {found[1]} px, but the camera's images are {allowed[0]} x {allowed[1]} px.",
             path=path,
             hint="Export the masks at the size of the video.",
         )
 
 
 def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> MaskImage:
-    """Return 255 where a label image shows the requested arch; reject unknown values."""
+    """Return a mask that is 255 where a label image shows the requested arch; reject unknown values."""
     plane = image if image.ndim == 2 else image[..., 0]
     if image.ndim == 3 and not all((image[..., c] == plane).all() for c in (1, 2)):
         raise CaptureError(
-            f"{where}the label image is coloured; one gray value per arch is needed.",
+            f"{where}the label image is coloured; expected one gray value per dental arch.",
             path=path,
-            hint="Export the labels as gray values (an index image without palette).",
+            hint="Export the labels as gray values (an index image without a palette).",
         )
     found = np.flatnonzero(np.bincount(plane.ravel()))
     if not np.isin(found, (0, *labels)).all():
         shown = ", ".join(map(str, found[:_FEW])) + (f" and {len(found) - _FEW} more" if len(found) > _FEW else "")
         low, high = sorted(labels)
         raise CaptureError(
-            f"{where}the label image has the values {shown}; they must be 0, {low} or {high}.",
+            f"{where}the label image has the values {shown}; expected only 0, {low} and {high}.",
             path=path,
             hint="Correct masks.upper_value and masks.lower_value, or export without other labels, antialiasing or "
             "lossy compression.",

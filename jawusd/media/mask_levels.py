@@ -1,4 +1,4 @@
-"""Conversion of images to masks: the channel and values of background and teeth, found once per take from content."""
+"""Convert images to masks; the channel and the values of background and teeth are found once per take."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from jawusd.base.arrays import Array
 from jawusd.media.pixels import Slices
 
 MaskImage = NDArray[np.uint8]
-RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as stored in files
+RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # image as stored in a file
 
-# Maximum fraction of a mask's pixels at intermediate values. Blurred edges reach 0.2 in small masks; photographs have
-# 0.39 or more.
+# Maximum fraction of a mask's pixels that have intermediate values. Blurred edges cause up to 0.2 in small masks;
+# photographs have 0.39 or more.
 MOST_GRAY = 0.2
-MOST_SOFT = 0.35  # maximum median fraction of intermediate values outside the background, as after a blur of 8 px
-_FAINT = 0.25  # maximum coverage of a pixel in an image without teeth, where coverage is noise
-_DEAD_ZONE = 0.06  # maximum deviation from a level due to lossy coding, as a fraction of the contrast
-_NEAR = 24  # maximum difference of values of one level after blur or lossy coding [of 255]
-_FLAT = 10  # maximum difference between adjacent pixels inside a region [of 255]; edges have larger differences
-_ALIKE = 0.15  # maximum difference of a level between images of one source, as a fraction of the contrast
-_MOST_THIRD = 0.25  # maximum flat area of a third level, relative to the second largest; soft edges have no flat area
+MOST_SOFT = 0.35  # maximum median fraction of intermediate values outside the background; reached by a blur of 8 px
+_FAINT = 0.25  # maximum coverage of a pixel, due to noise, in an image without teeth
+_DEAD_ZONE = 0.06  # maximum deviation from a level caused by lossy coding, as a fraction of the contrast
+_NEAR = 24  # Maximum difference [of 255] between values of one level after blur or lossy coding.
+_FLAT = 10  # Maximum difference [of 255] between adjacent pixels inside a region; edges have larger differences.
+_ALIKE = 0.15  # maximum difference of one level between images of a source, as a fraction of the contrast
+# Maximum flat area of a third level relative to the second-largest one; soft edges have no flat area.
+_MOST_THIRD = 0.25
 # Minimum fraction of a third gray level's pixels that lie within 1 of its value for the level to count as a label;
 # photographs stay below it.
 _SHARP = 0.8
@@ -34,7 +35,7 @@ _SHARP = 0.8
 
 @dataclass(frozen=True)
 class MaskLevels:
-    """How images of one source are converted to coverage.
+    """Rule that converts the images of one source to coverage.
 
     `plane` is the channel that separates teeth from background: "alpha", the "brightest" or "darkest" colour, or the
     index of a colour.
@@ -44,9 +45,9 @@ class MaskLevels:
     background: float = 0.0
     teeth: float = 255.0
     deep: bool = False  # whether images have 16 bits per channel
-    lossy: bool = False  # whether lossy coding has left noise around the levels
-    ambiguous: bool = False  # whether border and area disagree about which level is the background
-    # fraction of the pixels outside the background that lie between the levels
+    lossy: bool = False  # whether lossy coding has caused noise around the levels
+    ambiguous: bool = False  # whether border and area indicate different background levels
+    # Fraction of the pixels outside the background whose values lie between the two levels.
     soft: float = field(default=0.0, compare=False)
 
     @property
@@ -62,37 +63,37 @@ class MaskLevels:
         return self.teeth < self.background
 
     def coverage(self, image: RawImage) -> tuple[MaskImage | None, str]:
-        """Return the mask of an image, 0 .. 255 with the outline at half, or None; and the reason if it is rejected.
+        """Return the mask of an image (0 to 255, outline at half), or None; and the reason why it is rejected.
 
-        The reason, phrased to follow the image's name, is empty for masks and empty images. The mask may be the
+        The reason is a predicate whose subject is the image, and empty for masks and empty images. The mask may be the
         input array itself.
         """
         if (image.dtype == np.uint16) != self.deep:
-            return None, f"has {8 * image.dtype.itemsize} bits per channel, unlike other pictures"
+            return None, f"has {8 * image.dtype.itemsize} bits per channel, unlike other images"
         plane = channel(image, self.plane)
         low, high, _, _ = cv2.minMaxLoc(plane)
         if low == high:
             empty = self.plane == "alpha" or abs(low - self.teeth) > abs(low - self.background)
             return None, "" if empty else f"is uniformly {low:g}, the value of teeth"
-        box = self._around_teeth(plane)  # usually a tenth of the image, to save time
+        box = self._around_teeth(plane)  # crop, usually to a tenth of the image, to save time
         part = self._shares(plane[box])
         inside = cv2.countNonZero(cv2.inRange(part, 128, 255))
         if inside == 0:
             brightest = low if self.inverted else high
             faint = int(part.max()) <= 255 * _FAINT
-            return None, "" if faint else f"reaches only {brightest:g}, but teeth are {self.teeth:g} in other pictures"
+            return None, "" if faint else f"reaches only {brightest:g}, but teeth are {self.teeth:g} in other images"
         if (gray := cv2.countNonZero(cv2.inRange(part, 26, 229)) / plane.size) > MOST_GRAY:
             return None, f"is not a mask: {gray:.0%} of its pixels are neither teeth nor background"
         mask = part if part.shape == plane.shape else self._placed(part, box, plane)
         if inside > mask.size / 2 and border_share(mask, 127.5) > 0.5:
             return (
                 None,
-                f"has {inside / mask.size:.0%} teeth, up to the border: it seems inverted, unlike other pictures",
+                f"has {inside / mask.size:.0%} teeth, up to the border: it seems inverted, unlike other images",
             )
         return mask, ""
 
     def _around_teeth(self, plane: RawImage) -> Slices:
-        """Return the bounding box of all that is not background in a channel, at least one pixel."""
+        """Return the bounding box of all pixels of a channel that are not background; at least one pixel."""
 
         def seen(part: RawImage, axis: int) -> list[int]:
             most = part.min(axis) if self.inverted else part.max(axis)
@@ -106,7 +107,7 @@ class MaskLevels:
         return band, slice(columns[0], columns[-1] + 1, 1)
 
     def _shares(self, part: RawImage) -> MaskImage:
-        """Return the coverage of the pixels of a channel, 0 .. 255."""
+        """Convert the pixels of a channel to coverage, 0 to 255."""
         if part.dtype != np.uint8:
             return self._table[part]
         return cast(MaskImage, part if self._as_stored else cv2.LUT(part, self._table))
@@ -120,7 +121,7 @@ class MaskLevels:
 
     @cached_property
     def _as_stored(self) -> bool:
-        """Whether 8-bit pixels already are coverage."""
+        """Whether 8-bit pixels need no conversion to coverage."""
         return not self.deep and bool((self._table == np.arange(256)).all())
 
     @cached_property
@@ -134,7 +135,7 @@ class MaskLevels:
 
 
 def channel(image: RawImage, plane: str) -> RawImage:
-    """Return one channel (h, w) of an image; see `MaskLevels`."""
+    """Return one channel (h, w) of an image; see `MaskLevels.plane`."""
     if image.ndim == 2:
         return image
     parts = cv2.split(image)
@@ -153,31 +154,31 @@ def spread_of_colours(image: RawImage) -> float:
 
 
 def border_share(image: MaskImage, above: float) -> float:
-    """Return the fraction of the outermost pixels above a value."""
+    """Return the fraction of an image's outermost pixels that exceed a value."""
     return float((np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]) > above).mean())
 
 
 class NotMasks(Exception):
-    """Raised if images are not masks; `index` is that of the offending image, if it is a single one."""
+    """Raised if images are not masks; `index` is the index of the offending image if there is only one."""
 
     def __init__(self, index: int | None, reason: str, hint: str) -> None:
-        """Store the index of the offending image among the given ones, None if it concerns all."""
+        """Store the index of the offending image, None if all images are concerned."""
         super().__init__(reason)
         self.index, self.reason, self.hint = index, reason, hint
 
 
 @dataclass(frozen=True)
 class _Levels:
-    """The two levels of one channel of an image, and their distribution."""
+    """The two gray levels of one channel of an image, and their distribution."""
 
     low: float
     high: float
-    light: float  # fraction of the image that is closer to the high level
-    light_border: float  # fraction of the image's border that is closer to the high level
-    gray: float  # fraction of the image at neither level
-    soft: float  # fraction at neither level of all pixels that are not dark: the softness if teeth are light
-    soft_dark: float  # fraction at neither level of all pixels that are not light: the softness if teeth are dark
-    third: float | None  # a third level with a large area, if any
+    light: float  # fraction of the pixels that are closer to the high level
+    light_border: float  # fraction of the border pixels that are closer to the high level
+    gray: float  # Fraction of the pixels that are at neither level.
+    soft: float  # The same fraction among pixels that are not dark; the softness if teeth are light.
+    soft_dark: float  # fraction at neither level among pixels that are not light; the softness if teeth are dark
+    third: float | None  # third level with a large area, if there is one
 
     @property
     def contrast(self) -> float:
@@ -186,27 +187,27 @@ class _Levels:
 
 @dataclass(frozen=True)
 class _Looked:
-    """Levels of each non-uniform channel of one image."""
+    """Gray levels of each non-uniform channel of one sampled image."""
 
-    number: int  # index among the sampled images
+    number: int  # index of the image among the sampled images
     planes: dict[str, _Levels]
-    opaque: bool  # has an opaque alpha channel
+    opaque: bool  # whether the image has an opaque alpha channel
     deep: bool
 
 
 def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], Iterable[RawImage]]) -> MaskLevels | None:
-    """Return the meaning of a source's pixel values, None if all its images are empty.
+    """Return the meaning of the pixel values of a mask source, or None if all images are empty.
 
-    The two levels are those that most images share. The background is the darker one, unless the lighter one has
-    most of the area and of the border, since teeth are inside the image.
+    The two levels are those that most images have in common. The background is the darker level, unless the lighter
+    level covers most of the area and of the border, since teeth are inside the image.
 
     Args:
-        pictures: samples from the whole take.
-        lossy: whether coding is lossy.
-        more: returns all other images; called if the samples are empty.
+        pictures: images sampled from the whole take.
+        lossy: whether the images are coded with losses.
+        more: returns all images that were not sampled; called if the samples are empty.
 
     Raises:
-        NotMasks: most non-empty images are not masks, or have more than two levels.
+        NotMasks: most of the non-empty images are not masks, or have more than two levels.
     """
     looked = [_looked(k, image) for k, image in enumerate(pictures)]
     shown = _shown(looked)
@@ -218,14 +219,14 @@ def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], It
     if any(one.planes for one in looked):
         raise NotMasks(
             None,
-            f"the alpha channel is opaque in all {len(looked)} pictures: nothing is masked.",
+            f"the alpha channel is opaque in all {len(looked)} images: nothing is masked.",
             "Export the matte in black and white, or colour with alpha (in After Effects: RGB + Alpha).",
         )
     return None
 
 
 def _shown(looked: Sequence[_Looked]) -> list[_Looked]:
-    """Return the images with a mask; some programs write opaque photographs for frames without one."""
+    """Return the images with a mask; some programs write opaque photographs for frames without a mask."""
     if any("alpha" in one.planes for one in looked):
         return [one for one in looked if "alpha" in one.planes]
     return [one for one in looked if one.planes and not (one.opaque and one.planes["brightest"].gray > MOST_GRAY)]
@@ -240,7 +241,7 @@ def _agreed(shown: Sequence[_Looked], lossy: bool) -> MaskLevels:
         values = sorted({levels.low, levels.high, levels.third or 0.0})
         raise NotMasks(
             number,
-            f"it has the levels {', '.join(f'{value:g}' for value in values)}; a mask has two, background and teeth.",
+            f"it has the levels {', '.join(f'{value:g}' for value in values)}; expected two, background and teeth.",
             "Export one mask per arch, or name one file for both arches as masks.labels, with upper_value and "
             "lower_value.",
         )
@@ -262,13 +263,13 @@ def _agreed(shown: Sequence[_Looked], lossy: bool) -> MaskLevels:
 
 def _alike(levels: _Levels, of: _Levels, lossy: bool) -> bool:
     if lossy and of.contrast <= _NEAR < levels.contrast:
-        return False  # the image is empty except for noise
+        return False  # an image that is empty except for noise
     near = _ALIKE * of.contrast
     return abs(levels.low - of.low) <= near and abs(levels.high - of.high) <= near
 
 
 def _telling_plane(shown: Sequence[_Looked]) -> str:
-    """Return the channel with the highest contrast, or alpha if present."""
+    """Return the channel with the highest contrast, or the alpha channel if it is present."""
     totals: dict[str, float] = {}
     for one in shown:
         for plane, levels in one.planes.items():
@@ -289,7 +290,7 @@ def _looked(number: int, image: RawImage) -> _Looked:
 
 
 def _levels(plane: RawImage) -> _Levels | None:
-    """Return the levels of one channel, None if it is uniform."""
+    """Return the levels of one channel, or None if the channel is uniform."""
     low, high, _, _ = cv2.minMaxLoc(plane)
     if low == high:
         return None
@@ -304,7 +305,7 @@ def _levels(plane: RawImage) -> _Levels | None:
     counts = cv2.calcHist([unit], [0], cv2.inRange(uneven, 0, _FLAT), [256], [0, 256]).ravel().astype(np.float64)
     first, _, rest = _peak(counts)
     second, area, rest = _peak(rest)
-    if not area:  # the teeth are too small to have flat regions
+    if not area:  # teeth that are too small to have flat regions
         second = 255 if first < 128 else 0
     third, third_area, _ = _peak(rest)
     dark, light = sorted((first, second))
@@ -328,7 +329,7 @@ def _levels(plane: RawImage) -> _Levels | None:
 
 
 def _peak(counts: Array) -> tuple[int, float, Array]:
-    """Return the most frequent of 256 values, the total count of it and its neighbours, and the remaining histogram."""
+    """Return the most frequent of 256 values, its count including adjacent values, and the remaining histogram."""
     at = int(counts.argmax())
     near = slice(max(at - _NEAR, 0), at + _NEAR + 1)
     rest = counts.copy()

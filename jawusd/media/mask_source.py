@@ -1,4 +1,4 @@
-"""The meaning of pixel values in mask files and mask videos, cached per file version."""
+"""Find the meaning of pixel values in mask files and mask videos; results are cached for each version of a file."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from jawusd.media.pictures import has_palette, read_palette_numbers, read_pictur
 from jawusd.media.pixels import Colour
 from jawusd.media.video import Video
 
-_SAMPLED = 10  # number of sampled images per take
+_SAMPLED = 10  # number of images sampled from a take
 _FEWEST_OF_VIDEO = 4
-_NEUTRAL = 12  # maximum difference between channels of gray images after lossy coding [of 255]
+_NEUTRAL = 12  # maximum difference [of 255] between the channels of a gray image after lossy coding
 
 
 @dataclass(frozen=True)
 class SourceLevels:
-    """The meaning of one source's values.
+    """Meaning of the pixel values of one mask source.
 
-    `levels` is None if all images are empty. `palette_numbers`: use palette indices, because all palette colours are
-    equal. `sizes_px` lists the sizes (width, height) of the sampled files, with one file per size.
+    `levels` is None if all images are empty. `palette_numbers` is true if palette indices are used because all palette
+    colours are equal. `sizes_px` lists the sizes (width, height) of the sampled files, with one file for each size.
     """
 
     levels: MaskLevels | None
@@ -47,38 +47,38 @@ def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | Non
     try:
         return _png_levels_of_version(tuple(sample), versions, others, is_other)
     finally:
-        others.files = []  # the cache keeps this object alive, and takes have tens of thousands of files
+        others.files = []  # names only, since the cache keeps this object, and a take has tens of thousands of files
 
 
 def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
-    """Find the levels of a video from samples, and the format to decode.
+    """Find the levels of a mask video from samples, and the pixel format to decode.
 
     Raises:
-        CaptureError: it cannot be decoded, or the images are not masks.
+        CaptureError: the video cannot be decoded, or the images are not masks.
     """
     return _video_levels_of_version(path, path.stat().st_mtime_ns)
 
 
 def mask_video(path: Path) -> Video:
-    """Return a video of masks, cached, since a take opens it a dozen times.
+    """Return a mask video from a cache, since a take opens the video a dozen times.
 
     Raises:
         CaptureError: see `Video`.
     """
     if not path.is_file():
-        return Video(path)  # raises the error for a missing file
+        return Video(path)  # a missing file raises the error here
     found = path.stat()
     return _video_of_version(path, found.st_mtime_ns, found.st_size)
 
 
 @lru_cache(maxsize=64)
 def _video_of_version(path: Path, changed_ns: int, size: int) -> Video:
-    """Open a video; modification time and size identify its version."""
+    """Open a video; modification time and size identify the version of the file."""
     return Video(path)
 
 
 class _Others:
-    """All files that are not sampled. Instances of equal length are equal, so that the cache does not compare files."""
+    """Files of a take that are not sampled; equal if as many, so that the cache need not compare them."""
 
     def __init__(self, files: list[Path]) -> None:
         self.files, self._count = files, len(files)
@@ -91,7 +91,7 @@ class _Others:
 
 
 def _spread(count: int, most: int) -> list[int]:
-    """Return at most `most` evenly spaced indices below `count`."""
+    """Return at most `most` evenly spaced indices from 0 to `count` - 1."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
@@ -102,7 +102,7 @@ def _png_levels_of_version(
     others: _Others,
     is_other: Callable[[RawImage], bool] | None,
 ) -> SourceLevels:
-    """Find the levels of files; modification times and sizes of the sampled files identify their version."""
+    """Find the levels of files; modification times and sizes of the sampled files identify the version."""
     for palette_numbers in (False, True) if any(map(has_palette, sample)) else (False,):
         read: list[Path] = []
         sizes: dict[tuple[int, int], Path] = {}
@@ -114,7 +114,7 @@ def _png_levels_of_version(
                 try:
                     image = load_png(path)
                 except CaptureError:
-                    continue  # the error is raised when the frame is read
+                    continue  # an error is raised later, when the frame is read
                 if is_other is None or not is_other(image):
                     read.append(path)
                     sizes.setdefault((image.shape[1], image.shape[0]), path)
@@ -127,7 +127,7 @@ def _png_levels_of_version(
             where = read[error.index] if error.index is not None else sample[0].parent
             raise CaptureError(error.reason, path=where, hint=error.hint) from error
         if not read:
-            return SourceLevels(MaskLevels())  # all files are unreadable; the error is raised when a frame is read
+            return SourceLevels(MaskLevels())  # if all files are unreadable, an error is raised when a frame is read
         if found is not None:
             return SourceLevels(found, palette_numbers, tuple((path, size) for size, path in sizes.items()))
     return SourceLevels(None, sizes_px=tuple((path, size) for size, path in sizes.items()))
@@ -135,10 +135,10 @@ def _png_levels_of_version(
 
 @lru_cache(maxsize=256)
 def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels, Colour]:
-    """Find the levels of a video and the format to decode; the modification time identifies its version."""
+    """Find the levels of a video and the format to decode; the modification time identifies the version."""
     video = mask_video(path)
     colour: Colour = "gray" if video.is_gray else "rgba" if video.has_alpha else "rgb"
-    # Key frames are cheap to decode. Several are used, because some are empty, often the first.
+    # Key frames are sampled because they are fast to decode; several, because some are empty, often the first.
     sample = [int(video.keys[k]) for k in _spread(len(video.keys), _SAMPLED)]
     if len(sample) < _FEWEST_OF_VIDEO:
         sample = sorted({*sample, *_spread(video.count, _FEWEST_OF_VIDEO)})
@@ -160,22 +160,22 @@ def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels,
     try:
         found = find_levels(pictures(sample), lossy, partial(pictures, None))
     except NotMasks as error:
-        where = "" if error.index is None else f"picture {numbers[error.index]}: "
+        where = "" if error.index is None else f"image {numbers[error.index]}: "
         raise CaptureError(where + error.reason, path=path, hint=error.hint) from error
     if lossy and neutral[0]:
-        colour = "gray"  # luma, at full resolution
+        colour = "gray"  # luma has the full resolution
     return SourceLevels(found), colour
 
 
 def load_png(path: Path) -> RawImage:
-    """Read an image as stored.
+    """Read a mask image as stored.
 
     Raises:
-        CaptureError: it cannot be decoded.
+        CaptureError: the mask cannot be decoded.
     """
     image = read_picture(path, cv2.IMREAD_UNCHANGED)
     if image is None:
         raise CaptureError(
-            "the mask cannot be decoded.", path=path, hint="Export it again, or delete it: that frame is skipped."
+            "the mask cannot be decoded.", path=path, hint="Export the mask again, or delete it to skip the frame."
         )
     return image

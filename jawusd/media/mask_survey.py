@@ -1,4 +1,4 @@
-"""Quick checks of the masks of a capture on a few frames, without tracking."""
+"""Check the masks of a capture quickly on a few frames, without tracking."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from jawusd.media.masks import MaskReader, open_masks
 
 ARCHES = ("upper", "lower")
 _LISTED = 5
-_SPREAD = 9  # number of frames sampled per clip
-_POINTS = 500  # maximum number of pixels sampled per mask
+_SPREAD = 9  # number of frames sampled from a clip
+_POINTS = 500  # maximum number of pixels sampled from a mask
 _HALF = 128
 
 
@@ -26,21 +26,21 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
     """Return findings about the masks of one camera, from samples of the whole take.
 
     `size_px` is the (width, height) of the camera's images. Kinds: "camera_without_masks" and "masks_black", warnings
-    about unused masks; "mask_levels", a note about values other than 0 and full white; "masks_soft" and
-    "mask_polarity", warnings that the outline, or which level is teeth, is ambiguous.
+    about unused masks; "mask_levels", a note about values other than 0 and full white; "masks_soft", a warning that
+    the outline is ambiguous; "mask_polarity", a warning that it is ambiguous which level is teeth.
 
     Raises:
-        CaptureError: the masks cannot be used: missing, damaged, not of the size or number of the camera's images, or
-            not masks; the message names the file and its content.
+        CaptureError: the masks are missing, damaged, not as large or as many as the camera's images, or not masks; the
+            message names the file and its content.
     """
     if source.masks is None:
         return [
             Finding(
                 "camera_without_masks",
                 "warning",
-                "it has no masks and is not used for tracking.",
+                "the camera has no masks and is not used for tracking.",
                 camera=source.name,
-                hint="Add its masks in capture.toml, or create them with `jawusd segment`.",
+                hint="Add masks in capture.toml, or create them with `jawusd segment`.",
             )
         ]
     readers = open_masks(source, size_px)
@@ -61,7 +61,7 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
 
 
 def odd_pictures(source: CameraSource, arch: str, odd: Sequence[str]) -> list[Finding]:
-    """Return findings about mask images that are inconsistent with the others; see `MaskReader.odd`."""
+    """Return findings about mask images that are inconsistent with the other masks; see `MaskReader.odd`."""
     if not odd:
         return []
     more = f"; and {len(odd) - _LISTED} more" if len(odd) > _LISTED else ""
@@ -72,7 +72,7 @@ def odd_pictures(source: CameraSource, arch: str, odd: Sequence[str]) -> list[Fi
             f"{len(odd)} masks of the {arch} teeth are not used: {'; '.join(odd[:_LISTED])}{more}.",
             value=len(odd),
             camera=source.name,
-            hint="Export them like the other masks.",
+            hint="Export these masks like the other masks.",
         )
     ]
 
@@ -83,7 +83,7 @@ def _black(source: CameraSource, message: str) -> Finding:
         "warning",
         message,
         camera=source.name,
-        hint="Export them with the teeth in white, or remove `masks` of this camera.",
+        hint="Export the masks with the teeth in white, or remove `masks` of this camera.",
     )
 
 
@@ -125,7 +125,7 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
                 f"the masks of {rows} teeth have the values {levels.background:g} and {levels.teeth:g}, and it is "
                 f"unclear which is the background; {levels.teeth:g} is taken as teeth.",
                 camera=source.name,
-                hint="Export them with teeth in white on black up to the border of the picture.",
+                hint="Export the masks with teeth in white, on black up to the border of the image.",
             )
         )
     return out
@@ -133,21 +133,20 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
 
 @dataclass(frozen=True, eq=False)
 class MaskSamples:
-    """Samples of the masks of one camera, by the camera's own frames."""
+    """Samples of the masks of one camera, by frame number of the camera itself."""
 
-    counts: tuple[int, int]  # number of frames of the mask sources, upper and lower
-    first_last: tuple[
-        tuple[int, int] | None, tuple[int, int] | None
-    ]  # first and last frame with a mask, per arch, None if there is none
-    read: Callable[[int, int], MaskImage | None]  # returns the mask of (arch, frame)
+    counts: tuple[int, int]  # numbers of frames of the upper and the lower mask source
+    # First and last frame with a mask, for the upper and the lower arch; None if the arch has no masks.
+    first_last: tuple[tuple[int, int] | None, tuple[int, int] | None]
+    read: Callable[[int, int], MaskImage | None]  # returns the mask of an arch (0 upper, 1 lower) in a frame
 
     @property
     def first_frame(self) -> int | None:
-        """Return the first frame with a mask of any arch."""
+        """Return the first frame with a mask of either arch."""
         return min((frames[0] for frames in self.first_last if frames is not None), default=None)
 
     def pixels(self, arch: int, frame: int) -> Array:
-        """Return sampled pixels (x, y) of a mask, shape (N <= 500, 2); N = 0 without a mask."""
+        """Return at most 500 sampled pixels (x, y) of a mask, shape (N, 2); N = 0 if there is no mask."""
         mask = self.read(arch, frame)
         if mask is None:
             return np.empty((0, 2))
@@ -157,11 +156,11 @@ class MaskSamples:
 
 
 def sample_masks(source: CameraSource, size_px: tuple[int, int], files: ExitStack) -> MaskSamples:
-    """Sample masks over a clip, and find the first and last frame with a mask.
+    """Sample masks over a whole clip, and find the first and last frame with a mask.
 
     Args:
         source: a camera with masks.
-        size_px: (width, height) of its images.
+        size_px: (width, height) of the camera's images.
         files: exit stack that closes the masks.
 
     Raises:
@@ -175,7 +174,7 @@ def sample_masks(source: CameraSource, size_px: tuple[int, int], files: ExitStac
 
 
 def _first_last(reader: MaskReader) -> tuple[int, int] | None:
-    """Return the first and last frame with a mask, assuming no gaps, or None."""
+    """Return the first and last frame with a mask, assuming no gaps between them, or None."""
     spread = np.unique(np.linspace(0, reader.count - 1, _SPREAD).round().astype(int)).tolist()
     shown = [frame for frame in spread if _shows(reader, frame)]
     if not shown:
@@ -186,7 +185,7 @@ def _first_last(reader: MaskReader) -> tuple[int, int] | None:
 
 
 def _boundary(reader: MaskReader, shown: int, empty: int) -> int:
-    """Return the frame with a mask next to the empty frames, found by bisection."""
+    """Return the frame at which masks begin or end, found by bisection between a masked and an empty frame."""
     while abs(shown - empty) > 1:
         middle = (shown + empty) // 2
         if _shows(reader, middle):

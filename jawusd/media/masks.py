@@ -1,4 +1,4 @@
-"""Read segmentation masks by the frames of their camera's video, decoding ahead in a background thread."""
+"""Read segmentation masks by frame number of their camera's video, decoded ahead in a background thread."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from jawusd.media.mask_levels import MaskImage, MaskLevels
 from jawusd.media.timeline import Timeline
 from jawusd.media.video import Video
 
-_LOOKED_AT = 10  # number of label images sampled
-_AHEAD = 4  # number of buffered images: 8 MB per reader for full HD
+_LOOKED_AT = 10  # number of label images that are sampled
+_AHEAD = 4  # number of buffered images; takes 8 MB per reader for full HD
 
 
 class MaskReader:
@@ -31,12 +31,12 @@ class MaskReader:
     Sequential reads decode the next frames in a background thread; random access decodes on demand. A reader is not
     thread-safe. Use it as a context manager or close it, or its thread never ends.
 
-    Frames follow the camera's clock: frame k is shown k nominal frame durations after its first image. In videos of
-    variable rate some frames have no image, and no mask.
+    Frames follow the camera's clock: frame k is shown k nominal frame durations after the camera's first image. In
+    videos with a variable frame rate, some frames have no image and therefore no mask.
 
     Attributes:
-        count: one past the last frame of the source.
-        levels: meaning of the values; None if nothing is segmented, or for label images.
+        count: one past the last frame number of the masks.
+        levels: meaning of the pixel values; None for label images, or if nothing is segmented.
     """
 
     def __init__(
@@ -48,14 +48,14 @@ class MaskReader:
         labels: LabelValues | None = None,
         prepare: Callable[[MaskImage], MaskImage] | None = None,
     ) -> None:
-        """Find the masks, and the meaning of their values from samples of the whole take.
+        """Find the masks, and the meaning of their pixel values from samples of the whole take.
 
         Args:
             path: a PNG pattern with one `%d` or `%06d` (the index of the image in the camera's video), or a video with
                 one image per image, or per frame, of the camera's video.
-            timeline: timeline of the camera's video; without one, PNG files are numbered by frame.
-            labels: for label images, the gray values of the requested and the other arch.
-            prepare: applied to each mask in the background thread, such as `WorkingView.mask`.
+            timeline: timeline of the camera's video; if it is None, PNG files are numbered by frame.
+            labels: for label images, the gray values of the requested arch and of the other arch.
+            prepare: function applied to each mask in the background thread, such as `WorkingView.mask`.
 
         Raises:
             CaptureError: the folder or file is missing, has no masks, or their size or number is wrong.
@@ -78,9 +78,9 @@ class MaskReader:
         self._ahead: _Ahead | None = None
 
     def read(self, frame: int) -> MaskImage | None:
-        """Return the prepared mask (h, w) of a frame of the camera: 255 = tooth, 0 = background, intermediate at edges.
+        """Return the prepared mask (h, w) of a frame: 255 for tooth, 0 for background, intermediate values at edges.
 
-        None if the frame is not segmented: outside the video, without an image, or black.
+        Return None if the frame is not segmented: outside the video, without an image, or with a black mask.
 
         Raises:
             CaptureError: the image cannot be decoded, has the wrong size, or is not a mask.
@@ -101,7 +101,7 @@ class MaskReader:
 
     @cached_property
     def is_black(self) -> bool:
-        """Tell whether all images are empty.
+        """Return whether all mask images are empty.
 
         Raises:
             CaptureError: a label image cannot be decoded, has the wrong size or unknown values.
@@ -114,11 +114,11 @@ class MaskReader:
 
     @property
     def odd(self) -> list[str]:
-        """Return the images rejected so far, with reasons; they count as not segmented."""
+        """Return the reasons why images were rejected so far; rejected images count as not segmented."""
         return [self._source.odd[number] for number in sorted(self._source.odd)]
 
     def read_some(self, first: int, stop: int) -> list[MaskImage | None]:
-        """Return the masks of consecutive frames [first, stop), like `read`, without decoding ahead.
+        """Return the masks of frames first to stop - 1, like `read`, but without decoding ahead.
 
         Raises:
             CaptureError: an image cannot be decoded, has the wrong size, or is not a mask.
@@ -131,7 +131,7 @@ class MaskReader:
         return [None] * (inside.start - first) + found + [None] * (stop - inside.stop)
 
     def close(self) -> None:
-        """Stop decoding ahead; the reader remains usable."""
+        """Stop decoding in the background; the reader remains usable."""
         if self._ahead is not None:
             self._ahead.stop()
             self._ahead = None
@@ -151,7 +151,7 @@ class MaskReader:
             yield mask if mask is None or self._prepare is None else self._prepare(mask)
 
     def _masks(self, first: int) -> Iterator[MaskImage | None]:
-        """Yield the mask of every frame from the first on."""
+        """Yield the mask of every frame from `first` on."""
         if self._timeline is None:
             yield from self._source.masks(first)
             return
@@ -163,7 +163,7 @@ class MaskReader:
                 continue
             if pictures is None:
                 pictures, at = self._source.masks(picture), picture
-            while at < picture:  # if two images share a frame, use the first
+            while at < picture:  # if two images belong to one frame, use the first
                 next(pictures)
                 at += 1
             yield next(pictures)
@@ -171,30 +171,31 @@ class MaskReader:
 
 
 def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> Timeline | None:
-    """Return the timeline that maps frames to file numbers; None if both are equal."""
+    """Return the timeline that maps frames to the numbers of mask files; None if they are equal."""
     if video is None or not (video.missing or video.is_numbered):
         return None
     if video.is_numbered:
         if not source.numbers & set(video.stored.tolist()):
             raise CaptureError(
-                f"the masks are numbered {min(source.numbers)} to {max(source.numbers)}, but the camera's pictures are "
+                f"the masks are numbered {min(source.numbers)} to {max(source.numbers)}, but the camera's images are "
                 f"numbered {video.stored[0]} to {video.stored[-1]}.",
                 path=path,
-                hint="Number the masks like their pictures.",
+                hint="Number the masks like the images from which they were made.",
             )
         return video
     if source.count > len(video.numbers):
         raise CaptureError(
             f"the masks are numbered up to {source.count - 1}, but the camera's video, with a variable frame rate, has "
-            f"only pictures 0 to {len(video.numbers) - 1} (in {video.count} frames).",
+            f"only images 0 to {len(video.numbers) - 1} (in {video.count} frames).",
             path=path,
-            hint="Number masks by the pictures of the video, or convert it to a constant rate before making masks.",
+            hint="Number masks by the images of the video, or convert the video to a constant rate "
+            "before making masks.",
         )
     return video
 
 
 def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks) -> Callable[[int], int | None]:
-    """Return the function that maps frames to the numbers of masks in their source."""
+    """Return the function that maps frames to the numbers of masks in the mask source."""
     if timeline is None:
         return lambda frame: frame
     return timeline.number if isinstance(source, PngMasks) else timeline.picture
@@ -203,13 +204,13 @@ def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks) -> Calla
 def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -> Timeline:
     """Return the timeline that maps the camera's frames to images of a mask video."""
     if video is None or source.timeline.count == video.count != len(video.numbers) != source.count:
-        return source.timeline  # the masks were made from footage converted to a constant rate
+        return source.timeline  # masks that were made from footage converted to a constant rate
     if source.count != len(video.numbers):
         frames = f" in {video.count} frames" if video.missing else ""
         raise CaptureError(
-            f"the mask video has {source.count} pictures, but the camera's video has {len(video.numbers)}{frames}.",
+            f"the mask video has {source.count} images, but the camera's video has {len(video.numbers)}{frames}.",
             path=path,
-            hint="Export the masks again, one picture per picture of the video, from its first one on.",
+            hint="Export the masks again, with one mask for each image of the video, from the first image on.",
         )
     return video
 
@@ -235,7 +236,7 @@ def open_masks(
 
 @lru_cache(maxsize=64)
 def _timeline(clip: ClipSource, changed_ns: int) -> Timeline:
-    """Return the timeline of a clip; the modification time identifies its version."""
+    """Return the timeline of a clip; the modification time identifies the version of the file."""
     return open_clip(clip).timeline
 
 
@@ -244,7 +245,7 @@ def _changed_ns(path: Path) -> int:
 
 
 def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Return the (width, height) of the first mask of a PNG pattern or video.
+    """Return the (width, height) of the first mask in a PNG pattern or a video.
 
     Raises:
         CaptureError: the folder or file is missing, has no masks, or cannot be decoded.
@@ -256,7 +257,7 @@ def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 
 class _Ahead:
-    """An iterator that runs in a thread, a few items ahead of the reader."""
+    """Iterator that runs in a thread, a few items ahead of the reader."""
 
     def __init__(self, items: Generator[MaskImage | None], first_frame: int) -> None:
         self.next_frame = first_frame
@@ -269,13 +270,13 @@ class _Ahead:
         self.next_frame += 1
         item, error = self._queue.get()
         if error is not None:
-            self.next_frame = -1  # the thread has ended
+            self.next_frame = -1  # the thread has ended, and no item will follow
             raise error
         return item
 
     def stop(self) -> None:
         self._stopping.set()
-        # The thread may wait for space in the queue; it puts at most one more item.
+        # A thread that waits for space in the queue adds at most one more item.
         with contextlib.suppress(queue.Empty):
             while True:
                 self._queue.get_nowait()
@@ -288,7 +289,7 @@ class _Ahead:
                     self._put(item, None)
                     if self._stopping.is_set():
                         return
-        except Exception as error:  # re-raised in the reading thread
+        except Exception as error:  # the reading thread raises this exception again
             self._put(None, error)
 
     def _put(self, item: MaskImage | None, error: Exception | None) -> None:

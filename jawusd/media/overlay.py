@@ -1,4 +1,4 @@
-"""Draw tracked scans over the footage for visual checks (paper figs. 10 and 11)."""
+"""Draw tracked scans over the footage for visual checks (figs. 10 and 11 of the paper)."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from jawusd.geometry import Camera, transform_points
 from jawusd.media.backdrop import Backdrop
 from jawusd.meshes.raster import draw_depth_labels
 
-#: Red, green and blue, 0 .. 255.
+#: Colour: red, green and blue, 0 to 255.
 Colour = tuple[int, int, int]
 
 UPPER_COLOUR: Colour = (255, 170, 0)
 LOWER_COLOUR: Colour = (0, 200, 255)
 _LINE_PX = 2
 CAPTION_PX = 22
-#: Gray value of a tile whose camera has no image.
+#: Gray value of a tile if the camera has no image.
 EMPTY_GRAY = 60
-_MARGIN = 0.25  # margin around the teeth in a tile [fraction of their extent]
+_MARGIN = 0.25  # margin around the teeth in a tile, as a fraction of their extent
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedScan:
     """A teeth scan at its tracked pose."""
 
-    mesh: Mesh  # the scan [mm]; its gum is not drawn, but hides what is behind it
-    T_world_scan: Array  # its pose, shape (4, 4); NaN omits the scan
+    mesh: Mesh  # the scan [mm]; gum is not drawn, but hides what is behind it
+    T_world_scan: Array  # pose of the scan, shape (4, 4); the scan is omitted if NaN
     colour: Colour
 
 
 def draw_overlay(
     image: NDArray[np.uint8], camera: Camera, scans: Sequence[PlacedScan], *, fill: float = 0.3
 ) -> NDArray[np.uint8]:
-    """Return a copy of a recorded image (h, w, 3) RGB with the visible crowns tinted (opacity `fill`) and outlined.
+    """Return a copy of an RGB image (h, w, 3) with the visible crowns tinted (opacity `fill`) and outlined.
 
     Raises:
         ValueError: the image does not have the camera's size.
     """
     if image.shape != (camera.size_px[1], camera.size_px[0], 3) or image.dtype != np.uint8:
-        raise ValueError(f"picture must be RGB of {camera.size_px} px, got {image.dtype} {image.shape}")
+        raise ValueError(f"image is {image.dtype} of shape {image.shape}; expected RGB of {camera.size_px} px")
     labels = _visible_crowns(camera, scans)
     out = image.copy()
     kernel = np.ones((2 * _LINE_PX + 1,) * 2, np.uint8)
@@ -66,7 +66,7 @@ def draw_overlay(
 
 
 def arch_colours(tracks: Tracks, row: int) -> tuple[Colour, Colour]:
-    """Return the colours of the upper and lower arch at a row of tracks; by state for a solved performance."""
+    """Return the colours of the upper and lower arch for a row of tracks; by state for a solved performance."""
     if tracks.solved is None:
         return UPPER_COLOUR, LOWER_COLOUR
     whole = SolveState(int(tracks.solved.state[row]))
@@ -76,7 +76,7 @@ def arch_colours(tracks: Tracks, row: int) -> tuple[Colour, Colour]:
 
 
 def placed_scans(tracks: Tracks, row: int, meshes: Sequence[Mesh]) -> list[PlacedScan]:
-    """Return the upper and the lower scan, posed as in a row of tracks."""
+    """Return the upper and the lower scan with their poses in a row of tracks."""
     poses = tracks.T_world_upper[row], tracks.T_world_lower[row]
     return [PlacedScan(*one) for one in zip(meshes, poses, arch_colours(tracks, row), strict=True)]
 
@@ -91,12 +91,12 @@ def tracking_sheet(
     *,
     tile_px: tuple[int, int] = (480, 270),
 ) -> NDArray[np.uint8]:
-    """Return one RGB image with a row per frame and a column per camera, cropped to the teeth and captioned.
+    """Return one RGB image of captioned tiles cropped to the teeth, with a row per frame and a column per camera.
 
-    A tile is gray if the camera has no image, and has no tint if the jaw was lost.
+    A tile is gray if the camera has no image. Crowns are not tinted if the jaw was lost.
 
     Args:
-        frames: frames of the reference camera, all of them in tracks.
+        frames: frame numbers of the reference camera; all must be in the tracks.
         backdrops: image sources by camera.
 
     Raises:
@@ -120,13 +120,13 @@ def tracking_sheet(
 
 
 def contact_sheet(tiles: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
-    """Arrange images of equal size in rows; return RGB uint8, the last row padded with black.
+    """Arrange images of equal size in rows, the last row padded with black; return RGB uint8.
 
     Raises:
         ValueError: there are no images, or they differ in size.
     """
     if not tiles or columns < 1 or len({tile.shape for tile in tiles}) != 1:
-        raise ValueError(f"pictures must have equal sizes, got {[tile.shape for tile in tiles]}")
+        raise ValueError(f"images have the shapes {[tile.shape for tile in tiles]}; expected equal sizes")
     height, width, channels = tiles[0].shape
     rows = math.ceil(len(tiles) / columns)
     sheet = np.zeros((rows * height, columns * width, channels), np.uint8)
@@ -146,19 +146,19 @@ def save_png(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """Return an RGB image (h, w, 3) as a JPEG file; quality 0 .. 100."""
+    """Return the bytes of an RGB image (h, w, 3) as a JPEG file; quality 0 to 100."""
     return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def _points(camera: Camera, scan: PlacedScan) -> NDArray[np.float32]:
-    """Return the distorted pixel and the depth of each vertex; distortion within a triangle is negligible."""
+    """Return the distorted pixel and the depth of each vertex; distortion varies little within a triangle."""
     world = transform_points(scan.T_world_scan, scan.mesh.vertices)
     return np.column_stack([camera.project(world), camera.depth(world)]).astype(np.float32)
 
 
 @lru_cache(maxsize=8)
 def _parted_faces(mesh: Mesh) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the faces of gum and crowns; cached, since videos need them for every frame."""
+    """Return the gum faces and crown faces of a scan; cached, since videos need them for every frame."""
     crown = crown_face_mask(mesh)
     return mesh.faces[~crown], mesh.faces[crown]
 

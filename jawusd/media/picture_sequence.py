@@ -1,4 +1,4 @@
-"""Image sequences as clips: one file per frame, of any bit depth, with gaps for missing files."""
+"""Read image sequences as clips: one file per frame, of any bit depth, with gaps for missing files."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from jawusd.media.pictures import StoredPicture, read_header, read_stored
 from jawusd.media.pixels import Colour, Slices, coloured
 from jawusd.media.timeline import Timeline
 
-#: Frame rate if neither the capture nor the files have one.
+#: Frame rate [Hz] if neither the capture nor the files state one.
 _USUAL_RATE = 24.0
-_FASTEST_COUNT = 30.0  # maximum rate of time codes in headers [frames per second]
-_AHEAD = 2  # number of images decoded ahead
+_FASTEST_COUNT = 30.0  # maximum frame rate [Hz] of time codes in headers
+_AHEAD = 2  # number of images that are decoded ahead
 
 
 class PictureSequence(Clip):
@@ -37,7 +37,7 @@ class PictureSequence(Clip):
         """Find the files and read the first one.
 
         Raises:
-            CaptureError: there are none, or the first cannot be read.
+            CaptureError: there are no files, or the first file cannot be read.
         """
         self._source = source
         self.path = source.path
@@ -51,8 +51,8 @@ class PictureSequence(Clip):
         self.keys = np.arange(self.count)
         self.start_s, self.rotation_deg = 0.0, 0
         self.timecode = header.timecode
-        # The header field has room for frame numbers below 40; at higher rates several images have the same (SMPTE ST
-        # 12-3).
+        # The time code in a header is limited to frame numbers below 40; at higher rates, several images have the same
+        # number (SMPTE ST 12-3).
         self.timecode_fps = self.fps / math.ceil(self.fps / _FASTEST_COUNT - 0.01)
         self.pixel_aspect = header.pixel_aspect
         self._space = source.colour_space or header.colour_space
@@ -66,13 +66,13 @@ class PictureSequence(Clip):
         """Return an image as stored.
 
         Raises:
-            CaptureError: it cannot be read, or differs in size from the first one.
+            CaptureError: the image cannot be read, or differs in size from the first image.
         """
         found = self._stored(index)
         if found.pixels.shape[1::-1] != self.size_px:
             height, width = found.pixels.shape[:2]
             raise CaptureError(
-                f"is {width} x {height} px, but the first picture is {self.size_px[0]} x {self.size_px[1]} px.",
+                f"is {width} x {height} px, but the first image is {self.size_px[0]} x {self.size_px[1]} px.",
                 path=self._files[index][1],
             )
         return found

@@ -1,7 +1,7 @@
-"""Read single image files of any depth: PNG, TIFF, EXR, DPX, JPEG; and their headers.
+"""Read single image files of any bit depth (PNG, TIFF, EXR, DPX, JPEG) and their headers.
 
-Headers: OpenEXR, "Reading and Writing Image Files", https://openexr.com/en/latest/OpenEXRFileLayout.html; DPX,
-SMPTE ST 268-1.
+References for headers: OpenEXR, "Reading and Writing Image Files",
+https://openexr.com/en/latest/OpenEXRFileLayout.html; DPX, SMPTE ST 268-1.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ from jawusd.media.pixels import TO_RGB
 RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_HINT = "Export the pictures again, as PNG, TIFF, EXR, DPX or JPEG."
+_HINT = "Export the images again, as PNG, TIFF, EXR, DPX or JPEG."
 _MOST_HEADER_BYTES = 1 << 16
-#: Maximum number of pixels of an image, 8K: small files can declare images that exhaust memory, and decoding takes up
-#: to 28 bytes per pixel.
+#  Maximum number of pixels of an image, 8K; small files can declare images that exhaust memory, and decoding takes up
+# to
+#: 28 bytes per pixel.
 MOST_STORED_PX = 36_000_000
 _EXR, _DPX = b"\x76\x2f\x31\x01", (b"SDPX", b"XPDS")
-_QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # Exif orientations: quarter turns by value; mirrored values
-_DPX_LOG = (1, 3)  # transfer characteristics "printing density" and "logarithmic", SMPTE ST 268-1 table 5A
+_QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # quarter turns by Exif orientation, and mirrored orientations
+_DPX_LOG = (1, 3)  # DPX codes for "printing density" and "logarithmic" (SMPTE ST 268-1, table 5A)
 
 
 def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
@@ -42,7 +43,7 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
         check_input(path, CaptureError)
         if _pixels(path) > MOST_PX:
             return None
-        image = cv2.imdecode(np.fromfile(path, np.uint8), flags)  # imread crashes on names that are not UTF-8
+        image = cv2.imdecode(np.fromfile(path, np.uint8), flags)  # OpenCV's imread crashes on names that are not UTF-8
         if image is None or image.dtype == np.uint8:
             return None if image is None else np.asarray(image, np.uint8)
         return np.asarray(image, np.uint16)
@@ -51,10 +52,10 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
 
 
 def _pixels(path: Path) -> int:
-    """Return the number of pixels according to the file's header, 0 if unknown."""
+    """Return the number of pixels stated in a file's header, 0 if unknown."""
     with open(path, "rb") as file:
         head = file.read(24)
-    if head.startswith(_PNG):  # fast path for PNG
+    if head.startswith(_PNG):  # PNG headers are parsed here because that is faster
         return int.from_bytes(head[16:20]) * int.from_bytes(head[20:24])
     try:
         with warnings.catch_warnings():
@@ -63,7 +64,7 @@ def _pixels(path: Path) -> int:
                 return image.width * image.height
     except Image.DecompressionBombError:
         return MOST_PX + 1
-    except Exception:  # unknown to Pillow; OpenCV enforces its own limit
+    except Exception:  # Pillow does not know the format; OpenCV enforces a limit of its own
         return 0
 
 
@@ -74,10 +75,10 @@ def read_gray(path: Path) -> NDArray[np.uint8] | None:
 
 
 def has_palette(path: Path) -> bool:
-    """Tell whether a file is a PNG with a palette."""
+    """Return whether a file is a PNG with a palette."""
     with open(path, "rb") as file:
         head = file.read(26)
-    return head.startswith(_PNG) and head[25:26] == b"\x03"  # PNG specification, section 11.2.2
+    return head.startswith(_PNG) and head[25:26] == b"\x03"  # colour type 3 in section 11.2.2 of the PNG specification
 
 
 def read_palette_numbers(path: Path, picture: RawPicture) -> RawPicture:
@@ -90,7 +91,7 @@ def read_palette_numbers(path: Path, picture: RawPicture) -> RawPicture:
 
 @dataclass(frozen=True, eq=False)
 class StoredPicture:
-    """An image as stored: (h, w) or (h, w, 3) RGB; integers 0 .. largest, or floating point."""
+    """Image as stored in a file: (h, w) or (h, w, 3) RGB; integers 0 to `largest`, or floating point."""
 
     pixels: Stored
     largest: int
@@ -110,7 +111,7 @@ def read_stored(path: Path) -> StoredPicture:
     """Read an image file.
 
     Raises:
-        CaptureError: it is missing, damaged, or not an image.
+        CaptureError: the file is missing, damaged, or not an image.
     """
     check_input(path, CaptureError)
     try:
@@ -119,9 +120,9 @@ def read_stored(path: Path) -> StoredPicture:
             pixels, largest = _stored_pixels(frame)
             return StoredPicture(np.rot90(pixels, _quarters(path)), largest)
     except MemoryError as error:
-        raise CaptureError("there is not enough memory for the picture.", path=path, hint=_HINT) from error
+        raise CaptureError("there is not enough memory for the image.", path=path, hint=_HINT) from error
     except (av.FFmpegError, OSError, StopIteration, IndexError, ValueError) as error:
-        what = f"the picture cannot be read: it is damaged or has more than {MOST_STORED_PX} px ({error!s:.100})."
+        what = f"the image cannot be read: it is damaged or has more than {MOST_STORED_PX} px ({error!s:.100})."
         raise CaptureError(what, path=path, hint=_HINT) from error
 
 
@@ -134,7 +135,7 @@ def _quarters(path: Path) -> int:
     try:
         with Image.open(path) as image:
             orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-    except Exception:  # formats unknown to Pillow (EXR, DPX) have no Exif
+    except Exception:  # formats that Pillow does not know (EXR, DPX) have no Exif data
         return 0
     if orientation in _MIRRORED:
         raise CaptureError("the orientation in the file is mirrored, which is not supported.", path=path, hint=_HINT)
@@ -165,8 +166,8 @@ def _fractions(frame: av.VideoFrame) -> NDArray[np.float16] | NDArray[np.float32
     kind = kind.newbyteorder(">" if frame.format.name.endswith("be") else "<")
     count = len(frame.planes)
     pixels = np.empty((frame.height, frame.width, min(count, 3)), kind.newbyteorder("="))
-    order = (0,) if count == 1 else (1, 2, 0)  # ffmpeg's planar order is green, blue, red
-    for plane, channel in zip(frame.planes, order):  # a fourth plane is alpha
+    order = (0,) if count == 1 else (1, 2, 0)  # FFmpeg's order of planes is green, blue, red
+    for plane, channel in zip(frame.planes, order):  # ignore a fourth plane, which is alpha
         rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
         pixels[..., channel] = np.ascontiguousarray(rows[: frame.height, : frame.width * kind.itemsize]).view(kind)
     return pixels[..., 0] if count == 1 else pixels
@@ -176,7 +177,7 @@ def read_header(path: Path) -> PictureHeader:
     """Return the metadata of an EXR or DPX file; empty for other formats.
 
     Raises:
-        CaptureError: it cannot be read.
+        CaptureError: the file cannot be read.
     """
     check_input(path, CaptureError)
     try:
@@ -190,7 +191,7 @@ def read_header(path: Path) -> PictureHeader:
         if head[:4] in _DPX:
             return _dpx(head)
     except (struct.error, IndexError, ValueError):
-        pass  # damage is reported by the decoder
+        pass  # the decoder reports damaged headers
     return PictureHeader()
 
 
@@ -227,7 +228,7 @@ def _dpx(head: bytes) -> PictureHeader:
 
 
 def _timecode(code: int, bits_of_drop: bool = True) -> str:
-    """Return an SMPTE ST 12-1 time code from BCD: hours, minutes, seconds, frames, highest byte first."""
+    """Return the SMPTE ST 12-1 time code of a BCD number: hours, minutes, seconds, frames, highest byte first."""
     tens = (0x3, 0x7, 0x7, 0x3)
     parts = [(code >> shift) & 0xFF for shift in (24, 16, 8, 0)]
     hours, minutes, seconds, frame = (10 * (part >> 4 & mask) + (part & 0xF) for part, mask in zip(parts, tens))

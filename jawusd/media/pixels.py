@@ -1,4 +1,4 @@
-"""Decoded images as arrays: full-range gray, RGB or RGBA, rotated as the file requires."""
+"""Convert decoded images to arrays: full-range gray, RGB or RGBA, rotated as the file requires."""
 
 from __future__ import annotations
 
@@ -19,107 +19,108 @@ from jawusd.base.errors import CaptureError
 from jawusd.media.display import to_display
 
 Colour = Literal["gray", "rgb", "rgba"]
-#: Rows and columns of a region.
+#: Row slice and column slice of an image region.
 Slices: TypeAlias = "tuple[slice[int, int, int], slice[int, int, int]]"
 
-# ITU-R BT.709 / BT.601 video range: 16 is black, 235 is white.
+# Gray value of each luma value in the video range of ITU-R BT.709 and BT.601, where 16 is black and 235 is white.
 _STRETCH = np.clip(np.round((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
 _BYTE_BITS = 8
-# ffmpeg's fast conversion to RGB is 1.3 of 255 levels too dark and does not interpolate chroma; these flags round and
-# interpolate.
+# Flags of FFmpeg's conversion to RGB that enable rounding and chroma interpolation; without rounding, images are 1.3 of
+# 255 levels too dark.
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-_AROUND_PX = 8  # margin converted around a region, for chroma interpolation
-_STEP_PX = 32  # alignment of the region's sides [px]
-_ANY_TIME = Fraction(1, 1000)  # arbitrary, but filters need a time base
-_FULL_RANGE = 2  # AVCOL_RANGE_JPEG: full range
+_AROUND_PX = 8  # margin around a converted region, for chroma interpolation
+_STEP_PX = 32  # alignment of the sides of a converted region
+_ANY_TIME = Fraction(1, 1000)  # time base that FFmpeg's filters need; the value does not matter
+_FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG, the full range
 _PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
 _PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
-# Little-endian planar formats of more than 8 bits; p010 and similar store values in the highest bits.
+# Little-endian planar formats of more than 8 bits; p010 and similar formats store values in the highest bits.
 _DEEP = re.compile(r"(yuva?4\d\dp|p0)(10|12|14|16)le")
 
 
-_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])  # counter-clockwise, as in display matrices: rows map x and y
+# Counter-clockwise rotations as in display matrices, whose rows map x and y.
+_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
 def turn_deg(frame: av.VideoFrame) -> int:
     """Return the counter-clockwise rotation stored in a file: 0, 90, 180 or 270.
 
     Raises:
-        CaptureError: its display matrix mirrors the image, or is not a multiple of 90 degrees.
+        CaptureError: the display matrix mirrors the image, or does not rotate it by a multiple of 90 degrees.
     """
     try:
         stored = frame.side_data.get("DISPLAYMATRIX")
-    except ValueError:  # PyAV does not know other side data, such as Exif; only the rotation is available
+    except ValueError:  # PyAV fails on unknown side data, such as Exif; the rotation is still available
         return frame.rotation % 360
     if stored is None:
         return 0
     rows = np.frombuffer(bytes(cast(SideData, stored)), np.int32, 9).reshape(3, 3)[:2, :2].astype(float)
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     if not lengths.all():
-        return 0  # a zero matrix means no rotation
-    rows /= lengths  # drop the scale, as players do
+        return 0  # a zero matrix stands for no rotation
+    rows /= lengths  # remove the scale, as players do
     for quarters in range(4):
         if np.allclose(rows, np.linalg.matrix_power(_QUARTER_TURN, quarters), atol=1e-3):
             return 90 * quarters
     if np.linalg.det(rows) < 0:
         raise CaptureError(
-            "the display matrix in the file mirrors the picture, which is not supported.",
-            hint="Switch mirroring off in the camera. If the stored picture is not mirrored, remove the flag: "
+            "the display matrix in the file mirrors the image, which is not supported.",
+            hint="Switch mirroring off in the camera. If the stored image is not mirrored, remove the flag: "
             "ffmpeg -display_rotation 0 -i IN -c copy OUT.",
         )
     raise CaptureError(
         f"the display matrix in the file rotates by {frame.rotation} degrees or skews; "
-        "only multiples of 90 are supported.",
-        hint="Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4.",
+        "only rotations by multiples of 90 degrees are supported.",
+        hint="Re-encode the file, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4.",
     )
 
 
 @lru_cache(maxsize=16)
 def _deep_table(bits: int, high: bool, full: bool) -> NDArray[np.uint8]:
-    """Return the gray of each luma value, (65536,) uint8; video range is 16 to 235 of 8 bits, BT.709."""
+    """Return the gray value of each 16-bit luma value, (65536,) uint8; BT.709 video range is 16 to 235 in 8 bits."""
     luma = np.arange(1 << 16) / (1 << (16 - bits) if high else 1)
     low, span = (0.0, (1 << bits) - 1.0) if full else (16.0 * (1 << (bits - 8)), 219.0 * (1 << (bits - 8)))
     return np.asarray(np.clip(np.rint((luma - low) * 255 / span), 0, 255), np.uint8)
 
 
 class DecodedPicture:
-    """A decoded image that converts regions to RGB on access, like an array.
+    """Decoded image that is accessed like an array; accessed regions are converted to RGB.
 
     Attributes:
         shape: height, width, 3.
     """
 
     def __init__(self, frame: av.VideoFrame, rotation_deg: int) -> None:
-        """Wrap a decoded frame and the rotation stored in the file."""
+        """Store a decoded image and the rotation that the file states."""
         self._frame, self._rotation_deg = frame, rotation_deg
         turned = rotation_deg in (90, 270)
         self.shape = (frame.width, frame.height, 3) if turned else (frame.height, frame.width, 3)
 
     def __getitem__(self, window: Slices) -> NDArray[np.uint8]:
-        """Return the RGB pixels of some rows and columns, (h, w, 3)."""
+        """Return the RGB pixels of a range of rows and columns, (h, w, 3)."""
         return converted(self._frame, "rgb", self._rotation_deg, window)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.uint8]:
-        """Return the whole image."""
+        """Return the whole image as RGB."""
         whole = (slice(0, self.shape[0], 1), slice(0, self.shape[1], 1))
         return np.asarray(self[whole], dtype)
 
 
-#: An RGB image, (h, w, 3) uint8, as an array or converted on access.
+#: RGB image (h, w, 3) uint8: an array, or a decoded image that is converted on access.
 ColourPicture: TypeAlias = "NDArray[np.uint8] | DecodedPicture"
 
 
 def converted(frame: av.VideoFrame, colour: Colour, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
-    """Return a window (h, w), (h, w, 3) or (h, w, 4) of a decoded image after rotation."""
+    """Return a window of a decoded image after rotation, shape (h, w), (h, w, 3) or (h, w, 4)."""
     if colour == "gray":
         return _gray(frame, rotation_deg, window)
     part, inside = _around(frame, _stored_window(frame, rotation_deg, window))
     pixels: NDArray[np.uint8]
     if colour == "rgb" and max(one.bits for one in frame.format.components) > _BYTE_BITS:
-        # ffmpeg's conversion from 10 to 8 bits loses up to two levels; rounding from 16 bits does not.
+        # FFmpeg's conversion from 10 to 8 bits is wrong by up to two levels; rounding from 16 bits is exact.
         pixels = to_display(*deep_rgb(part), None, None)
     elif colour == "rgb" and not part.format.is_rgb:
-        # ffmpeg writes planar RGB twice as fast as packed RGB, with the same values.
+        # FFmpeg writes planar RGB twice as fast as packed RGB, with the same values.
         green, blue, red = (_plane(p) for p in part.reformat(format="gbrp", interpolation=TO_RGB).planes)
         pixels = np.asarray(cv2.merge([red, green, blue]), np.uint8)
     else:
@@ -129,12 +130,12 @@ def converted(frame: av.VideoFrame, colour: Colour, rotation_deg: int, window: S
 
 
 def _plane(plane: av.video.plane.VideoPlane) -> NDArray[np.uint8]:
-    """Return a plane of bytes, (h, w), without a copy."""
+    """Return an image plane as an array of bytes (h, w), without a copy."""
     return np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
 
 
 def _stored_window(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> Slices:
-    """Return the rows and columns of a stored image that rotation maps to a window."""
+    """Return the rows and columns of a stored image that the rotation maps to a window."""
     turns = rotation_deg // 90
     height, width = (frame.width, frame.height) if turns % 2 else (frame.height, frame.width)
     rows, columns = (slice(*part.indices(side)[:2]) for part, side in zip(window, (height, width), strict=True))
@@ -145,7 +146,7 @@ def _stored_window(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> S
 
 
 def _widened(part: slice[int, int, int], limit: int) -> tuple[int, int]:
-    """Return a range of pixels along one side of an image, widened by a margin and aligned for fast conversion."""
+    """Return a pixel range along one side of an image, widened by a margin and aligned for fast conversion."""
     start = max(0, part.start - _AROUND_PX) // _STEP_PX * _STEP_PX
     return start, min(limit, start + -(-(part.stop + _AROUND_PX - start) // _STEP_PX) * _STEP_PX)
 
@@ -160,7 +161,7 @@ def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices
     height, width = bottom - top, right - left
     if height * width > 0.5 * frame.height * frame.width:
         return frame, window
-    # ffmpeg's filter preserves colour metadata and chroma location.
+    # FFmpeg's crop filter preserves colour metadata and chroma location.
     graph = av.filter.Graph()
     source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=_ANY_TIME)
     crop = graph.add("crop", f"{width}:{height}:{left}:{top}:exact=1")
@@ -174,13 +175,13 @@ def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices
 
 
 def deep_rgb(frame: av.VideoFrame) -> tuple[NDArray[np.uint16], int]:
-    """Return a decoded image as 16-bit RGB (h, w, 3), not rotated, and its white value."""
+    """Return a decoded image as unrotated 16-bit RGB (h, w, 3), and the value of white."""
     stored = np.asarray(frame.to_ndarray(format="rgb48le", interpolation=TO_RGB), np.uint16)
     if frame.format.is_rgb:
         return stored, 65535
     bits = max(part.bits for part in frame.format.components)
     full = frame.color_range == _FULL_RANGE or len(frame.format.components) == 1
-    # ffmpeg shifts values to 16 bits, so the low bits of white are 0.
+    # FFmpeg shifts values to 16 bits, so the low bits of white are 0.
     return stored, ((1 << bits) - 1) << (16 - bits) if full else 255 << 8
 
 
@@ -188,7 +189,7 @@ def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np
     name = frame.format.name
     deep = _DEEP.fullmatch(name)
     if deep is not None:
-        # ffmpeg's conversion to gray mixes in chroma: errors of up to 11 levels of 255.
+        # FFmpeg's conversion to gray mixes in chroma, which causes errors of up to 11 of 255 levels.
         plane = frame.planes[0]
         stored = np.frombuffer(memoryview(plane), "<u2").reshape(-1, plane.line_size // 2)
         luma = np.rot90(stored[: frame.height, : frame.width], rotation_deg // 90)[window]
@@ -203,7 +204,7 @@ def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np
 
 
 def coloured(shown: NDArray[np.uint8], colour: Colour) -> NDArray[np.uint8]:
-    """Return an image (h, w) or (h, w, 3) RGB in the requested format, opaque."""
+    """Convert an image (h, w) or (h, w, 3) RGB to the requested format; alpha is opaque."""
     if colour == "gray":
         gray = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY)
         return np.ascontiguousarray(gray, np.uint8)

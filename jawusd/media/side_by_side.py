@@ -1,4 +1,4 @@
-"""All cameras of a take in one image, each cropped to the teeth, with scans drawn over it and a status bar below."""
+"""Draw all cameras of a take in one image, each cropped to the teeth, with scans over it and a status bar below."""
 
 from __future__ import annotations
 
@@ -34,21 +34,22 @@ from jawusd.media.overlay import (
 Part = tuple[int, int, int, int]
 
 _MOST_IN_ROW = 3
-_MOST_FRAMES, _MOST_POINTS = 200, 300  # maximum number of frames and of vertices per scan, sampled to locate the teeth
-_STRAYS_PERCENT = 1.0  # percentage of frames in which teeth may leave the crop, per side
-_ROOM = 0.25  # margin around the teeth [fraction of their extent]
+# Maximum numbers of frames, and of vertices per scan, sampled to locate the teeth.
+_MOST_FRAMES, _MOST_POINTS = 200, 300
+_STRAYS_PERCENT = 1.0  # percentage of frames in which teeth may leave the crop on each side
+_ROOM = 0.25  # margin around the teeth, as a fraction of their extent
 _LEAST_PX = 32
-_SHOW_PARTLY_S = 0.3  # time after which partial results are shown
+_SHOW_PARTLY_S = 0.3  # time after which an incomplete image is shown
 _WHITE: Colour = (240, 240, 240)
-_WIDE_PX = 1200  # width below which a status bar has one line per piece of text
+_WIDE_PX = 1200  # width below which each piece of text in a status bar has a line of its own
 _LINE_PX, _LEFT_PX, _GAP_PX, _SWATCH_PX = 26, 10, 34, 14
 _FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.55
 
-Piece = tuple[str, Colour, bool]  # text, colour, and whether the text is white and follows a swatch of the colour
+Piece = tuple[str, Colour, bool]  # text, its colour, and whether white text follows a swatch of the colour instead
 
 
 class CameraWall:
-    """All cameras of a take side by side.
+    """Image of all cameras of a take side by side.
 
     Attributes:
         size_px: (width, height) of the images.
@@ -62,10 +63,10 @@ class CameraWall:
         scans: Sequence[Mesh],
         tile_px: tuple[int, int],
     ) -> None:
-        """Crop the images to the region of the teeth over a take; without tracks, show them whole.
+        """Crop the images to the region of the teeth over a take; without tracks, show whole images.
 
         Args:
-            cameras: calibrated cameras; others are shown without scans.
+            cameras: calibrated cameras; other cameras are shown without scans.
             backdrops: image sources by camera.
             scans: teeth scans of the tracks, upper and lower [mm].
             tile_px: (width, height) of each camera's image.
@@ -93,7 +94,7 @@ class CameraWall:
         Args:
             scans: scans to draw.
             fill: opacity of the crowns.
-            partly: called with incomplete images while cameras are being decoded, if that takes long.
+            partly: called with incomplete images while cameras are decoded, if decoding takes long.
 
         Raises:
             CaptureError: a camera's image cannot be decoded.
@@ -114,18 +115,18 @@ class CameraWall:
     def _tile(self, name: str, frame: int, scans: Sequence[PlacedScan], fill: float) -> NDArray[np.uint8]:
         backdrop = self._backdrops[name]
         image = backdrop.picture(frame)
-        words = "no picture" if image is None else "" if backdrop.is_footage else "masks, no footage"
+        words = "no image" if image is None else "" if backdrop.is_footage else "masks, no footage"
         return captioned(self._cells[name].draw(image, scans, fill), f"{name}   frame {frame}   {words}")
 
     def close(self) -> None:
-        """Stop decoding ahead."""
+        """Stop decoding in the background."""
         self._pool.shutdown()
         for backdrop in self._backdrops.values():
             backdrop.close()
 
 
 class _Cell:
-    """The mapping of a region of one camera's images to a tile."""
+    """Mapping of a region of one camera's images to a tile."""
 
     def __init__(self, part: Part, camera: Camera | None, tile_px: tuple[int, int]) -> None:
         x, y, width, height = part
@@ -137,7 +138,7 @@ class _Cell:
         self._camera = None if camera is None else camera.cropped(x, y, (width, height)).scaled(self._size_px)
 
     def draw(self, image: NDArray[np.uint8] | None, scans: Sequence[PlacedScan], fill: float) -> NDArray[np.uint8]:
-        """Return the tile (h, w, 3) of an image; empty for None."""
+        """Return the tile (h, w, 3) of an image; an empty tile for None."""
         width, height = self._tile_px
         tile = np.full((height, width, 3), EMPTY_GRAY, np.uint8)
         if image is not None:
@@ -152,9 +153,9 @@ class _Cell:
 def _teeth_parts(
     cameras: Mapping[str, Camera], tracks: Tracks, meshes: Sequence[Mesh], aspect: float
 ) -> dict[str, Part]:
-    """Return the region of each camera's images that contains the teeth over a take, by name.
+    """Return the region of each camera's images that contains the teeth over a take, by camera name.
 
-    Regions have the given aspect (width over height) where possible.
+    Regions have the given aspect ratio (width over height) where possible.
     """
     rows = np.unique(np.linspace(0, len(tracks.frames) - 1, _MOST_FRAMES).round().astype(int))
     moved = []
@@ -167,7 +168,7 @@ def _teeth_parts(
 
 
 def _part_around(camera: Camera, world: Array, aspect: float) -> Part:
-    """Return the image region that shows points (F, n, 3) [mm], NaN if unknown, in all frames, except outliers."""
+    """Return the image region of points (F, n, 3) [mm], NaN if unknown, over all frames, without outliers."""
     size = np.array(camera.size_px)
     pixels = camera.project(world)
     pixels[camera.depth(world) <= 0] = np.nan
@@ -184,10 +185,10 @@ def _part_around(camera: Camera, world: Array, aspect: float) -> Part:
 
 
 class StatusBar:
-    """A status bar for one take: frame and time, solved parameters, and a colour legend."""
+    """Status bar of one take: frame and time, solved parameters, and a colour legend."""
 
     def __init__(self, tracks: Tracks, fps: float, width_px: int) -> None:
-        """Prepare the legend; time 0 is at frame 0."""
+        """Prepare the colour legend; time 0 is at frame 0."""
         self._tracks, self._fps, self._width_px = tracks, fps, width_px
         if tracks.solved is None:
             self._legend: list[Piece] = [("upper teeth", UPPER_COLOUR, True), ("lower teeth", LOWER_COLOUR, True)]
@@ -195,7 +196,7 @@ class StatusBar:
             self._legend = [(STATE_WORDS[state], colour, True) for state, colour in STATE_COLOURS.items()]
 
     def draw(self, row: int) -> NDArray[np.uint8]:
-        """Return the bar for a row of the tracks, (h, w, 3) RGB; h is the same for all rows."""
+        """Return the status bar for a row of the tracks, (h, w, 3) RGB; h is the same for all rows."""
         lines: list[list[Piece]] = [self._said(row), self._legend]
         if self._width_px < _WIDE_PX:
             lines = [[piece] for line in lines for piece in line]

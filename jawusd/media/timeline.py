@@ -1,4 +1,4 @@
-"""Map evenly spaced frames to the images of a video, which may be irregular."""
+"""Map evenly spaced frames to the images of a video, whose presentation times may be irregular."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from jawusd.base.arrays import Array
 
 
 class Timeline:
-    """The images of a video on a regular grid of frames, by presentation time.
+    """Assignment of the images of a video to a regular grid of frames by presentation time.
 
-    Frame k is the image displayed k nominal frame durations after the first one. At a constant rate that is image k; at
-    a variable rate some frames have no image.
+    Frame k is the image that is displayed k nominal frame durations after the first image. At a constant rate this is
+    image k; at a variable rate, some frames have no image.
 
     Attributes:
-        numbers: frame of each image, increasing, shape (n,).
-        count: one past the frame of the last image.
-        stored: number of each image in its files, increasing, shape (n,); for videos 0, 1, 2, ...
+        numbers: frame number of each image, increasing, shape (n,).
+        count: one past the frame number of the last image.
+        stored: file number of each image, increasing, shape (n,); 0, 1, 2, ... for videos.
     """
 
     def __init__(self, times_s: Array, fps: float) -> None:
@@ -26,7 +26,7 @@ class Timeline:
 
     @classmethod
     def of_files(cls, stored: NDArray[np.int64], fps: float) -> Timeline:
-        """Return the timeline of numbered images, (n,) increasing: the first is frame 0, gaps have no image."""
+        """Return the timeline of images with increasing numbers (n,): the first is frame 0; gaps have no image."""
         line = cls.__new__(cls)
         line._set(stored - stored[0], fps, stored)
         return line
@@ -34,12 +34,12 @@ class Timeline:
     def _set(self, numbers: NDArray[np.int64], rate: float, stored: NDArray[np.int64]) -> None:
         self.numbers, self.rate, self.stored = numbers, rate, stored
         self.count = int(numbers[-1]) + 1
-        # If two images share a frame, use the first.
+        # If two images belong to one frame, use the first.
         self._picture = dict(zip(numbers[::-1].tolist(), range(len(numbers) - 1, -1, -1)))
 
     @property
     def is_numbered(self) -> bool:
-        """Whether the numbers of the images differ from 0, 1, 2, ..."""
+        """Whether the file numbers of the images differ from 0, 1, 2, ..."""
         return bool(self.stored[0] != 0 or self.stored[-1] != len(self.stored) - 1)
 
     def number(self, frame: int) -> int | None:
@@ -58,13 +58,13 @@ class Timeline:
 
 
 def _grid(times_s: Array, fps: float) -> tuple[NDArray[np.int64], float]:
-    """Return the frame of each image and frames per second."""
+    """Return the frame number of each image, and the frame rate [Hz]."""
     steps = np.diff(times_s)
     if len(steps) < 2 or not (median := float(np.median(steps))) > 0:
         return np.arange(len(times_s)), fps
-    # Mean over adjacent frames only: gaps bias the mean, and rounded time stamps the median.
+    # Use the mean over adjacent frames: gaps would bias the mean of all, and rounded time stamps would bias the median.
     period = float(steps[(steps > 0.5 * median) & (steps < 1.5 * median)].mean())
-    last = 16  # jitter gives the first estimate an error of a few per mille; refine it on growing intervals
+    last = 16  # jitter causes an error of a few per mille, so refine the period on growing intervals
     while True:
         stretch = times_s[:last]
         numbers = np.round(stretch / period)

@@ -1,8 +1,8 @@
 """Read videos by presentation time with PyAV.
 
-Frame k is the k-th image in presentation order. The table of times is read once from the packets, without decoding.
-Seeking goes to the previous key frame and decodes from there. Every decoded image is identified by its time stamp, so
-that B-frames, edit lists and variable rates cannot shift the count.
+Frame k is the k-th image in presentation order. The table of presentation times is read once from the packets, without
+decoding. To read an image, the reader seeks to the previous key frame and decodes from there. Every decoded image is
+identified by its time stamp, so that B-frames, edit lists and variable rates cannot shift the count.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from jawusd.media.display import to_display
 from jawusd.media.pixels import Colour, ColourPicture, DecodedPicture, Slices, coloured, converted, deep_rgb, turn_deg
 from jawusd.media.timeline import Timeline
 
-_REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
-_CUT_OFF = "Copy it again from the camera; repair an interrupted recording first."
-# WebM stores alpha in a second stream, as flagged in the metadata; only these decoders read it.
+_REENCODE = "Re-encode the video, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
+_CUT_OFF = "Copy the file again from the camera; repair an interrupted recording first."
+# Decoders, by codec, that read the alpha channel of WebM; it is in a second stream, and a flag in the metadata tells
+# so.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 # Decoders that report damage with any number of threads. Decoders with error concealment (H.264, MPEG-4) mark an image
 # as damaged only after threads have returned it: with eight threads, a third of the damage in H.264 was missed.
 _THREADED = ("hevc", "prores", "ffv1")
-_PROGRESSIVE = (0, 1)  # FFmpeg's field order: unknown, or progressive
+_PROGRESSIVE = (0, 1)  # FFmpeg's field orders "unknown" and "progressive"
 
 
 class Video(Clip):
-    """A video file."""
+    """Video file, read as a clip."""
 
     def __init__(
         self,
@@ -57,14 +58,14 @@ class Video(Clip):
         self._config = colour_config
         check_input(self.path, CaptureError)
         if not self.path.is_file():
-            raise CaptureError("no such video.", path=path, hint="Check the path in capture.toml.")
+            raise CaptureError("there is no such video.", path=path, hint="Check the path in capture.toml.")
         if self.path.stat().st_size == 0:
             raise CaptureError("the file is empty.", path=path, hint="Copy it again from the camera.")
         with self._open() as container:
             stream = container.streams.video[0]
             announced = stream.frames
             self._time_base = float(stream.time_base or 1)
-            self._has_checksums = False  # whether the slices of each image have checksums
+            self._has_checksums = False  # FFV1 with a checksum in each slice
             self._pts, self._seek_dts, self._key_before, stored = self._packet_table(container, stream)
             self.fps = float(stream.average_rate or 0)
             stored_aspect = stream.sample_aspect_ratio
@@ -76,7 +77,7 @@ class Video(Clip):
             self._alpha_decoder = _ALPHA_DECODERS.get(stream.codec_context.name) if hidden else None
         self.count = len(self._pts)
         if self.count == 0:
-            raise CaptureError("the video has no pictures.", path=path, hint="Copy it again from the camera.")
+            raise CaptureError("the video has no images.", path=path, hint="Copy it again from the camera.")
         if announced > stored:
             raise CaptureError(
                 f"frame {stored} of {announced} cannot be read: the file is truncated.",
@@ -90,7 +91,7 @@ class Video(Clip):
         first = next(self._decode(0, 1, threads=1))[1]
         with naming_file(path):
             self.rotation_deg = turn_deg(first)
-        aspect = float(stored_aspect or 1) or 1.0  # 0 means unknown
+        aspect = float(stored_aspect or 1) or 1.0  # an aspect ratio of 0 means unknown
         self.pixel_aspect = 1 / aspect if self.rotation_deg in (90, 270) else aspect
         turned = self.rotation_deg in (90, 270)
         self.size_px = (first.height, first.width) if turned else (first.width, first.height)
@@ -100,7 +101,7 @@ class Video(Clip):
         self.is_gray = not self.is_rgb and len(stored_as.components) == 1
 
     def colour_pictures(self, wanted: Sequence[int | None], *, threads: int = 0) -> Iterator[ColourPicture | None]:
-        """Yield images as `Clip.colour_pictures` does."""
+        """Yield RGB images; see `Clip.colour_pictures`."""
         if self._space is not None:
             yield from super().colour_pictures(wanted, threads=threads)
             return
@@ -118,7 +119,7 @@ class Video(Clip):
     def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
         for index, frame in self._decode(first, last, threads, alpha=colour == "rgba"):
             image = self._image(frame, colour, window)
-            image.flags.writeable = False  # the gray buffer may be a reference image of the decoder
+            image.flags.writeable = False  # the gray buffer may be a reference image of the decoder, so it is read-only
             yield VideoFrame(index, float(self.times_s[index]), image)
 
     def _image(self, frame: av.VideoFrame, colour: Colour, window: Slices) -> NDArray[np.uint8]:
@@ -144,24 +145,24 @@ class Video(Clip):
         if context.width * context.height > MOST_PX:
             container.close()
             raise CaptureError(
-                f"pictures have {context.width} x {context.height} px; at most {MOST_PX} px in total are allowed.",
+                f"images have {context.width} x {context.height} px; at most {MOST_PX} px in total are allowed.",
                 path=self.path,
-                hint="Scale it down.",
+                hint="Scale the video down.",
             )
         return container
 
     def _packet_table(
         self, container: av.container.InputContainer, stream: av.VideoStream
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.intp], int]:
-        """Return each image's time stamp, the decoding time of its key frame, and the index of that key frame.
+        """Return the time stamp of each image, and the decoding time and the index of its key frame.
 
-        The last value is the number of stored images.
+        The last return value is the number of stored images.
         """
         pts, dts, key, stored = [], [], [], 0
         may_have_checksums = stream.codec_context.name == "ffv1"
         try:
             for packet in container.demux(stream):
-                if packet.size == 0:  # end of stream
+                if packet.size == 0:  # packet that marks the end of the stream
                     continue
                 stored += 1
                 if may_have_checksums and not self._has_checksums:
@@ -173,7 +174,8 @@ class Video(Clip):
                     dts.append(packet.pts if packet.dts is None else packet.dts)
                     key.append(packet.is_keyframe)
         except av.FFmpegError:
-            # Truncated file: use the images before the truncation. A caller compares their number with `announced`.
+            # The file is truncated; use the images before the truncation. Callers compare their number with
+            # `announced`.
             pass
         order = np.argsort(pts, kind="stable")
         times = np.array(pts, np.int64)[order]
@@ -182,7 +184,7 @@ class Video(Clip):
         return times, np.array(dts, np.int64)[order][latest], latest, stored
 
     def _decode(self, first: int, last: int, threads: int, alpha: bool = False) -> Iterator[tuple[int, av.VideoFrame]]:
-        """Yield (index, decoded frame) for every index of [first, last); raise an error for a missing one."""
+        """Yield (index, decoded frame) for indices first to last - 1; raise an error if an image is missing."""
         wanted, key, damaged = first, self._pts[self._key_before[first]], False
         broken: set[int] = set()
         with self._open() as container:
@@ -197,7 +199,8 @@ class Video(Clip):
                         return
                     if frame.pts is None or frame.pts < key:
                         continue
-                    damaged = damaged or frame.is_corrupt or frame.pts in broken  # later images may depend on it
+                    # Later images may depend on the damaged image.
+                    damaged = damaged or frame.is_corrupt or frame.pts in broken
                     if frame.pts < self._pts[wanted]:
                         continue
                     if frame.pts > self._pts[wanted] or damaged:
@@ -211,11 +214,11 @@ class Video(Clip):
             raise self._undecodable(wanted)
 
     def _seek(self, container: av.container.InputContainer, stream: av.VideoStream, index: int) -> None:
-        """Seek to the last key frame shown no later than an image, or to an earlier key frame.
+        """Seek to the last key frame that is shown no later than an image, or to an earlier key frame.
 
-        Containers seek by presentation or by decoding time of key frames. If seeking by presentation time leads past
-        the image, decoding time is used. MP4 seeks by presentation time; a decoding time would lead to one key frame
-        too early.
+        Depending on the container, the time that is sought is a presentation or a decoding time. The presentation time
+        is tried first (a decoding time would lead to one key frame too early in MP4); if this leads past the image, the
+        decoding time is used.
         """
         for time in (self._pts[self._key_before[index]], self._seek_dts[index]):
             container.seek(int(time), stream=stream, backward=True)
@@ -227,7 +230,7 @@ class Video(Clip):
     def _decoded(
         self, container: av.container.InputContainer, stream: av.VideoStream, alpha: bool, first: int, broken: set[int]
     ) -> Iterator[av.VideoFrame]:
-        """Yield decoded images from the current position on; decode only reference images before time stamp `first`.
+        """Yield decoded images from the current position on; before time stamp `first`, decode only reference images.
 
         Time stamps of packets that are damaged according to container flags or checksums are added to `broken`, with
         those of all later packets up to the next key frame.
@@ -257,6 +260,6 @@ class Video(Clip):
 
 
 def _timecode(container: av.container.InputContainer, stream: av.VideoStream) -> str:
-    """Return the time code of the first image: from the video stream, a time code track, or the file."""
+    """Return the time code of the first image from the video stream, a time code track, or the file's metadata."""
     tables = [stream.metadata, *(other.metadata for other in container.streams), container.metadata]
     return next((table["timecode"] for table in tables if table.get("timecode")), "")

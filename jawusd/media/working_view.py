@@ -1,4 +1,4 @@
-"""Resample images to the undistorted working size of the tracker."""
+"""Undistort images and resample them to the working size of the tracker."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry.camera import Camera
 from jawusd.media.pixels import ColourPicture, DecodedPicture, Slices
 
-_NODE_PX = 16  # spacing of the map's nodes, among which the region of a mask is searched
+_NODE_PX = 16  # spacing of the map nodes by which the region of a mask is located
 
 
 _Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
 
 def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pixel]:
-    """Return an image sampled bilinearly at positions (h, w, 2) [px], 0 outside the image."""
+    """Sample an image bilinearly at positions (h, w, 2) [px]; samples outside the image are 0."""
     black = cv2.BORDER_CONSTANT
     found = cv2.remap(image, positions, None, cv2.INTER_LINEAR, borderMode=black)  # type: ignore[call-overload]  # no 2nd map
     return np.asarray(found, image.dtype)
 
 
 def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return an image of which only the bounding box of positions (h, w, 2) [px] is converted.
+    """Convert only the bounding box of positions (h, w, 2) [px] in an image.
 
-    The rest is black and costs no memory, as untouched pages are not allocated.
+    The rest of the result is black and takes no memory, since untouched pages are not allocated.
     """
     sides = np.concatenate([positions[0], positions[-1], positions[:, 0], positions[:, -1]])
     limit = np.array(picture.shape[1::-1])
@@ -43,7 +43,7 @@ def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[
 
 
 class WorkingView:
-    """Undistortion and downscaling of the images of one camera; thread-safe.
+    """Undistort and downscale the images of one camera; thread-safe.
 
     A working pixel is the mean of n x n bilinear samples of the recorded image, at the distorted positions of the
     pixels of an n times larger working image; n is the downscaling factor, rounded up. This equals undistortion at
@@ -51,17 +51,19 @@ class WorkingView:
 
     Attributes:
         camera: the pinhole camera of the working images.
-        source: the camera as recorded.
+        source: the camera of the recorded images.
     """
 
     def __init__(self, source: Camera, size_px: tuple[int, int]) -> None:
         """Prepare the maps to working images of size_px (width, height).
 
         Raises:
-            ValueError: the working size is larger than the recorded one, or empty.
+            ValueError: the working size is larger than the recorded size, or empty.
         """
         if not (0 < size_px[0] <= source.size_px[0] and 0 < size_px[1] <= source.size_px[1]):
-            raise ValueError(f"working size {size_px} px must be between 1 x 1 and the recorded {source.size_px} px")
+            raise ValueError(
+                f"working size is {size_px} px; expected 1 x 1 px to the recorded size of {source.size_px} px"
+            )
         self.source = source
         self.camera = replace(source.scaled(size_px), distortion=np.zeros(0))
         self._samples = ceil(max(source.size_px[0] / size_px[0], source.size_px[1] / size_px[1]))
@@ -72,7 +74,7 @@ class WorkingView:
         )
         self._map = np.asarray(maps[0], np.float32)
         self._nodes = np.ascontiguousarray(np.moveaxis(self._map[::_NODE_PX, ::_NODE_PX], 2, 0))
-        # Largest distance between neighbouring nodes [px of the recorded image].
+        # Largest distance between adjacent nodes [px of the recorded image].
         steps = [np.abs(np.diff(self._nodes, axis=axis)).max(initial=_NODE_PX) for axis in (1, 2)]
         self._reach_px = float(max(steps)) + 1
 
@@ -106,14 +108,16 @@ class WorkingView:
         """Return a recorded linear-light image (H, W, 3) undistorted at full size; 0 where nothing was recorded.
 
         Raises:
-            ValueError: the image does not have the recorded size, or the view is smaller.
+            ValueError: the image does not have the recorded size, or the working size is smaller.
         """
         if image.shape[1::-1] != self.source.size_px or self._map.shape[1::-1] != self.source.size_px:
-            raise ValueError(f"light must have {self.source.size_px} px, as the view, got {image.shape}")
+            raise ValueError(
+                f"linear-light image has shape {image.shape}; expected {self.source.size_px} px, the size of the view"
+            )
         return remap(image, self._map)
 
     def part(self, image: ColourPicture, window: Slices) -> NDArray[np.uint8]:
-        """Return the part of `picture` at rows and columns inside it.
+        """Return a part of `picture`, given rows and columns inside it.
 
         Raises:
             ValueError: the image does not have the recorded size.
@@ -124,7 +128,7 @@ class WorkingView:
     def _check(self, image: ColourPicture) -> None:
         if image.shape[1::-1] != self.source.size_px or (isinstance(image, np.ndarray) and image.dtype != np.uint8):
             kind = getattr(image, "dtype", "")
-            raise ValueError(f"picture must be uint8 of {self.source.size_px} px, got {kind} {image.shape}")
+            raise ValueError(f"image is {kind} of shape {image.shape}; expected uint8 of {self.source.size_px} px")
 
     def _averaged(self, image: ColourPicture, window: Slices) -> NDArray[np.uint8]:
         n, (rows, cols) = self._samples, window
@@ -136,14 +140,14 @@ class WorkingView:
         return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _window(self, mask: NDArray[np.uint8]) -> Slices | None:
-        """Return the window of working pixels that may sample a non-black pixel of the mask, None if there are none."""
+        """Return the window of working pixels that may sample a non-black mask pixel, or None if there are none."""
         rows = np.flatnonzero(mask.max(axis=1))
         if rows.size == 0:
             return None
         cols = np.flatnonzero(mask[rows[0] : rows[-1] + 1].max(axis=0))
         reach, (x, y) = np.float32(self._reach_px), self._nodes
-        # On each side of the box, at least one node lies beyond it but within reach, so the cells around those nodes
-        # contain the box.
+        # On each side of the bounding box of the mask, at least one node lies outside the box but within reach, so the
+        # cells around these nodes contain the box.
         across: Mask = (x >= cols[0] - reach) & (x <= cols[-1] + reach)
         inside: Mask = across & (y >= rows[0] - reach) & (y <= rows[-1] + reach)
         spans = []
@@ -163,8 +167,8 @@ def warp_nearest(
     """Resample by nearest neighbour through an affine map; 0 outside the image.
 
     Args:
-        picture: shape (H, W).
-        to_picture: maps pixels of `out` to those of the image, shape (2, 3).
-        out: output, of the image's dtype, shape (h, w).
+        picture: input image, shape (H, W).
+        to_picture: affine map from pixels of `out` to pixels of `picture`, shape (2, 3).
+        out: output image with the dtype of `picture`, shape (h, w).
     """
     cv2.warpAffine(picture, to_picture, out.shape[::-1], out, cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)

@@ -20,9 +20,9 @@ _QUALITY = 95
 
 
 class VideoWriter:
-    """Writer of a video, as a context manager.
+    """Writer of a video file, as a context manager.
 
-    The file appears under its name only if the block succeeds.
+    The file gets its name only if the block succeeds.
     """
 
     def __init__(
@@ -34,23 +34,23 @@ class VideoWriter:
         lossless: bool = False,
         quality_crf: int = 16,
     ) -> None:
-        """Prepare a file.
+        """Prepare the video file.
 
         Args:
             path: `.mp4` for H.264 (yuv420p), `.mkv` for lossless FFV1 gray.
             size_px: (width, height); both even for H.264.
-            quality_crf: H.264 constant rate factor, 0 (best) .. 51.
+            quality_crf: constant rate factor of H.264, 0 (best) to 51.
 
         Raises:
-            ValueError: the suffix, the size or the rate does not fit.
+            ValueError: the suffix, the size or the frame rate is not supported.
         """
         suffix = ".mkv" if lossless else ".mp4"
         if not str(path).endswith(suffix):
-            raise ValueError(f"{path}: a {'lossless' if lossless else 'H.264'} video must be a {suffix} file")
+            raise ValueError(f"{path}: expected the suffix {suffix} for a {'lossless' if lossless else 'H.264'} video")
         if min(size_px) < 2 or (not lossless and (size_px[0] % 2 or size_px[1] % 2)):
-            raise ValueError(f"size {size_px} px: H.264 needs even sides of at least 2 px")
+            raise ValueError(f"size is {size_px} px; expected even sides of at least 2 px for H.264")
         if not fps > 0:
-            raise ValueError(f"fps must be positive, got {fps}")
+            raise ValueError(f"fps is {fps}; expected a positive number")
         self._size_px = size_px
         self._lossless = lossless
         self._atomic = atomic_path(path)
@@ -65,7 +65,7 @@ class VideoWriter:
             stream = container.add_stream("ffv1" if self._lossless else "libx264", rate=self._rate)
             stream.width, stream.height = self._size_px
             stream.pix_fmt = "gray" if self._lossless else "yuv420p"
-            # FFV1 with key frames only: seeking is fast, and damage affects one image.
+            # Only key frames in FFV1: seeking is fast, and damage affects a single image.
             stream.options = {"level": "3", "g": "1"} if self._lossless else {"crf": str(self._crf)}
             self._stream = stream
             self._next = 0
@@ -76,12 +76,12 @@ class VideoWriter:
         """Append an image: (h, w) gray, or (h, w, 3) RGB for H.264; uint8.
 
         Raises:
-            ValueError: the image's shape or type does not fit.
+            ValueError: the image has the wrong shape or type.
         """
         shape = (self._size_px[1], self._size_px[0])
         colour = image.ndim == 3
         if image.dtype != np.uint8 or image.shape not in ((shape,) if self._lossless else (shape, (*shape, 3))):
-            raise ValueError(f"picture must be uint8 of {shape}, got {image.dtype} of {image.shape}")
+            raise ValueError(f"image is {image.dtype} of shape {image.shape}; expected uint8 of shape {shape}")
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24" if colour else "gray")
         frame.pts = self._next
         frame.time_base = 1 / self._rate
@@ -98,7 +98,7 @@ class VideoWriter:
 
 
 class PlateWriter:
-    """Writer of the undistorted images of one camera at full size: as JPEG, or as EXR for linear light.
+    """Writer of the undistorted images (plates) of one camera at full size: JPEG, or EXR for linear light.
 
     A plate has the intrinsics K and size of the recorded image, so that the same pinhole camera applies; regions that
     were not recorded are black.

@@ -89,7 +89,7 @@ def test_frozen_cameras_and_doubled_pictures_are_named(tmp_path, again, said, cr
 
 def test_clips_converted_from_another_rate_are_named(tmp_path):
     (finding,) = repeated(tmp_path / "a.mp4", repeating(talking(), range(3, 120, 4)))
-    assert " more times repeat the previous picture" in finding.message and finding.value > 20
+    assert " more times repeat the previous image" in finding.message and finding.value > 20
 
 
 def test_a_frozen_camera_is_named_in_noise_that_hides_motion(tmp_path):

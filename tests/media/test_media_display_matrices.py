@@ -49,9 +49,9 @@ def test_turns_are_done(tmp_path, suffix, matrix, turn):
         ((0, -1, -1, 0), "mirrors"),
         ((-1.5, 0, 0, 1.5), "mirrors"),
         ((0.6, 0.8, 0.8, -0.6), "mirrors"),
-        ((0.8, 0.6, -0.6, 0.8), "only multiples of 90"),
-        ((1, 0.3, 0, 1), "only multiples of 90"),
-        ((1, 0, 0.2, 1), "only multiples of 90"),
+        ((0.8, 0.6, -0.6, 0.8), "only rotations by multiples of 90"),
+        ((1, 0.3, 0, 1), "only rotations by multiples of 90"),
+        ((1, 0, 0.2, 1), "only rotations by multiples of 90"),
     ],
 )
 def test_mirrors_and_skews_are_refused(tmp_path, suffix, matrix, said):

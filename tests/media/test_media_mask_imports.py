@@ -87,11 +87,11 @@ def test_transparency_that_cuts_nothing_out_is_refused(tmp_path):
     opaque = np.full(SIZE[::-1], 255, np.uint8)
     pictures = [np.dstack([footage(k), opaque]) for k in range(COUNT)]
     path = write(tmp_path / "upper.mov", pictures, "prores_ks", "yuva444p10le", {"profile": "4444"})
-    with pytest.raises(CaptureError, match=r"upper\.mov: the alpha channel is opaque in all 8 pictures.*RGB \+ Alpha"):
+    with pytest.raises(CaptureError, match=r"upper\.mov: the alpha channel is opaque in all 8 images.*RGB \+ Alpha"):
         MaskReader(path, SIZE)
     for k, picture in enumerate(pictures):
         cv2.imwrite(str(tmp_path / f"{k:04d}.png"), picture)
-    with pytest.raises(CaptureError, match=r": the alpha channel is opaque in all 8 pictures"):
+    with pytest.raises(CaptureError, match=r": the alpha channel is opaque in all 8 images"):
         MaskReader(tmp_path / "%04d.png", SIZE)
     # A matte in black and white may come with an opaque alpha channel.
     matte = [np.dstack([mask(k)] * 3 + [opaque]) for k in range(COUNT)]
@@ -112,7 +112,7 @@ def test_footage_named_as_masks_is_refused(tmp_path):
     with VideoWriter(path, SIZE, 24, quality_crf=4) as out:
         for k in range(COUNT):
             out.write(footage(k))
-    with pytest.raises(CaptureError, match=r"cam0\.mp4: picture 0: \d+% of its pixels are gray.*and not the footage"):
+    with pytest.raises(CaptureError, match=r"cam0\.mp4: image 0: \d+% of its pixels are gray.*and not the footage"):
         MaskReader(path, SIZE).read(2)
     cv2.imwrite(str(tmp_path / "7.png"), footage(7))
     with pytest.raises(CaptureError, match=r"7\.png: \d+% of its pixels are gray"):
@@ -157,15 +157,15 @@ def test_labels_that_mean_nothing_are_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "1.png"), soft)
     cv2.imwrite(str(tmp_path / "2.png"), np.dstack([label_image(2, 128, 0), label_image(2, 0, 128), 0 * soft]))
     for number, values, message in (
-        (0, (1, 2), r"0\.png: the label image has the values 0, 1, 3; they must be 0, 1 or 2.*masks\.upper_value"),
-        (1, (255, 128), r"1\.png: the label image has the values 0, .* and \d+ more; they must be 0, 128 or 255"),
+        (0, (1, 2), r"0\.png: the label image has the values 0, 1, 3; expected only 0, 1 and 2.*masks\.upper_value"),
+        (1, (255, 128), r"1\.png: the label image has the values 0, .* and \d+ more; expected only 0, 128 and 255"),
         (2, (255, 128), r"2\.png: the label image is coloured"),
     ):
         upper, _ = open_masks(rows_of(tmp_path / "%d.png", *values), SIZE)
         with pytest.raises(CaptureError, match=message):
             upper.read(number)
     lossy = write(tmp_path / "lossy.mp4", [label_image(k, 255, 128) for k in range(4)], "libx264", "yuv420p", {})
-    with pytest.raises(CaptureError, match=r"lossy\.mp4: picture 1: the label image has the values .*lossy"):
+    with pytest.raises(CaptureError, match=r"lossy\.mp4: image 1: the label image has the values .*lossy"):
         open_masks(rows_of(lossy, 255, 128), SIZE)[0].read(1)
 
 
@@ -243,11 +243,11 @@ def test_masks_of_a_variable_rate_are_shown_at_their_time(tmp_path, variable):
 def test_masks_that_cannot_belong_to_a_video_are_refused(tmp_path, variable):
     short = write(tmp_path / "short.mkv", [mask(k) for k in range(9)], "ffv1", "gray", {})
     source = CameraSource(name="a", video=variable, masks={"upper": short, "lower": short, **VALUES})
-    with pytest.raises(CaptureError, match=r"short\.mkv: .* 9 pictures, but the camera's video has 11 in 14 frames"):
+    with pytest.raises(CaptureError, match=r"short\.mkv: .* 9 images, but the camera's video has 11 in 14 frames"):
         open_masks(source, SIZE)
     cv2.imwrite(str(tmp_path / "u000012.png"), mask(1))
     source = CameraSource(name="a", video=variable, masks={"labels": tmp_path / "u%06d.png", **VALUES})
-    with pytest.raises(CaptureError, match=r"numbered up to 12, .* only pictures 0 to 10 \(in 14 frames\)"):
+    with pytest.raises(CaptureError, match=r"numbered up to 12, .* only images 0 to 10 \(in 14 frames\)"):
         open_masks(source, SIZE)
 
 

@@ -123,7 +123,7 @@ def test_a_video_cut_out_on_black_is_doubted(tmp_path):
 
 def test_single_teeth_in_levels_of_their_own_are_refused(tmp_path):
     numbers = [cv2.connectedComponents((teeth(k) > 0).astype(np.uint8))[1].astype(np.uint8) for k in range(COUNT)]
-    with pytest.raises(CaptureError, match=r"000\.png: it has the levels 0, \d, \d; a mask has two"):
+    with pytest.raises(CaptureError, match=r"000\.png: it has the levels 0, \d, \d; expected two"):
         written(tmp_path, numbers)
 
 
@@ -147,7 +147,7 @@ def test_survey_finds_wrong_sizes_and_missing_labels(tmp_path):
         cv2.imwrite(str(tmp_path / f"{k:03d}.png"), picture[::2, ::2] if k == 7 else picture)
     masks = {row: tmp_path / "%03d.png" for row in ("upper", "lower")}
     source = CameraSource.model_construct(name="a", video=None, masks=Masks.model_construct(**masks, **NO_LABELS))
-    with pytest.raises(CaptureError, match=r"007\.png: the mask is 80 x 48 px, but .* pictures are 160 x 96 px"):
+    with pytest.raises(CaptureError, match=r"007\.png: the mask is 80 x 48 px, but .* images are 160 x 96 px"):
         survey_masks(source, SIZE)
     cv2.imwrite(str(tmp_path / "007.png"), teeth(7) // 255 * 3)
     labels = {"labels": tmp_path / "%03d.png", "upper_value": 3, "lower_value": 4}

@@ -162,7 +162,7 @@ def test_sources_that_are_not_there(tmp_path: Path, pattern: Path, video: Path) 
         with pytest.raises(CaptureError, match=message):
             MaskReader(path, SIZE)
     assert MaskReader(video, SIZE, timeline=Timeline(np.arange(COUNT) / 24, 24)).count == COUNT
-    with pytest.raises(CaptureError, match=r"has 14 pictures, but the camera's video has 15"):
+    with pytest.raises(CaptureError, match=r"has 14 images, but the camera's video has 15"):
         MaskReader(video, SIZE, timeline=Timeline(np.arange(15) / 24, 24))
 
 

@@ -52,7 +52,7 @@ def test_gaps_are_frames_without_a_picture(images, tmp_path):
         assert found is None if wanted is None else np.array_equal(found, images[wanted])
     assert gaps(clip.numbers.tolist()) == "1002, 1004"
     (told,) = rate_findings({"a": clip}, 25.0, "capture.toml")
-    assert told.kind == "pictures_missing" and told.message == "pictures 1002, 1004 are missing"
+    assert told.kind == "pictures_missing" and told.message == "images 1002, 1004 are missing"
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_names_are_grouped_by_what_stays():
 def test_pictures_that_do_not_belong_together(images, tmp_path):
     pattern = write_sequence(tmp_path, images[:2], "png8")
     write_picture(tmp_path / "take.1003.png", images[0, :24], "png8")
-    with pytest.raises(CaptureError, match=r"64 x 24 px, but the first picture is 64 x 48 px"):
+    with pytest.raises(CaptureError, match=r"64 x 24 px, but the first image is 64 x 48 px"):
         list(open_clip(pattern).frames())
     (tmp_path / "take.1003.png").write_bytes(b"no picture")
     with pytest.raises(CaptureError, match="cannot be read"):
@@ -124,7 +124,7 @@ def test_film_scans_are_shown_by_their_density():
 
 
 def test_a_colour_space_that_nobody_knows(tmp_path):
-    with pytest.raises(CaptureError, match='"Log C" is unknown; it must be display, linear, cineon'):
+    with pytest.raises(CaptureError, match='"Log C" is unknown; expected display, linear, cineon'):
         to_display(np.zeros((2, 2), np.uint16), 65535, "Log C", None)
 
 

@@ -199,7 +199,7 @@ def test_h264_writer_is_read_by_opencv(tmp_path: Path) -> None:
 
 def test_a_failed_writer_leaves_nothing(tmp_path: Path) -> None:
     path = tmp_path / "out.mp4"
-    with pytest.raises(ValueError, match="picture"), VideoWriter(path, SIZE, 24) as out:
+    with pytest.raises(ValueError, match="image"), VideoWriter(path, SIZE, 24) as out:
         out.write(picture(0))
         out.write(np.zeros((3, 3), np.uint8))
     assert list(tmp_path.iterdir()) == []

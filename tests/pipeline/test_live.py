@@ -99,7 +99,7 @@ def silent():
 def test_a_source_that_connects_and_is_silent_is_not_waited_for(silent):
     source = LiveSource(silent, (64, 48))
     source.open()
-    with pytest.raises(CaptureError, match=r"tcp.*has sent no picture for 0.5 s"):
+    with pytest.raises(CaptureError, match=r"tcp.*has sent no image for 0.5 s"):
         source.wait_open(0.5)
     source.stop()
 
@@ -121,7 +121,7 @@ def test_a_source_that_falls_silent_is_not_waited_for(film, tmp_path):
         camera.flush()
         source.wait_open(20.0)
         source.play(live_clock.now_s())
-        with pytest.raises(CaptureError, match="has sent no picture for 1 s"):
+        with pytest.raises(CaptureError, match="has sent no image for 1 s"):
             for _ in range(200):
                 source.wait(np.inf, 0.1)
                 source.refuse_silence(1.0)
@@ -130,7 +130,7 @@ def test_a_source_that_falls_silent_is_not_waited_for(film, tmp_path):
 
 @pytest.mark.slow
 def test_live_ends_where_no_camera_sends(rig, silent):
-    with pytest.raises(CaptureError, match="has sent no picture for 0.5 s"):
+    with pytest.raises(CaptureError, match="has sent no image for 0.5 s"):
         list(live(rig, EXAMPLE, dict.fromkeys(("cam0", "cam1", "cam2"), silent), silence_s=0.5))
 
 
