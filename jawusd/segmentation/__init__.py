@@ -1,4 +1,4 @@
-"""Segment both arches in footage, guided by the projected scans.
+"""Segment the teeth of both arches in footage, guided by the projected scans.
 
-Writes mask files that the user can edit; imports no other stage.
+The package writes mask files that the user can edit; it imports no other stage.
 """

@@ -1,4 +1,4 @@
-"""Both arches in one image: projected crowns, the three-way cut, and its costs from colour, position and edges."""
+"""Both arches in one image: projected crowns, and the three-way cut with costs from colour, position and edges."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from jawusd.meshes.raster import draw_depth_labels
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 
 OTHER, UPPER, LOWER = 0, 1, 2
-_TAU = _SIGMA = 0.35  # step sizes of the primal-dual iteration; convergence needs tau sigma 8 < 1
-_NEVER = 30.0  # magnitude of the log-odds that impose a hard constraint
+_TAU = _SIGMA = 0.35  # step sizes tau and sigma of the primal-dual iteration, which converges if 8 tau sigma < 1
+_NEVER = 30.0  # magnitude of log-odds that act as a hard constraint
 _FEWEST_OPEN = 20  # minimum number of undecided pixels between the arches for re-estimating their border
-_ARCH_BLUR_PX = 0.8  # sigma of the blur of the border between the arches, for fractional coverage
+_ARCH_BLUR_PX = 0.8  # sigma of the blur that makes the coverage fractional at the border between the arches
 
 
 @dataclass(frozen=True, eq=False)
 class ScanSurface:
-    """Scan of one arch, split for rasterisation."""
+    """Scan of one arch, split into teeth and other faces for rasterisation."""
 
     vertices: Array  # scan coordinates [mm], shape (V, 3)
     crown_faces: NDArray[np.int32]  # faces of the teeth, int32, shape (F, 3)
@@ -32,7 +32,7 @@ class ScanSurface:
 
     @classmethod
     def of(cls, mesh: Mesh) -> ScanSurface:
-        """Split the faces of a teeth scan into teeth and the rest, by the majority of their corners."""
+        """Split the faces of a teeth scan into teeth and other faces, by the label of most of their corners."""
         crown = crown_face_mask(mesh)
         return cls(mesh.vertices, mesh.faces[crown], mesh.faces[~crown])
 
@@ -43,21 +43,21 @@ class ScanSurface:
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """Expected crowns in an image; px are pixels of that image."""
+    """Expected crowns in an image; lengths in px are pixels of this image."""
 
-    labels: NDArray[np.uint8]  # visible crowns: OTHER, UPPER or LOWER, shape (h, w)
+    labels: NDArray[np.uint8]  # labels of the visible crowns: OTHER, UPPER or LOWER, shape (h, w)
     # signed distance to the outline of each arch's visible crowns, positive inside, shape (2, h, w)
     inside_px: NDArray[np.float32]
 
 
 def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> Expectation:
-    """Render both arches at poses (2, 4, 4), T_world_upper and T_world_lower, in a pinhole camera."""
+    """Render both arches at poses (2, 4, 4), T_world_upper and T_world_lower, with a pinhole camera."""
     labels = draw_crowns(scans, poses, camera)
     return Expectation(labels, np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)]))
 
 
 def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> NDArray[np.uint8]:
-    """Return the label of every pixel: OTHER, or the visible crown, UPPER or LOWER; shape (h, w)."""
+    """Return the label of every pixel, UPPER or LOWER where a crown is visible, otherwise OTHER; shape (h, w)."""
     width, height = camera.size_px
     inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     for scan, pose, label in zip(scans, poses, (UPPER, LOWER), strict=True):
@@ -88,7 +88,7 @@ def _iterate(
     """Run the first-order primal-dual iteration (Chambolle and Pock 2011) of the relaxed Potts energy.
 
     Shapes: cost (3, h, w); edge (2, h, w), weights of the links to the right and down; u (3, h, w), updated in place;
-    spans (h, 2), the range of free columns in each row; pixels outside it are fixed.
+    spans (h, 2), the range of free columns in each row; pixels outside this range are fixed.
     """
     n, h, w = cost.shape
     px, py = np.zeros_like(u), np.zeros_like(u)
@@ -129,7 +129,7 @@ def _iterate(
 
 @numba.njit(nogil=True, cache=True)
 def _to_simplex(a: np.float32, b: np.float32, c: np.float32) -> tuple[np.float32, np.float32, np.float32]:
-    """Project three values onto the probability simplex."""
+    """Project three label weights onto the probability simplex."""
     high = max(a, b, c)
     low = min(a, b, c)
     mid = a + b + c - high - low
@@ -149,23 +149,23 @@ def cut_three_ways(
     free: Mask,
     steps: int,
 ) -> NDArray[np.float32]:
-    """Return the label weights of the minimal cut, non-negative with sum 1, shape (3, h, w).
+    """Return the label weights of the minimal cut, shape (3, h, w); they are non-negative and their sum is 1.
 
     The energy is the cost of the labels plus the weighted length of the borders between them: the convex relaxation of
     the Potts model with one indicator per label (Zach et al. 2008), and with links to the right and down.
 
     Args:
-        cost: cost of each label per pixel, shape (3, h, w).
+        cost: cost of each label at each pixel, shape (3, h, w).
         edge: cost of a border between a pixel and its right and lower neighbour, shape (2, h, w).
         start: initial label weights, shape (3, h, w).
-        free: pixels to label, shape (h, w); the others keep their initial weights.
+        free: pixels to be labelled, shape (h, w); the other pixels keep their initial weights.
     """
     u = np.ascontiguousarray(start, np.float32).copy()
     spans = np.zeros((cost.shape[1], 2), np.int64)
     for y in np.flatnonzero(free.any(1)):
         columns = np.flatnonzero(free[y])
         spans[y] = columns[0], columns[-1] + 1
-    # Each border is part of the outline of two labels, but its cost counts once.
+    # Each border is part of the outlines of two labels, but its cost counts only once.
     half = np.ascontiguousarray(0.5 * edge, np.float32)
     _iterate(np.ascontiguousarray(cost, np.float32), half, u, spans, steps)
     return u
@@ -193,13 +193,13 @@ def learn_colours(
     px_per_mm: float,
     weight: float = 1.0,
 ) -> None:
-    """Update a colour model with an image, shape (h, w, 3), and the expected position of the crowns."""
+    """Update a colour model with an image (h, w, 3) and the expected position of the crowns."""
     nearest = expected.inside_px.max(0) / px_per_mm
     model.learn(rgb, nearest > config.inner_mm, nearest < -config.outer_mm, weight)
 
 
 def excess_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
-    """Return the log-odds of tooth from colour alone, minus the required threshold, shape (h, w)."""
+    """Return the log-odds that pixels are tooth, from colour alone and minus the required threshold, shape (h, w)."""
     demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
     return model.log_odds(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
 
@@ -248,9 +248,9 @@ def separate_arches(
 ) -> NDArray[np.float32]:
     """Return the coverage of both arches, shape (2, h, w), after re-estimating the border between them from edges.
 
-    The sum of the two coverages is unchanged. Edges between upper and lower teeth are much weaker than those between
-    teeth and lips. With a common edge weight, these weak edges would have no effect: the border would stay at its
-    predicted position, and bias the poses towards the prediction.
+    The sum of both coverages is unchanged. Edges between upper and lower teeth are much weaker than those between
+    teeth and lips. With a common edge weight, these weak edges would have no effect; the border would stay at its
+    predicted position and bias the poses towards the prediction.
     """
     inside = expected.inside_px / px_per_mm
     teeth = shares.sum(0)
@@ -278,7 +278,7 @@ def separate_arches(
 def _edge_prices(rgb: NDArray[np.uint8], config: SegmentationConfig, where: Mask | None = None) -> NDArray[np.float32]:
     """Return the cost of a border between each pixel and its right and lower neighbour, shape (2, h, w).
 
-    Edge contrast is normalised by the mean contrast of the image (Boykov and Jolly 2001), or of its part `where`.
+    The edge contrast is normalised by the mean contrast (Boykov and Jolly 2001) of the image or of its part `where`.
     """
     smooth = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), (0, 0), 0.8).astype(np.float32)
     out = np.full((2, *rgb.shape[:2]), config.border, np.float32)

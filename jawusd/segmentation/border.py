@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Mask
 from jawusd.segmentation.colours import SegmentationConfig, log_chroma
 
-_EVEN = 1e-4  # variance added to the log colours [-], for errors of half an 8-bit step
+_EVEN = 1e-4  # variance added to that of the log colours [-], for errors of half an 8-bit step
 _FEWEST = 100  # minimum number of pixels near the border for estimating the covariance of colours
-_ARCH_BLUR_PX = 0.8  # sigma of the blur of the border between the arches, for fractional coverage
-_FAR_BLUR_PX = 2.0  # sigma of the blur that assigns tooth pixels far from both coverages to the nearer arch
+_ARCH_BLUR_PX = 0.8  # sigma of the blur that makes the coverage fractional at the border between the arches
+_FAR_BLUR_PX = 2.0  # sigma of the blur that assigns tooth pixels far from both arches to the nearer arch
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class _Sides:
     """Classification of every pixel by the local colours on both sides of the border."""
 
     share: NDArray[np.float32]  # tooth coverage, 0.5 midway between the sides, shape (h, w)
-    # separation of the colours of both sides in standard deviations, 0 unless both sides are nearby, shape (h, w)
+    # separation of the colours of both sides in standard deviations; 0 unless both sides are nearby; shape (h, w)
     contrast: NDArray[np.float32]
 
 
@@ -32,10 +32,10 @@ def refine_borders(
     """Return coverages (2, h, w) with soft borders, 0.5 at the outline, and a mask of visible borders, shape (h, w).
 
     Pixels along the border are reclassified by the local colours on both sides. The colours learned over the take
-    determine which parts are teeth, but not their exact borders, since the midpoint between two colours varies locally.
-    Fisher's discriminant between the local means determines the border (local region statistics, Lankton & Tannenbaum
-    2008). Where these colours are too similar, the border is invisible and stays unchanged; parts with hardly any
-    visible border are discarded.
+    determine which parts are teeth, but not their exact borders, since the midpoint between tooth colour and
+    surrounding colour varies locally. Fisher's discriminant between the local means determines the border (local region
+    statistics, Lankton & Tannenbaum 2008). Where the two colours are too similar, the border is invisible and stays
+    unchanged; parts with hardly any visible border are discarded.
     """
     colours = _blurred(log_chroma(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1
@@ -59,7 +59,7 @@ def _blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]
 
 
 def _signed_distance(region: Mask) -> NDArray[np.float32]:
-    """Return the signed distance to the region's outline, positive inside [px]."""
+    """Return the signed distance to a region's outline, positive inside [px]."""
     inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
     return inner - cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
 
@@ -82,7 +82,7 @@ def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], wi
 
 
 def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[NDArray[np.float32], Mask]:
-    """Return the local mean colour of one side at every pixel, and a mask of pixels with enough of that side nearby."""
+    """Return the local mean colour of one side at every pixel, and a mask of pixels with enough of this side nearby."""
     weight = side.astype(np.float32)
     count = cv2.boxFilter(weight, -1, (window, window), normalize=False)
     total = cv2.boxFilter(colours * weight[..., None], -1, (window, window), normalize=False)

@@ -20,7 +20,7 @@ from jawusd.segmentation.learn import Example, cut_picture
 from jawusd.segmentation.picture import PictureFrame, Window
 
 _ARCHES = (0, 1)
-_EVERY = 20  # stride over the crown vertices: only every 20th is projected to find the window
+_EVERY = 20  # stride over the crown vertices; only every 20th vertex is projected to find the window
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Segment:
     camera: Camera  # pinhole camera of the window
     masks: NDArray[np.uint8]  # coverage of the upper and lower arch, 0..255, uint8, shape (2, h, w)
     present: Mask  # whether each arch is visible, shape (2,)
-    # tooth probability just inside the outline minus that just outside, per arch, -1 .. 1; NaN without an outline
+    # tooth probability just inside each arch's outline minus that just outside it, -1 .. 1; NaN without an outline
     contrast: Array
     # fraction of each arch's mask outside the expected crowns; NaN without a mask
     unexpected: Array
@@ -42,7 +42,7 @@ class Segment:
     expected: Expectation
 
     def only(self, arches: Mask) -> Segment:
-        """Return the segment with only the masks of the arches selected by a boolean array, shape (2,)."""
+        """Return the segmentation with the masks of selected arches only, given a boolean array, shape (2,)."""
         if arches.all():
             return self
         masks = np.where(arches[:, None, None], self.masks, np.uint8(0))
@@ -74,7 +74,7 @@ class CameraSegmenter:
         self.colours = ColourModel(config.memory_frames)
 
     def configure(self, config: SegmentationConfig) -> None:
-        """Replace the configuration."""
+        """Replace the configuration of the segmentation."""
         self._config = config
 
     def segment(
@@ -88,7 +88,7 @@ class CameraSegmenter:
 
         Args:
             poses: expected T_world_upper, T_world_lower, shape (2, 4, 4).
-            turn: number of the iteration: 0 with predicted poses, 1 or more with refined ones.
+            turn: number of the iteration; 0 with predicted poses, 1 or more with refined poses.
         """
         c = self._config
         window = self._frame.window(image, self._around(poses), c.margin_mm)
@@ -99,11 +99,11 @@ class CameraSegmenter:
         if turn == 0 or not self.colours.is_trained():
             self._learn(window, expected, keys, seeds)
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
-        # The tracker needs outlines that are consistent over time, and computed ones are more so than annotated ones: a
-        # finished mask therefore replaces a computed one only if the computed one is wrong.
+        # The tracker needs outlines that are consistent over time. Computed outlines are more consistent than annotated
+        # outlines, so a finished mask replaces a computed mask only if the computed mask is wrong.
         drawn = seeds.share if seeds is not None and seeds.known.all() else None
         guide = None if drawn is not None else seeds
-        # Refine borders in the first iteration too: with rough outlines, the tracker reports a lost arch.
+        # Refine the borders in the first iteration, too; with rough outlines, the tracker would report a lost arch.
         shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide)
         if drawn is not None and _overlap(shares, drawn) < c.key_overlap:
             shares = drawn
@@ -120,9 +120,9 @@ class CameraSegmenter:
         return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ARCHES])
 
     def study(self, image: ColourPicture, poses: Array, keys: Sequence[Key | None]) -> Example | None:
-        """Learn the colours of an annotated image at aligned poses, and return it as an example.
+        """Learn the colours of an annotated image at aligned poses, and return the image as an example for learning.
 
-        Return None if the masks are not finished or the teeth are out of view.
+        Return None if the annotated masks are not finished, or if the teeth are out of view.
         """
         window = self._frame.window(image, self._around(poses), self._config.margin_mm)
         if window is None:
@@ -135,7 +135,7 @@ class CameraSegmenter:
         return Example(window, expected, seeds.share, self.colours, self._frame.px_per_mm)
 
     def _seeds(self, window: Window, keys: Sequence[Key | None]) -> Seeds | None:
-        """Return the annotations in a window."""
+        """Return the annotations of an image in a window."""
         if all(key is None for key in keys):
             return None
         known, share = np.zeros((2, *window.rgb.shape[:2]), bool), np.zeros((2, *window.rgb.shape[:2]), np.float32)
@@ -146,7 +146,7 @@ class CameraSegmenter:
         return Seeds(known | all(key is not None and key.finished for key in keys), share)
 
     def _learn(self, window: Window, expected: Expectation, keys: Sequence[Key | None], seeds: Seeds | None) -> None:
-        """Update the colours with an image, with annotated pixels weighted higher."""
+        """Update the colours with an image; annotated pixels have a higher weight."""
         c = self._config
         if not all(key is not None and key.finished for key in keys):
             learn_colours(self.colours, window.rgb, expected, c, self._frame.px_per_mm)
@@ -157,7 +157,7 @@ class CameraSegmenter:
             self.colours.learn(window.rgb, cv2.erode(teeth, kernel) > 0, outer, c.key_weight)
 
     def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> Array:
-        """Return the tooth probability just inside an arch's outline minus that just outside both arches."""
+        """Return the tooth probability just inside an arch's outline minus the probability just outside both arches."""
         odds = self.colours.log_odds(window.rgb)
         share = 1 / (1 + np.exp(-odds))
         teeth = (masks.max(0) > 127).astype(np.uint8)
@@ -174,7 +174,7 @@ class CameraSegmenter:
 
 
 def _overlap(shares: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
-    """Return the intersection over union with the annotation, of the worse arch."""
+    """Return the intersection over union of a segmentation and its annotation, in the arch with the lower value."""
     a, b = shares > 0.5, drawn > 0.5
     return float(((a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)).min())
 

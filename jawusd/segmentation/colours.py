@@ -1,7 +1,7 @@
-"""Colour model of teeth and surroundings in one camera, its saved state, and the configuration.
+"""Colour model of teeth and surroundings in one camera, with its saved state and its configuration.
 
-Colour histograms adapt during the take. Their state is saved after every frame, so that resumed runs give the same
-masks as uninterrupted ones.
+The colour histograms adapt during the take. Their state is saved after every frame, so that resumed runs give the same
+masks as uninterrupted runs.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from jawusd.base.npz import DAMAGED
 from jawusd.formats.atomic import write_npz_atomic
 
 _BINS = 32  # number of histogram bins per channel
-_FLOOR = 12.0  # offset of every channel [8-bit steps], which damps the noisy colour ratios of dark pixels
+_FLOOR = 12.0  # offset added to every channel [8-bit steps], which damps the noisy colour ratios of dark pixels
 _RATIO_STEP = 0.03  # bin width of the log ratios [-]; the bins cover red over green from 0.6 to more than 1.6
 _MOST = 6.0  # maximum magnitude of the log-odds from colour alone [-]
-_ROUNDS, _STEPS = 5, 8  # number of reclassifications of the pixels under crowns, and of Newton steps for each
+_ROUNDS, _STEPS = 5, 8  # number of reclassifications of the pixels under crowns, and number of Newton steps in each
 _LIGHT = 1  # index of the lightness term
 _RIDGE = 0.01  # ridge penalty on the weights, which keeps them finite if the colours are separable
 # Two files are written alternately, since a run may be killed between saving the colours of a frame and recording the
@@ -33,42 +33,43 @@ _FILES = ("colours_0.npz", "colours_1.npz")
 
 @dataclass(frozen=True)
 class SegmentationConfig:
-    """Configuration of the segmentation; px are pixels of the working image."""
+    """Configuration of the segmentation; lengths in px are pixels of the working image."""
 
-    # Working resolution at the teeth [px/mm], the same as the tracker's.
+    # Working resolution at the teeth [px/mm], the same as that of the tracker.
     working_px_per_mm: float = 7.2
-    # Margin around the projected crowns [mm]: includes lips, gum and tongue, but no background.
+    # Margin around the projected crowns [mm], which includes lips, gum and tongue, but no background.
     margin_mm: float = 4.0
-    # Minimum depth inside the projected crowns of pixels that train the tooth colours [mm]: larger than the pose error.
+    # Minimum depth inside the projected crowns of pixels that train the tooth colours [mm]; larger than the pose error.
     inner_mm: float = 0.4
     # Minimum distance outside the projected crowns of pixels that train the colours of the surroundings [mm].
     outer_mm: float = 1.0
     # Maximum distance of tooth pixels outside the projected crowns [mm], in the first iteration and after alignment.
     reach_mm: tuple[float, ...] = (1.6, 1.0)
-    # Time constant of the colour histograms [frames]: light changes slowly, as the head moves.
+    # Time constant of the colour histograms [frames]; the light changes slowly, as the head moves.
     memory_frames: float = 24.0
-    # Quantile of the surroundings' log-odds that tooth colours must exceed [-], since the separability of colours
-    # differs between subjects; and the margin required in addition without evidence from position [-].
+    # Quantile of the log-odds in the surroundings that tooth colours must exceed [-], since the separability of colours
+    # differs between subjects; and additional margin that is required without evidence from position [-].
     surroundings_share: float = 0.95
     doubt: float = 1.5
     # Minimum and maximum of the required log-odds [-].
     doubt_range: tuple[float, float] = (-1.0, 1.0)
-    # Log-odds of tooth per mm inside the projected outline [1/mm], and their lower limit outside and upper limit inside
-    # [-].
+    # Increase of the log-odds of tooth per mm inside the projected outline [1/mm]; their minimum outside and their
+    # maximum inside [-].
     place_per_mm: float = 2.0
     place_most: tuple[float, float] = (1.5, 1.0)
-    # Cost of a border per pixel of its length, in log-odds [-], and the fraction of this cost on the strongest edges.
+    # Cost of a border per pixel of its length, in log-odds [-], and fraction of this cost that applies on the strongest
+    # edges.
     border: float = 4.0
     border_on_edge: float = 0.15
     # Log-odds of upper against lower arch per mm of distance from their projected common border [1/mm]; segment.json
     # uses the name of this setting.
     rows_per_mm: float = 2.0
-    # Maximum displacement of a border by refinement, and width of the area on either side in which colours are compared
+    # Maximum displacement of a border by refinement, and width of the area on each side in which colours are compared
     # [mm].
     border_band_mm: float = 0.4
     border_side_mm: float = 0.8
-    # Sigma of the blur of the compared colours [px], and minimum separation of visible borders in standard deviations
-    # [-].
+    # Sigma of the blur of the compared colours [px], and minimum colour separation at a visible border in standard
+    # deviations [-].
     border_blur_px: float = 0.7
     border_contrast: float = 2.0
     # Outward shift of the outlines of the upper and lower arch [-], learned from annotated masks; 1 is the width of the
@@ -80,27 +81,28 @@ class SegmentationConfig:
     speck_px: int = 25
     # Number of iterations of the cut.
     steps: int = 40
-    # Search range of the border between the arches [mm], and number of iterations of its cut.
+    # Search range for the border between the arches [mm], and number of iterations of the cut that finds it.
     arch_band_mm: float = 1.0
     arch_steps: int = 60
     # Weight of an annotated mask in the colour histograms, as a number of frames.
     key_weight: float = 12.0
     # Intersection over union with a finished mask below which the finished mask replaces the segmentation [-].
     key_overlap: float = 0.8
-    # Minimum area of a mask [px]: 4 square millimetres.
+    # Minimum area of a mask [px], equal to 4 square millimetres.
     least_px: int = 200
 
 
 class ColourModel:
-    """Colour model of teeth and their surroundings: log-odds of tooth by colour.
+    """Colour model of teeth and their surroundings: log-odds that a colour is tooth.
 
     Pixels under projected crowns are teeth or, where lips, cheeks or tongue hide them, surroundings; all other pixels
     are surroundings. A logistic regression on the colours, their squares and products separates the two classes. Pixels
-    under crowns that it classifies as surroundings are relabelled, and the regression is repeated. With so few terms,
-    it cannot overfit lip colours that occur only under crowns.
+    under crowns that the regression classifies as surroundings are relabelled, and the regression is repeated. With so
+    few terms, it cannot overfit lip colours that occur only under crowns.
 
-    Colours are lightness and the logs of red and blue over green. Shading scales all channels equally, so the ratios
-    are invariant to it (Finlayson et al. 2006), and shaded back teeth have the same ratios as lit front teeth.
+    Colours are represented by lightness and the logs of red and blue over green. Shading scales all channels equally,
+    so the ratios are invariant to shading (Finlayson et al. 2006): shaded back teeth have the same ratios as lit front
+    teeth.
     """
 
     def __init__(self, memory: float) -> None:
@@ -111,7 +113,7 @@ class ColourModel:
         self._table: NDArray[np.float32] | None = None
 
     def learn(self, rgb: NDArray[np.uint8], under: Mask, beyond: Mask, weight: float = 1.0) -> None:
-        """Update the histograms with an image (h, w, 3), and masks (h, w) well inside and outside the crowns."""
+        """Update the histograms with an image (h, w, 3), given masks (h, w) well inside and well outside the crowns."""
         index = _bins(rgb)
         for counts, where in ((self._under, under), (self._beyond, beyond)):
             new = np.bincount(index[where], minlength=_BINS**3).reshape(counts.shape)
@@ -120,7 +122,7 @@ class ColourModel:
         self._table = None
 
     def is_trained(self) -> bool:
-        """Return whether any image was learned."""
+        """Return whether any image has been learned."""
         return bool(self._under.any() and self._beyond.any())
 
     def counts(self) -> tuple[NDArray[np.int64], Array]:
@@ -137,11 +139,11 @@ class ColourModel:
         self._table = None
 
     def log_odds(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the log-odds of tooth against surroundings at each pixel, shape (h, w)."""
+        """Return the log-odds of tooth against surroundings at each pixel of an image, shape (h, w)."""
         return self._odds()[_bins(rgb)]
 
     def surroundings_quantile(self, share: float) -> float:
-        """Return a quantile of the surroundings' log-odds."""
+        """Return a quantile of the log-odds in the surroundings."""
         odds, counts = self._odds(), self._beyond.ravel()
         order = np.argsort(odds)
         return float(odds[order[np.searchsorted(np.cumsum(counts[order]), share * counts.sum())]])
@@ -174,20 +176,20 @@ def _bins(rgb: NDArray[np.uint8]) -> Indices:
 
 @cache
 def _terms() -> Array:
-    """Return the terms of the regression for the centre of every bin, shape (bins, 7).
+    """Return the terms of the regression at the centre of every histogram bin, shape (bins, 7).
 
     Lightness enters only linearly, so that dark lips under crowns cannot raise the log-odds of dark colours.
     """
     step = np.arange(_BINS) + 0.5
     light, ratio = np.log(step * 256 / _BINS + _FLOOR), (step - _BINS // 2) * _RATIO_STEP
     light, a, b = np.meshgrid(light, ratio, ratio, indexing="ij")
-    # Normalise to about unit variance.
+    # Normalise the terms to about unit variance.
     light, a, b = (light.ravel() - 4.6) / 0.5, (a.ravel() - 0.15) / 0.1, b.ravel() / 0.1
     return np.stack([np.ones_like(a), light, a, b, a**2, b**2, a * b], axis=1)
 
 
 def _fitted_weights(under: Array, beyond: Array) -> Array:
-    """Fit the weights of the terms to the counts of every bin, shape (7,); the lightness weight is never negative."""
+    """Fit the weights (7,) of the terms to the counts in every bin; the weight of lightness is never negative."""
     seen = np.flatnonzero(under + beyond)
     x = _terms()[seen]
     under, beyond = (c[seen] / max(c.sum(), 1e-12) for c in (under, beyond))
@@ -199,7 +201,7 @@ def _fitted_weights(under: Array, beyond: Array) -> Array:
 
 
 def _regress(x: Array, under: Array, beyond: Array) -> Array:
-    """Fit coefficients of terms (N, 7) that separate two classes, given as weights (N,); the first has outliers."""
+    """Fit coefficients of terms (N, 7) that separate two classes with weights (N,); the first class has outliers."""
     weights, ridge = np.zeros(x.shape[1]), _RIDGE * np.eye(x.shape[1])
     ridge[0, 0] = 1e-9
     tooth = np.ones(len(x))
@@ -220,10 +222,10 @@ def _logistic(odds: Array) -> Array:
 
 
 class ColourStates:
-    """Saved colours of all cameras."""
+    """Files with the colours of all cameras."""
 
     def __init__(self, folder: Path, colours: Mapping[str, ColourModel]) -> None:
-        """Use a folder for the files and the colours by camera."""
+        """Store the folder of the files, and the colours by camera."""
         self._folder, self._colours = folder, dict(colours)
 
     def save(self, frame: int, step: int) -> None:
@@ -240,7 +242,7 @@ class ColourStates:
     def restore(self, done: int, step: int) -> int | None:
         """Restore the latest colours saved up to frame `done`; step is 1 (forwards) or -1 (backwards).
 
-        Return the frame after which they were saved; None if there are none.
+        Return the frame after which the colours were saved; None if there are no saved colours.
         """
         for frame in (done, done - step):
             path = self._folder / _FILES[frame % 2]
@@ -254,7 +256,7 @@ class ColourStates:
 
 
 def _stored(path: Path) -> dict[str, Array] | None:
-    """Return the arrays of a file; None if it is missing or corrupt, so that its frames are processed again."""
+    """Return the arrays of a state file; None if it is missing or corrupt, so that its frames are processed again."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}

@@ -1,4 +1,4 @@
-"""Mask files: paths, writing, annotated masks, and contact sheets."""
+"""Mask files: paths, writing, annotated masks, and contact sheets of thumbnails."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from jawusd.media.pictures import read_gray
 
 ARCHES = ("upper", "lower")
 PATTERN = "%06d.png"
-_UNKNOWN = 128  # gray value of pixels without annotation
+_UNKNOWN = 128  # gray value of pixels that are not annotated
 _STROKES_UNKNOWN = 0.5  # minimum fraction of unannotated pixels for an image to count as strokes
 _COLUMNS = 3
 _TILE_PX = (480, 270)
-_MARGIN = 0.15  # margin of a tile, relative to the extent of the teeth
+_MARGIN = 0.15  # margin of a tile as a fraction of the extent of the teeth
 
 
 def mask_pattern(folder: Path, camera: str, arch: str) -> Path:
@@ -45,7 +45,7 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    # Run-length encoding is twenty times faster than the default strategy, for files of the same size.
+    # Run-length encoding is twenty times faster than the default strategy, and the files have the same size.
     settings = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
     write_bytes_atomic(path, cv2.imencode(".png", mask, settings)[1].tobytes())
 
@@ -54,14 +54,14 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
 class Key:
     """Annotation of one arch in one image."""
 
-    mask: NDArray[np.uint8]  # 255 = tooth, (H, W) uint8
-    # 255 at annotated pixels, (H, W) uint8: everywhere in a finished mask, otherwise under strokes
+    mask: NDArray[np.uint8]  # 255 where annotated as tooth, (H, W) uint8
+    # 255 at annotated pixels (everywhere in a finished mask, otherwise under strokes), (H, W) uint8
     known: NDArray[np.uint8]
     finished: bool  # whether all pixels are annotated
 
 
 class KeyMasks:
-    """Annotations of some frames, in folders named like those of the computed masks.
+    """Annotations of some frames, in folders with the same names as those of the computed masks.
 
     An image is a finished mask or, if at least half of its pixels have the gray value 128, strokes: 255 on teeth of the
     arch, 0 on anything else, and 128 where nothing was drawn.
@@ -71,7 +71,7 @@ class KeyMasks:
         """Find the images CAMERA/upper/%06d.png and CAMERA/lower/%06d.png in a folder, if one is given.
 
         Raises:
-            CaptureError: the folder is missing or contains nothing for these cameras.
+            CaptureError: the folder is missing or contains no images for these cameras.
         """
         self._folder, self._sizes_px = folder, sizes_px
         self._masks: dict[tuple[str, str], PngMasks] = {}
@@ -95,7 +95,7 @@ class KeyMasks:
         return sorted({int(path.stem) for path in files if path.stem.isdecimal()})
 
     def of(self, camera: str, own: int) -> list[Key | None]:
-        """Return the annotation of both arches at a camera's own frame, None for an arch without one.
+        """Return the annotations of both arches at a camera's own frame; None for an arch without annotation.
 
         Raises:
             CaptureError: an image cannot be decoded or has the wrong size.
@@ -130,7 +130,7 @@ def _is_strokes(picture: RawImage) -> bool:
 def write_sheet(
     path: Path, shown: Sequence[tuple[str, int, str]], videos: Mapping[str, ClipSource | Path], folder: Path
 ) -> None:
-    """Write a PNG with one tile per (camera, own frame, remark), with both arches outlined.
+    """Write a PNG with one tile per (camera, own frame, remark), in which both arches are outlined.
 
     Raises:
         CaptureError: an image or mask cannot be decoded.
@@ -148,7 +148,7 @@ def write_sheet(
 
 
 def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None], caption: str) -> NDArray[np.uint8]:
-    """Return an RGB image cropped to its masks, outlined and captioned."""
+    """Return an RGB image that is cropped to its masks, with their outlines and a caption."""
     extent = np.zeros(picture.shape[:2], bool)
     for _, mask, colour in zip(ARCHES, masks, (UPPER_COLOUR, LOWER_COLOUR), strict=True):
         if mask is not None:
@@ -160,7 +160,7 @@ def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None],
 
 
 def _cut(picture: NDArray[np.uint8], extent: Mask) -> NDArray[np.uint8]:
-    """Crop an image around the marked pixels, with the aspect ratio of a tile where possible."""
+    """Crop an image to the surroundings of the marked pixels, with the aspect ratio of a tile if possible."""
     if not extent.any():
         return picture
     rows, columns = np.flatnonzero(extent.any(1)), np.flatnonzero(extent.any(0))

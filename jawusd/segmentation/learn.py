@@ -1,4 +1,4 @@
-"""Learn the weights of the energy, and the offset of the annotator's outlines, from finished masks of a few frames."""
+"""Learn the weights of the energy and the offset of the annotator's outlines from finished masks of a few frames."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from jawusd.segmentation.border import refine_borders
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.picture import Window
 
-_FACTORS = (0.5, 2.0)  # factors by which every weight is multiplied in turn
+_FACTORS = (0.5, 2.0)  # factors by which the weights are multiplied, one weight at a time
 _NUMBERS = ("border", "place_per_mm", "rows_per_mm")
-_DOUBTS = (-1.0, 1.0)  # values added to `doubt` in turn
+_DOUBTS = (-1.0, 1.0)  # values that are tried as increments of `doubt`
 _WIDER = np.arange(-6, 7) * 0.05  # candidate outward shifts of the outlines, in widths of the soft border
-_LEAST_GAIN = 0.01  # minimum relative improvement for a change to be kept
+_LEAST_GAIN = 0.01  # minimum relative improvement for which a change is kept
 
 
 class LearnedNumbers(TypedDict):
-    """The weights that changed, and the mean error (1 - intersection over union) before and after."""
+    """Weights that were changed, and mean error (1 - intersection over union) before and after."""
 
     numbers: dict[str, object]
     disagreement: list[float]
@@ -32,13 +32,13 @@ class LearnedNumbers(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """An image with finished masks."""
+    """Example for learning: an image with finished masks."""
 
     # the image and the expected crowns
     window: Window
     expected: Expectation
     drawn: NDArray[np.float32]  # annotated coverage of both arches, shape (2, h, w)
-    colours: ColourModel  # the colours of its camera
+    colours: ColourModel  # colour model of the image's camera
     px_per_mm: float  # resolution of the image
 
     def cut(self, config: SegmentationConfig) -> NDArray[np.float32]:
@@ -56,7 +56,7 @@ def cut_picture(
     reach_mm: float,
     seeds: Seeds | None,
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Segment both arches, refine their borders and keep annotations.
+    """Segment both arches, refine their borders, and keep annotated pixels.
 
     Return the coverage of both arches, shape (2, h, w), and the pixels with visible borders, shape (h, w).
     """
@@ -97,7 +97,7 @@ def _trials(config: SegmentationConfig) -> Iterator[SegmentationConfig]:
 
 
 def _widened(shares: NDArray[np.float32], wider: tuple[float, float]) -> NDArray[np.float32]:
-    """Return coverages with outlines moved by fractions of the soft border's width, but not between the arches."""
+    """Return coverages with outlines moved by fractions of the soft border's width, except between the arches."""
     if not any(wider):
         return shares
     alone = shares[::-1] < 0.05

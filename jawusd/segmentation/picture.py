@@ -17,26 +17,26 @@ from jawusd.media.pixels import ColourPicture
 from jawusd.media.working_view import WorkingView, remap
 
 _NODE_PX = 8  # spacing of the grid on which the undistortion map is computed
-_CHUNK = 16  # number of frames buffered when reading backwards: 50 MB per full HD camera
+_CHUNK = 16  # number of frames that are buffered when reading backwards; 50 MB per full HD camera
 
 Pictures: TypeAlias = "dict[str, ColourPicture | None]"
-_Frames = range  # built-in type, since `range` is a method of the class below
+_Frames = range  # the built-in type, since `range` is also a method of the class below
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A part of a working image."""
+    """A window: part of a working image."""
 
-    camera: Camera  # pinhole camera of the part
+    camera: Camera  # pinhole camera of the window
     rgb: NDArray[np.uint8]  # 8-bit RGB pixels, shape (h, w, 3)
-    corner: tuple[int, int]  # first column and row in the working image [px]
+    corner: tuple[int, int]  # first column and row of the window in the working image [px]
 
 
 class PictureFrame:
-    """Windows around the teeth in one camera's images."""
+    """Factory of windows around the teeth in the images of one camera."""
 
     def __init__(self, source: Camera, centre_world: Array, px_per_mm: float) -> None:
-        """Choose the working size from the resolution at the teeth, centre_world (3,) [mm], without upsampling."""
+        """Choose the working image size from the resolution at the teeth, centre_world (3,) [mm]; never upsample."""
         recorded = float(np.sqrt(source.K[0, 0] * source.K[1, 1]) / source.depth(centre_world))
         scale = min(1.0, px_per_mm / recorded)
         self.px_per_mm = recorded * scale
@@ -46,7 +46,7 @@ class PictureFrame:
         self._back = _positions(source, self._working.camera)
 
     def window(self, image: ColourPicture, points_world: Array, margin_mm: float) -> Window | None:
-        """Return the window around world points (N, 3) [mm] in a recorded image (H, W, 3), None if out of view."""
+        """Return the window around world points (N, 3) [mm] in a recorded image (H, W, 3); None if out of view."""
         camera = self._working.camera
         seen = camera.project_pinhole(points_world[camera.depth(points_world) > 0])
         if not len(seen):
@@ -63,12 +63,12 @@ class PictureFrame:
         return Window(cropped, part, (int(low[0]), int(low[1])))
 
     def given(self, mask: NDArray[np.uint8], window: Window) -> NDArray[np.uint8]:
-        """Return the part of a recorded mask, (H, W) uint8, in a window, shape (h, w)."""
+        """Return the part of a recorded mask (H, W), uint8, that lies in a window, shape (h, w)."""
         (x, y), (width, height) = window.corner, window.camera.size_px
         return self._working.part(mask, (slice(y, y + height), slice(x, x + width)))
 
     def recorded(self, shares: NDArray[np.float32], window: Window) -> NDArray[np.uint8]:
-        """Convert a window's tooth coverage, shape (h, w), to a mask at recorded size, 0 or 255."""
+        """Convert the tooth coverage in a window, shape (h, w), to a mask at recorded size, 0 or 255."""
         nodes = self._back[::_NODE_PX, ::_NODE_PX] - np.array(window.corner, np.float32)
         limit = np.array(shares.shape[::-1], np.float32) + _NODE_PX
         inside: Mask = np.all((nodes > -_NODE_PX) & (nodes < limit), axis=2)
@@ -94,14 +94,14 @@ def _positions(source: Camera, working: Camera) -> NDArray[np.float32]:
 
 
 class ColourFootage:
-    """Images of all cameras, readable in both directions."""
+    """Images of all cameras, which can be read in both directions of time."""
 
     def __init__(self, videos: Mapping[str, Clip], offsets: Mapping[str, int]) -> None:
-        """Open the videos; `offsets` are reference frame minus own frame number, by the same names."""
+        """Open the videos; `offsets` are reference frame number minus own frame number, by camera name."""
         self._videos, self._offsets = dict(videos), dict(offsets)
 
     def own(self, name: str, frame: int) -> int | None:
-        """Return a camera's image index at a frame of the reference camera; None if the camera has no image then."""
+        """Return a camera's image index at a frame of the reference camera; None if the camera has no image there."""
         return self._videos[name].timeline.picture(frame - self._offsets[name])
 
     def number(self, name: str, frame: int) -> int | None:
@@ -115,11 +115,11 @@ class ColourFootage:
         return max(0, starts[min(1, len(starts) - 1)]), stops[-min(2, len(stops))]
 
     def at(self, frame: int) -> Pictures:
-        """Return the RGB images (H, W, 3) of one frame of the reference camera, None for a missing one."""
+        """Return the RGB images (H, W, 3) of the cameras at a frame of the reference camera, None where missing."""
         return next(self.walk(range(frame, frame + 1)))[1]
 
     def walk(self, frames: _Frames) -> Iterator[tuple[int, Pictures]]:
-        """Yield frames with their images; a descending range is read forwards in chunks.
+        """Yield frame numbers with their images; descending ranges are read forwards in chunks.
 
         Raises:
             CaptureError: an image cannot be decoded.

@@ -1,6 +1,6 @@
-"""Find both rows of teeth in an image without prior knowledge, to initialise a search.
+"""Find both dental arches in an image without prior knowledge, to initialise a search.
 
-Teeth are brighter and less red than their surroundings; the gap between the rows of an open mouth is dark or red.
+Teeth are brighter and less red than their surroundings; the gap between the arches of an open mouth is dark or red.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from jawusd.base.arrays import Array, Mask
 
-_WIDTH_PX = 480  # width to which images are resized
+_WIDTH_PX = 480  # image width at which teeth are searched for
 # Teeth are found by thresholding lightness minus redness, CIELAB L* - 2.5 a*: weight of a*, candidate thresholds as
 # percentiles of the image, and the percentile that counts as white.
 _REDNESS, _LEVELS, _BRIGHTEST = 2.5, (40, 55, 65, 72, 78, 83, 87, 90, 92, 94, 96), 99.5
@@ -23,24 +23,25 @@ _REDNESS, _LEVELS, _BRIGHTEST = 2.5, (40, 55, 65, 72, 78, 83, 87, 90, 92, 94, 96
 # redder, and maximum ratio of brightness to count as darker.
 _UNLIKE, _REDDER, _DARKER = 0.6, 3.0, 0.3
 _LEAST_AREA, _MOST_AREA = 0.0015, 0.2  # minimum and maximum fraction of the image covered by teeth
-# radius of the closing; inner and outer distance of the ring around teeth that samples their surroundings
+# radius of the morphological closing; inner and outer distance of the ring that samples the surroundings of teeth
 _CLOSE_PX, _NEAR_PX, _FAR_PX = 4, 3, 12
-# Maximum distance between the rows, in row widths; minimum area of a part relative to a row; minimum brightness and
-# contrast of a part relative to the teeth found first, above those of wet lips and chins.
+# Maximum distance between the arches, in arch widths; minimum area of a part relative to an arch; minimum brightness
+# and contrast of a part relative to the teeth found first, above those of wet lips and chins.
 _ROWS_APART, _LEAST_PART, _AS_BRIGHT, _LIKE = 1.0, 0.02, 0.65, 0.5
-# Candidate lines between the rows: tilts relative to half the width, sags relative to the height, and minimum fraction
-# of the tooth pixels on either side.
+# Candidate lines between the arches: tilts relative to half the width, sags relative to the height, and minimum
+# fraction of the tooth pixels on each side.
 _TILTS, _SAGS, _LEAST_SHARE = np.linspace(-0.3, 0.3, 21), np.linspace(-0.4, 0.4, 13), 0.2
 _LINE_PX = (-1, 0, 1)  # offsets of the pixel rows around a line that are averaged when testing for a gap
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Both rows of teeth in an image.
+    """Both dental arches in an image.
 
     Attributes:
-        masks: upper and lower row, 0 or 255, shape (2, H, W).
-        bridged: fraction of the dividing line that crosses teeth instead of a gap, 0 .. 1; 0 if the rows do not touch.
+        masks: upper and lower arch, 0 or 255, shape (2, H, W).
+        bridged: fraction of the line between the arches that crosses teeth instead of a gap, 0 .. 1; 0 if the arches do
+            not touch.
     """
 
     masks: NDArray[np.uint8]
@@ -48,9 +49,10 @@ class Rows:
 
 
 def tooth_rows(rgb: NDArray[np.uint8], turns: int = 0) -> Rows | None:
-    """Return the rows of teeth in an RGB image (H, W, 3) of a roughly upright head; None if no teeth are found.
+    """Return the dental arches in an RGB image (H, W, 3) of a roughly upright head; None if no teeth are found.
 
-    `turns` is the number of counter-clockwise quarter turns that make the image upright. Masks are as the image given.
+    `turns` is the number of counter-clockwise quarter turns that make the image upright. The masks have the orientation
+    of the given image.
     """
     found = _upright_rows(np.ascontiguousarray(np.rot90(rgb, turns)))
     return found and Rows(np.ascontiguousarray(np.rot90(found.masks, -turns, axes=(1, 2))), found.bridged)
@@ -94,7 +96,7 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
     if best is None:
         return None
     _, inside, outside, group = best
-    # midway between the two, since highlights on lips are brighter than the surroundings
+    # midway between teeth and surroundings, since highlights on lips are brighter than the surroundings
     level = (inside + outside) / 2
     parts, count = ndimage.label(toothlike > level)
     like = ndimage.median(toothlike, parts, np.arange(count + 1)) > outside + _AS_BRIGHT * (inside - outside)
@@ -114,12 +116,12 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
 
 
 def _distance(away: Mask) -> NDArray[np.float32]:
-    """Return the city-block distance of every pixel to the nearest one outside `away` [px]."""
+    """Return the city-block distance of every pixel from the nearest pixel outside `away` [px]."""
     return np.asarray(cv2.distanceTransform(away.astype(np.uint8), cv2.DIST_L1, 3), np.float32)
 
 
 def _closed(mask: Mask) -> Mask:
-    """Return a mask with small gaps closed; pixels outside the image count as background."""
+    """Return a mask with its small gaps filled; pixels outside the image count as background."""
     grown = np.pad(_distance(~mask) <= _CLOSE_PX, 1)
     return (_distance(grown) > _CLOSE_PX)[1:-1, 1:-1]
 
@@ -136,7 +138,7 @@ def _group_contrast(
     toothlike: Array,
     redness: Array,
 ) -> tuple[float, float]:
-    """Return brightness inside and around a group of teeth; zeros if its surroundings are neither redder nor darker."""
+    """Return the brightness of a group of teeth and of its surroundings; zeros if they are not redder or darker."""
     rows, columns = box
     around = (
         slice(max(rows.start - _FAR_PX, 0), rows.stop + _FAR_PX),
@@ -155,7 +157,7 @@ def _group_contrast(
 
 
 def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
-    """Return the numbers of parts in and near a group of teeth that may be teeth, by size and position."""
+    """Return the labels of the parts in and near a group of teeth that may be teeth, judging by size and position."""
     rows, columns = np.nonzero(group)
     reach = _ROWS_APART * (np.ptp(columns) + 1)
     around = np.zeros(parts.shape, bool)
@@ -169,10 +171,10 @@ def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
 
 
 def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None:
-    """Split teeth into upper and lower row (2, h, w) at the line with the lowest bridged fraction; also return that."""
+    """Split teeth into upper and lower arch (2, h, w) at the line with the lowest bridged fraction; return both."""
     rows, columns = np.nonzero(teeth)
     first, last, top, bottom = columns.min(), columns.max(), rows.min(), rows.max()
-    lines = top + _lines(int(last - first + 1), int(bottom - top + 1))  # row at each column, shape (N, width)
+    lines = top + _lines(int(last - first + 1), int(bottom - top + 1))  # pixel row at each column, shape (N, width)
     np.clip(lines, 1, len(teeth) - 2, out=lines)
     across = np.arange(first, last + 1)
     taken = teeth[:, across].any(0)
@@ -192,7 +194,7 @@ def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None
 
 @lru_cache(maxsize=8)
 def _lines(width: int, height: int) -> NDArray[np.int64]:
-    """Return candidate lines across a box, as the pixel row at every column, shape (N, width)."""
+    """Return candidate lines across a box, each as the pixel row at every column, shape (N, width)."""
     place = np.linspace(-1.0, 1.0, width)
     middles = np.arange(0.15 * height, 0.9 * height, 1.0)
     middle, tilt, sag = (grid.reshape(-1, 1) for grid in np.meshgrid(middles, _TILTS * width / 2, _SAGS * height))
