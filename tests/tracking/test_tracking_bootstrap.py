@@ -70,7 +70,7 @@ def test_three_contradicting_picks_are_an_error_with_their_residuals():
     picks = _picks(3)
     picks[0] = _moved(picks[0], 90.0)
     with pytest.raises(
-        TrackingError, match=r"picks on the upper teeth contradict one another \(pick 1: .* allowed 1.1 mm"
+        TrackingError, match=r"picks on the upper teeth contradict one another \(pick 1: .* up to 1.1 mm is allowed"
     ):
         pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
 
@@ -101,14 +101,14 @@ def test_pick_outside_of_the_picture_is_refused():
 def test_pick_beyond_the_scan_is_refused():
     picks = _picks(3)
     picks[1] = Pick(vertex=len(MESH.vertices), views=picks[1].views)
-    with pytest.raises(TrackingError, match=r"pick 2 .* names vertex \d+, but the scan has"):
+    with pytest.raises(TrackingError, match=r"pick 2 .* refers to vertex \d+, but the scan has"):
         pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
 
 
 def test_pick_seen_twice_by_one_camera_is_refused():
     picks = _picks(3)
     picks[0] = Pick(vertex=picks[0].vertex, views=(picks[0].views[0], picks[0].views[0]))
-    with pytest.raises(TrackingError, match="pick 1 .* seen by camera cam0 only: its depth is unknown"):
+    with pytest.raises(TrackingError, match="pick 1 .* has a pixel in camera cam0 only; its depth is unknown"):
         pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
 
 
@@ -116,7 +116,7 @@ def test_pick_in_an_unknown_camera_is_refused():
     picks = _picks(3)
     views = (picks[0].views[0], PickView(camera="cam9", x=1.0, y=1.0))
     picks[0] = Pick(vertex=picks[0].vertex, views=views)
-    with pytest.raises(TrackingError, match="names camera cam9, which is not calibrated"):
+    with pytest.raises(TrackingError, match="refers to camera cam9, which is not calibrated"):
         pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
 
 

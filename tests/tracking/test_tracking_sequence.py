@@ -211,7 +211,8 @@ def test_a_picked_frame_without_two_masks_of_each_row_is_replaced_by_another(tak
 def test_first_frame_needs_two_masks_of_each_row(take):
     for camera in CAMERAS[1:]:
         png(take, camera.name, "upper", START).unlink()
-    with pytest.raises(TrackingError, match="frame 8: 1 masks of the upper teeth; the first frame needs two"):
+    problem = "frame 8: the first frame has 1 masks of the upper teeth; at least two are needed"
+    with pytest.raises(TrackingError, match=problem):
         track(_capture(take, frames=(8, 9)))
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Indices, Mask
 
-_SHORTEST_MM = 1e-3  # minimum length of a segment: shorter ones have no reliable direction
+_SHORTEST_MM = 1e-3  # minimum length of a segment [mm]: shorter ones have no reliable direction
 
 
 def crown_gum_segments(

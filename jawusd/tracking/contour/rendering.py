@@ -16,7 +16,7 @@ from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
-_AROUND_PX = 24  # margin rendered around the window, since the window moves with the masks
+_AROUND_PX = 24  # margin rendered around the window [px], since the window moves with the masks
 _LARGEST_ZOOM = 1.02  # maximum change of scale for which a drawing is warped instead of rendered again
 _MOST_KEPT = 64  # maximum number of drawings in the cache; every correction of the camera poses adds new ones
 

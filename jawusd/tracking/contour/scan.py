@@ -48,8 +48,9 @@ class Scan:
     gingival_margin: Array  # segments of the crown-gum line that are not mesh edges [mm], shape (S, 2, 3)
     margin_directions: Array  # unit vectors on the crown surface across these segments, shape (S, 3)
     probes: Array  # vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
-    centre: Array  # centroid of the crown vertices [mm], shape (3,)
-    radius_mm: float  # maximum distance of a crown vertex from `centre`
+    # centroid of the crown vertices [mm], shape (3,)
+    centre: Array
+    radius_mm: float  # maximum distance of a crown vertex from `centre` [mm]
     # whether labels or paint separate crown from gum (back faces of separated crowns are culled); otherwise the whole
     # scan counts as crown
     painted: bool

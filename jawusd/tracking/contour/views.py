@@ -22,7 +22,7 @@ from jawusd.media.working_view import WorkingView
 #: Minimum number of cameras if the depth of the teeth is determined only by masks.
 FEWEST_CAMERAS = 2
 
-_BORDER_PX = 20  # margin of a view around the masks: more than the widest search
+_BORDER_PX = 20  # margin of a view around the masks [px]: more than the widest search
 _CHUNK = 48  # number of frames buffered when iterating backwards: about 20 MB
 
 

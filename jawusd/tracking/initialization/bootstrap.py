@@ -27,8 +27,8 @@ _FEWEST = 3
 # Distance between projected vertex and picked pixel above which a pick is rejected [mm at the teeth]: three times the
 # error of a careless click (5 px where a pixel is 0.07 mm).
 TOLERANCE_MM = 1.1
-_CLICK_MM = TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
-_GAP_MM = 0.8  # maximum distance between the lines of sight of a careless pick
+_CLICK_MM = TOLERANCE_MM / 3  # standard deviation of a careless click along each axis [mm]
+_GAP_MM = 0.8  # maximum distance between the lines of sight of a careless pick [mm]
 # Minimum relative error of the scan size, estimated from the picks, for it to explain their misfit [-]: clicks 0.4 mm
 # off, on vertices 40 mm apart, cause an error of 0.01.
 _SIZE_SHARE = 0.03
@@ -48,7 +48,7 @@ class _Sighting:
 def pose_from_picks(
     picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], arch: str
 ) -> tuple[Array, list[int]]:
-    """Return T_world_scan from the picks, shape (4, 4), and the numbers of rejected picks.
+    """Return T_world_scan (4, 4) from the picks, and the numbers of rejected picks.
 
     Pick numbers start at 1. `vertices` are those of the scan file [mm], shape (V, 3); `arch` is the arch's name for
     messages.
@@ -97,7 +97,7 @@ def pose_from_picks(
             misses = ", ".join(f"pick {s.number}: {_miss_mm(s, best):.1f} mm" for s in sightings)
             raise TrackingError(
                 f"bootstrap: the picks on the {arch} teeth contradict one another "
-                f"({misses}; allowed {TOLERANCE_MM} mm)",
+                f"({misses}; up to {TOLERANCE_MM} mm is allowed)",
                 hint="Check the vertices, pixels and camera names of the picks, and that views show the same frame.",
             )
         best = _refined(good, best)
@@ -127,7 +127,7 @@ def _wrong_sight(
     places: Array,
     sightings: Sequence[_Sighting],
 ) -> str | None:
-    """Describe swapped cameras that explain the misfit of the picks, or lines of sight that miss; otherwise None.
+    """Describe swapped cameras or lines of sight that do not meet, if they explain the misfit of the picks, or None.
 
     `places` are the triangulated picks in world coordinates [mm], shape (P, 3).
     """
@@ -210,7 +210,7 @@ def picked_size(
         try:
             turned = given @ rigid_fit(given, places)[:3, :3].T
         except ValueError:
-            continue  # the picks are collinear
+            continue  # collinear picks do not determine a rotation
         product += float((turned * (places - places.mean(0))).sum())
         square += float((turned**2).sum())
     return square / max(product, 1e-9), _CLICK_MM / np.sqrt(max(square, 1e-9))
@@ -219,16 +219,19 @@ def picked_size(
 def _sighting(number: int, pick: Pick, vertices: Array, cameras: Mapping[str, Camera], arch: str) -> _Sighting:
     where = f"bootstrap: pick {number} on the {arch} teeth"
     if pick.vertex >= len(vertices):
-        raise TrackingError(f"{where} names vertex {pick.vertex}, but the scan has vertices 0 to {len(vertices) - 1}")
+        raise TrackingError(
+            f"{where} refers to vertex {pick.vertex}, but the scan has vertices 0 to {len(vertices) - 1}"
+        )
     names = [view.camera for view in pick.views]
     if len(set(names)) < 2:
         raise TrackingError(
-            f"{where} is seen by camera {names[0]} only: its depth is unknown", hint="Add a pixel in a second camera."
+            f"{where} has a pixel in camera {names[0]} only; its depth is unknown",
+            hint="Add a pixel in a second camera.",
         )
     matrices, pixels = [], []
     for view in pick.views:
         if view.camera not in cameras:
-            raise TrackingError(f"{where} names camera {view.camera}, which is not calibrated")
+            raise TrackingError(f"{where} refers to camera {view.camera}, which is not calibrated")
         camera = cameras[view.camera]
         width, height = camera.size_px
         if not (-0.5 <= view.x <= width - 0.5 and -0.5 <= view.y <= height - 0.5):

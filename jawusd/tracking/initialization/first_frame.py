@@ -51,7 +51,7 @@ def first_record(
     for r in ARCHES:
         if use[r].sum() < _FEWEST_MASKS:
             raise TrackingError(
-                f"{use[r].sum()} masks of the {ARCH_NAMES[r]} teeth; the first frame needs two",
+                f"the first frame has {use[r].sum()} masks of the {ARCH_NAMES[r]} teeth; at least two are needed",
                 frame=frame,
                 hint="Choose a bootstrap frame that is segmented in every camera.",
             )
@@ -78,9 +78,9 @@ class _Aligned:
     """An alignment of both arches, the masks used for it, and its quality."""
 
     solution: Solution
-    use: Mask  # masks used, shape (2, C)
+    use: Mask  # whether each mask is used, shape (2, C)
     coverage: Array  # uncovered fraction of every mask, shape (2, C)
-    fit: Array  # `arch_fit`, shape (2,)
+    fit: Array  # `arch_fit` of both arches, shape (2,)
 
 
 def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View], use: Mask) -> _Aligned:
@@ -151,8 +151,8 @@ def _without_camera(use: Mask, camera: int) -> Mask:
 def _without_spoiled(use: Mask, coverage: Array, limit: float) -> Mask:
     """Exclude uncovered masks of arches that have at least two covered ones; return the masks kept (2, C).
 
-    The limit of the uncovered fraction is that for lost arches: an arch aligned with an excluded mask would be lost in
-    every frame.
+    The limit on the uncovered fraction is the one for lost arches: an arch aligned with an excluded mask would be lost
+    in every frame.
     """
     kept = use & ~(coverage > limit)
     return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)

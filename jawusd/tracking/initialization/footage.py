@@ -18,7 +18,7 @@ from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
 _BESIDE = 2  # number of surveyed frames, on either side of a chosen one, that are redundant
-_WIDTH_PX = 320  # width of the surveyed mask images: enough for mask centres accurate to 0.1 mm
+_WIDTH_PX = 320  # width of the surveyed mask images [px]: enough for mask centres accurate to 0.1 mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +57,11 @@ class MaskSurvey:
 
     frames: NDArray[np.int64]  # frame numbers of the reference camera, shape (F,)
     # mean position (x, y) of every mask in its undistorted survey image [px], NaN without a mask, shape (F, 2, C, 2);
-    # rows are upper, lower
+    # axis 1 is (upper, lower)
     middles: Array
-    areas_px: Array  # area of every mask, shape (F, 2, C); 0 without a mask
-    matrices: Array  # world [mm] to homogeneous px of the survey images, shape (C, 3, 4)
+    areas_px: Array  # area of every mask [px], shape (F, 2, C); 0 without a mask
+    # world [mm] to homogeneous px of the survey images, shape (C, 3, 4)
+    matrices: Array
     eyes: Array  # camera centres in world coordinates [mm], shape (C, 3)
     fewest: int = FEWEST_CAMERAS  # minimum number of cameras with masks of both arches
 
@@ -98,7 +99,7 @@ def survey_masks(
     count: int,
     fewest: int = FEWEST_CAMERAS,
 ) -> MaskSurvey:
-    """Measure the masks of at most `count` evenly spaced frames; other arguments as in `Footage`.
+    """Measure the masks of at most `count` evenly spaced frames; other arguments are as in `Footage`.
 
     Raises:
         TrackingError: no surveyed frame has masks of both arches in enough cameras.

@@ -73,11 +73,12 @@ Instant = tuple[Array, Sequence[View], Mask]
 class _Rows:
     """Linearised contour distances of an arch in a video frame: d = J x + C theta, pose x, shared unknowns theta."""
 
-    distance: Array  # signed distances to the edges [px], shape (n,)
-    length: Array  # contour length [px], shape (n,)
+    distance: Array  # signed distances of the samples to the mask edges [px], shape (n,)
+    length: Array  # contour length that each sample represents [px], shape (n,)
     pose: Array  # derivatives with respect to the twist of the arch, shape (n, 6)
     camera: Array  # camera index of each row, shape (n,)
-    shared: Array  # derivatives with respect to the unknowns of the row's camera, shape (n, _UNKNOWNS)
+    # derivatives with respect to the unknowns of the row's camera, shape (n, _UNKNOWNS)
+    shared: Array
 
 
 def measure_magnification(

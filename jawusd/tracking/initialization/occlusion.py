@@ -14,19 +14,19 @@ from jawusd.tracking.contour.scan import Scan
 
 _SAMPLES = 8000  # number of surface samples per arch; they are about half a millimetre apart
 _SHARE = 0.002  # fraction of the crown surface that is ignored as outliers, such as spikes of the mesh
-_DEEPEST_MM = 5.0  # maximum depth of a point inside a crown: deeper points lie beyond an open border
+_DEEPEST_MM = 5.0  # maximum depth of a point inside a crown [mm]: deeper points lie beyond an open border
 _DEEP_MM = 1.0
 _SAME_MM = 0.05
-_BESIDE_MM = 4.0  # maximum distance in the bite plane between opposed crown points: half the width of a molar
+_BESIDE_MM = 4.0  # maximum distance in the bite plane between opposed crown points [mm]: half the width of a molar
 _CELL_MM = 1.0
-_THROUGH_MM = 2.0  # minimum vertical overlap of arches that passed through one another; cusps overlap less
+_THROUGH_MM = 2.0  # minimum vertical overlap of arches that passed through one another [mm]; cusps overlap less
 _SLAB_MM = 3.0
 _FEWEST = 50  # minimum number of surface samples for a side of an arch to be measured
 # minimum distance from the midline for a point to count as left or right: nearer ones may be on the central incisors
 _ASIDE_MM = 6.0
-_OPEN = 0.08  # minimum ratio of directed area to area for a surface to count as open
-# For the gum to indicate the orientation of a scan: minimum area relative to the crowns, and minimum vertical distance
-# from them.
+_OPEN = 0.08  # minimum ratio of vector area to area for a surface to count as open [-]
+# Limits for the gum to indicate the orientation of a scan: minimum area relative to the crowns [-], and minimum
+# vertical distance from the crowns [mm].
 _GUM_SHARE, _GUM_BELOW_MM = 0.3, 2.0
 
 
@@ -34,9 +34,9 @@ _GUM_SHARE, _GUM_BELOW_MM = 0.3, 2.0
 class Occlusion:
     """Measurements of how two arches meet; lengths in mm, NaN if not measurable."""
 
-    gap_mm: float  # minimum distance between the crowns, 0 if they touch
-    side_gaps_mm: tuple[float, float]  # gaps left and right of the midline, negative if crowns overlap
-    depth_mm: float  # maximum overlap of the crowns
+    gap_mm: float  # minimum distance between the crowns [mm], 0 if they touch
+    side_gaps_mm: tuple[float, float]  # gaps left and right of the midline [mm], negative if crowns overlap
+    depth_mm: float  # maximum depth by which the crowns overlap [mm]
     deep_share: float  # fraction of the opposed crown surface that is more than 1 mm inside the other arch
     # fraction of the common area in the bite plane in which lower crowns reach more than 2 mm above the lowest point of
     # the upper ones
@@ -44,15 +44,17 @@ class Occlusion:
     same: float  # fraction of the lower surface that coincides with the upper one
     # fraction of crown points directly above or below crowns of the other arch; the larger value of both arches
     opposite: float
-    aside_mm: float  # distance between the centres of the arches along the bite plane
-    turn_rad: float  # angle in the bite plane between the forward directions of both arches
+    aside_mm: float  # distance between the centres of the arches along the bite plane [mm]
+    # angle in the bite plane between the forward directions of both arches [rad]
+    turn_rad: float
     # per arch, whether its gum lies between its crowns and the other arch; None if unknown
     turned_over: tuple[bool | None, bool | None]
     opens_towards: tuple[bool, bool]  # per arch, whether the open side of its crowns faces the other arch
-    midlines_mm: float  # lateral distance between the midlines, where both arches have teeth left and right
-    width_ratio: float  # ratio of the upper to the lower width, measured in the same transverse slabs
-    widths_mm: tuple[float, float]  # maximum extent of each arch in its own plane
-    lower_ahead_mm: float  # distance by which the lower front teeth lie in front of the upper ones
+    midlines_mm: float  # lateral distance between the midlines, where both arches have teeth left and right [mm]
+    # ratio of the upper to the lower width, measured in the same transverse slabs
+    width_ratio: float
+    widths_mm: tuple[float, float]  # maximum extent of each arch in its own plane [mm]
+    lower_ahead_mm: float  # distance by which the lower front teeth lie in front of the upper ones [mm]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +64,12 @@ class CrownSurface:
     points: Array  # centres of faces [mm], shape (N, 3)
     normals: Array  # outward unit normals, shape (N, 3)
     areas: Array  # areas of these faces [mm^2], shape (N,)
-    border: Mask  # whether a sample adjoins an opening of the surface, where the inside is undefined, shape (N,)
+    # whether a sample adjoins an opening of the surface, where the inside is undefined, shape (N,)
+    border: Mask
 
 
 def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlusion:
-    """Measure how two scans in one scan frame meet; `T_anatomical_scan` maps it to (left, up, front) axes."""
+    """Measure how two scans in a common frame meet; `T_anatomical_scan` maps that frame to (left, up, front) axes."""
     surfaces = [crown_surface(scan) for scan in scans]
     crowns = [scan.crown_vertices(_SAMPLES) for scan in scans]
     normal = bite_normal(*crowns)

@@ -22,14 +22,15 @@ from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.initialization.bootstrap import TOLERANCE_MM, picks_miss_mm, pose_from_picks
 from jawusd.tracking.initialization.pick_causes import Mistake, Setting, possible_mistakes
 
-_CLOSE_MM = 1.0  # maximum distance of a covered mask pixel from a projected crown point
+_CLOSE_MM = 1.0  # maximum distance of a covered mask pixel from a projected crown point [mm]
 _ON = 0.85  # minimum fraction of a camera's mask pixels on the scans for its masks to agree with the picks
 # Misfit of the given inputs above which mistakes are tested [-]; exceeded by 1 in 60 valid subjects.
 _SUSPECT_MISFIT = 1.7
 # Maximum ratio of the misfit after correcting a mistake to that of the given inputs for the mistake to be reported [-]:
-# in general; and if tracking corrects the mistake itself and rejected picks then fit, which is only a warning.
+# first in general; then for mistakes whose correction makes rejected picks fit and which tracking corrects, so that
+# they are only warnings.
 _PROOF, _PROOF_BY_PICKS = 0.5, 0.75
-# fraction of mask pixels off the scans that adds 1 to the misfit, and rms pick error that adds 1
+# fraction of mask pixels off the scans that adds 1 to the misfit, and rms pick error [mm] that adds 1
 _OFF, _MISS_MM = 0.05, 0.3
 # fraction of mask pixels off the scans that is assumed for a camera without masks in this frame, since its masks might
 # contradict the picks
@@ -64,7 +65,7 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
         problem = error
     cause = None
     if found is None or not found.good or found.misfit > _SUSPECT_MISFIT:
-        with contextlib.suppress(TrackingError):  # raised for an invalid pick
+        with contextlib.suppress(TrackingError):  # an invalid pick raises a TrackingError
             cause = _explanation(given, found, seen, masked) if _valid(given) else None
     if cause is not None:
         yield _explained(*cause, found, frame)
@@ -86,7 +87,7 @@ class _Evidence:
 
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     wrong: Mapping[str, list[int]]  # numbers (from 1) of the rejected picks, by arch
-    miss_mm: float  # rms error of the picks, clipped at the rejection limit
+    miss_mm: float  # rms error of the picks [mm], clipped at the rejection limit
     on: Mapping[str, float]  # fraction of each camera's mask pixels on the scans; cameras without masks are omitted
     unseen: int  # number of cameras without masks in this frame
 

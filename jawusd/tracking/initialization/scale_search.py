@@ -48,12 +48,12 @@ def seen_size(
     Args:
         capture: provides masks, frame range and anatomical axes.
         cameras: calibrated up to the scale of the world.
-        offsets: reference frame minus own frame number, by camera name.
+        offsets: time offsets by camera name: the reference frame number minus the camera's own frame number.
         meshes: upper and lower teeth scans in one coordinate frame, in occlusion [mm].
         map_: distributes the search among threads.
 
     Raises:
-        TrackingError: too few masks, or the scans do not fit them at any size.
+        TrackingError: too few masks, or the scans do not fit the masks at any size.
         CaptureError: a mask cannot be read.
     """
     solver = ContourSolver(tuple(prepare_scan(m, n) for m, n in zip(meshes, ARCH_NAMES, strict=True)), TrackingConfig())

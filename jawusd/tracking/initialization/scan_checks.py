@@ -57,7 +57,7 @@ def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) 
 
 
 def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
-    """Return T_anatomical_scan (4, 4), given or derived, and findings about two scans in one scan frame.
+    """Return T_anatomical_scan (4, 4), given or derived, and findings about two scans in a common scan frame.
 
     Only impossible bites are errors; with an error, warnings are omitted, since they would be its consequences.
     """

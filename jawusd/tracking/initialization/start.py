@@ -46,14 +46,14 @@ class Start:
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     notes: dict[str, object]  # how the start was found, for the metadata of the tracks
     findings: tuple[Finding, ...] = ()  # findings about scans and picks
-    T_anatomical_scan: Array = field(default_factory=lambda: np.eye(4))  # scan frame to (left, up, front) axes
+    T_anatomical_scan: Array = field(default_factory=lambda: np.eye(4))  # from the scan frame to (left, up, front) axes
 
 
 def search_start(search: StartSearch, footage: Footage, suspects: Collection[str] = (), explain: bool = True) -> Start:
     """Find a frame on which both arches can be aligned, and their poses.
 
-    Uses the first frame with a clear fit, or else the one with the best fit. If neither arch fits acceptably on the
-    frame with the best fit, but both fit clearly once a mistake is corrected, that mistake is reported as an error.
+    The first frame with a clear fit is used, otherwise the frame with the best fit. If neither arch fits acceptably on
+    the frame with the best fit, but both fit clearly once a mistake is corrected, that mistake is reported as an error.
 
     Args:
         search: search for the poses of the scans.
@@ -63,7 +63,7 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
 
     Raises:
         TrackingError: none of the frames tried could be aligned; the message gives the reason for each frame, or the
-            mistake whose correction makes it succeed.
+            mistake whose correction makes the search succeed.
     """
     most = max(1, min(FRAMES_TRIED, MOST_PICTURES // len(footage.sources)))
     frames = footage.survey(None, SURVEYED).promising(most).tolist()
@@ -167,7 +167,7 @@ def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Sea
         )
 
 
-_PICKS_OFF_MM = 3.0  # minimum distance between picked and found poses for a warning: half a tooth
+_PICKS_OFF_MM = 3.0  # minimum distance between picked and found poses for a warning [mm]: half a tooth
 # Maximum uncertainty of picked poses for the contour solver to converge from them [mm].
 _SURE_MM = 0.8
 

@@ -18,7 +18,7 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_search import StartSearch
 
-# Maximum ratio of the uncovered mask fraction after correcting a swap to that before for the swap to be reported [-].
+# Maximum ratio of the uncovered mask fractions after and before correcting a swap for the swap to be reported [-].
 _PROOF = 0.5
 # Minimum uncovered fraction of a camera's masks for a swap to be suspected: good poses leave 0.01, and swapped masks of
 # similar cameras as little as 0.1.
@@ -86,7 +86,7 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
         try:
             shares = _uncovered_shares(replace(footage, sources=exchange.sources), solver, poses, frame)
         except CaptureError:
-            continue  # mask videos differ in length from the clips of the cameras they would be assigned to
+            continue  # mask videos differ in length from the clips of the cameras to which they would be assigned
         # If a swap leaves a camera without masks in this frame, that does not count against the swap.
         both = np.isfinite(given) & np.isfinite(shares)
         if (given[both] >= _ODD_SHARE).any():
@@ -125,8 +125,8 @@ def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
     return any(size[_masks(source).upper] != footage.cameras[source.name].size_px for source in sources)
 
 
-#: Minimum of a clear fit [-]: correct poses exceed it unless lips are nearly closed; wrong poses stay below 0.1 in one
-#: arch.
+#: Minimum fit that counts as clear [-]: correct poses exceed it unless lips are nearly closed; wrong poses stay below
+#: 0.1 in one arch.
 CLEAR_FIT = 0.3
 #: Minimum acceptable fit with a mistake corrected [-]: wrong poses do not reach it.
 EXPLAINS = 0.1
@@ -182,7 +182,7 @@ def raise_cause(
         search, footage: the search that failed, and its footage.
         frames: frames to try, in this order.
         fits: `arch_fit` of both arches by frame, as found by the search [-], shape (2,).
-        suspected: hints of the suspected mistakes, which identify them.
+        suspected: hints of the suspected mistakes; a mistake is identified by its hint.
         only_clear: whether only a clear fit counts.
 
     Returns:
@@ -229,7 +229,7 @@ def _raise_cause_on(frame: int, groups: Sequence[Sequence[_Cause]], only_clear: 
 
 
 def raise_for_unmatched_arch(fits: Mapping[int, Array]) -> None:
-    """Raise an error for a scan that fits none of its masks while the other one fits clearly.
+    """Raise an error for a scan that fits none of its masks while the other scan clearly fits its own.
 
     Args:
         fits: `arch_fit` of both arches by frame, as found by a failed search [-], shape (2,).

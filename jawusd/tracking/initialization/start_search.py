@@ -23,7 +23,7 @@ from jawusd.tracking.initialization.pose_search import Candidate, Grid, coarse_s
 # resolution of the search: a pixel is a third of the motion of the canines between neighbouring orientations
 _PX_PER_MM = 2.0
 _FINALISTS = 5  # number of poses per arch that are refined
-_DISTINCT_MM = 2.0  # minimum distance of distinct poses: closer ones converge to the same local minimum
+_DISTINCT_MM = 2.0  # minimum distance of distinct poses [mm]: closer ones converge to the same local minimum
 # Rotations and translations around a guess in which the teeth face the cameras with the upper arch above the lower one.
 # Lateral movements and lips bias mostly the roll of the guess. With retracted lips, the centre of the masks lies up to
 # 20 mm behind the front teeth.
@@ -43,8 +43,8 @@ _NEAR_GRID = Grid(
 # Jaw openings [mm] for placing one arch relative to the other, and height and depth [mm] of the hinge axis relative to
 # the front teeth. A single arch also fits when shifted by a tooth, but jaws do not move that way.
 _OPENINGS_MM, _CONDYLES_MM = (0.0, 6.0, 14.0, 24.0, 36.0), (40.0, -90.0)
-_WIDEST_JAW_RAD = 0.8  # maximum rotation between the arches
-_FARTHEST_JAW_MM = 75.0  # maximum distance between the front teeth of the arches
+_WIDEST_JAW_RAD = 0.8  # maximum rotation between the arches [rad]
+_FARTHEST_JAW_MM = 75.0  # maximum distance between the front teeth of the arches [mm]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class SearchResult:
     """The result of a search on a frame."""
 
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
-    objective_px: float  # matched contour of both arches less the penalty for uncovered mask
+    objective_px: float  # matched contour of both arches less the penalty for uncovered mask [px]
     fits: Array  # `arch_fit` of both arches [-], shape (2,)
 
     @property
@@ -145,7 +145,7 @@ class StartSearch:
         """Return the best pair of finalists, refined at working resolution."""
         pairs = self._refined_pairs(finalists, views)
         if not pairs:
-            raise TrackingError("the best poses of the two arches are not possible for a jaw", frame=frame)
+            raise TrackingError("the best poses of the two arches are anatomically impossible", frame=frame)
         with footage.views(teeth_centre(self._coarse, pairs[0]), self._config.working_px_per_mm) as masks:
             views = masks.at(frame)
         ends = [self.solver.solve(poses, views, self._config.wide_gates_px) for poses in pairs]
@@ -237,7 +237,7 @@ def guessed_axes(places: Array, eyes: Array) -> Array:
 
 
 def mirrored_scan(mesh: Mesh, T_anatomical_scan: Array) -> Mesh:
-    """Return a teeth scan with left and right exchanged, in the same frame."""
+    """Return a teeth scan with left and right exchanged, in the same coordinate frame."""
     points = transform_points(T_anatomical_scan, mesh.vertices) * [-1.0, 1.0, 1.0]
     vertices = transform_points(se3_inverse(T_anatomical_scan), points)
     return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(mesh.faces[:, ::-1]))

@@ -58,7 +58,7 @@ _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="
 _HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 240, 32, 160, 24, 5
 # Penalty per crown pixel outside the mask, in px of contour [1/px]: low, since lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
-_DISTINCT_MM = 3.0  # minimum distance between head poses that are kept, as mean displacement of the teeth
+_DISTINCT_MM = 3.0  # minimum distance between head poses that are kept [mm], as mean displacement of the teeth
 # Fit of the worse arch above which a start is accepted at once, and fit below which it is rejected [-]; the limit for
 # several cameras is `start_causes.CLEAR_FIT`.
 _CLEAR_FIT, _LEAST_FIT = 0.3, 0.1

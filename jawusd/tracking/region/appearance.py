@@ -33,7 +33,7 @@ CORRELATION_PX = 110.0
 class Picture(NamedTuple):
     """Part of an undistorted image around the teeth."""
 
-    camera: Camera  # the pinhole camera of the part
+    camera: Camera  # pinhole camera of this part of the image
     rgb: NDArray[np.uint8]  # 8-bit pixels, shape (h, w, 3)
 
 
@@ -61,7 +61,7 @@ class LearnedColours:
     """Colour models of all cameras, and offsets between observed gum lines and those of the scans."""
 
     def __init__(self, scans: Sequence[Scan], cameras: Sequence[Camera], axes: Array) -> None:
-        """Start without statistics.
+        """Start without learned colours.
 
         Args:
             scans: upper and lower scan, in one coordinate frame.
@@ -123,7 +123,7 @@ class LearnedColours:
     def learn(
         self, views: Sequence[View], pictures: Sequence[Picture | None], poses: Array, rates: tuple[float, float]
     ) -> None:
-        """Update the colour models from both sides of matched borders, and the offset of the gum line.
+        """Update the colour models with the colours on both sides of matched borders, and update the gum-line offset.
 
         Args:
             views: views of the images, with the colour counts of one alignment.

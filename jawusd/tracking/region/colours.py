@@ -23,7 +23,8 @@ _REACH = 2  # radius of the blur kernel [bins]
 _SPREAD = gaussian_filter1d(np.eye(1 << _BITS), _BLUR, axis=0, mode="nearest", radius=_REACH)
 _LOCAL = 0.5  # weight of a patch's own histogram in its colour model
 _MOST = 3.0  # maximum magnitude of the log ratios, since no colour is conclusive
-_LIPS = 0.2  # weight of skin and lips in the background model
+# weight of skin and lips in the background model
+_LIPS = 0.2
 _EMPTY = 2e-5  # probability assigned to unseen colours
 _ENOUGH = 200.0  # minimum number of counts for a new histogram to have full weight
 _ROUNDS = 3  # number of iterations that separate lips from teeth among the pixels under crowns
@@ -50,10 +51,11 @@ def _write_bins(rgb: NDArray[np.uint8], out: NDArray[np.uint16]) -> None:
 class Areas:
     """Masks of an image that select the training pixels of the initial model, shape (h, w) each."""
 
-    crowns: Mask  # well inside projected crowns
-    ring: Mask  # around projected crowns, within reach of the search
-    gum: Mask  # under projected gum, away from crowns
-    far: Mask  # away from the teeth: skin and lips
+    crowns: Mask  # pixels well inside projected crowns
+    ring: Mask  # pixels around projected crowns, within reach of the search
+    gum: Mask  # pixels under projected gum, away from crowns
+    # pixels away from the teeth: skin and lips
+    far: Mask
 
 
 class CameraColours:

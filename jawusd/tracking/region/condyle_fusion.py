@@ -81,7 +81,7 @@ class CondyleFusion:
 
         Args:
             poses: T_world_upper and T_world_lower, NaN where lost, shape (F, 2, 4, 4).
-            covariance: covariance of their left twists about the world origin, shape (F, 2, 6, 6).
+            covariance: covariance of the poses' left twists about the world origin, shape (F, 2, 6, 6).
             between: covariance of the left twist of T_upper_lower about the skull origin, shape (F, 6, 6).
         """
         poses, covariance, between = poses.copy(), covariance.copy(), between.copy()
@@ -116,7 +116,7 @@ def _shared(poses: Array, covariance: Array, twist: Array, gained: Array) -> tup
 
     Args:
         poses: T_world_upper and T_world_lower, shape (2, 4, 4).
-        covariance: covariance of their left twists about the world origin, shape (2, 6, 6).
+        covariance: covariance of the poses' left twists about the world origin, shape (2, 6, 6).
         twist: left twist about the skull origin, shape (6,).
         gained: reduction of the covariance of T_upper_lower's left twist by the fusion, shape (6, 6).
     """

@@ -38,7 +38,7 @@ def search_creases(
     Args:
         contrast: minimum difference between the brighter tooth and the line [8-bit steps].
         weight: weight of the edges found [-].
-        Other arguments as for `edges.search_borders`; only samples without a border are processed.
+        Other arguments are those of `edges.search_borders`; only samples without a border are processed.
     """
     reach = min(reach_px, _CREASE_PX)
     n = 2 * int(reach + _BESIDE_PX) + _CREASE_ARM

@@ -20,7 +20,7 @@ _MOST_STEPS = 10  # maximum number of search steps to either side of a sample
 _LEAST_CLEAR = 0.15  # fraction of `clear_ratio` below which an edge is rejected
 # minimum and maximum motion blur that is compensated; gamma of the images
 _LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2
-_SMOOTH_PX = 1.0  # half the width over which image gradients are computed
+_SMOOTH_PX = 1.0  # half the width over which image gradients are computed [px]
 _PER_CODE = 8  # entries of the linearisation table per 8-bit step
 _LIGHT = (np.arange(255 * _PER_CODE + 1) / (255 * _PER_CODE)) ** _GAMMA
 
@@ -67,7 +67,7 @@ def search_borders(
 
     Args:
         samples: shape (n, COLUMNS).
-        tables: row index of every sample in `ratio`, shape (n,).
+        tables: index of every sample's row in `ratio`, shape (n,).
         bins: colour bin of every pixel, shape (h, w).
         ratio: bounded log likelihood ratio of tooth to background by colour bin [-], shape (T, B).
         own_labels, other_labels: rendered labels of this and of the other arch: CROWN, GUM or 0, shape (h, w).
@@ -217,7 +217,7 @@ def sharpen(
 ) -> None:
     """Move every border to the steepest colour change between its inside and outside.
 
-    The midpoint between both colours would be biased, as crowns darken towards their edges.
+    The midpoint between both colours would be biased, since crowns darken towards their edges.
 
     Args:
         contrast: minimum difference of both sides' mean colours [8-bit steps].

@@ -23,7 +23,7 @@ class Effort:
         search_every: interval between searches, in failed frames.
         searches: number of failed frames after which teeth count as not visible.
         later_every: like `search_every`, once teeth count as not visible.
-        in_turn: whether jaw and head are searched in different frames once teeth count as not visible, to limit the
+        in_turn: whether jaw and head are searched for in different frames once teeth count as not visible, to limit the
             time per frame.
         learn_every: interval between updates of the colours, in frames.
     """

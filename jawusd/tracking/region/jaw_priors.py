@@ -17,7 +17,7 @@ from jawusd.geometry import hat, relative_pose, rigid_fit, se3_adjoint, se3_inve
 from jawusd.tracking.contour.equations import NormalEquations, Solution, translation
 from jawusd.tracking.contour.quality import landmark_sigmas
 
-_UNIT_MM = (5.0, 20.0, 5.0)  # scale of the incisal point's motion to the left, upwards and forwards
+_UNIT_MM = (5.0, 20.0, 5.0)  # scale of the incisal point's motion to the left, upwards and forwards [mm]
 # Mean motion of the left condyle to the left, upwards and forwards [mm]: coefficients of 1, x, y, z, xx, xy, xz, yy,
 # yz, zz, over 60 joints of `jawusd.synthetic.person`, whose ranges come from the literature. The motion of the right
 # condyle is the mirror image.
@@ -134,7 +134,7 @@ class CondyleTerm:
     """Penalises the distances of both condyles from their predicted positions."""
 
     motion: CondyleMotion
-    noise_px3: float  # border variance times correlation length
+    noise_px3: float  # variance of colour borders times correlation length [px^3]
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the squared condyle distances at the solution's poses, in units of the outline's sum of squares."""
@@ -160,7 +160,7 @@ class BiteTerm:
 
     Attributes:
         points: points on the lower teeth, in scan coordinates [mm], shape (N, 3).
-        up: bite normal, scan coordinates, shape (3,).
+        up: bite normal in scan coordinates, shape (3,).
         noise_px3: variance of border errors times their correlation length.
     """
 

@@ -50,7 +50,8 @@ _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
 _ALONE = 2.0  # factor on the variance for a single camera [-], since no other view reveals shifted borders
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
-_SAME_MM = 0.15  # maximum difference of jaw parameters of equal poses
+# maximum difference of jaw parameters of equal poses [mm]
+_SAME_MM = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +248,7 @@ def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, rang
         fits: fits by frame, updated in place. Backward tracking starts at each frame that is more trusted than its
             predecessor, and ends when the teeth are lost or when a trusted frame is not fitted clearly better.
         way: frames in tracking order.
-        back: yields the fits of a range of frames, tracked from a given frame.
+        back: function that yields the fits of a range of frames, tracked from a given frame.
     """
     for last, frame in pairwise(way):
         if _trust(fits[frame]) <= _trust(fits[last]):

@@ -77,7 +77,8 @@ class ArchStart:
 
         Args:
             sources: two or more cameras with masks of that frame.
-            cameras, offsets: by camera name; an offset is reference minus own frame number.
+            cameras, offsets: calibrations and time offsets by camera name; an offset is the reference frame number
+                minus the camera's own.
             frame: frame number of the reference camera.
         """
         masked = masked_sources(sources, cameras, offsets, 2)
@@ -131,7 +132,8 @@ class PictureStart:
 
         Args:
             sources: cameras with masks of that frame.
-            cameras, offsets: by camera name; an offset is reference minus own frame number.
+            cameras, offsets: calibrations and time offsets by camera name; an offset is the reference frame number
+                minus the camera's own.
             frame: frame number of the reference camera.
         """
         if len(sources) > 1:

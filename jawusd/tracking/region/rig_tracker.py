@@ -28,7 +28,7 @@ from jawusd.tracking.region.search import fitting_share, head_shifts, rank_by_co
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _LAST_GATES_PX = (2.0,)
-_TRIAL_GATES_PX = (8.0, 6.0)  # residual gates of the short trial alignments of a search
+_TRIAL_GATES_PX = (8.0, 6.0)  # residual gates of the short trial alignments of a search [px]
 # Longest intervals between steps [frames] that count as no dropped frame, and as one dropped frame.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
 _FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some tenths of a millimetre
@@ -37,7 +37,8 @@ _LOST, _AGAIN = 0.33, 0.5
 # number of frames since the last step above which an arch must fit as well as a recovered one
 _UNSURE_FRAMES = 3.0
 _USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
-_LEAST_USUAL = 0.7  # lower bound of the usual matched fraction, relative to the first frame
+# lower bound of the usual matched fraction, relative to the first frame
+_LEAST_USUAL = 0.7
 _JAWS = 96  # number of jaw poses that a search ranks by colour
 
 
@@ -179,7 +180,7 @@ class RigTracker:
     def _best_in_turn(
         self, found: Aligned, expected: Expected, look: _InstantImages, cut: Cut
     ) -> tuple[Aligned, _InstantImages]:
-        """Search jaw and head in different frames, to limit the time per frame while teeth are not visible."""
+        """Search for jaw and head in different frames, to limit the time per frame while teeth are not visible."""
         turn = self._failed % self._effort.later_every
         if turn == 0:
             look = self._wide_look(found, cut)
@@ -259,7 +260,7 @@ class _InstantImages:
         self._colours.learn(self._counting, self._pictures, self._instants.coordinates.arches(pose), rates)
 
     def fit(self, found: Aligned, trusted: Mask, free_focal: bool) -> FrameFit:
-        """Return the fit of the frame; only trusted arches, shape (2,), count as found."""
+        """Return the fit of the frame, in which only arches in `trusted` (2,) count as found."""
         use = self.use & trusted[:, None]
         unknown = np.full(use.shape, np.nan)
         if not free_focal or not trusted.any():

@@ -56,7 +56,7 @@ _BORDER_PX3 = 0.7**2 * CORRELATION_PX  # border variance times correlation lengt
 # Penalty per unit of the condyles' squared Mahalanobis distance, as length of matched contour [px]: Tukey's loss of a
 # sample beyond the gate is 4.685^2 / 6, and neighbouring samples are correlated over `CORRELATION_PX`.
 _STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
-_FAST_MM = 1.0  # predicted motion per frame above which other starts are tried
+_FAST_MM = 1.0  # predicted motion per frame above which other starts are tried [mm]
 # Number of starts that a search tries near the last poses, number of starts that it tries anywhere in the human range
 # of motion, and number of starts that it aligns fully. Colours rank the correct start among the first 22 of 57.
 _HOPEFUL_NEAR, _HOPEFUL, _FINALISTS = 12, 24, 3
@@ -140,7 +140,7 @@ class PoseSearch:
         """Align from a start accurate to some tenths of a millimetre, T_world_upper and T_world_lower (2, 4, 4).
 
         Args:
-            firm: whether to use a high weight of the condylar prior, for uncertain frames.
+            firm: whether the condylar prior has a high weight, for uncertain frames.
         """
         return self._align(start, look, _FAR_GATES_PX, firm)
 
@@ -172,7 +172,7 @@ class PoseSearch:
         motion: MotionPredictor,
         everywhere: bool,
     ) -> Solution:
-        """Try earlier and rotated jaw poses and, if `everywhere`, all humanly possible ones; keep the head pose."""
+        """Try earlier and rotated jaw poses, with `everywhere` also the full human range; keep the head pose."""
         near = [se3_inverse(poses[0]) @ poses[1] for poses in (last, *motion.pose_history())]
         near += turned_starts(self.condyles, (se3_inverse(predicted[0]) @ predicted[1], near[0]))
         anywhere = starts_everywhere(self.condyles) if everywhere else []
@@ -187,7 +187,7 @@ class PoseSearch:
         return solution
 
     def with_head_alone(self, solution: Solution, start: Array, look: InstantViews) -> Solution:
-        """Align the head alone if that improves its fit: a wrong jaw pose biases the head by the condylar prior."""
+        """Align the head alone if that improves its fit: through the condylar prior, a wrong jaw pose biases it."""
         alone = self._align(start, look, _FAR_GATES_PX, use=_upper_alone(look.views))
         return max((solution, alone), key=lambda trial: float(fitting_share(trial)[0]))
 

@@ -30,7 +30,7 @@ from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings, mirror_findings
 from jawusd.tracking.sequence.time_checks import time_findings
 
-_LEAST_SHARE = 0.3  # matched fraction of a camera's contour, relative to the best camera, below which it is reported
+_LEAST_SHARE = 0.3  # matched fraction of a camera's contour, relative to the best one, below which a camera is reported
 # Standard deviation of the position of the lower teeth above which a frame is uninformative [mm]; and fractions of such
 # frames above which a take is partly unreliable, and above which it is unusable.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
@@ -59,8 +59,8 @@ def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list
         Finding(
             "camera_rarely_used",
             "warning",
-            f"{share[c]:.0%} of the teeth's outlines match its images, compared with {share.max():.0%} for the best "
-            f"camera; at least {_LEAST_SHARE:.0%} of the latter is usual. It contributes little to the tracks.",
+            f"{share[c]:.0%} of the teeth's outlines match this camera's images, compared with {share.max():.0%} for "
+            f"the best camera; at least {_LEAST_SHARE:.0%} of the latter is usual. This camera contributes little.",
             value=round(float(share[c]), 3),
             limit=round(float(_LEAST_SHARE * share.max()), 3),
             camera=name,

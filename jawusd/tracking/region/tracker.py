@@ -30,7 +30,7 @@ _USUAL_FRAMES = 15  # number of recent frames that define the usual matched frac
 _EAGER, _OFTEN = 6, 4  # a lost arch is searched for in each of the first frames, then in every n-th one; see `_is_due`
 # number of frames in which wide residual gates are not tried again after a failure: lips stay closed for a while
 _RESTING = 4
-_WIDE_MM = 40.0  # maximum expected opening of a jaw that was not visible
+_WIDE_MM = 40.0  # maximum expected opening of a jaw that was not visible [mm]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class RegionPose:
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4); predictions for arches not found
     found: Mask  # whether each arch was found, shape (2,)
     covariance: Array  # covariance of the poses' left twists about the world origin, NaN if not found, shape (2, 6, 6)
-    objective_px: float = 0.0  # objective: matched contour of both arches minus a penalty for implausible condyles
+    objective_px: float = 0.0  # objective [px]: matched contour of both arches minus a penalty for implausible condyles
     solution: Solution | None = None  # the alignment; None for poses read from a file
     # matched fraction of the contour relative to the usual one, shape (2,)
     usual: Array = field(default_factory=lambda: np.ones(2))

@@ -19,19 +19,19 @@ from jawusd.tracking.region.colours import BINS, KINDS, TABLES
 from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
 
-_AHEAD_PX = 2.0  # distance outside a crown's silhouette at which the rendered label is tested for gum
+_AHEAD_PX = 2.0  # distance outside a crown's silhouette at which the rendered label is tested for gum [px]
 
 _SHUTTER = 0.5  # assumed exposure as a fraction of the frame time, as is typical of film
 # Motion during the exposure at which the weight of a border is halved [px]: the variance of an edge position grows with
 # the square of its blur. The weight is applied only in the final alignment: in earlier ones, the matched fraction of
 # the contour determines whether teeth are lost.
 _BLURRED_PX = 10.0
-_LEARNED_PX = (2, 7)  # minimum and maximum distance from the contour of pixels whose colours are learned
+_LEARNED_PX = (2, 7)  # minimum and maximum distance from the contour of pixels whose colours are learned [px]
 # Limits for estimating the gum-line offset: minimum weight of a border [-], maximum distance of a border from its
 # sample [px], and number of samples that must be exceeded.
 _SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
 _CLEAR_RATIO = 1.0  # minimum mean log ratio on both sides for full weight of a border [-]
-_SHARPEN_PX = 5.0  # maximum search range for which borders are refined by colour
+_SHARPEN_PX = 5.0  # maximum search range for which borders are refined by colour [px]
 _CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # minimum contrast of refined borders [8-bit steps]; maximum refinement
 _CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
 

@@ -14,7 +14,7 @@ from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.scan import ARCHES
 
 _KEPT_POSES = 16  # maximum number of earlier poses kept: enough to cover the range of motion of a jaw
-_APART_MM = 2.0  # minimum distance between the poses kept: closer ones converge to the same local minimum
+_APART_MM = 2.0  # minimum distance between the poses kept [mm]: closer ones converge to the same local minimum
 # Number of failed multi-start searches allowed in any take, and number of frames for each further search: at up to five
 # seconds per search, all searches together take no longer than tracking.
 _FRUITLESS, _FRAMES_PER_FRUITLESS = 8, 32

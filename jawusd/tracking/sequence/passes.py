@@ -24,7 +24,7 @@ Progress = Callable[[int, int], None]
 # Maximum number of frames around a restart from which the tracker is initialised: without this limit, long takes with
 # many gaps would take quadratic time.
 _NEARBY_FRAMES = 4000
-_AGREED_MM = 0.05  # maximum distance between arch centres for tracking in both directions to agree
+_AGREED_MM = 0.05  # maximum distance between arch centres for tracking in both directions to agree [mm]
 
 
 class Passes:
