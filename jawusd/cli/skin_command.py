@@ -57,7 +57,7 @@ Rigid = Annotated[
     ),
 ]
 RestFrame = Annotated[
-    int | None, typer.Option(help="Frame of the face that defines the shape of the head, for --rigid.")
+    int | None, typer.Option(help="For --rigid: frame of the face that defines the marker positions on the head.")
 ]
 HeadError = Annotated[
     tuple[float, float],

@@ -120,8 +120,7 @@ def build(
 
     Raises:
         CaptureError: the check found errors (all are listed in the message), or inputs changed while a stage ran.
-        JawusdError: a stage failed, with the subclass that describes the failure; finished stages stay valid for
-            `resume`.
+        JawusdError: a stage failed; finished stages stay valid for `resume`.
     """
 
     def read() -> Capture:

@@ -184,7 +184,7 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
             f"{recorded[0]} x {recorded[1]} px: the aspect ratios differ.",
             camera=camera.name,
             path=capture.calibration,
-            hint="Calibrate in the recording mode of the take: their sizes alone do not show how images are cropped.",
+            hint="Calibrate in the recording mode of the take: sizes alone do not show how the images are cropped.",
         )
     return camera.scaled(recorded)
 

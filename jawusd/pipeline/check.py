@@ -141,7 +141,7 @@ def _run(check: _Check, parts: Parts) -> list[Finding]:
 
 
 def _without_duplicates(findings: Sequence[Finding]) -> list[Finding]:
-    """Return findings without duplicates, which have the same message and the same file or camera."""
+    """Return findings without duplicates, i.e. findings with equal message, and equal file or camera."""
     unique: dict[tuple[str, str | None, str | None], Finding] = {}
     for finding in findings:
         key = (finding.message, finding.path, None if finding.path else finding.camera)

@@ -56,7 +56,7 @@ class Parts:
         """Return the capture.
 
         Raises:
-            ValueError: it could not be read.
+            ValueError: the capture could not be read.
         """
         if self.capture is None:
             raise ValueError("there is no capture")

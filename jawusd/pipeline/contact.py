@@ -42,7 +42,7 @@ def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture,
         subject: the subject; its scans must be in the registration to which the model's poses refer.
 
     Raises:
-        RigError: the scans do not show contacts.
+        RigError: tooth contact cannot be computed from the scans.
     """
     from jawusd.media.overlay import encode_jpeg
     from jawusd.meshes.contact import ContactMap

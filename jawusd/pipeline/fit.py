@@ -198,7 +198,7 @@ def read_trajectory(
 def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int, path: Path) -> Array:
     rows = np.flatnonzero(frames == wanted)
     if not rows.size:
-        between = f"; it has {frames.min()} to {frames.max()}" if len(frames) else ""
+        between = f"; it has frames {frames.min()} to {frames.max()}" if len(frames) else ""
         raise FormatError(f"has no frame {wanted}{between}.", path=path)
     found = T[rows[0]]
     if not np.isfinite(found).all():

@@ -44,7 +44,7 @@ class FoundFiles:
     clips: list[PurePath] = field(default_factory=list)
     boards: list[PurePath] = field(default_factory=list)
     masks: dict[PurePath, str] = field(default_factory=dict)  # arch of each mask file
-    scans: dict[str, list[PurePath]] = field(default_factory=lambda: defaultdict(list))  # by key of [scans], or ""
+    scans: dict[str, list[PurePath]] = field(default_factory=lambda: defaultdict(list))  # meshes by [scans] key
     calibrations: list[PurePath] = field(default_factory=list)
 
 

@@ -279,7 +279,7 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
             # Port 0 means any free port; without an address, the dashboard server would require its default port.
             dashboard_address=f"{_LOOPBACK}:0",
             scheduler_kwargs={"dashboard": False},
-            memory_limit=0,  # no limit per worker
+            memory_limit=0,  # no memory limit per worker
             silence_logs=logging.CRITICAL,
             local_directory=scratch,
         ) as cluster,

@@ -209,11 +209,11 @@ def _shape_at(rest_frame: int | None, seen: Array, body: RigidBody, name: str, p
             f"the positions of the markers on the rigid body of the {name} are unknown.", path=path, hint=hint
         )
     if not 0 <= rest_frame < len(seen):
-        raise FormatError(f"has no frame {rest_frame}; it has 0 to {len(seen) - 1}.", path=path)
+        raise FormatError(f"has no frame {rest_frame}; it has frames 0 to {len(seen) - 1}.", path=path)
     hidden = [str(marker) for marker, point in zip(body.markers, seen[rest_frame]) if not np.isfinite(point).all()]
     if hidden:
         raise FormatError(
-            f"frame {rest_frame} does not show all markers of the {name}: {', '.join(hidden)} is occluded.",
+            f"frame {rest_frame} does not show all markers of the {name}; occluded: {', '.join(hidden)}.",
             path=path,
             hint=hint,
         )

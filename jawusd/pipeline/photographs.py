@@ -21,7 +21,7 @@ from jawusd.pipeline.state import Progress, no_progress
 
 RESULT = "photos.json"
 _COLOURS = np.array([[60, 220, 60], [60, 160, 255]], np.uint8)  # RGB colours of the upper and lower crowns
-# Fraction of bright pixels above which a drawing is read as filled teeth; outlines 4 px wide of 20 teeth cover 4 %.
+# Fraction of bright pixels above which a drawing is read as filled teeth; outlines of 20 teeth, 4 px wide, cover 4 %.
 _FILLED = 0.08
 
 

@@ -37,9 +37,9 @@ _MOST_BRIDGED = 0.1
 # image is turned.
 _SHORTEST_UP = 0.5
 #: Limits of the fraction of the visible contour that matches the colours. Starts below `LEAST_FIT` are rejected; the 20
-#: starts found in one take, all but one within 0.5 mm, had 0.19 to 0.48, and starts from images turned the wrong way at
-#: most 0.07. A start above `_CLEAR_FIT` (several cameras)
-#: or `_CLEAR_FIT_SINGLE` (one camera, where depth may be wrong) ends the search.
+#: starts found in one take, all but one within 0.5 mm, reached 0.19 to 0.48, and starts from images turned the wrong
+#: way at most 0.07. A start above `_CLEAR_FIT` (several cameras) or `_CLEAR_FIT_SINGLE` (one camera, where depth may be
+#: wrong) ends the search.
 LEAST_FIT, _CLEAR_FIT, _CLEAR_FIT_SINGLE = 0.15, 0.25, 0.4
 
 T = TypeVar("T")
@@ -87,7 +87,7 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
-        """Return the first start with a clear fit, otherwise the best one of a part of the take and an orientation.
+        """Return the first start with a clear fit, else the best one within a part of the take and an orientation.
 
         `up_world` is the up direction of the head in the world, shape (3,), if known from other frames. If it is given,
         one camera orientation is tried and, with several cameras, the first start that fits is returned, because it
@@ -121,7 +121,7 @@ class PictureSearch(Generic[T]):
                 break
         raise TrackingError(
             _describe_failure(tried, best, frames[seen:]),
-            hint="Check that the scans or the rig belong to this subject. Film both arches apart for a moment, "
+            hint="Check that the scans or the rig belong to this subject. Otherwise, film both arches apart, "
             "pick teeth in two cameras ([bootstrap]), or draw masks.",
         )
 
@@ -214,7 +214,7 @@ def masked_cameras(
 
 
 def picked_start(picked_frame: int, frames: range, begin: Callable[[], tuple[T, float]], least_fit: float) -> Start[T]:
-    """Return a start from picks.
+    """Return a start of tracking from picks.
 
     Args:
         picked_frame: frame of the picks.

@@ -79,7 +79,7 @@ def draw_frames(
 
 
 def chosen_frames(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return the frames to inspect, as row in the tracks and reason, worst first."""
+    """Return the frames to inspect, worst first, each as its row in the tracks and the reason."""
     tracked = tracks.tracked()
     uncovered = np.where(tracked, np.fmax.reduce(uncovered_percent(tracks), axis=1), np.nan)
     sigma_mm = np.where(tracked, tracks.sigma_mm.max(axis=1), np.nan)

@@ -125,7 +125,7 @@ def read_face(
         unit: unit of the points, if the file does not state it.
         rigid: the rigid body "head", formed by markers on the head (see `formats.rigid_bodies`); points are then
             returned relative to it. Default: the head does not move, or the points are stabilised.
-        rest_frame: frame that defines the shape of the head, if only its markers are named.
+        rest_frame: frame that defines the marker positions on the head, if only the names of its markers are given.
 
     Raises:
         FormatError: the file is none of these, or the head cannot be found.

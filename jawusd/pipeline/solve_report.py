@@ -30,7 +30,7 @@ def check_page(path: str | os.PathLike[str]) -> None:
     """Check, before any work, that a report can be written to a file of this name.
 
     Raises:
-        OutputError: its suffix is not .html.
+        OutputError: the suffix of the file is not .html.
         MissingDependencyError: matplotlib or jinja2 is not installed.
     """
     import jawusd.report.solve_page  # noqa: F401
@@ -135,7 +135,7 @@ def _overlays(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> t
 
 
 def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return the frames to inspect, as row in the tracks and reason, such as a hidden arch or a pose outside.
+    """Return the frames to inspect, each as its row in the tracks and the reason.
 
     Raises:
         ValueError: the tracks were not written by `solve`.

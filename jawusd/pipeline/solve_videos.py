@@ -65,7 +65,7 @@ class VideoShot:
     Attributes:
         cameras: calibrated cameras with a video, by name.
         footage: the images of those cameras.
-        take: tracks the teeth.
+        take: tracker of the teeth.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Track the teeth of a capture, in a second pass with the fitted model as a prior, and summarise tracks."""
+"""Track the teeth of a capture, track them again with the fitted model as a prior, and summarise tracks."""
 
 from __future__ import annotations
 

@@ -132,7 +132,8 @@ class ArchSearch:
             return found.poses, fit
 
         begin = PictureSearch(self.capture, self.footage, cameras, near, judged).run(frames, progress, up_world)
-        self.follower.start_at(begin.frame, begin.pose)  # the search may have tried other starts later
+        # Start again: the search may have tried other starts after this one.
+        self.follower.start_at(begin.frame, begin.pose)
         return begin
 
     def again(self, frames: range, up_world: Array) -> Start[Array]:

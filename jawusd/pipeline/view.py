@@ -113,7 +113,7 @@ class ContactView:
 
 
 def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
-    """Return decimated meshes of a rig by the viewer's names, with the gum separate and including placeholders.
+    """Return the decimated meshes of a rig, placeholders included, by the viewer's names; gum is separate.
 
     Raises:
         RigError: the rig has neither a mandible nor lower teeth.
@@ -136,7 +136,7 @@ def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
 
 
 def part_of(mesh: Mesh, chosen: Mask) -> Mesh:
-    """Return the faces of a mesh chosen by a mask (F,), with the vertices that they use."""
+    """Return the faces of a mesh selected by a Boolean mask (F,), with the vertices that they use."""
     used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
     return Mesh(
         mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), None if mesh.colors is None else mesh.colors[used]

@@ -109,7 +109,7 @@ def test_fit_reads_markers_in_centimetres_relative_to_a_rest_frame(tmp_path, mar
         ({"jaw": "5,6,7", "tongue": "1,2,3"}, 0, "jaw is required"),
         ({"jaw": "7,8,9"}, 0, "has 8 markers; the rigid body of the jaw uses marker 9"),
         ({"jaw": "5,6,7"}, None, "--rest-frame"),
-        ({"jaw": "5,6,7"}, 12, "has no frame 12; it has 0 to 11"),
+        ({"jaw": "5,6,7"}, 12, "has no frame 12; it has frames 0 to 11"),
         ({"jaw": "5,6,7"}, 2, "frame 2 does not show all markers of the jaw"),
     ],
 )

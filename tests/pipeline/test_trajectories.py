@@ -76,7 +76,7 @@ def test_a_rest_frame_works_for_tables_and_inverted_poses(tmp_path, poses):
     write_poses(tmp_path / "p.csv", 5 + np.arange(COUNT), np.linalg.inv(elsewhere))
     _, T, _ = read_trajectory(tmp_path / "p.csv", TrajectoryOptions(invert=True, rest_frame=5))
     np.testing.assert_allclose(T, truth, atol=1e-9)
-    with pytest.raises(FormatError, match="has no frame 4; it has 5 to 12"):
+    with pytest.raises(FormatError, match="has no frame 4; it has frames 5 to 12"):
         read_trajectory(tmp_path / "p.csv", TrajectoryOptions(rest_frame=4))
 
 
