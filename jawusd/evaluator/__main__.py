@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text)
         command.add_argument("model", type=Path, help="model.npz")
         if name == "pose":
-            command.add_argument("--d", type=float, nargs=3, required=True, metavar=("D1", "D2", "D3"), help="[mm]")
+            command.add_argument("--d", type=float, nargs=3, required=True, metavar=("D1", "D2", "D3"), help="mm")
         elif name != "info":
             command.add_argument("poses", type=Path, help="CSV with the columns frame, m00 ... m33")
         if name == "encode":

@@ -85,8 +85,8 @@ class RigAuthoring(RigArrays):
             d3: Protrusion [mm] while d2 varies.
 
         Returns:
-            The limits [mm]; NaN where no value is valid. The bound closes a few tenths of a mm
-            before the ends of ``d_range[0]``; beyond that point, the limits at the nearest valid opening are returned.
+            The limits [mm]; NaN where no value is valid. The bound ends a few tenths of a mm inside ``d_range[0]``;
+            beyond its ends, the limits at the nearest valid opening are returned.
         """
         each = (as_floats(x, name) for x, name in ((d1, "d1"), (d2, "d2"), (d3, "d3")))
         d = np.stack(np.broadcast_arrays(*each), axis=-1)
@@ -117,6 +117,6 @@ class RigAuthoring(RigArrays):
         return in_chunks(lambda n: denormalized(self.bound, self.d_range, n), rows).reshape(*batch, 3)
 
     def captured_distance(self, d: ArrayLike) -> Array:
-        """Return the distance (...) [mm] from d (..., 3) to that of the nearest captured pose; inf if there is none."""
+        """Return the distance (...) [mm] from d (..., 3) to the d of the nearest captured pose; inf if none."""
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(lambda d: nearest_distance(self.captured_d, d), rows).reshape(batch)

@@ -137,7 +137,7 @@ def _retimed(bound: SliceHull, spine: Spine, path: Array, allowed: Array, ends_s
 
 
 def _thinned(bound: SliceHull, times: Array, d: Array, given: Mask) -> Inside:
-    """Return the original samples, and the others that are needed to keep the lines between samples inside."""
+    """Return the original samples, and those others that keep the lines between samples inside the bound."""
     keep = given.copy()
     while True:
         kept = np.flatnonzero(keep)
@@ -189,7 +189,7 @@ def _leaves(bound: SliceHull, start: Array, end: Array) -> Mask:
 
 
 def _positions(marked: Mask, first: Indices, count: Indices) -> Indices:
-    """Return, for each group of consecutive entries, the position of its last marked entry within it."""
+    """Return the position of the last marked entry within each group of consecutive entries."""
     place = np.where(marked, np.arange(len(marked)), -1)
     return np.maximum.reduceat(place, first) - first if len(count) else first
 

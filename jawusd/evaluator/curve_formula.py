@@ -64,7 +64,7 @@ def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) 
 
 
 def curve(name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]) -> list[N]:
-    """Return the point, a row, at x on the curve with the tables of `curve_tables`."""
+    """Return the point at x, as a row, of a curve given by the tables of `curve_tables`."""
     s, powers = _interval(name, x, tables, ops)
     return [((c3 * s + c2) * s + c1) * s + c0 for c0, c1, c2, c3 in zip(*powers)]
 
@@ -72,7 +72,7 @@ def curve(name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table
 def curve_derivatives(
     name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]
 ) -> tuple[list[N], list[N], list[N]]:
-    """Return the point of `curve` at x, its derivative and its second derivative, a row each."""
+    """Return the point of `curve` at x, its derivative and its second derivative, each as a row."""
     s, (c0, c1, c2, c3) = _interval(name, x, tables, ops)
     return (
         [((d * s + c) * s + b) * s + a for a, b, c, d in zip(c0, c1, c2, c3)],

@@ -231,7 +231,7 @@ class Encoder:
         measured = make_transform(*self._frames.motions(T[known]))
         _, J = self._whitened(d[known], measured, whitening[known] @ self._frames.adjoint)
         precision = np.swapaxes(J, 1, 2) @ J
-        # keeps the variance of a parameter that does not move the jaw finite
+        # keeps the variance finite for a parameter that does not move the jaw
         floor = _MIN_PRECISION * np.einsum("nii->n", precision)[:, None, None] * np.eye(3)
         noise = np.linalg.inv(precision + floor)
         gain = noise @ np.swapaxes(J, 1, 2) @ whitening[known]
@@ -263,7 +263,7 @@ def covariance_of_points(points: Array, sigma_mm: Array) -> Array:
         return np.zeros((len(points), 6, 6))
     J = np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)
     precision = np.einsum("npki,npkj,p->nij", J, J, 3.0 / sigma_mm**2)
-    # the points of a rigid body are not independent measurements of its pose
+    # the factor len / 2 is needed because points of a rigid body do not measure its pose independently
     return np.asarray(np.linalg.inv(precision) * len(sigma_mm) / 2.0)
 
 

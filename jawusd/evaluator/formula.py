@@ -75,7 +75,7 @@ class GaugeNumbers(NamedTuple):
 def long_angle_series() -> list[list[float]]:
     """Return the coefficients of a, b and c of `jawusd.geometry.rodrigues` as series of the squared angle [rad^2].
 
-    Eight terms each: accurate to 1e-8 up to 2 rad.
+    Each series has eight terms and is accurate to 1e-8 up to 2 rad.
     """
     return [[(-1.0) ** k / math.factorial(2 * k + start) for k in range(8)] for start in (1, 2, 3)]
 

@@ -52,7 +52,7 @@ class JawModelForm(Protocol):
         ...
 
     def arrays(self) -> dict[str, Array]:
-        """Return the arrays of this kind by their names in a rig."""
+        """Return the arrays of the model by their names in a rig."""
         ...
 
     def motion(self, d: Array) -> Array:
@@ -150,7 +150,7 @@ class AnchoredModel:
         )
 
     def arrays(self) -> dict[str, Array]:
-        """Return the arrays of this kind by their names in a rig."""
+        """Return the arrays of an anchored model by their names in a rig."""
         own = {"spline_scales": self.scales, "spline_centres": self.centres, "spline_weights": self.weights}
         return {**self.gauge.arrays(), **own}
 
@@ -283,7 +283,7 @@ class AdditiveModel:
         )
 
     def arrays(self) -> dict[str, Array]:
-        """Return the arrays of this kind by their names in a rig."""
+        """Return the arrays of an additive model by their names in a rig."""
         own: dict[str, Array] = {}
         for i, curve in enumerate(self.curves, start=1):
             parts = {"knots": curve.knots, "twists": curve.values, "slopes": curve.slopes}

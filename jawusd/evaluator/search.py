@@ -170,7 +170,7 @@ class _Scan:
         return rows, self.points[found[rows, places]]
 
     def _deepest(self, distance: Array) -> Indices:
-        """Return the best point in each of the lowest valleys (n, v) of distances (n, p); -1 where there are fewer."""
+        """Return the index of the best point in each of the lowest valleys (n, v) of distances (n, p); -1 if fewer."""
         least = np.minimum.reduceat(distance, self._first, axis=1)
         walls = np.pad(least, ((0, 0), (1, 1)), constant_values=np.inf)
         valley = (least <= walls[:, :-2]) & (least <= walls[:, 2:])

@@ -63,7 +63,7 @@ def minimise(
             NaN.
         bound: The bound that points must stay inside.
         iterations: Maximum number of steps per row.
-        tolerance_mm: A row has converged when its next step is shorter.
+        tolerance_mm: Step length below which a row has converged.
 
     Returns:
         The points [mm], shape (n, 3).

@@ -23,10 +23,10 @@ def spline(
 ) -> Triple[N]:
     """Return ``sum_i W_i |q - c_i|^3 + q L``: a polyharmonic spline with a linear tail (Duchon 1977).
 
-    Far from the centres the cubes of distances nearly cancel. If ``sum_i W_i = 0`` and ``sum_i W_i c_i = 0``, they are
-    replaced by what remains of them, so that single precision suffices. With ``r = |q - c|``, ``p^2 = |q|^2 + 1`` and
-    ``e = c (2 q - c) + 1 = p^2 - r^2`` it is ``r^3 = p^3 - 3/2 p e + (e / (r + p))^2 (r + p / 2)``, in which the sums
-    of ``p^3 W_i`` and of ``p q c_i W_i`` vanish.
+    Far from the centres the cubes of distances nearly cancel. If ``sum_i W_i = 0`` and ``sum_i W_i c_i = 0``, the cubes
+    are replaced by what remains after cancellation, so that single precision suffices. With ``r = |q - c|``, ``p^2 =
+    |q|^2 + 1`` and ``e = c (2 q - c) + 1 = p^2 - r^2``, this is ``r^3 = p^3 - 3/2 p e + (e / (r + p))^2 (r + p / 2)``,
+    in which the sums of ``p^3 W_i`` and of ``p q c_i W_i`` vanish.
 
     Args:
         q: The argument; see `spline_input`.

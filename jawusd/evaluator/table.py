@@ -58,7 +58,7 @@ class SampledTable:
         d = np.asarray(d, dtype=np.float64)
         if d.shape == (3,):
             x, y, z = d.tolist()
-            if abs(x) + abs(y) + abs(z) < _SINGLE_LIMIT_MM:  # false for NaN and infinities
+            if abs(x) + abs(y) + abs(z) < _SINGLE_LIMIT_MM:  # false for NaN and inf
                 return motion_matrix(motion_of_twist(*self._single_twist(x, y, z))).dot(self.T_rest)
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(self._poses, rows).reshape(*batch, 4, 4)

@@ -17,7 +17,7 @@ SMALL_SQUARED_ANGLE = 1e-4
 
 
 class Number(Protocol):
-    """The arithmetic that formulas need, between two numbers of the type and between one and a float."""
+    """The arithmetic that formulas need, between two values of a number type and between a value and a float."""
 
     def __add__(self: N, other: N | float, /) -> N: ...
     def __radd__(self: N, other: float, /) -> N: ...

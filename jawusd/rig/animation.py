@@ -84,7 +84,7 @@ def write_animation(
     if not np.isfinite(frames).all() or (np.diff(frames) <= 0).any():
         raise RigError("the frame numbers of an animation must increase.", path=out)
     if not fps > 0:
-        raise RigError(f"{fps} frames per second; the rate must be greater than 0.", path=out)
+        raise RigError(f"the frame rate is {fps}; it must be greater than 0.", path=out)
     if frames[-1] - frames[0] > _MAX_FRAMES or np.abs(frames).max() > _FARTHEST_FRAME:
         raise RigError(
             f"has frames {frames[0]:g} to {frames[-1]:g}; an animation has at most {_MAX_FRAMES} frames within "
@@ -109,7 +109,7 @@ def root_prim_of(actor: Path) -> str:
     """Return the name of the root prim with the rig in an actor's file.
 
     Raises:
-        RigError: Not exactly one root prim is a rig.
+        RigError: There is not exactly one root prim that is a rig.
     """
     stage = open_stage(actor)
     names = [prim.GetName() for prim in rig_prims(stage) if prim.GetPath().IsRootPrimPath()]

@@ -4,10 +4,10 @@ To add a format version:
 
 1. Raise `layout.FORMAT_VERSION`.
 2. Add the upgrade from the previous version to `UPGRADES`. It derives the new attributes from the old ones.
-3. Write golden rigs of the new version with `tests/golden/make_golden_rig.py`; keep the old ones, which tests upgrade.
+3. Write golden rigs of the new version with `tests/golden/make_golden_rig.py`; keep the old ones for tests.
 4. Do the same in `plugins/jawusd_reader.py`.
 
-Upgrades happen in memory; files are never rewritten. `jawusd bake` on the model writes a rig of the current version.
+Upgrades happen in memory; files are never rewritten. To write a rig of the current version, run `jawusd bake`.
 """
 
 from __future__ import annotations
@@ -163,9 +163,9 @@ def time_codes(times: Array) -> list[Usd.TimeCode]:
 
 
 def _upgrade_1_to_2(prim: Usd.Prim) -> None:
-    """Derive the tolerance of measured poses; version 1 stored the smallest valid margin instead.
+    """Derive the tolerance of measured poses; format version 1 stored the smallest valid margin instead.
 
-    The other additions of version 2 are optional: the glide surface table and the clearances of the teeth.
+    The other additions of format version 2 are optional: the glide surface table and the clearances of the teeth.
     """
     limit = read_value(prim, "jaw:thresholds:margin", prim.GetStage().GetRootLayer().identifier)
     if not isinstance(limit, float):

@@ -79,7 +79,7 @@ def bake_rig(
     if (frames is None) != (d is None):
         raise ValueError("frames and d belong together: give both or neither")
     if not fps > 0:
-        raise RigError(f"{fps} frames per second; the rate must be greater than 0.", path=folder)
+        raise RigError(f"the frame rate is {fps}; it must be greater than 0.", path=folder)
     check_meshes(meshes)
     check_prim_name(prim_name)
     placeholder = None

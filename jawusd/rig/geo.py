@@ -184,7 +184,7 @@ def _define_mesh(
     prim.CreateFaceVertexCountsAttr(_gf.int_array(np.full(len(mesh.faces), 3)))
     prim.CreateExtentAttr(_gf.vec3f_array(extent(mesh.vertices)))
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    prim.CreateDoubleSidedAttr(True)  # necessary because scans are open surfaces
+    prim.CreateDoubleSidedAttr(True)  # double-sided, because scans are open surfaces
     prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     gum = ~crown_face_mask(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)

@@ -161,7 +161,7 @@ def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] |
     if len(sampled) < len(PARAMETERS) or not len(times):
         return None
     if len(times) > MAX_FRAMES:
-        raise FormatError(f"has {len(times)} samples of d, more than the limit of {MAX_FRAMES}.", path=str(path))
+        raise FormatError(f"has {len(times)} samples of d; the maximum is {MAX_FRAMES}.", path=str(path))
     d = np.array([values_at(attribute, times.tolist()) for attribute in attributes], dtype=np.float64).T
     if not np.isfinite(d).all():
         raise FormatError("its samples of d have values that are not finite.", path=str(path))

@@ -86,8 +86,8 @@ def encode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
     """Build the graph that finds the jaw parameters of poses.
 
     Input `pose` (N, 4, 4): T_skull_mandible, row-major, for column vectors [mm]. Outputs `d` (N, 3) [mm]: the
-    parameters of the nearest pose of the model, by landmark distance, bounds ignored; `residual` (N,): that distance
-    (rms over the landmarks) [mm]. A row with a NaN gives NaN.
+    parameters of the nearest pose of the model, by landmark distance, without regard to bounds; `residual` (N,): that
+    distance (rms over the landmarks) [mm]. A row with a NaN gives NaN.
 
     Args:
         rig: the exact model.

@@ -114,7 +114,7 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
             yield _finding("error", "Onnx", prim, f"{asset.path} {error.message}")
             continue
         if not error_mm <= ALLOWED_MM:
-            message = f"{asset.path} is {error_mm:.3f} mm from the model; allowed {ALLOWED_MM} mm."
+            message = f"{asset.path} is {error_mm:.3f} mm from the model; the maximum is {ALLOWED_MM} mm."
             yield _finding("error", "Onnx", prim, message)
 
 
@@ -167,7 +167,10 @@ def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
         yield _finding("error", "Mandible", mandible, error.message)
         return
     if not away_mm <= BAKED_MM:
-        message = f"the skull is moved in the actor by {away_mm:.3f} mm ({BAKED_MM} allowed): move the actor instead."
+        message = (
+            f"the skull is moved in the actor by {away_mm:.3f} mm; the maximum is {BAKED_MM} mm. "
+            "Move the actor instead."
+        )
         yield _finding("error", "Mandible", prim, message)
         return
     unkeyed = not any(attribute.GetNumTimeSamples() for attribute in moving)
@@ -193,8 +196,8 @@ def _check_baked(
     over_mm = error_mm - allowed_mm
     worst = int(np.argmax(np.where(np.isfinite(over_mm), over_mm, np.inf)))
     if not over_mm[worst] <= 0:
-        message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from that of d "
-        message += f"({allowed_mm[worst]:.2f} allowed)."
+        message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from the pose of d; "
+        message += f"the maximum is {allowed_mm[worst]:.2f} mm."
         message += " Only d is keyed, not the mandible: bake it with" if unkeyed else " To make them agree, run"
         message += " `jawusd rebake`."
         yield _finding("error", "Mandible", mandible, message)

@@ -83,8 +83,8 @@ def fit_poses_of_stage(
 
     Args:
         path: Any stage with copies of the actor's meshes, moved by transforms, bones or time-sampled points.
-        actor: The rig's own file, which defines the meshes in their frames.
-        mandible: Prim below which the lower teeth or the mandible are looked for; None: everywhere.
+        actor: The rig's own file, which contains the meshes in their coordinate frames.
+        mandible: Prim below which the lower teeth or the mandible are searched; None to search the whole stage.
         skull: The same for the upper teeth or the skull.
         rig_prim: The rig's prim, if the file has several rigs.
 

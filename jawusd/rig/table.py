@@ -22,7 +22,7 @@ from jawusd.geometry.se3 import se3_exp, transform_points
 DEFAULT_SIZE = 33  # knots per axis
 SIZES = (17, 33, 65)
 _VALID_SAMPLES = 10_000  # number of random valid d at which the error is measured
-_FULL_CHECKS = 200  # number of d, those with the largest errors, that are checked at every vertex
+_FULL_CHECKS = 200  # number of d with the largest errors, which are checked at every vertex
 
 _PROBES_PER_AXIS = 41  # number of values per axis of the grid that finds the box of valid d
 _FINE = 161  # number of values per axis at which the curvature is measured

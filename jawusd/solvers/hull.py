@@ -40,7 +40,7 @@ _ROWS = 512  # number of rows compared with all candidates at once
 class Expansion(NamedTuple):
     """The signed distance (n,) [mm], its gradient (n, 3), and its Hessian (n, 3, 3) [1/mm] in two parts.
 
-    The part from the rounding is positive semidefinite; the bending of the supports along d1 may be indefinite.
+    The part from the rounding is positive semidefinite; that from the curvature along d1 may be indefinite.
     """
 
     distance: Tensor
@@ -92,7 +92,7 @@ class Hull(Formula):
         return Expansion(distance, gradient, rounding, bending)
 
     def _sides(self, d: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the distance (n,) [mm], weights (n, k), gradients (n, k, 3) of the half-spaces, and d2 reach / d d1^2.
+        """Return the distance (n,) [mm], weights (n, k), gradients (n, k, 3) of the half-spaces, and d^2 reach / dd1^2.
 
         The half-spaces are in the order of `jawusd.evaluator.bounds`: the sides, then both ends.
         """
@@ -161,7 +161,7 @@ class Hull(Formula):
         """Return the nearest valid points (n, 3) [mm] in the basins of valid starts.
 
         As in `jawusd.evaluator.solver`, every iterate is inside: the step of the quadratic model under the linearised
-        bound is pulled back onto the surface, and accepted only if the distance does not grow.
+        bound is moved back onto the surface, and accepted only if the distance does not grow.
         """
         x, cost = start, (start - wanted).square().sum(dim=1)
         state = [wanted, x, cost, torch.full_like(cost, _START_DAMPING), torch.zeros_like(cost)]

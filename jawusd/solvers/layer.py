@@ -103,7 +103,8 @@ class JawLayer(nn.Module):
     `state_dict` saves them, and `load_state_dict` accepts only the state of the same rig. Every function works under
     `torch.func`, `torch.compile(fullgraph=True)`, `torch.export` and its ONNX exporter, for any batch shape.
 
-    `encode` and `loss` have first and second derivatives; `residuals`, `project` and `inside` have first ones only.
+    `encode` and `loss` have first and second derivatives; `residuals`, `project` and `inside` have only first
+    derivatives.
 
     All functions compute in the precision of the layer: autocast and TensorFloat-32 are off within them. A captured
     graph, however, uses the matrix multiplication precision that the surrounding program has set.

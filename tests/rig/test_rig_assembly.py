@@ -197,7 +197,7 @@ BROKEN = [
     (name_a_mandible_elsewhere, "Mandible", "is not below the actor"),
     (name_a_skull_that_is_not_there, "Assembly", "geo/Head: there is no such prim"),
     (widen_a_range, "Model", "ranges were edited"),
-    (block_the_motion, "Mandible", "from that of d"),
+    (block_the_motion, "Mandible", "from the pose of d"),
     (refer_to_a_missing_file, "CompositionError", "nothing.usda"),
     (refer_to_a_missing_actor, "CompositionError", "nothing.usda"),
     (rename_the_joints, "Assembly", "the joints Actor_skull/Actor_jaw are animated"),

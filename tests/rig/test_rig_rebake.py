@@ -163,7 +163,7 @@ def test_a_mandible_that_departs_from_d_between_keys_is_found(anchored_folder):
             mandible.GetAttribute("xformOp:orient").Set(Gf.Quatd(w, x, y, z), time)
 
     path = shot(folder, key_both)
-    assert "(0.03 allowed)" in run("validate", path, code=1)
+    assert "the maximum is 0.03 mm" in run("validate", path, code=1)
     assert deviation(path, rig).largest_mm > 0.3
     run("validate", folder / "actor.usda", path, code=1)
 
