@@ -1,4 +1,4 @@
-"""The file formats of jawusd: per format one dataclass with reader and writer.
+"""File formats of jawusd: for each format a dataclass, a reader and a writer.
 
-May import only base, numpy, pydantic and the standard library.
+This package may import only base, numpy, pydantic and the standard library.
 """

@@ -1,15 +1,15 @@
-"""Face captures of ARKit, as exported by Live Link Face, and a subject's mapping from blend shape weights to d.
+"""Face captures of ARKit, as exported by Live Link Face, and a subject's mapping from weights to jaw parameters d.
 
 A capture is a CSV table of blend shape weights with time codes:
 
     Timecode,BlendShapeCount,...,JawForward,JawRight,JawLeft,JawOpen,...
     14:03:52:28.207,61,...,0.01,0,0.02,0.31,...
 
-A time code is HH:MM:SS:FF.fff. FF counts at the rate of the time code, which may differ from the sample rate: devices
+A time code is HH:MM:SS:FF.fff. FF counts at the rate of the time code, which may differ from the sample rate. Devices
 that record 60 samples per second with a 30 fps time code write a fraction of `.50`, or every time code twice. At 29.97
 and 59.94 frames per second it may skip the first two or four frame numbers of every minute that is not a multiple of
 ten ("drop frame", SMPTE ST 12-1), marked by a semicolon before the frames or by the skipped numbers themselves. Column
-names are case-insensitive, other columns are ignored. In a row whose count is 0 no face was detected.
+names are case-insensitive; other columns are ignored. In a row whose BlendShapeCount is 0, no face was detected.
 
 The mapping is a JSON file, format jawusd-arkit/1.
 """
@@ -34,18 +34,18 @@ from jawusd.base.tables import TextTable, check_width, read_table, read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_model
 
-_OTHER = re.compile(r"(head|lefteye|righteye)(yaw|pitch|roll)")  # rotations, which are not blend shapes
+_OTHER = re.compile(r"(head|lefteye|righteye)(yaw|pitch|roll)")  # columns of rotations, which are not blend shapes
 JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
 _TIME, _COUNT = "timecode", "blendshapecount"
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:[.,]\d+)?)")
 _RATES = (24, 25, 30, 48, 50, 60, 100, 120)
 _NTSC_SLACK = 0.006
 _DAY_S = 86_400
-_FEWEST_REPEATED = 3  # minimum number of distinct time codes for detecting repetition
-_FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # range of median rows per second / requested rate
-_MOST_STEPS_OFF = 2.0  # maximum deviation of the step across seconds from that within a second [steps]
-# Accepted range of weights, and the weight above which they are taken as percentages. ARKit's weights are 0 to 1; with
-# a calibrated neutral face or gains they exceed this slightly, percentages and standardised weights by far.
+_FEWEST_REPEATED = 3  # minimum number of distinct time codes from which repetition is detected
+_FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # range of the ratio of the median number of rows per second to the requested rate
+_MOST_STEPS_OFF = 2.0  # maximum difference between steps across seconds and within a second [steps]
+# Accepted range of weights, and the weight above which weights are assumed to be percentages. ARKit's weights are 0 to
+# 1; a calibrated neutral face or gains exceed this slightly, percentages and standardised weights by far.
 _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
 _MAX_MAPPING_BYTES = 1 << 20
@@ -56,27 +56,28 @@ _Weights = tuple[_Number, _Number, _Number, _Number]
 
 @dataclass(frozen=True, eq=False)
 class BlendShapes:
-    """All weights of a face capture."""
+    """Weights of all blend shapes of a face capture."""
 
-    frames: Array  # frame numbers from the first row on, increasing, possibly fractional, shape (F,)
-    weights: Array  # one column per shape, nominally 0 .. 1, NaN without a face, shape (F, K)
-    names: tuple[str, ...]  # names of the shapes
-    fps: float  # frames per second
+    frames: Array  # increasing frame numbers, 0 in the first row, possibly fractional, shape (F,)
+    weights: Array  # one column per blend shape, nominally 0 to 1, NaN if no face was detected, shape (F, K)
+    names: tuple[str, ...]  # names of the blend shapes, length K
+    fps: float  # frame rate [Hz]
 
 
 @dataclass(frozen=True, eq=False)
 class FaceCapture:
     """The jaw weights of a face capture."""
 
-    frames: Array  # frame numbers from the first row on, increasing, possibly fractional, shape (F,)
-    # JawOpen, JawLeft, JawRight, JawForward, nominally 0 .. 1, NaN without a face, shape (F, 4); left is the subject's
+    frames: Array  # increasing frame numbers, 0 in the first row, possibly fractional, shape (F,)
+    # JawOpen, JawLeft (subject's left), JawRight, JawForward: nominally 0 to 1, NaN if no face was detected, shape (F,
+    # 4).
     weights: Array
-    fps: float  # frames per second
+    fps: float  # frame rate [Hz]
     timecode: str  # time code of the first row, as written
 
 
 def shares_of(weights: Array) -> Array:
-    """Return opening, leftward and forward motion of weights (F, 4) as fractions of their full ranges, shape (F, 3)."""
+    """Convert weights (F, 4) to opening, leftward and forward motion as fractions of the full ranges, shape (F, 3)."""
     opening, left, right, forward = weights.T
     return np.stack([opening, left - right, forward], axis=1)
 
@@ -85,13 +86,13 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
     """Read a face capture of Live Link Face.
 
     Args:
-        path: the CSV.
-        fps: frames per second of the result: the sample rate, the time code rate, or an integer multiple or fraction
-            of the latter. None uses the time code rate; the capture must then contain a full second.
+        path: the CSV file.
+        fps: frame rate of the result [Hz]: the sample rate, the time code rate, or an integer multiple or fraction
+            of the time code rate. None uses the time code rate; the capture must then contain a full second.
 
     Raises:
-        FormatError: not such a table, a value that is not finite, a time code that does not increase, or a rate that
-            does not fit. The message names line and column.
+        FormatError: the file is not such a table, a value is not finite, a time code does not increase, or the rate
+            does not fit the time codes. The message names line and column.
     """
     path = Path(path)
     table, columns = _read_columns(path, (_TIME, *JAW_COLUMNS))
@@ -120,7 +121,7 @@ def _read_columns(path: Path, needed: tuple[str, ...]) -> tuple[TextTable, list[
     for name in needed:
         if columns.count(name) != 1:
             raise FormatError(
-                f'has {columns.count(name)} columns named "{name}", expected one.',
+                f'has {columns.count(name)} columns named "{name}"; expected one.',
                 path=path,
                 hint="Live Link Face exports Timecode, JawOpen, JawLeft, JawRight and JawForward.",
             )
@@ -130,11 +131,11 @@ def _read_columns(path: Path, needed: tuple[str, ...]) -> tuple[TextTable, list[
 
 
 def _timed(table: TextTable, at: int, fps: float | None) -> tuple[Array, float, str]:
-    """Return frame numbers (F,), frames per second, and the first time code, of time codes in a column."""
+    """Return frame numbers (F,), the frame rate [Hz], and the first time code, given a column of time codes."""
     written = [row[at].strip() if len(row) > at else "" for row in table.rows]
     codes = np.array([_seconds_and_frame(code, table.named(i, at), table.path) for i, code in enumerate(written)])
     seconds, inside = codes[:, 0].astype(np.int64), _spread(codes)
-    # Time codes restart at midnight.
+    # Time codes start again at midnight.
     seconds += _DAY_S * np.concatenate([[0], np.cumsum(np.diff(seconds) < -_DAY_S // 2)])
     number = _numbers_per_second(seconds, inside, fps, table, at)
     dropped = _dropped(seconds, inside, number, any(";" in code for code in written))
@@ -146,7 +147,7 @@ def _timed(table: TextTable, at: int, fps: float | None) -> tuple[Array, float, 
 
 
 def _weights(table: TextTable, columns: list[str], shapes: list[int]) -> Array:
-    """Return the weights of columns (F, K), NaN without a face."""
+    """Return the weights of columns (F, K), NaN where no face was detected."""
     count = columns.index(_COUNT) if _COUNT in columns else None
     seen = [i for i, row in enumerate(table.rows) if count is None or len(row) <= count or row[count].strip() != "0"]
     for i in seen:
@@ -213,17 +214,17 @@ def _spread(codes: Array) -> Array:
 def _numbers_per_second(
     seconds: NDArray[np.int64], inside: Array, fps: float | None, table: TextTable, column: int
 ) -> int:
-    """Return the rate of the time codes: the standard rate that best fits the steps across seconds."""
+    """Return the rate of the time codes, which is the standard rate that fits the steps across seconds best."""
     top = int(np.argmax(inside))
     highest = math.floor(inside[top])
     given = 0 if fps is None else math.ceil(fps - _NTSC_SLACK)
     same = np.diff(seconds) == 0
     step = float(np.median(np.diff(inside)[same])) if same.any() else 1.0
-    at_rate = round(given * step, 3)  # rate of the time codes if the samples have the given rate
+    at_rate = round(given * step, 3)  # rate of the time codes if `fps` is the rate of the samples
     rates = [rate for rate in sorted({*_RATES, given, at_rate}) if rate > highest and rate % 1 == 0]
-    # Starts of minutes are excluded, because frame numbers may be dropped there.
+    # Minute starts are excluded, because frame numbers may be dropped there.
     turns = np.flatnonzero((np.diff(seconds) == 1) & (seconds[1:] % 60 != 0))
-    # The first and last seconds are incomplete.
+    # The first and last second are excluded, because they are incomplete.
     rows_of_whole = np.unique(seconds, return_counts=True)[1][1:-1]
     found = 0
     if turns.size and rates and (rows_of_whole.size or given):
@@ -238,7 +239,7 @@ def _numbers_per_second(
             "the frame rate cannot be found from the time codes: there is no full second, or the rate is not one of "
             f"{', '.join(map(str, _RATES))} frames per second.",
             path=table.path,
-            hint="Give the rate with --fps." if fps is None else None,
+            hint="Set the rate with --fps." if fps is None else None,
         )
     samples = float(np.median(rows_of_whole)) if rows_of_whole.size else 0.0
     fits = (
@@ -256,12 +257,12 @@ def _numbers_per_second(
 
 
 def _is_of_ntsc(rate: float) -> bool:
-    """Tell whether a rate is an NTSC rate, such as 29.97 = 30000 / 1001."""
+    """Return whether a frame rate is an NTSC rate, such as 29.97 = 30000 / 1001."""
     return abs(rate - math.ceil(rate - _NTSC_SLACK) * 1000 / 1001) < _NTSC_SLACK
 
 
 def _dropped(seconds: NDArray[np.int64], inside: Array, number: int, marked: bool) -> int:
-    """Return how many frame numbers the time codes skip at the start of a minute, 0 without drop-frame counting."""
+    """Return the number of frame numbers that time codes skip at minute starts; 0 without drop-frame counting."""
     if number not in (30, 60):
         return 0
     count = number // 15
@@ -290,11 +291,12 @@ def _frames(
 
 
 class ArkitMapping(BaseModel):
-    """A subject's mapping from jaw weights to d; arrays of four are JawOpen, JawLeft, JawRight, JawForward.
+    """Mapping of one subject from jaw weights to jaw parameters d.
 
+    The order of weights is JawOpen, JawLeft, JawRight, JawForward.
     d = rest_mm + (gain_mm + u_open * opened_gain_mm) @ u, where u is the deviation of each weight from its neutral
-    value, reduced by the dead zone (0 inside it), and u_open that of JawOpen. Gains of weights for other directions
-    model cross-talk; opened gains model the change of lateral and forward reach as the jaw opens.
+    value, reduced by the dead zone (0 inside the zone), and u_open is the deviation of JawOpen. Gains of weights for
+    other directions model cross-talk; opened gains model how lateral and forward reach change as the jaw opens.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -310,14 +312,14 @@ class ArkitMapping(BaseModel):
     opened_gain_mm: tuple[_Weights, _Weights, _Weights] = Field(description=f"three rows of four {_WITHIN} [mm]")
 
     def d(self, weights: Array) -> Array:
-        """Return the jaw parameters [mm], shape (..., 3), of weights (..., 4); NaN gives NaN."""
+        """Convert weights (..., 4) to jaw parameters d [mm], shape (..., 3); NaN gives NaN."""
         gains = np.concatenate([self.gain_mm, self.opened_gain_mm], axis=1)
         moved = moved_terms(weights, np.array(self.neutral), np.array(self.dead_zone))
         return np.array(self.rest_mm) + moved @ gains.T
 
 
 def moved_terms(weights: Array, neutral: Array, dead_zone: Array) -> Array:
-    """Return u and u_open * u of `ArkitMapping` for weights (..., 4), shape (..., 8)."""
+    """Return u and u_open * u (see `ArkitMapping`) of weights (..., 4), shape (..., 8)."""
     change = weights - neutral
     u = np.sign(change) * np.maximum(np.abs(change) - dead_zone, 0.0)
     return np.concatenate([u, u[..., :1] * u], axis=-1)
@@ -327,7 +329,7 @@ def load_mapping(path: str | os.PathLike[str]) -> ArkitMapping:
     """Read an ARKit mapping.
 
     Raises:
-        FormatError: not such a file; the message names the entry.
+        FormatError: the file is not an ARKit mapping; the message names the wrong entry.
     """
     path = Path(path)
     hint = "Such a file is written by `jawusd arkit-fit`."

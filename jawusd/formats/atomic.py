@@ -1,4 +1,4 @@
-"""Write outputs atomically: temporary file, fsync, rename. Pipes and devices are written in place."""
+"""Write outputs atomically (temporary file, fsync, rename); pipes and devices are written in place."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from jawusd.base.errors import OutputError, shown
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# Prefix of unfinished files and folders, by which leftovers of killed runs are found and deleted.
+# Name prefix of unfinished files and folders, by which leftovers of killed runs are recognised and deleted.
 _UNFINISHED = ".jawusd-tmp-"
-_LONGEST_SUFFIX = 16  # maximum length of a kept suffix [bytes], so that temporary names are not too long
+_LONGEST_SUFFIX = 16  # maximum length of a suffix kept in a temporary name [bytes]
 #: Hint for files and folders that cannot be written.
 ELSEWHERE = "Choose a folder where you have write access."
-# Errors of file systems that lack fsync or file modes.
+# Error numbers of file systems that do not support fsync or file modes.
 _UNSUPPORTED = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM)
 
 
 def destination(path: str | os.PathLike[str]) -> Path:
-    """Return the file that an output is written to: the path itself or, for a link within its folder, its target.
+    """Return the file to which an output is written: the path or, for a link within its folder, the link's target.
 
     Raises:
         OutputError: the path is a folder, a disk, a socket, a link that leads out of its folder, or an invalid name.
@@ -44,19 +44,19 @@ def destination(path: str | os.PathLike[str]) -> Path:
                 hint = "Delete the link, or name the file itself."
                 raise OutputError(f"is a link out of its folder, to {target}.", path=path, hint=hint)
         found = _mode(target)
-    except (OSError, ValueError) as error:  # a name that is too long, circular links, a null byte
+    except (OSError, ValueError) as error:  # the name is too long or contains a null byte, or links are circular
         raise OutputError(f"cannot write here: {getattr(error, 'strerror', error)}.", path=path) from error
     if found is not None and not stat.S_ISREG(found):
         what = "a folder" if stat.S_ISDIR(found) else "something other than a file or a pipe"
-        raise OutputError(f"is {what}; it is not replaced by a file.", path=path, hint="Choose another file name.")
+        raise OutputError(f"is {what}, which is not replaced by a file.", path=path, hint="Choose another file name.")
     return target
 
 
 def refuse_existing(path: Path, force: bool) -> None:
-    """Check before any work that an output may be written: it does not exist yet, or `force` is set.
+    """Check before any work that an output may be written, because it does not exist yet or `force` is set.
 
     Raises:
-        OutputError: it exists, or `destination` rejects the path.
+        OutputError: the output exists and `force` is not set, or `destination` rejects the path.
     """
     destination(path)
     if os.path.lexists(path) and not force and not is_stream(path):
@@ -64,7 +64,7 @@ def refuse_existing(path: Path, force: bool) -> None:
 
 
 def is_stream(path: Path) -> bool:
-    """Tell whether a path is written in place: a pipe, a device such as /dev/null, the file behind /dev/stdout."""
+    """Return whether a path is written in place: a pipe, a device such as /dev/null, or the file of /dev/stdout."""
     found = _mode(path)
     if found is None:
         return False
@@ -91,12 +91,12 @@ def open_stream(path: Path) -> int:
     """Open a path for which `is_stream` holds; return a file descriptor for writing.
 
     Raises:
-        OutputError: it cannot be written, or is a pipe without a reader.
+        OutputError: the path cannot be written, or is a pipe without a reader.
     """
     number = _standard(path)
     if number is not None:
         return os.dup(number)
-    try:  # opening a pipe without a reader would block
+    try:  # without this flag, opening a pipe that has no reader would block
         handle = os.open(path, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
     except OSError as error:
         why = "no program reads this pipe" if error.errno == errno.ENXIO else error.strerror
@@ -184,7 +184,7 @@ def clear_unfinished(folder: str | os.PathLike[str]) -> None:
 
 
 def _umask() -> int:
-    # The umask can only be read by setting it.
+    # The umask cannot be read without setting it.
     current = os.umask(0o022)
     os.umask(current)
     return current
@@ -218,7 +218,7 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
     """
     try:
         data = text.encode()
-    except UnicodeEncodeError as error:  # undecodable bytes of file names, kept as surrogates
+    except UnicodeEncodeError as error:  # surrogates stand for undecodable bytes of file names
         name = error.object[max(0, error.start - 20) : error.end + 20]
         raise OutputError(
             f'would contain a name that is not UTF-8: "{name}".', path=path, hint="Rename that file or folder."
@@ -242,18 +242,18 @@ def write_csv_atomic(
 
 
 def write_npz_atomic(path: str | os.PathLike[str], arrays: Mapping[str, ArrayLike], *, packed: bool = True) -> None:
-    """Write an npz atomically; equal arrays give equal bytes.
+    """Write an npz file atomically; equal arrays give equal bytes.
 
     Arrays are written in C order, which simple readers require.
 
     Args:
-        packed: compress the arrays.
+        packed: whether to compress the arrays.
 
     Raises:
         OutputError: the file cannot be written.
-        ValueError: an array would need a pickle.
+        ValueError: an array contains Python objects.
     """
-    import numpy as np  # commands import this module for output checks, before anything heavy
+    import numpy as np  # imported late, since commands import this module for output checks before slow modules
 
     buffer = io.BytesIO()
     rows = {name: np.asarray(value, order="C") for name, value in arrays.items()}

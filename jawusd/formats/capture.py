@@ -1,4 +1,4 @@
-"""Captures: `capture.toml`, format jawusd-capture/1."""
+"""Read captures from `capture.toml`, format jawusd-capture/1."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
 
 FAMILY, VERSION = "jawusd-capture", 1
-_MOST_PICKS = 200  # maximum number of picks per arch; tracking tries triples, whose number grows cubically
+_MOST_PICKS = 200  # maximum number of picked vertices per arch; tracking tries all triples of them
 
 
 class Sync(Strict):
-    """How the cameras are synchronised.
+    """Synchronisation of the cameras.
 
-    `flash` uses light flashes or, if a clip has none, the sound; `audio` uses only the sound. `timecode` compares the
-    time codes of the clips, `numbers` the frame numbers of image sequences. `offsets` sets one integer per camera:
-    frame k of the camera is simultaneous with frame k + offset of the reference camera.
+    Method `flash` uses light flashes or, if a clip has none, the sound; `audio` uses only the sound. `timecode`
+    compares the time codes of the clips, `numbers` the frame numbers of image sequences. `offsets` sets one integer per
+    camera: frame k of the camera is simultaneous with frame k + offset of the reference camera.
     """
 
     method: Annotated[
@@ -50,7 +50,7 @@ class Sync(Strict):
 
 
 class PickView(Strict):
-    """The pixel of a picked vertex in one camera (OpenCV pixels of the recorded image)."""
+    """Pixel of a picked vertex in the recorded image of one camera (OpenCV coordinates)."""
 
     camera: Annotated[str, Key("Name of the camera.", '"left"')]
     x: Annotated[float, Key("Pixel column; the centre of the first pixel is 0.", "651.5", "px")]
@@ -58,7 +58,7 @@ class PickView(Strict):
 
 
 class Pick(Strict):
-    """A vertex of a teeth scan and the pixels where it is seen."""
+    """Picked vertex of a teeth scan, and the pixels at which cameras see it."""
 
     vertex: Annotated[
         int,
@@ -77,7 +77,7 @@ class Pick(Strict):
 
 
 class Bootstrap(Strict):
-    """The picks that initialise tracking, on one frame of the reference camera."""
+    """Picked vertices that initialise tracking, in one frame of the reference camera."""
 
     frame: Annotated[int, Field(ge=0), Key("Frame of the reference camera in which the points are picked.", "120")]
     upper: Annotated[tuple[Pick, ...], Field(max_length=_MOST_PICKS)] = ()
@@ -85,7 +85,7 @@ class Bootstrap(Strict):
 
 
 class MotionSection(Strict):
-    """The rest frame, with the teeth in occlusion."""
+    """Rest frame: the video frame in which the teeth are in occlusion."""
 
     rest_frame: Annotated[
         Annotated[int, Field(ge=0)] | None,
@@ -94,7 +94,7 @@ class MotionSection(Strict):
 
 
 class AnatomySection(Strict):
-    """Overrides of values that are derived from the scans."""
+    """Values that replace those derived from the scans."""
 
     T_anatomical_skull: Annotated[
         list[list[float]] | None,
@@ -116,7 +116,7 @@ class AnatomySection(Strict):
 
 
 class Capture(Strict):
-    """A capture; paths are absolute once loaded."""
+    """Content of a capture.toml; paths are absolute after loading."""
 
     folder: Path
     name: Annotated[
@@ -156,7 +156,7 @@ class Capture(Strict):
             camera.model_copy(update={key: value for key, value in own.items() if getattr(camera, key) is None})
             for camera in self.cameras
         )
-        object.__setattr__(self, "cameras", cameras)  # bypasses the check for frozen models
+        object.__setattr__(self, "cameras", cameras)  # a frozen model rejects plain assignment
         names = [camera.name for camera in self.cameras]
         listed = ", ".join(names)
         twice = [name for name in names if names.count(name) > 1]
@@ -201,7 +201,7 @@ class Capture(Strict):
 
     @property
     def reference(self) -> str:
-        """Return the name of the reference camera, the first one unless [sync] names it."""
+        """Return the name of the reference camera: the one in [sync], otherwise the first camera."""
         return self.sync.reference or self.cameras[0].name
 
 
@@ -212,7 +212,7 @@ def _refuse_other_files(path: Path) -> None:
     """Reject a path that cannot be a capture.toml, with a hint.
 
     Raises:
-        FormatError: it is missing, or not text.
+        FormatError: the file is missing, or not text.
     """
     if not path.exists():
         hint = f"There is no folder {path.parent} either."
@@ -255,13 +255,13 @@ def capture_keys() -> list[KeyEntry]:
 
 
 def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
-    """Read `capture.toml`, given by its path or folder; paths in the result are absolute.
+    """Read a `capture.toml`, given its path or folder; paths in the result are absolute.
 
     Raises:
-        FormatError: not such a file; the message names the key.
-        UnitsError: lengths not in mm.
-        VersionError: written for a newer jawusd.
-        CaptureError: a referenced file does not exist, or is outside the capture's folder.
+        FormatError: the file is not a capture.toml; the message names the wrong key.
+        UnitsError: lengths are not in mm.
+        VersionError: the file was written for a newer version of jawusd.
+        CaptureError: a file named in the capture does not exist, or is outside the capture's folder.
     """
     capture, problems = read_capture(path, allow_outside=allow_outside)
     if capture is None or problems:

@@ -1,4 +1,4 @@
-"""Replace the picks in a capture.toml and preserve everything else, including comments."""
+"""Replace the picked points in a capture.toml, and preserve everything else including comments."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _TABLE = "bootstrap"
 
 
 def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bootstrap | None) -> None:
-    """Replace or add `[bootstrap]` of a capture.toml, if its picks are still the expected ones.
+    """Replace or add `[bootstrap]` of a capture.toml, if its picked points are still the expected ones.
 
     Raises:
         FormatError: the file is not TOML.
-        OutputError: the picks have changed, have a form that cannot be replaced safely, or the file cannot be written.
+        OutputError: the picked points have changed or cannot be replaced safely, or the file cannot be written.
             The file is then unchanged.
     """
-    path = Path(path).resolve()  # replaces the target of a link, not the link
+    path = Path(path).resolve()  # for a link, replace its target
     check_input(path)
     try:
         data = path.read_bytes()
-        encoding = json.detect_encoding(data)  # by the rule of `jawusd.base.tables.read_text`; kept on writing
+        encoding = json.detect_encoding(data)  # detected like in `jawusd.base.tables.read_text`, and kept on writing
         text = data.decode(encoding)
         found = tomllib.loads(text).get(_TABLE)
         there = None if found is None else Bootstrap.model_validate(found)
@@ -42,7 +42,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
         raise FormatError(f"[{_TABLE}] cannot be read: {error.errors()[0]['msg']}.", path=path) from error
     if there != expected:
         raise OutputError(
-            f"its [{_TABLE}] was changed by another program since it was read.",
+            f"[{_TABLE}] was changed by another program after the file was read.",
             path=path,
             hint="Open the capture again to load the current picks.",
         )
@@ -58,10 +58,10 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
 
 
 def with_bootstrap(text: str, picks: Bootstrap) -> str:
-    """Return the text of a capture.toml with new picks; comments among the old picks are kept.
+    """Return the text of a capture.toml with new picked points; comments among the old ones are kept.
 
     Raises:
-        ValueError: the old picks are not written as tables.
+        ValueError: the old picked points are not written as tables.
     """
     blocks = list(_blocks(text))
     newline = "\r\n" if "\r\n" in text else "\n"
@@ -83,14 +83,14 @@ def _lines(picks: Bootstrap) -> list[str]:
     lines = [f"frame = {picks.frame}"]
     for arch, picked in (("upper", picks.upper), ("lower", picks.lower)):
         for pick in picked:
-            # Camera names contain no characters that TOML escapes.
+            # Camera names need no escapes, since they contain no characters that TOML escapes.
             views = (f'{{ camera = "{view.camera}", x = {view.x:.2f}, y = {view.y:.2f} }}' for view in pick.views)
             lines += ["", f"[[{_TABLE}.{arch}]]", f"vertex = {pick.vertex}", f"views = [{', '.join(views)}]"]
     return lines
 
 
 def _blocks(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield every table's top-level name with its header and content lines; "" before the first header."""
+    """Yield the top-level name, header and content lines of each table; the name is "" before the first header."""
     table = ""
     lines: list[str] = []
     for statement in _statements(text):
@@ -109,7 +109,7 @@ def _statements(text: str) -> Iterator[list[str]]:
         try:
             tomllib.loads("".join(pending))
         except tomllib.TOMLDecodeError:
-            continue  # the value continues in the next line
+            continue  # the value continues on the next line
         yield pending
         pending = []
     if pending:
@@ -117,14 +117,14 @@ def _statements(text: str) -> Iterator[list[str]]:
 
 
 def _comments(lines: list[str], last: bool) -> list[str]:
-    """Return the comments of a block; a line with a value and a trailing comment is commented out."""
+    """Return the comments of a block; a value with a trailing comment is commented out as a whole."""
     among = lines[: len(lines) - len(_after(lines))] if last else lines
-    # Values of picks contain no #, so a # starts a comment.
+    # Values of picked points contain no #, so a # starts a comment.
     return [line.strip() if line.lstrip().startswith("#") else f"# {line.strip()}" for line in among if "#" in line]
 
 
 def _after(lines: list[str]) -> list[str]:
-    """Return the blank lines and comments at the end of a block, which belong to the next one."""
+    """Return the blank lines and comments at the end of a block, which belong to the next block."""
     count = 0
     while count < len(lines) and lines[-1 - count].strip()[:1] in ("", "#"):
         count += 1
@@ -132,10 +132,10 @@ def _after(lines: list[str]) -> list[str]:
 
 
 def _check(before: str, after: str, picks: Bootstrap) -> None:
-    """Check that two texts differ only in the picks.
+    """Check that two texts differ only in the picked points.
 
     Raises:
-        ValueError: they differ elsewhere.
+        ValueError: the texts differ elsewhere.
     """
     try:
         old, new = tomllib.loads(before), tomllib.loads(after)

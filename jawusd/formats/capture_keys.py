@@ -1,4 +1,4 @@
-"""The keys of a capture.toml: their reference, and validation errors that name table, key, value and allowed values.
+"""Keys of capture.toml: reference, and validation errors that name table, key, value and allowed values.
 
 Both are derived from the pydantic models that read the file.
 """
@@ -17,8 +17,8 @@ from typing import Annotated, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-_CLOSE = 0.6  # minimum difflib ratio between a misspelt and a suggested key; "mask" and "masks" have 0.89
-_ALLOWED_SHOWN = 300  # maximum length of a list of keys in messages [characters]
+_CLOSE = 0.6  # minimum difflib ratio of a misspelt and a suggested key; 0.89 for "mask" and "masks"
+_ALLOWED_SHOWN = 300  # maximum length of a list of keys in a message [characters]
 
 Location = tuple[int | str, ...]
 #: Messages by pydantic's error type; names in braces are keys of the error's context.
@@ -48,21 +48,21 @@ _NEEDED = (
 
 @dataclass(frozen=True)
 class Key:
-    """Documentation of one key, stored in the annotation of the model's field."""
+    """Documentation of one key, stored in the annotation of the model field."""
 
     meaning: str
-    example: str = ""  # example value, as written in the file
+    example: str = ""  # example value as written in the file
     unit: str = ""
 
 
 @dataclass(frozen=True)
 class KeyEntry:
-    """One key of the reference."""
+    """One key in the reference of capture.toml."""
 
-    table: str  # as written in the file: "", "[scans]", "[[camera]]"
+    table: str  # table header as written in the file: "", "[scans]" or "[[camera]]"
     name: str
-    kind: str  # "text", "number", "path", ...
-    default: str  # "" for required keys, "none" if the key may be omitted without a default taking its place
+    kind: str  # kind of the value: "text", "number", "path", ...
+    default: str  # default value; "" for required keys, "none" for optional keys without a default
     key: Key
 
 
@@ -112,7 +112,7 @@ def table_model(field: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
 
 
 def _parts(annotation: object) -> list[object]:
-    """Return the members of a union except None, without annotations; for other types, the type itself."""
+    """Return the members of a union type except None, without annotations; for other types, the type itself."""
     if get_origin(annotation) is Annotated:
         return _parts(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
@@ -149,7 +149,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def reference_lines(listed: list[KeyEntry], width: int = 100) -> list[str]:
-    """Return keys as text: a heading per table; per key a line with name, kind and default, and its meaning below."""
+    """Return keys as text: per table a heading; per key a line with name, kind and default, then its meaning."""
     import textwrap
 
     lines: list[str] = []
@@ -172,10 +172,10 @@ def reference_lines(listed: list[KeyEntry], width: int = 100) -> list[str]:
 def problems_of(
     error: ValidationError, model: type[BaseModel], data: Mapping[str, object]
 ) -> list[tuple[str, str | None]]:
-    """Return the problems, each as a sentence that names table and key, with a hint or None.
+    """Return the validation problems, each as a sentence that names table and key, and a hint or None.
 
     Args:
-        error: raised when `model` validated `data`, the content of the file.
+        error: the error raised when `model` validated `data`, the content of the file.
     """
     found = error.errors()
     unknown = [(problem["loc"][:-1], str(problem["loc"][-1])) for problem in found if _is_unknown(problem["type"])]
@@ -184,13 +184,13 @@ def problems_of(
     for problem in sorted(found, key=lambda problem: not _is_unknown(problem["type"])):
         location, kind = problem["loc"], problem["type"]
         if kind == "too_short" and location in deeper:
-            continue  # the errors of the list's entries are reported instead
+            continue  # errors of the list's entries are reported instead
         if _is_unknown(kind):
             out.append(_unknown_key(str(location[-1]), location[:-1], model, place(location[:-1], data)))
         elif kind == "missing" and any(
             table == location[:-1] and _meant(key, [str(location[-1])]) for table, key in unknown
         ):
-            continue  # the key is misspelt, and reported as an unknown key
+            continue  # a misspelt key, which is reported as an unknown key
         else:
             out.append(_wrong_value(problem, location, model, data))
     return out
@@ -201,7 +201,7 @@ def _is_unknown(kind: str) -> bool:
 
 
 def place(location: Location, data: Mapping[str, object]) -> str:
-    """Return a table as written in the file: `[scans]`, `[[camera]] 2 ("left")`, `[[bootstrap.upper]] 1, views 2`."""
+    """Return a table's name for messages: `[scans]`, `[[camera]] 2 ("left")`, `[[bootstrap.upper]] 1, views 2`."""
     if not location:
         return ""
     at: object = data
@@ -278,7 +278,7 @@ def _wrong_value(
 
 
 def _signs(pattern: str) -> str:
-    """Return the characters that a pattern of one character class allows; other patterns unchanged."""
+    """Return the characters that a pattern of one character class allows; return other patterns unchanged."""
     inside = re.fullmatch(r"\^\[(.+)\]\+\$", pattern)
     if inside is None:
         return f"{pattern.strip('^$')}"

@@ -28,8 +28,8 @@ _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-. ]*")
 class ListedCapture:
     """One capture of a list."""
 
-    path: Path  # capture.toml or its folder, absolute; may not exist
-    name: str  # name of its output folder, unique in the list
+    path: Path  # absolute path of a capture.toml or its folder; may not exist
+    name: str  # name of the output folder, unique in the list
 
 
 def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
@@ -45,13 +45,13 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         item = _listed(line, folder, path, number)
-        # Some file systems are case-insensitive.
+        # names are compared in lower case, since some file systems are case-insensitive
         earlier = lines.setdefault(item.name.casefold(), number)
         if earlier != number:
             raise FormatError(
                 f'lines {earlier} and {number} have the same output folder "{item.name}".',
                 path=path,
-                hint="Name one of them after a comma: PATH, NAME.",
+                hint="Add a different name after a comma: PATH, NAME.",
             )
         found.append(item)
     if not found:
@@ -65,10 +65,10 @@ def _listed(line: str, folder: Path, path: Path, number: int) -> ListedCapture:
     except (csv.Error, ValueError) as error:
         raise FormatError(f"line {number} is not CSV ({error}).", path=path) from error
     cells = [cell.strip() for cell in cells]
-    while len(cells) > 1 and not cells[-1]:  # blank columns appended by spreadsheets
+    while len(cells) > 1 and not cells[-1]:  # remove blank columns appended by spreadsheets
         cells.pop()
     if len(cells) > 2 or not cells[0] or "\0" in cells[0]:
-        raise FormatError(f"line {number} must be a path, or a path, a comma and a name.", path=path)
+        raise FormatError(f"line {number} must be a path, optionally followed by a comma and a name.", path=path)
     capture = Path(os.path.normpath(folder / cells[0]))
     name = cells[1] if len(cells) == 2 else _default_name(capture)
     if not _NAME.fullmatch(name) or name.endswith((".", " ")):

@@ -66,7 +66,7 @@ class Masks(Strict):
             return data
         rest = {key: value for key, value in data.items() if key != "labels"}
         if rest.keys() & {"upper", "lower"}:
-            raise ValueError("has both labels and upper or lower; only one kind is allowed. Remove the other")
+            raise ValueError("has both labels and upper or lower; only one of these is allowed. Remove the others")
         return rest | {"upper": data["labels"], "lower": data["labels"]}
 
     @model_validator(mode="after")
@@ -159,7 +159,7 @@ class CameraSource(Strict):
 
     @property
     def clip(self) -> ClipSource | None:
-        """Return the footage and how to read it, or None."""
+        """Return the footage and the properties that determine how it is read, or None if there is no footage."""
         if self.video is None:
             return None
         return ClipSource(self.video, self.fps, self.colour_space, self.colour_config, self.pixel_aspect, self.timecode)
@@ -169,7 +169,7 @@ class Boards(Strict):
     """The calibration board and its clips; columns and rows count inner corners.
 
     `videos` lists one video or image sequence (`%04d`) per camera, in camera order; images with the same number count
-    as simultaneous. A ChArUco board also needs OpenCV's name of its dictionary, and its marker size.
+    as simultaneous. A ChArUco board also needs OpenCV's name of its marker dictionary, and the marker size.
     """
 
     pattern: Annotated[Literal["chessboard", "charuco"], Key("Type of board.")] = "chessboard"

@@ -1,4 +1,4 @@
-"""Resolve the paths in a capture.toml, and report those that are missing or outside its folder."""
+"""Resolve the paths in a capture.toml, and report files that are missing or outside the capture's folder."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from jawusd.formats.file_names import is_pattern, wrong_kind
 M = TypeVar("M", bound=BaseModel)
 _MOVE = "Move the file into that folder, or allow it with --allow-outside."
 _SHOWN = 3  # maximum number of suggested names
-_DRIVE = re.compile(r"[A-Za-z]:[\\/]")  # prefix of a Windows path
-_NO_NAME = re.compile(r"[\x00-\x1f]")  # control characters from TOML escapes, such as \t in videos\take.mp4
+_DRIVE = re.compile(r"[A-Za-z]:[\\/]")  # drive letter at the start of a Windows path
+_NO_NAME = re.compile(r"[\x00-\x1f]")  # control characters that TOML escapes produce, such as \t in videos\take.mp4
 _RELATIVE = "Write it relative to the capture's folder, with slashes, such as video/left.mp4."
 
 
 def resolve_paths(
     model: M, source: Path, data: Mapping[str, object], *, allow_outside: bool
 ) -> tuple[M, list[JawusdError]]:
-    """Return a model with absolute paths, and an error for each path outside the folder or missing.
+    """Return a model with absolute paths, and an error for each path that is missing or outside the folder.
 
     Args:
-        model: read from a file.
-        source: that file; paths are relative to its folder.
-        data: the file's contents, for the names of tables in messages.
-        allow_outside: allow paths outside the folder.
+        model: a model that was read from a file.
+        source: the file of the model; paths are relative to its folder.
+        data: content of the file, for the names of tables in messages.
+        allow_outside: whether paths outside the folder are allowed.
 
     Raises:
         TypeError: the argument is not a model.
@@ -46,7 +46,8 @@ def resolve_paths(
         try:
             problem = _problem(value, full, folder, allow_outside) or _misnamed(location, full)
             problem = problem or _named_twice(location, full, named, data)
-        except (OSError, ValueError, RuntimeError) as error:  # too long a path, a null byte, a circular link
+        # The path is too long, contains a null byte, or has a circular link.
+        except (OSError, ValueError, RuntimeError) as error:
             problem = f"is not a valid path ({error!s:.100}).", None
         if problem is not None:
             text, hint = problem
@@ -71,7 +72,7 @@ def resolve_paths(
 
 
 def _where(location: Location, data: Mapping[str, object]) -> str:
-    """Return table and key, such as `[[camera]] 2 ("left") video`."""
+    """Return the table and key of a path, such as `[[camera]] 2 ("left") video`."""
     keys = len(location) - 1
     while keys > 0 and isinstance(location[keys], int):
         keys -= 1
@@ -81,10 +82,10 @@ def _where(location: Location, data: Mapping[str, object]) -> str:
 
 
 def _problem(value: Path, full: Path, folder: Path, allow_outside: bool) -> tuple[str, str | None] | None:
-    """Return the problem with a path and a hint, None if it is fine."""
+    """Return the problem with a path and a hint, or None if there is no problem."""
     if os.name != "nt" and _DRIVE.match(str(value)):
         return "is a Windows path, which does not exist on this system.", _RELATIVE
-    # Resolve links too: a link inside the folder may point outside.
+    # Links are resolved because a link inside the folder may point outside.
     anchor = full.parent if is_pattern(full) else full
     inside, exists = anchor.resolve().is_relative_to(folder), anchor.exists()
     if not allow_outside and not inside:
@@ -109,10 +110,10 @@ def _misnamed(location: Location, full: Path) -> tuple[str, str | None] | None:
 def _named_twice(
     location: Location, full: Path, named: dict[tuple[str, Path], Location], data: Mapping[str, object]
 ) -> tuple[str, str | None] | None:
-    """Return the problem with a scan, clip or mask that another key names too; otherwise record its use."""
+    """Return the problem with a scan, clip or mask that another key also names; otherwise record its use."""
     group = next((str(part) for part in location if part in ("scans", "masks", "video", "videos")), "")
     other = named.setdefault((group, full), location)
-    # One label file may hold both arches of a camera.
+    # One label file may contain both arches of a camera.
     if not group or other == location or (group == "masks" and other[:2] == location[:2]):
         return None
     return f"is already used by {_where(other, data)}; each key needs its own file.", "Correct one of the two."
@@ -136,7 +137,7 @@ def _similar(path: Path) -> str:
 
 
 def similar_names(path: Path) -> str:
-    """Return similar names in the folder of a path, such as "left.mp4 or left.mov", "" if there are none."""
+    """Return similar names in the folder of a path, such as "left.mp4 or left.mov"; "" if there are none."""
     names = sorted(entry.name for entry in path.parent.iterdir() if not entry.name.startswith("."))
     lower = {name.lower(): name for name in names}
     close = [lower[found] for found in difflib.get_close_matches(path.name.lower(), lower, n=_SHOWN)]

@@ -1,4 +1,4 @@
-"""Write a new capture.toml, with comments that explain each part and mark missing values."""
+"""Write a new capture.toml with comments that explain each part and mark missing values."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class CameraSketch:
 
     name: str
     video: PurePath | None = None
-    masks: Mapping[str, PurePath] = field(default_factory=dict)  # masks by arch, "upper" and "lower"
+    masks: Mapping[str, PurePath] = field(default_factory=dict)  # paths of the masks by arch, "upper" and "lower"
     board: PurePath | None = None
-    remark: str = ""  # remark on the footage, written as a comment
+    remark: str = ""  # remark on the footage that becomes a comment
 
 
 @dataclass(frozen=True)
 class BoardSketch:
-    """The calibration board found in the clips."""
+    """Calibration board found in the clips."""
 
     pattern: str = "chessboard"
     cols: int | None = None
@@ -35,19 +35,19 @@ class BoardSketch:
 
 @dataclass(frozen=True)
 class CaptureSketch:
-    """Files and values found for a capture; None if not found."""
+    """Files and values found for a capture; what was not found is None."""
 
     name: str
     fps: float | None = None
-    scans: Mapping[str, PurePath] = field(default_factory=dict)  # files by key of [scans]
+    scans: Mapping[str, PurePath] = field(default_factory=dict)  # paths of the scans by key of [scans]
     cameras: tuple[CameraSketch, ...] = ()
     calibration: PurePath | None = None
     board: BoardSketch | None = None
-    flashes: bool = True  # False if there are no clips
+    flashes: bool = True  # whether the cameras have clips
 
 
 def capture_text(sketch: CaptureSketch) -> str:
-    """Return a capture.toml. Missing values become comments, so that the text is always valid TOML."""
+    """Return the text of a capture.toml; missing values become comments, so that the text is always valid TOML."""
     lines = [
         "# A capture for jawusd: one subject, one take. `jawusd check FOLDER` reports problems,",
         "# `jawusd init --reference` explains all keys. Paths are relative to this file; lengths are in mm.",
@@ -136,7 +136,7 @@ def _board(sketch: CaptureSketch) -> Iterable[str]:
         yield '# videos = ["board_left.mp4", "board_right.mp4"]'
         yield ""
         return
-    # With a calibration, boards are not needed; they are kept as comments.
+    # Boards are not needed if there is a calibration, and become comments.
     mute = "# " if sketch.calibration is not None else ""
     yield f"{mute}[boards]  # clips of a calibration board, in the order of the cameras"
     yield f'{mute}pattern = "{board.pattern}"'

@@ -1,11 +1,11 @@
-"""Clips of a capture: where they are and how they are read, their brightness over time, and their time codes.
+"""Clips of a capture: paths and reading options, brightness over time, and time codes.
 
-Time code, SMPTE ST 12-1, counts frames since midnight; the digits after "HH:MM:SS:" number the frames within a second.
-At 29.97, 59.94 and 119.88 frames per second it may skip the first two, four or eight frame numbers of every minute that
-is not a multiple of ten ("drop frame", written with ";" or "." before the frames), to stay in step with the clock.
+Time codes (SMPTE ST 12-1) count frames since midnight; digits after "HH:MM:SS:" number the frames within a second.
+At 29.97, 59.94 and 119.88 frames per second they may skip the first 2, 4 or 8 frame numbers of every minute that
+is not a multiple of ten ("drop frame", with ";" or "." before the frames), to agree with the clock.
 
-Rates of time code tracks are read from QuickTime and MP4 files, as FFmpeg does not report them: Apple, "QuickTime File
-Format Specification", atoms and timecode sample description.
+Rates of time code tracks are read from QuickTime and MP4 files here, since FFmpeg does not report them (Apple,
+"QuickTime File Format Specification", atoms and timecode sample description).
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from jawusd.base.errors import CaptureError
 _CODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.,])(\d{2,3})")
 _HOURS_PER_DAY = 24
 _PATH = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
-_HEAD, _LONG_HEAD = 8, 16  # length of an atom's header (size and type) [bytes], and that of atoms above 4 GB
-_TO_ENTRIES = 8  # length of a table's version, flags and count, before its entries [bytes]
-_MOST_ATOMS = 100_000  # maximum number of atoms that are read; limits the search in damaged files
+_HEAD, _LONG_HEAD = 8, 16  # header lengths [bytes] of an atom (size and type), and of an atom above 4 GB
+_TO_ENTRIES = 8  # length [bytes] of version, flags and count before the entries of a table
+_MOST_ATOMS = 100_000  # maximum number of atoms that are read, which limits the search in damaged files
 
 
 @dataclass(frozen=True)
 class ClipSource:
-    """A video or image sequence, with properties that may be missing from the files.
+    """Video or image sequence, with properties that its files may lack.
 
     Attributes:
-        path: the file, or a pattern as in `formats.file_names`.
+        path: the video file, or a pattern of image files as in `formats.file_names`.
         fps: frame rate of an image sequence; ignored for videos.
-        colour_space: "display", "linear", "cineon" or a name in the OpenColorIO config; None: by file type.
+        colour_space: "display", "linear", "cineon" or a name in the OpenColorIO config; if None, the file type decides.
         colour_config: OpenColorIO config.
-        pixel_aspect: width of a pixel over its height; None: from the file.
-        timecode: time code of the first image; "": from the file.
+        pixel_aspect: width of a pixel divided by its height; if None, as stated in the file.
+        timecode: time code of the first image; if "", as stated in the file.
     """
 
     path: Path
@@ -56,7 +56,7 @@ class ClipSource:
 
     @property
     def is_light(self) -> bool:
-        """Whether the images are floating-point light (EXR)."""
+        """Whether the images are floating-point linear light (EXR)."""
         return self.path.suffix.lower() == ".exr"
 
 
@@ -64,23 +64,23 @@ class ClipSource:
 class LightCurve:
     """Brightness of one clip over time."""
 
-    times_s: Array  # presentation times, relative to the first image [s], shape (n,)
-    frames: NDArray[np.int64]  # frame of each image on the clip's regular grid, shape (n,)
-    brightness: Array  # mean brightness of each image, 0 .. 255, shape (n,)
-    # times of abrupt darkening and brightening [frames], shapes (a,), (b,)
+    times_s: Array  # presentation times relative to the first image [s], shape (n,)
+    frames: NDArray[np.int64]  # frame number of each image, shape (n,)
+    brightness: Array  # mean brightness of each image, 0 to 255, shape (n,)
+    # Times of abrupt darkening, shape (a,), and of abrupt brightening, shape (b,) [frames].
     off_frames: Array
     on_frames: Array
 
 
 def frame_of_timecode(text: str, fps: float) -> int:
-    """Return the frames since midnight of a time code.
+    """Convert a time code to the number of frames since midnight.
 
     Args:
-        text: HH:MM:SS:FF, or with ";" or "." before FF for drop-frame counting.
-        fps: frames per second; time codes at 23.976 count 24 frames per second.
+        text: HH:MM:SS:FF, with ";" or "." before FF for drop-frame counting.
+        fps: frame rate [Hz]; time codes at 23.976 Hz count 24 frames per second.
 
     Raises:
-        CaptureError: it is not a time code, or not valid at this rate.
+        CaptureError: the text is not a time code, or not valid at this frame rate.
     """
     found = _CODE.fullmatch(text.strip())
     if found is None:
@@ -110,7 +110,7 @@ def timecode_rates(path: str | os.PathLike[str]) -> list[Fraction]:
     """Return the frame rates of a file's time code tracks; empty for other files.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with open(path, "rb") as file:
         size = file.seek(0, os.SEEK_END)
@@ -145,6 +145,6 @@ def _rate(file: BinaryIO, place: int) -> Fraction | None:
     entry = file.read(34)
     if len(entry) < 33 or entry[4:8] != b"tmcd":
         return None
-    # Time scale and units per frame follow type, index and flags.
+    # The time scale and the units per frame are stored after type, index and flags.
     scale, duration = struct.unpack_from(">2I", entry, 24)
     return Fraction(scale, duration) if scale and duration else None

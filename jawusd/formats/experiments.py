@@ -15,15 +15,15 @@ TABLE_COLUMNS = ("experiment", "model", "quantity", "count", "mean_mm", "median_
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """A named set of distances."""
+    """Named set of distances measured in one experiment."""
 
-    experiment: str  # "condyle path", "reconstruction" or "synthesis": paper Figs. 5, 12 and 13
+    experiment: str  # "condyle path", "reconstruction" or "synthesis" (figs. 5, 12 and 13 of the paper)
     model: str
-    quantity: str  # what was measured
-    values_mm: Array  # one distance per pose or point of a path [mm], shape (N,)
+    quantity: str  # description of what was measured
+    values_mm: Array  # distances [mm], one per pose or per point of a path, shape (N,)
 
     def row(self) -> dict[str, str | int | float]:
-        """Return the distances as one row of the table, keys `TABLE_COLUMNS`."""
+        """Return statistics of the distances as one row of the table, with the keys `TABLE_COLUMNS`."""
         v = self.values_mm
         figures = (len(v), v.mean(), np.median(v), np.percentile(v, 95), v.max()) if len(v) else (0, *[np.nan] * 4)
         count, *rest = figures
@@ -33,63 +33,64 @@ class Distances:
 
 @dataclass(frozen=True, eq=False)
 class CondylePath:
-    """The opening movement of one model at the condyles, anatomical frame."""
+    """Opening movement of one model at the condyles, in the anatomical frame."""
 
     model: str
-    opening_mm: Array  # vertical opening at the incisal point [mm], shape (K,)
+    opening_mm: Array  # vertical mouth openings at the incisal point [mm], shape (K,)
     points: Array  # centres of the left and right condyle [mm], shape (2, K, 3)
-    # outline of the left condyle at some openings, in the sagittal plane through its centre: segments (z, y) [mm], each
-    # of shape (S, 2, 2); empty without a mandible mesh
+    # Outlines of the left condyle at some mouth openings, in the sagittal plane through its centre: segments (z, y)
+    # [mm], each of shape (S, 2, 2); empty without a mandible mesh
     heads: tuple[Array, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterPath:
-    """The path of the left condyle when only one parameter of a model varies, anatomical frame."""
+    """Path of the left condyle when only one parameter of a model varies, in the anatomical frame."""
 
     model: str
-    parameter: int  # 0 opening, 1 laterotrusion, 2 protrusion
-    values_mm: Array  # values of the parameter [mm], shape (K,)
-    points: Array  # centre of the left condyle [mm], shape (K, 3)
+    parameter: int  # index of the varied parameter: 0 opening, 1 laterotrusion, 2 protrusion
+    values_mm: Array  # values of the varied parameter [mm], shape (K,)
+    points: Array  # centres of the left condyle [mm], shape (K, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """The captured part of the envelope, in the parameters d of the default model."""
+    """Captured part of the envelope of motion, in the parameters d of the default model."""
 
-    d: Array  # captured poses [mm], shape (N, 3)
+    d: Array  # parameters of the captured poses [mm], shape (N, 3)
     # boundary rings of the paper's bound in (d1, d2) and (d1, d3) [mm], each of shape (n, 2)
     outlines: tuple[tuple[Array, ...], tuple[Array, ...]]
-    slices_d1: Array  # openings [mm], shape (K,)
+    slices_d1: Array  # mouth openings d1 [mm], shape (K,)
     # lowest and highest valid d2 and d3 [mm] of the slice hull on the habitual path, shape (2, K, 2)
     slices: Array
     # points (d1, d2) and (d1, d3) [mm] inside the slice hull but far from all captured poses, each (G, 2)
     gaps: tuple[Array, Array]
-    sentences: tuple[str, ...]  # movements to record next
+    sentences: tuple[str, ...]  # descriptions of movements to record next
 
 
 @dataclass(frozen=True, eq=False)
 class Experiments:
-    """Results of all experiments."""
+    """Results of all experiments of the paper on one take."""
 
     actor: str
-    frames: int  # number of captured poses that were used
+    frames: int  # number of captured poses used in the experiments
     # centres of the left and right condyle in all captured poses, anatomical frame [mm], shape (2, N, 3)
     captured_condyles: Array
-    skull: Array  # outline of the skull beside the left condyle: segments (z, y) [mm], shape (S, 2, 2)
+    skull: Array  # outline of the skull near the left condyle: segments (z, y) [mm], shape (S, 2, 2)
     condyle_paths: tuple[CondylePath, ...]  # opening movements, one per model
-    distances: tuple[Distances, ...]  # everything measured, in the order of the table
-    coverage: Coverage  # captured part of the envelope
+    distances: tuple[Distances, ...]  # all sets of distances, in the order of the table
+    coverage: Coverage  # captured part of the envelope of motion
     # remarks: numbers of frames excluded by each model, models that could not be fitted, experiments not requested
     notes: tuple[str, ...]
-    parameter_paths: tuple[ParameterPath, ...] = ()  # paths of the linear and the default model, for each parameter
+    # Condyle paths of the linear and the default model, for each parameter.
+    parameter_paths: tuple[ParameterPath, ...] = ()
 
     def of(self, experiment: str) -> list[Distances]:
         """Return the sets of distances of one experiment."""
         return [found for found in self.distances if found.experiment == experiment]
 
     def table(self) -> list[dict[str, str | int | float]]:
-        """Return the table, one dictionary per row with the keys `TABLE_COLUMNS`."""
+        """Return the rows of the table as dictionaries with the keys `TABLE_COLUMNS`."""
         return [found.row() for found in self.distances]
 
 

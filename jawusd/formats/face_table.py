@@ -1,4 +1,4 @@
-"""Tables with a face per row: any columns, or points, in CSV of any locale (see `jawusd.base.tables`).
+"""Tables with one pose of a face per row (any columns, or points), in CSV of any locale (see `jawusd.base.tables`).
 
     frame,brow_left,jaw_open,...                 any columns in one unit, such as curves of a rig or weights
     time_s,chin_x,chin_y,chin_z,lip_x,...        points, if all columns come in threes NAME_x, NAME_y, NAME_z
@@ -26,14 +26,14 @@ _AXIS = re.compile(r"(.+)[_.:]([xyz])", re.IGNORECASE)
 
 @dataclass(frozen=True, eq=False)
 class FaceTable:
-    """Columns or points of a face.
+    """Columns or points of a face over time.
 
     Attributes:
         frames: frame numbers or times of the rows, increasing, shape (F,).
         X: columns (F, K), or points (F, N, 3) in the table's unit; NaN where hidden.
         names: names of the columns or points; may be empty.
-        fps: frames per second, 1 if `frames` are times [s], None if unknown.
-        unit: unit of length of points, None if unknown.
+        fps: frame rate [Hz]; 1 if `frames` are times [s], None if unknown.
+        unit: length unit of points, None if unknown.
     """
 
     frames: Array
@@ -47,7 +47,7 @@ def header_of(path: str | os.PathLike[str]) -> list[str]:
     """Return the cells of the first row of a text table, in lower case.
 
     Raises:
-        FormatError: not text, or empty.
+        FormatError: the file is not text, or empty.
     """
     path = Path(path)
     rows, _ = split_rows(read_text(path, _MAX_BYTES), path)
@@ -57,7 +57,7 @@ def header_of(path: str | os.PathLike[str]) -> list[str]:
 
 
 def is_face_table(header: list[str]) -> bool:
-    """Tell whether a first row, in lower case, is that of a face table."""
+    """Return whether a first row, in lower case, is the header of a face table."""
     return any(clock in header for clock in _CLOCKS)
 
 
@@ -65,8 +65,8 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
     """Read a face table.
 
     Raises:
-        FormatError: no or two columns `frame` or `time_s`, no other columns, a cell that is not a number, or rows that
-            do not increase.
+        FormatError: there is not exactly one column `frame` or `time_s`, there are no other columns, a cell is not a
+            number, or frames or times do not increase.
     """
     table = read_table(Path(path), _MAX_BYTES)
     lower = [name.lower() for name in table.header]
@@ -74,7 +74,7 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
     others = [k for k in range(len(lower)) if k not in clocks]
     if len({lower[k] for k in clocks}) != len(clocks) or not clocks or not others or not table.rows:
         raise FormatError(
-            f"has the columns {', '.join(table.header[:8])} and {len(table.rows)} rows; it must have one column frame "
+            f"has the columns {', '.join(table.header[:8])} and {len(table.rows)} rows; expected one column frame "
             "or time_s, other columns, and at least one row.",
             path=table.path,
         )
@@ -96,7 +96,7 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
 
 
 def _points_of(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of the points if the columns are x, y, z of points, otherwise an empty tuple."""
+    """Return the names of the points if the columns are x, y, z of points; otherwise return an empty tuple."""
     found = [_AXIS.fullmatch(name) for name in names]
     labels = [(match[1], match[2].lower()) for match in found if match]
     named = tuple(labels[k][0] for k in range(0, len(labels), 3))

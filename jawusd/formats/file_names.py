@@ -41,19 +41,19 @@ _GROUPS = {
 
 
 def is_pattern(path: Path) -> bool:
-    """Tell whether a path is a pattern of numbered files rather than one file."""
+    """Return whether a path is a pattern of numbered files instead of one file."""
     try:
         return any(sign in path.name for sign in "%#*?") and not path.is_file()
-    except (OSError, ValueError):  # the path is too long or has a null byte; the reader reports it
+    except (OSError, ValueError):  # the reader reports a path that is too long or has a null byte
         return False
 
 
 def numbered_files(pattern: Path) -> dict[int, Path]:
-    """Return the files of a pattern by number, increasing.
+    """Return the files of a pattern by number, in increasing order.
 
     Raises:
-        CaptureError: the pattern has no number or several, the folder is missing or has no such file, or two files
-            have the same number.
+        CaptureError: the pattern does not have exactly one number, the folder is missing or has no file of this
+            pattern, or two files have the same number.
     """
     name = pattern.name
     folder = pattern.parent
@@ -80,13 +80,15 @@ def numbered_files(pattern: Path) -> dict[int, Path]:
 
 
 def _matching(pattern: Path) -> re.Pattern[str]:
-    """Return a regular expression for the file names of a pattern; its group, if any, is the number."""
+    """Return a regular expression for the file names of a pattern; its group, if there is one, is the number."""
     name = pattern.name
     for sign, width in ((_PRINTF, lambda m: int(m[1] or 1)), (_HASHES, lambda m: len(m[0]))):
         places = list(sign.finditer(name))
         if len(places) > 1:
             raise CaptureError(
-                "the pattern has two numbers; one is allowed.", path=pattern, hint="Write the fixed number in digits."
+                "the pattern has two numbers; only one is allowed.",
+                path=pattern,
+                hint="Write the fixed number in digits.",
             )
         if places:
             start, end = places[0].span()
@@ -98,7 +100,7 @@ def _matching(pattern: Path) -> re.Pattern[str]:
 
 
 def groups(names: Iterable[str]) -> Mapping[str, list[int]]:
-    """Return the numbers of files by their name pattern (`%06d`); names without digits are ignored."""
+    """Return the numbers of files by name pattern (with `%06d`); names without digits are ignored."""
     out: dict[str, list[int]] = defaultdict(list)
     widths: dict[str, set[int]] = defaultdict(set)
     for name in names:
@@ -117,7 +119,7 @@ def groups(names: Iterable[str]) -> Mapping[str, list[int]]:
 
 
 def gaps(numbers: Iterable[int]) -> str:
-    """Return the missing numbers between the first and the last, such as "1007, 1010 to 1012", "" if none."""
+    """Return the numbers missing between the first and the last, such as "1007, 1010 to 1012"; "" if none."""
     there = sorted(numbers)
     out = []
     for before, after in zip(there, there[1:]):
@@ -140,7 +142,7 @@ def _offer(folder: Path) -> str:
 
 
 def wrong_kind(key: str, path: PurePath) -> str | None:
-    """Return why a key in capture.toml does not accept the type of a file, and what it accepts; None if it does.
+    """Return why a key in capture.toml does not accept the type of a file, and accepted types; None if it does.
 
     Args:
         key: the key, such as `upper_teeth`, `video`, `calibration`.

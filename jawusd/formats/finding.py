@@ -1,4 +1,4 @@
-"""Findings of checks and estimates: one class for the terminal, JSON, tracks and reports."""
+"""Findings of checks and estimates, for the terminal, JSON, tracks and reports."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ Severity = Literal["error", "warning", "note"]
 
 @dataclass(frozen=True)
 class Finding:
-    """A problem or remark: place, measured value, limit, and what to do.
+    """Problem or remark: place, measured value, limit, and what to do.
 
     An error makes the result impossible or useless; a warning may make it wrong; a note explains what was done.
     """
 
     kind: str  # stable identifier for programs, such as "scans_apart"
     severity: Severity
-    message: str  # one sentence, without the place: what was found and what is allowed, with units
-    value: float | None = None  # the measured value, in the unit given in the message
-    limit: float | None = None  # the limit of the value, in the same unit
+    message: str  # one sentence without the place: what was found and what is allowed, with units
+    value: float | None = None  # Measured value, in the unit stated in the message.
+    limit: float | None = None  # Limit of the value, in the same unit.
     path: str | None = None
     camera: str | None = None
     frame: int | None = None
-    hint: str | None = None  # what to do about it
+    hint: str | None = None  # what the user can do about the problem
 
     def line(self) -> str:
         """Return the finding as one line of text."""
@@ -45,7 +45,7 @@ class Finding:
 
     @classmethod
     def from_json(cls, found: Mapping[str, str | float | int]) -> Finding:
-        """Return the finding from the output of `as_json`; unknown fields are ignored, missing ones get defaults."""
+        """Return the finding from the output of `as_json`; unknown fields are ignored, missing fields get defaults."""
         severities: dict[object, Severity] = {"error": "error", "note": "note"}
         texts = {name: str(found[name]) for name in ("path", "camera", "hint") if name in found}
         numbers = {name: float(found[name]) for name in ("value", "limit") if name in found}

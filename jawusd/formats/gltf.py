@@ -1,7 +1,7 @@
-"""Binary glTF 2.0 (.glb) for the web: meshes under named nodes, and their animation.
+"""Write binary glTF 2.0 (.glb) for the web: meshes under named nodes, and their animation.
 
-Khronos Group, "glTF 2.0 Specification", 2021. Lengths are metres in the file and mm here, y is up; nodes are animated
-by translation and quaternion, which viewers interpolate linearly and by slerp.
+Lengths are in metres in the file and in mm here; y is up. Nodes are animated by translations and quaternions, which
+viewers interpolate linearly and by slerp. Reference: Khronos Group, "glTF 2.0 Specification", 2021.
 """
 
 from __future__ import annotations
@@ -20,42 +20,42 @@ from jawusd.base.arrays import Array
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.geometry.quaternion import continuous_wxyz
 
-_MM = 1e-3  # a millimetre in metres
+_MM = 1e-3  # one millimetre in metres
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _Values = NDArray[np.float32] | NDArray[np.uint16] | NDArray[np.uint32]
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
-_VERTICES, _INDICES = 34962, 34963  # glTF targets of buffer views
+_VERTICES, _INDICES = 34962, 34963  # glTF's codes for the targets of buffer views
 
 
 @dataclass(frozen=True)
 class Material:
-    """A material; its colour is multiplied by vertex colours, if there are any."""
+    """Material whose colour is multiplied by vertex colours, if there are any."""
 
-    color: tuple[float, float, float]  # linear red, green, blue, 0 .. 1
+    color: tuple[float, float, float]  # linear red, green and blue, 0 to 1
     roughness: float
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A mesh whose faces are grouped by material."""
+    """Mesh whose faces are grouped by material."""
 
     name: str
-    vertices: Array  # positions [mm], shape (V, 3)
-    normals: Array  # unit vectors, shape (V, 3)
-    parts: Mapping[str, NDArray[np.int32]]  # faces (F, 3) by the names of their materials
-    colors: Array | None = None  # linear RGB per vertex, multiplied by the material's, shape (V, 3)
-    uv: Array | None = None  # texture coordinates, u to the right, v upwards, shape (V, 2)
+    vertices: Array  # vertex positions [mm], shape (V, 3)
+    normals: Array  # unit normals of the vertices, shape (V, 3)
+    parts: Mapping[str, NDArray[np.int32]]  # faces (F, 3) by name of their material
+    colors: Array | None = None  # linear RGB of the vertices, multiplied by the material's colour, shape (V, 3)
+    uv: Array | None = None  # texture coordinates of the vertices, u to the right, v upwards, shape (V, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """Surfaces that move together."""
+    """Node: surfaces that move together."""
 
     name: str
-    pose: Array  # pose at rest, shape (4, 4) [mm]
+    pose: Array  # pose at rest [mm], shape (4, 4)
     surfaces: Sequence[Surface]
-    times_s: Array = field(default_factory=lambda: np.empty(0))  # key times, >= 0, increasing, shape (n,)
-    poses: Array = field(default_factory=lambda: np.empty((0, 4, 4)))  # poses at these times, shape (n, 4, 4) [mm]
+    times_s: Array = field(default_factory=lambda: np.empty(0))  # increasing key times, >= 0, shape (n,)
+    poses: Array = field(default_factory=lambda: np.empty((0, 4, 4)))  # poses at the key times [mm], shape (n, 4, 4)
 
 
 def save_glb(
@@ -125,7 +125,7 @@ def frame_rate(path: str | os.PathLike[str]) -> float | None:
 
 
 class _Builder:
-    """Builder of the binary buffer, its views and accessors."""
+    """Builder of the binary buffer, buffer views and accessors."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -159,7 +159,7 @@ class _Builder:
             "POSITION": self.add(np.asarray(surface.vertices * _MM, "<f4"), target=_VERTICES, limits=True),
             "NORMAL": self.add(np.asarray(surface.normals, "<f4"), target=_VERTICES),
         }
-        if surface.uv is not None:  # v points down in the file
+        if surface.uv is not None:  # glTF's v coordinate points down
             attributes["TEXCOORD_0"] = self.add(np.asarray(surface.uv * [1, -1] + [0, 1], "<f4"), target=_VERTICES)
         if surface.colors is not None:
             opaque = np.column_stack([np.clip(surface.colors, 0, 1), np.ones(len(surface.colors))])
@@ -176,7 +176,7 @@ class _Builder:
 
 
 def _motion(node: Node) -> list[tuple[str, NDArray[np.float32], NDArray[np.float32]]]:
-    """Return targets, times [s] and values of a node's channels."""
+    """Return the target, times [s] and values of each animation channel of a node."""
     if not len(node.times_s):
         return []
     times, first = np.unique(np.asarray(node.times_s, "<f4"), return_index=True)
@@ -193,7 +193,8 @@ def _placed(pose: Array) -> dict[str, list[float]]:
 
 def _look(name: str, material: Material) -> dict[str, object]:
     surface = {"baseColorFactor": [*material.color, 1.0], "metallicFactor": 0.0, "roughnessFactor": material.roughness}
-    return {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}  # scans are open surfaces
+    # Both sides are drawn, since scans are open surfaces.
+    return {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
 
 
 def _container(document: Mapping[str, object], data: bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""Animation keys: `keys.json`, parameters d at chosen frames."""
+"""Animation keys in `keys.json`: jaw parameters d at chosen frames."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from jawusd.base.tables import read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_model
 
-#: Maximum number of frames, an hour at 60 frames per second, since every frame is baked; maximum frame number.
+#: Maximum number of frames, all of which are baked (an hour at 60 frames per second), and maximum frame number.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
 _MAX_BYTES = 64 << 20
-#: Maximum magnitude of a parameter [mm]: larger values overflow when projected into the bound.
+#: Maximum magnitude of a jaw parameter [mm]; larger values overflow when they are projected into the bound.
 FARTHEST_MM = 1e6
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Parameter = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST_MM, le=FARTHEST_MM)]
 
 
 class Key(BaseModel):
-    """The parameters d [mm] at one frame."""
+    """Animation key: the jaw parameters d [mm] at one frame."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -37,7 +37,7 @@ class Key(BaseModel):
 
 
 class Keys(BaseModel):
-    """An animation of strictly increasing frames at `fps` frames per second."""
+    """Animation with keys at strictly increasing frames, at `fps` frames per second."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -50,14 +50,14 @@ class Keys(BaseModel):
         frames = [key.frame for key in self.keys]
         if frames[-1] - frames[0] > MOST_FRAMES or max(abs(frames[0]), abs(frames[-1])) > FARTHEST_FRAME:
             found = f"frames {frames[0]:g} to {frames[-1]:g}"
-            raise ValueError(f"{found}: they must span at most {MOST_FRAMES} frames within +-{FARTHEST_FRAME:g}")
+            raise ValueError(f"{found}; they must span at most {MOST_FRAMES} frames within +-{FARTHEST_FRAME:g}")
         for before, after in zip(frames, frames[1:], strict=False):
             if after <= before:
                 raise ValueError(f"frames must increase, but frame {after:g} follows {before:g}")
         return self
 
     def arrays(self) -> tuple[Array, Array]:
-        """Return the key frames (K,) and their parameters d [mm] (K, 3)."""
+        """Return the key frames (K,) and their jaw parameters d [mm] (K, 3)."""
         return np.array([key.frame for key in self.keys]), np.array([key.d for key in self.keys])
 
 
@@ -65,7 +65,7 @@ def load_keys(path: str | os.PathLike[str]) -> Keys:
     """Read animation keys.
 
     Raises:
-        FormatError: not such a file; the message names the entry.
+        FormatError: the file does not contain animation keys; the message names the wrong entry.
     """
     path = Path(path)
     return parse_model(read_text(path, _MAX_BYTES), path, Keys)

@@ -5,8 +5,8 @@
                    "condyle_left": [...], "condyle_right": [...]},
      "T_anatomical_skull": [[...], [...], [...], [...]]}
 
-The five points are on the mandible, in one frame with the teeth in occlusion. The transform to the anatomical frame is
-optional.
+The five points are on the mandible, in one coordinate frame, with the teeth in occlusion. The transform to the
+anatomical frame is optional.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ _MAX_BYTES = 1 << 20
 class LandmarkFile:
     """Content of a landmarks file."""
 
-    landmarks: Array  # positions in the order of `geometry.LANDMARKS` [mm], shape (5, 3)
-    T_anatomical_skull: Array | None  # the file's frame to the anatomical frame, shape (4, 4), or None
+    landmarks: Array  # positions [mm] in the order of `geometry.LANDMARKS`, shape (5, 3)
+    # Transform from the file's coordinates to the anatomical frame, shape (4, 4), or None.
+    T_anatomical_skull: Array | None
 
 
 def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
     """Read landmarks.
 
     Raises:
-        FormatError: not such a file; the message names the key.
-        VersionError: written for a newer version.
-        UnitsError: lengths not in mm.
+        FormatError: the file is not a landmarks file; the message names the wrong key.
+        VersionError: the file was written for a newer version.
+        UnitsError: lengths are not in mm.
     """
     path = Path(path)
     data = parse_json(read_text(path, _MAX_BYTES), path)
@@ -74,5 +75,7 @@ def _numbers(value: object, shape: tuple[int, ...], name: str, path: Path) -> Ar
     except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{name} is not an array of numbers.", path=path) from error
     if array.shape != shape or not np.isfinite(array).all():
-        raise FormatError(f"{name} must be finite numbers of shape {shape}, found shape {array.shape}.", path=path)
+        raise FormatError(
+            f"{name} must consist of finite numbers, with shape {shape}; found shape {array.shape}.", path=path
+        )
     return array

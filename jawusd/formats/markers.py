@@ -1,4 +1,4 @@
-"""Tables of marker positions from optical tracking systems.
+"""Read tables of marker positions from optical tracking systems.
 
 Supported tables have one row per frame with x, y, z of every marker, in any locale (see `jawusd.base.tables`); frames
 are numbered from 0:
@@ -47,7 +47,7 @@ _NOT_READ = {
 _LENGTHS = ("mm", "cm", "m")
 _MAX_BYTES = 1 << 28
 _MOST_FRAMES = 10_000_000
-_OUT_OF_SIGHT = 1e20  # coordinates of at least this magnitude indicate a hidden marker
+_OUT_OF_SIGHT = 1e20  # magnitude of coordinates from which a marker is considered hidden
 _INTERPOLATIONS = ("step", "linear", "parabolic", "cubic", "cubicstep", "quadraticstep", "sphericallinear")
 _LEADING_ZERO = re.compile(r"[+-]?0\d+")
 
@@ -56,13 +56,13 @@ _Rows = list[tuple[int, list[str]]]
 
 @dataclass(frozen=True, eq=False)
 class MarkerTable:
-    """Marker positions of a take.
+    """Marker positions over a take.
 
     Attributes:
         points: positions in the file's unit, shape (F, N, 3), NaN where a marker is hidden.
         names: marker names, empty if the file has none.
-        unit: unit of the positions, "mm", "cm" or "m"; None if the file has none.
-        fps: frames per second, None if the file has none.
+        unit: unit of the positions, "mm", "cm" or "m"; None if the file states none.
+        fps: frame rate [Hz]; None if the file states none.
     """
 
     points: Array
@@ -76,7 +76,7 @@ def mark_hidden(points: Array, zeros: bool = True) -> Array:
 
     Args:
         points: positions as read from the file.
-        zeros: treat a marker at exactly 0 0 0 as hidden.
+        zeros: whether a marker at exactly 0 0 0 counts as hidden.
     """
     with np.errstate(invalid="ignore"):
         seen: Mask = np.all(np.abs(points) < _OUT_OF_SIGHT, axis=-1)
@@ -93,8 +93,8 @@ def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
             concatenated in numerical order.
 
     Raises:
-        FormatError: not such a table, a value that is not a number, tables of different lengths, or a truncated file.
-        CaptureError: a pattern without files.
+        FormatError: not a marker table, a value that is not a number, tables of different lengths, or a truncated file.
+        CaptureError: no file matches the pattern.
     """
     path = Path(path)
     if not is_pattern(path):
@@ -118,7 +118,7 @@ def _read_table(path: Path) -> MarkerTable:
     rows, separator = split_rows(read_text(path, _MAX_BYTES), path, blank_rows=True)
     if not rows:
         raise FormatError("has no frames.", path=path)
-    if max(len(row) for _, row in rows) == 1:  # columns are separated only by spaces
+    if max(len(row) for _, row in rows) == 1:  # a table whose columns are separated only by spaces
         rows = [(line, row[0].split()) for line, row in rows]
     keys = [row[0].strip().lower() for _, row in rows]
     if "marker_names" in keys or "data_included" in keys:
@@ -135,8 +135,8 @@ def _read_table(path: Path) -> MarkerTable:
 
 
 def _plain(rows: _Rows, separator: str, path: Path) -> Array:
-    """Return the positions in plain numbers or an ArtiSynth probe, shape (F, N, 3)."""
-    if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # columns are also separated by spaces
+    """Return the marker positions in a table of plain numbers or an ArtiSynth probe, shape (F, N, 3)."""
+    if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # columns may also be separated by spaces
         rows = [(line, separator.join(row).split()) for line, row in rows]
     probe = len(rows) > 1 and rows[1][1][0].strip().lower() in _INTERPOLATIONS
     if probe:
@@ -156,7 +156,7 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
     for line, row in rows:
         if len(row) != width:
             raise FormatError(f"line {line} has {len(row)} numbers; expected {width}.", path=path)
-    while width % 3 and not any(row[width - 1].strip() for _, row in rows):  # blank columns at the end
+    while width % 3 and not any(row[width - 1].strip() for _, row in rows):  # remove blank columns at the end
         width -= 1
     if width % 3:
         raise FormatError(f"has {width} numbers per frame; expected three per marker.", path=path, hint=READ)
@@ -164,7 +164,7 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
 
 
 def _positions(rows: _Rows, first: int, width: int, path: Path, zeros: bool = True) -> Array:
-    """Return cells as positions (F, N, 3), NaN where a marker is hidden; trailing blanks may be missing."""
+    """Convert cells to positions (F, N, 3), NaN where a marker is hidden; trailing blank cells may be missing."""
     if not rows or not width:
         raise FormatError("has no frames or no markers.", path=path)
     cells = []
@@ -182,7 +182,7 @@ def _positions(rows: _Rows, first: int, width: int, path: Path, zeros: bool = Tr
 
 
 def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
-    """Read the 3D data of a TSV of Qualisys Track Manager."""
+    """Read 3D data in TSV of Qualisys Track Manager."""
     keys = {row[0].strip().upper(): [cell.strip() for cell in row[1:] if cell.strip()] for _, row in rows[:40]}
     included = "".join(keys.get("DATA_INCLUDED", ["3D"])[:1])
     if included != "3D" or "MARKER_NAMES" not in keys:
@@ -194,7 +194,7 @@ def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
     data = [(line, row) for line, row in rows if _is_number_or_blank(row[0])]
     header = next((row for _, row in rows if row[0].strip().lower() == "frame"), [])
     first = [cell.strip().lower() in ("frame", "time") for cell in header[:2]].count(True)
-    if not header:  # extra columns at the beginning are frame and time
+    if not header:  # skip extra columns at the beginning, which are frame and time
         filled = max((k + 1 for _, row in data for k, cell in enumerate(row) if cell.strip()), default=0)
         first = max(filled - 3 * count, 0)
     points = _positions(data, first, 3 * count, path)
@@ -204,7 +204,7 @@ def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
 
 
 def _read_trc(rows: _Rows, at: int, path: Path) -> MarkerTable:
-    """Read a TRC; `at` is the row that names the markers."""
+    """Read a TRC file; `at` is the index of the row that names the markers."""
     keys: dict[str, list[str]] = {}
     for (_, above), (_, below) in zip(rows[:at], rows[1:at]):
         if above[0].strip().lower() == "datarate":
@@ -296,7 +296,7 @@ def _rate(cells: list[str] | None, key: str, path: Path) -> float | None:
 
 
 def length_unit(unit: str, path: Path) -> str | None:
-    """Return the unit in lower case, None if it is empty.
+    """Return a length unit in lower case, or None if it is empty.
 
     Raises:
         UnitsError: the unit is not supported.

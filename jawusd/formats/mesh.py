@@ -1,4 +1,4 @@
-"""The triangle mesh used by all layers, its crown faces, and the colours of contacts between teeth."""
+"""Triangle mesh used by all layers, its crown faces, and the colours of contacts between teeth."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from jawusd.base.arrays import Array, Mask
 
 GUM, TOOTH, BOUNDARY, BASE = 0, 1, 2, 3
 
-# Minimum difference of red or green from the other channels (of 255) in a painted label: pure red has 255, gum in
+# Minimum difference of red or green from the other channels (of 255) in a painted label. Pure red has 255; gum in
 # photographic textures, such as (200, 110, 110), has less than 100.
 _PAINT_CONTRAST = 100
-_FEWEST_PAINTED = 0.01  # minimum fraction of red or green vertices in a painted scan
+_FEWEST_PAINTED = 0.01  # minimum fraction of red or green vertices for a scan to count as painted
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh."""
+    """Triangle mesh, optionally with colours, labels and texture coordinates."""
 
-    vertices: Array  # positions [mm], shape (V, 3), float64
+    vertices: Array  # vertex positions [mm], shape (V, 3), float64
     faces: NDArray[np.int32]  # vertex indices, counter-clockwise seen from outside, shape (F, 3), int32
-    colors: NDArray[np.uint8] | None = None  # red, green, blue per vertex, shape (V, 3), uint8, or None
-    # labels of a teeth scan that are not painted: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,), uint8
+    colors: NDArray[np.uint8] | None = None  # red, green and blue of each vertex, shape (V, 3), uint8, or None
+    # Labels of a teeth scan that are not painted: GUM, TOOTH, BOUNDARY or BASE for each vertex, shape (V,), uint8.
     labels: NDArray[np.uint8] | None = None
     # texture coordinates of face corners, u to the right, v upwards, shape (F, 3, 2), float64, or None
     uv: Array | None = None
@@ -50,9 +50,9 @@ class Mesh:
 def without_loose(
     vertices: Array, faces: NDArray[np.int64] | NDArray[np.int32], colors: NDArray[np.uint8] | None
 ) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Return vertices (V, 3) and colours with the unused vertices moved onto used ones, evenly distributed.
+    """Return vertices (V, 3) and colours after moving unused vertices onto used ones, evenly distributed.
 
-    Indices stay valid for picks, and unused vertices do not affect sizes, centres and labels.
+    Indices of picked vertices stay valid, and unused vertices do not affect sizes, centres and labels.
     """
     used = np.zeros(len(vertices), bool)
     used[faces] = True
@@ -65,7 +65,7 @@ def without_loose(
 
 
 def painted_labels(mesh: Mesh) -> NDArray[np.uint8] | None:
-    """Return GUM, TOOTH or BOUNDARY per vertex of a painted teeth scan, shape (V,); None if it is not painted.
+    """Return GUM, TOOTH or BOUNDARY for each vertex of a painted teeth scan, shape (V,); None if it is not painted.
 
     Red vertices are teeth, green ones are teeth at a border of interest (the incisal edge), others are gum. A scan with
     very few red or green vertices counts as not painted.
@@ -80,16 +80,16 @@ def painted_labels(mesh: Mesh) -> NDArray[np.uint8] | None:
 
 
 def natural_colors(mesh: Mesh) -> NDArray[np.uint8] | None:
-    """Return the natural colours of a scan, shape (V, 3); None if painted, uniform or missing."""
+    """Return the natural vertex colours of a scan, shape (V, 3); None if they are painted, uniform or missing."""
     if mesh.colors is None or painted_labels(mesh) is not None or (mesh.colors == mesh.colors[:1]).all():
         return None
     return mesh.colors
 
 
 def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
-    """Return GUM, TOOTH or BOUNDARY per vertex of a teeth scan, shape (V,); tooth labels are > 0.
+    """Return GUM, TOOTH or BOUNDARY for each vertex of a teeth scan, shape (V,); tooth labels are > 0.
 
-    Uses the mesh's labels, with the base as gum, or painted labels; without either, every vertex is TOOTH.
+    The labels are those of the mesh, with the base as gum, or painted ones; without labels, every vertex is TOOTH.
     """
     if mesh.labels is not None:
         return np.where(mesh.labels == BASE, GUM, mesh.labels).astype(np.uint8)
@@ -103,11 +103,11 @@ def crown_face_mask(mesh: Mesh) -> Mask:
 
 
 class Mark(NamedTuple):
-    """A colour in contact images."""
+    """Colour in contact images, for a range of distances."""
 
-    color: tuple[int, int, int]  # red, green, blue, 0 to 255
+    color: tuple[int, int, int]  # red, green and blue, 0 to 255
     meaning: str
-    apart_mm: float  # maximum distance with this colour; negative: penetration deeper than in occlusion
+    apart_mm: float  # maximum distance with this colour; negative for penetration deeper than in occlusion
 
 
 DEEP = Mark((120, 40, 200), "deeper than in occlusion", -0.15)

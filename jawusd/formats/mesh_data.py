@@ -1,4 +1,4 @@
-"""Shared by the mesh readers: raw mesh data, size limits, triangulation of polygons, colours as bytes."""
+"""Common parts of the mesh readers: raw mesh data, size limits, triangulation of polygons, colours as bytes."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ Indices = NDArray[np.int64]
 
 MOST_BYTES = 4 << 30
 MOST_TRIANGLES, MOST_VERTICES = 10_000_000, 30_000_000
-NO_COLOUR = 128  # gray for vertices without a colour
+NO_COLOUR = 128  # gray, the colour of vertices without a colour
 
 COPY_AGAIN = "Copy the file again from its source, or export it again."
 
 
 class MeshData(NamedTuple):
-    """A mesh as read from a file."""
+    """Mesh as read from a file."""
 
-    vertices: Array  # positions, shape (V, 3)
-    faces: Indices  # triangles, shape (F, 3); indices may lie outside the vertices
-    colors: NDArray[np.uint8] | None = None  # red, green, blue per vertex, shape (V, 3)
-    uv: Array | None = None  # texture coordinates of the corners, shape (F, 3, 2)
+    vertices: Array  # vertex positions, shape (V, 3)
+    faces: Indices  # vertex indices of triangles, shape (F, 3); they may exceed the number of vertices
+    colors: NDArray[np.uint8] | None = None  # red, green and blue of each vertex, shape (V, 3)
+    uv: Array | None = None  # texture coordinates of the triangle corners, shape (F, 3, 2)
 
 
 def read_mesh_bytes(path: Path) -> bytes:
     """Return the content of a mesh file.
 
     Raises:
-        CaptureError: it is larger than MOST_BYTES.
-        OSError: it cannot be read.
+        CaptureError: the file is larger than MOST_BYTES.
+        OSError: the file cannot be read.
     """
     size = path.stat().st_size
     if size > MOST_BYTES:
@@ -48,7 +48,7 @@ def check_count(path: Path, count: int, what: str) -> None:
     """Check the number of "vertices", "triangles" or "faces" of a file before reading them.
 
     Raises:
-        CaptureError: too many.
+        CaptureError: the number is too large.
     """
     most = MOST_VERTICES if what == "vertices" else MOST_TRIANGLES
     if count > most:
@@ -61,10 +61,10 @@ def cut_off(path: Path, found: int, said: int, what: str) -> CaptureError:
 
 
 def byte_colors(values: Array) -> NDArray[np.uint8] | None:
-    """Return colours (n, 3) of 0 to 1, 0 to 255 or 0 to 65535 as bytes; NaN becomes gray; None for negative values."""
+    """Convert colours (n, 3) of 0 to 1, 0 to 255 or 0 to 65535 to bytes, NaN to gray; None for negative values."""
     top = np.nanmax(values, initial=0.0)
     if np.nanmin(values, initial=0.0) < 0 or top > 65535:
-        return None  # these are not colours but, for example, normals
+        return None  # negative values are not colours but, for example, normals
     scale = 255.0 if top <= 1 else 1.0 if top <= 255 else 1 / 257
     return np.where(np.isfinite(values), np.round(values * scale), NO_COLOUR).astype(np.uint8)
 
@@ -81,7 +81,7 @@ def cut_polygons(vertices: Array, counts: Indices, corners: Indices) -> tuple[In
         corners: concatenated vertex indices of all polygons, shape (C,).
 
     Returns:
-        For every triangle, in polygon order: its three positions in `corners` (F, 3), and its vertices (F, 3).
+        The positions (F, 3) of each triangle's corners in `corners`, and its vertices (F, 3), in polygon order.
     """
     starts = np.cumsum(counts) - counts
     triangles, owners = [], []
@@ -103,7 +103,7 @@ def cut_polygons(vertices: Array, counts: Indices, corners: Indices) -> tuple[In
 def _fan_starts(vertices: Array, polygons: Indices) -> Indices:
     """Return the corner order of each polygon (m, n), rotated to start at a valid fan apex, shape (m, n)."""
     m, n = polygons.shape
-    turns = (np.arange(n)[:, None] + np.arange(n)) % n  # row k: all corners, beginning with corner k
+    turns = (np.arange(n)[:, None] + np.arange(n)) % n  # row k has all corners, beginning with corner k
     chosen = np.zeros(m, np.int64)
     points = vertices[np.clip(polygons, 0, len(vertices) - 1)]
     open_ones = np.ones(m, bool)

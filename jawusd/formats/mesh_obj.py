@@ -1,4 +1,4 @@
-"""Wavefront OBJ: vertices, texture coordinates and faces ("Object Files (.obj)", Alias|Wavefront, 1995).
+"""Read Wavefront OBJ: vertices, texture coordinates and faces ("Object Files (.obj)", Alias|Wavefront, 1995).
 
 Negative indices count backwards from the last vertex before the face. Vertices may have a colour after their
 coordinates, 0 to 1 (MeshLab, Blender) or 0 to 255. Materials, normals, groups, lines and curves are ignored.
@@ -27,9 +27,10 @@ from jawusd.formats.mesh_data import (
 
 _MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
-_COUNTED = re.compile(r"^#\s*Faces:\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE)  # written by MeshLab above the faces
-# Minimum fraction of unused vertices in a truncated file, whose last line also lacks a line break; OBJ does not declare
-# counts.
+# Comment with the face count that MeshLab writes above the faces.
+_COUNTED = re.compile(r"^#\s*Faces:\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE)
+# Minimum fraction of unused vertices for a file without a final line break to count as truncated; OBJ files do not
+# declare the number of faces.
 _LEAST_LOOSE = 0.1
 
 
@@ -37,7 +38,7 @@ def read_obj(path: Path) -> MeshData:
     """Read an OBJ file; vertices and faces keep the file's order.
 
     Raises:
-        CaptureError: it is truncated, or a number or an index is invalid.
+        CaptureError: the file is truncated, or a number or an index is invalid.
     """
     data = read_mesh_bytes(path)
     text = data.decode(_MARKS.get(data[:2], "utf-8-sig"), errors="replace")
@@ -70,7 +71,7 @@ def read_obj(path: Path) -> MeshData:
 
 
 def _points(path: Path, rows: list[list[str]]) -> tuple[Array, np.typing.NDArray[np.uint8] | None]:
-    """Return vertices (V, 3) and their colours, if any; vertices without a colour are gray."""
+    """Return vertices (V, 3) and, if there are any, vertex colours; vertices without a colour are gray."""
     vertices = _numbers(path, [row[:3] for row in rows], 3)
     coloured = [k for k, row in enumerate(rows) if len(row) >= 6]
     if not coloured:
@@ -96,7 +97,7 @@ def _numbers(path: Path, rows: list[list[str]], columns: int) -> Array:
 def _indices(
     path: Path, corners: list[str], counts: list[int], relative: list[tuple[int, int, int]]
 ) -> tuple[Indices, Indices | None]:
-    """Return the vertex and, if all corners have one, the texture index of every corner (C,), from 0."""
+    """Return the vertex index and, if all corners have one, the texture index of each corner (C,), from 0."""
     texture = None
     try:
         if any("/" in corner for corner in corners):
@@ -134,7 +135,7 @@ def _uv(path: Path, rows: list[list[str]], texture: Indices | None, placed: Indi
 
 
 def _check_whole(path: Path, text: str, polygons: int, vertices: Array, faces: Indices) -> None:
-    """Raise an error if a file is truncated within its faces."""
+    """Raise an error if a file is truncated within the faces."""
     declared = _COUNTED.findall(text)
     if len(declared) == 1 and int(declared[0]) > polygons:
         raise cut_off(path, polygons, int(declared[0]), "faces")

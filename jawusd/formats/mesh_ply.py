@@ -1,7 +1,7 @@
-"""PLY, text and binary of both byte orders (G. Turk, "The PLY Polygon File Format", Stanford, 1994).
+"""Read PLY, as text or binary of both byte orders (G. Turk, "The PLY Polygon File Format", Stanford, 1994).
 
-Supports vertices with colours and texture coordinates, polygons with texture coordinates per corner (`texcoord`,
-MeshLab), and triangle strips separated by -1. Other elements, and data after the last, are ignored.
+The reader supports vertices with colours and texture coordinates, polygons with texture coordinates (`texcoord`,
+MeshLab), and triangle strips separated by -1. Other elements, and data after the last element, are ignored.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ _CORNERS = ("vertex_indices", "vertex_index")
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _PLACES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _END = re.compile(rb"(?:^|(?<=[\r\n]))end_header[ \t]*(\r\n|\n|\r)")
-_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}  # as in struct
+# Byte orders as in the module struct.
+_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
 _LETTERS |= {"f2": "e", "f4": "f", "f8": "d"}
 _PLURAL = {"vertex": "vertices", "tristrips": "triangle strips"}
 
@@ -42,8 +43,8 @@ _PLURAL = {"vertex": "vertices", "tristrips": "triangle strips"}
 @dataclass(frozen=True)
 class _Property:
     name: str
-    value: str  # numpy dtype from the header
-    length: str = ""  # numpy dtype of a list's length, "" for scalars
+    value: str  # numpy dtype of the values, from the header
+    length: str = ""  # numpy dtype of the length of a list, "" for scalars
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,11 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Table:
-    """Values of an element: a column (n,) per scalar property; lengths (n,) and concatenated values per list."""
+    """Values of an element: for each scalar property a column (n,); for each list lengths (n,) and joined values."""
 
     columns: dict[str, Array]
     lists: dict[str, tuple[Indices, Array]]
-    kinds: dict[str, str]  # numpy dtypes from the header
+    kinds: dict[str, str]  # numpy dtypes of the values, from the header
 
     def joined(self, choices: tuple[tuple[str, ...], ...]) -> tuple[Array | None, str]:
         """Return the first complete set of columns, shape (n, k), and its dtype; None if there is none."""
@@ -73,7 +74,7 @@ def read_ply(path: Path) -> MeshData:
     """Read a PLY file; vertices and faces keep the file's order.
 
     Raises:
-        CaptureError: it is truncated, or header and data do not match.
+        CaptureError: the file is truncated, or header and data do not match.
     """
     data = read_mesh_bytes(path)
     elements, at, order = _header(path, data)
@@ -125,7 +126,7 @@ def _mesh(path: Path, tables: dict[str, _Table]) -> MeshData:
 
 
 def _strip_triangles(values: Indices) -> Indices:
-    """Return the triangles of strips, (F, 3): every second one is flipped, degenerate ones are dropped."""
+    """Convert strips to triangles (F, 3): every second one is flipped, and degenerate ones are dropped."""
     place = np.arange(len(values))
     corners = np.stack([values[:-2], values[1:-1], values[2:]], axis=1) if len(values) > 2 else np.zeros((0, 3), int)
     begin = np.maximum.accumulate(np.where(values < 0, place + 1, 0))
@@ -136,7 +137,7 @@ def _strip_triangles(values: Indices) -> Indices:
 
 
 def _header(path: Path, data: bytes) -> tuple[list[_Element], int, str]:
-    """Return the elements, the offset of their data, and the byte order; "" for text."""
+    """Return the elements, the offset of their data, and the byte order ("" for text)."""
     found = _END.search(data)
     if data.removeprefix(b"\xef\xbb\xbf")[:3].lower() != b"ply" or found is None:
         raise CaptureError('is not a PLY file: "ply" or "end_header" is missing.', path=path, hint="Export it again.")
@@ -170,7 +171,7 @@ def _plural(element: _Element) -> str:
 
 
 def _numbers(text: bytes) -> tuple[Array, str | None]:
-    """Return the numbers of a text up to the first invalid word, and that word unless it ends the text."""
+    """Return the numbers of a text up to the first invalid word, and this word unless it ends the text."""
     words = text.split()
     try:
         return np.fromiter(map(float, words), np.float64, len(words)), None
@@ -199,12 +200,12 @@ class _Reader:
 
     def __init__(self, path: Path, element: _Element, order: str) -> None:
         self._path, self._element = path, element
-        # numbers of text files are read as doubles
+        # numbers in text files are read as doubles
         self._values = [(order + one.value if order else "<f8") for one in element.properties]
         self._lengths = [one.length and (order + one.length if order else "<f8") for one in element.properties]
 
     def read(self, data: bytes, at: int) -> tuple[_Table, int]:
-        """Return the table at an offset, and the offset of the next one."""
+        """Return the table at an offset, and the offset of the next table."""
         rows, listed = self._element.rows, sum(map(bool, self._lengths))
         if not rows or not self._values:
             return self._table([], np.zeros((0, listed), np.int64)), at
@@ -230,14 +231,14 @@ class _Reader:
         return cut_off(self._path, whole, self._element.rows, _plural(self._element))
 
     def _row_type(self, counts: list[int]) -> np.dtype[np.void]:
-        """Return the dtype of rows whose lists have these lengths: fields "p0", "p1", ..., lengths "n0", ..."""
+        """Return the dtype of rows with given list lengths: fields "p0", "p1", ..., list lengths "n0", "n1", ..."""
         parts: list[tuple[str, str, tuple[int, ...]]] = []
         for k, (value, length) in enumerate(zip(self._values, self._lengths, strict=True)):
             parts += [(f"n{k}", length, ()), (f"p{k}", value, (counts.pop(0),))] if length else [(f"p{k}", value, ())]
         return np.dtype(parts)
 
     def _walk(self, data: bytes, at: int, rows: int) -> tuple[Indices, Indices]:
-        """Return the offset of each row and the end of the last, shape (n + 1,), and list lengths, shape (n, lists)."""
+        """Return the offset of each row and the end of the last row (n + 1,), and the list lengths (n, lists)."""
         steps = [
             (np.dtype(value).itemsize, Struct(length[0] + _LETTERS[length[1:]]) if length else None)
             for value, length in zip(self._values, self._lengths, strict=True)
@@ -261,7 +262,7 @@ class _Reader:
         return np.array(starts, np.int64), np.array(counts, np.int64).reshape(rows, -1)
 
     def _table(self, groups: list[tuple[Indices, NDArray[np.void]]], counts: Indices) -> _Table:
-        """Return the table assembled from groups of rows, each given with its row indices."""
+        """Return the table assembled from groups of rows with their row indices."""
         columns: dict[str, Array] = {}
         lists: dict[str, tuple[Indices, Array]] = {}
         for k, one in enumerate(self._element.properties):

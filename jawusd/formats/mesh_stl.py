@@ -1,6 +1,7 @@
-"""STL, binary and text (3D Systems, "StereoLithography Interface Specification", 1989); vertices are not shared.
+"""Read binary and text STL (3D Systems, "StereoLithography Interface Specification", 1989).
 
-Binary: 80 bytes of header, the count, and 50 bytes per triangle: normal, corners, two bytes often used for colours.
+Triangles do not share vertices. A binary file has an 80-byte header, the number of triangles, and 50 bytes per
+triangle: normal, corners, and two bytes that are often used for colours.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from jawusd.formats.mesh_data import COPY_AGAIN, MOST_TRIANGLES, MeshData, check
 
 _HEADER = 84
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_LENGTHS = (1e-6, 1e5)  # plausible magnitudes of coordinates, for detecting triangles beyond the declared count
+_LENGTHS = (1e-6, 1e5)  # range of plausible coordinates, which reveals triangles beyond the declared count
 _SOLID = re.compile(rb"\n[ \t]*(end)?solid\b[^\n]*")
 _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 
@@ -26,11 +27,11 @@ def read_stl(path: Path) -> MeshData:
     """Read an STL file, with three vertices per triangle.
 
     Raises:
-        CaptureError: it is truncated, its count is wrong, or a number is invalid.
+        CaptureError: the file is truncated, the count is wrong, or a number is invalid.
     """
     data = read_mesh_bytes(path)
     begins_as_text = data[:512].removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() == b"solid"
-    # Binary headers may also start with "solid"; but a plausible count contains a zero byte, and text does not.
+    # A binary header may also start with "solid", but a plausible count contains a zero byte, and text does not.
     corners = _text(path, data) if begins_as_text and 0 not in data[80:_HEADER] else _binary(path, data)
     return MeshData(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
@@ -40,7 +41,8 @@ def _binary(path: Path, data: bytes) -> Array:
         raise CaptureError("is neither a text nor a binary STL file.", path=path, hint="Export it again.")
     said = int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
     whole = (len(data) - _HEADER) // _TRIANGLE.itemsize
-    if said > max(whole, MOST_TRIANGLES):  # the writer did not know the count, or the file is not STL
+    # The program that wrote the file did not know the count, or the file is not STL.
+    if said > max(whole, MOST_TRIANGLES):
         raise CaptureError(
             f"declares {said:,} triangles, but has room for {whole:,}.",
             path=path,
@@ -67,7 +69,7 @@ def _are_triangles(corners: Array) -> np.typing.NDArray[np.bool_]:
 def _text(path: Path, data: bytes) -> Array:
     data = (b"\n" + data.removeprefix(b"\xef\xbb\xbf")).lower().replace(b"\r", b"\n")
     ends = [bool(word) for word in _SOLID.findall(data)]
-    body = _SOLID.sub(b"", data)  # names of solids may contain keywords
+    body = _SOLID.sub(b"", data)  # remove names of solids, which may contain keywords
     whole = body.count(b"endfacet")
     facets = body.count(b"facet") - whole
     check_count(path, facets, "triangles")

@@ -1,7 +1,7 @@
-"""The fitted jaw model: `model.npz`, format jawusd-model/2.
+"""Read and write the fitted jaw model: `model.npz`, format jawusd-model/2.
 
-The decoder arrays (`JawModel.arrays`) have the same names here, in the rig and in the evaluator, which validates them
-on construction; this module validates only the additional arrays.
+The decoder arrays (`JawModel.arrays`) have the same names in this file, in the rig and in the evaluator. The evaluator
+validates them on construction; this module validates only the additional arrays.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_
 
 @dataclass(eq=False)
 class JawModel:
-    """A fitted model and its parameters of the captured poses."""
+    """Fitted model, and the jaw parameters of the captured poses."""
 
-    arrays: dict[str, Array]  # the decoder's named arrays; see `jawusd.evaluator`
+    arrays: dict[str, Array]  # arrays of the decoder by name; see `jawusd.evaluator`
     frames: NDArray[np.int64]  # captured frame numbers, shape (F,)
-    d: Array  # parameters of the captured poses [mm], NaN for lost frames, shape (F, 3)
+    d: Array  # jaw parameters of the captured poses [mm], NaN for lost frames, shape (F, 3)
     residual_mm: Array  # rms landmark distance between pose and model [mm], NaN for lost frames, shape (F,)
-    trained: Mask  # whether a frame was used in the fit, shape (F,)
+    trained: Mask  # whether each frame was used to fit the model, shape (F,)
     # kind, method, actor, error tables, warnings, configuration, versions, hashes
     meta: dict[str, object] = field(default_factory=dict)
 
     @property
     def notes(self) -> ModelMeta:
-        """The values of `meta` that have a schema."""
+        """Values of `meta` that have a schema."""
         return cast(ModelMeta, self.meta)
 
 
@@ -61,9 +61,9 @@ def load_model(path: str | os.PathLike[str]) -> JawModel:
     """Read a model.
 
     Raises:
-        FormatError: not a model file, wrong shapes, or header values of the wrong type.
-        VersionError: written by a newer version.
-        UnitsError: other units or twist order.
+        FormatError: the file is not a model file, or arrays or header values have the wrong shape or type.
+        VersionError: the file was written by a newer version.
+        UnitsError: the file uses other units or another twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
     check_notes(meta, ModelMeta, path)

@@ -1,6 +1,6 @@
 """Schema of the JSON headers (`meta`) of results, shared by writers, checks and reports.
 
-Every value is optional: other programs and older versions omit some or add their own.
+Every value is optional: other programs and older versions omit some values or add others.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _STRICT = ConfigDict(strict=True, extra="ignore")
 
 
 class CameraCorrections(TypedDict, total=False):
-    """Corrections of the camera poses, estimated on a take; tables by camera name."""
+    """Corrections of the camera poses, estimated on a take, in tables by camera name."""
 
     corrected: bool
     pivot_mm: list[float]
@@ -35,13 +35,13 @@ class CameraCorrections(TypedDict, total=False):
 class Registration(TypedDict, total=False):
     """Registration of the lower scan to the occlusion found in the take, in skull (scan) axes.
 
-    `T` (4, 4) maps the lower scan from its given to its corrected position; shift and turn describe the same motion,
+    `T` (4, 4) maps the lower scan from the given to the corrected position; shift and turn describe the same motion,
     about the centre of the lower crowns.
     """
 
-    frames: Required[list[int]]  # frames with the teeth together
+    frames: Required[list[int]]  # number of frames with the teeth together
     named: bool  # whether the capture specifies the rest frame
-    applied: Required[bool]  # whether poses and lower scan use the corrected registration
+    applied: Required[bool]  # whether the poses and the lower scan use the corrected registration
     shift_mm: Required[list[float]]
     turn_deg: Required[list[float]]
     shift_sigma_mm: list[float]
@@ -50,7 +50,7 @@ class Registration(TypedDict, total=False):
 
 
 class RegistrationSizes(NamedTuple):
-    """Lengths of the vectors of a `Registration`: shift [mm], turn [deg], and standard deviations, NaN if unknown."""
+    """Magnitudes of a `Registration`: shift [mm], turn [deg], and standard deviations, NaN if unknown."""
 
     shift_mm: float
     turn_deg: float
@@ -59,7 +59,7 @@ class RegistrationSizes(NamedTuple):
 
 
 def registration_sizes(found: Registration) -> RegistrationSizes:
-    """Return how far and how much a registration moves the lower scan."""
+    """Return the magnitudes of the shift and the turn of a registration."""
     shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
     unknown = [math.nan]
     sigma_mm = math.hypot(*found.get("shift_sigma_mm", unknown))
@@ -68,20 +68,21 @@ def registration_sizes(found: Registration) -> RegistrationSizes:
 
 
 class TakeNotes(TypedDict, total=False):
-    """Estimates for the whole take, stored in tracks and printed in summaries; pairs are (upper, lower)."""
+    """Estimates for the whole take, stored in tracks and printed in summaries; pairs are (upper, lower) arch."""
 
-    outline_bias_px: dict[str, list[float]]  # by camera: bias of the mask outlines at free edges
-    gum_bias_px: dict[str, list[float]]  # by camera: bias of the mask outlines at the gum line
-    gum_line_mm: list[float]  # offset of the drawn gum line from the scans', along the surface towards the gum
+    outline_bias_px: dict[str, list[float]]  # bias of the mask outlines at free tooth edges, by camera
+    gum_bias_px: dict[str, list[float]]  # bias of the mask outlines at the gum line, by camera
+    # Offset of the gum line in masks from that of the scans, along the surface towards the gum.
+    gum_line_mm: list[float]
     registration: Registration  # registration of the lower scan, estimated in occlusion
-    calibration_rescaled_px: dict[str, list[list[int]]]  # by camera: calibrated and recorded (width, height)
-    prior_spread_mm: float  # standard deviation of the model prior used for all final poses, if any
+    calibration_rescaled_px: dict[str, list[list[int]]]  # calibrated and recorded (width, height), by camera
+    prior_spread_mm: float  # standard deviation of the model prior of all final poses, if there is one
     findings: list[dict[str, str | float | int]]  # `Finding.as_json` of all warnings about the take
 
 
 @with_config(_STRICT)
 class TracksMeta(TakeNotes, total=False):
-    """Header of tracks; tables by camera name, pairs are (upper, lower)."""
+    """Header of tracks; tables are by camera name, pairs are (upper, lower) arch."""
 
     tracking: dict[str, object]  # configuration of the tracker
     correlation_px: float
@@ -90,20 +91,20 @@ class TracksMeta(TakeNotes, total=False):
     outline_bias_sigma_px: dict[str, list[float]]
     gum_bias_sigma_px: dict[str, list[float]]
     gum_line_sigma_mm: list[float]
-    steady_error: list[list[list[float]]]  # per arch: S (4, 4) such that T_world_arch @ S fits the masks
+    steady_error: list[list[list[float]]]  # for each arch: S (4, 4) such that T_world_arch @ S matches the masks
     extrinsics: CameraCorrections
-    focal: dict[str, list[float]]  # by camera: estimated / calibrated focal length, and its standard deviation
-    start: dict[str, object]  # how and on which frame tracking was initialised
+    focal: dict[str, list[float]]  # ratio of estimated to calibrated focal length and its standard deviation, by camera
+    start: dict[str, object]  # method and frame of the initialisation of tracking
     painted: list[bool]
     solver: str
     backend: str
     evaluations_per_row_and_frame: float
-    fps: float  # frames per second of a performance
+    fps: float  # frame rate of a performance [Hz]
     tolerance_mm: float  # maximum distance outside the bound at which the rig accepts poses of a performance
 
 
 class ModelWarning(TypedDict):
-    """A warning about a model: a movement that the take lacks, or insufficient quality."""
+    """Warning about a model: a movement that the take lacks, or insufficient quality."""
 
     code: str
     message: str

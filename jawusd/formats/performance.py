@@ -1,4 +1,4 @@
-"""A solved performance: head and jaw of a known subject per frame, its CSV table, and its arrays in `tracks.npz`."""
+"""Solved performance: head and jaw of a known subject in each frame, as CSV table and as arrays in `tracks.npz`."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _PREFIX = "solved_"
 class SolveState(IntEnum):
     """Values of `Performance.state`."""
 
-    LOST = 0  # no pose fits the images; interpolated
-    SOLVED = 1  # both arches found
-    CARRIED = 2  # an arch is hidden (lips closed, no image); interpolated
+    LOST = 0  # no pose fits the images; the pose is interpolated
+    SOLVED = 1  # both arches were found
+    CARRIED = 2  # an arch is hidden (closed lips, no image); the pose is interpolated
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -45,25 +45,25 @@ STATE_COLOURS: dict[SolveState, tuple[int, int, int]] = {
 
 @dataclass(eq=False)
 class Performance:
-    """A performance; every frame has a pose, and `covariance` gives its uncertainty.
+    """Solved performance; every frame has a pose, and `covariance` is its uncertainty.
 
     Attributes:
         frames: frame numbers of the reference camera, shape (F,).
         T_world_upper: pose of the head, shape (F, 4, 4).
         d: jaw parameters [mm], shape (F, 3).
-        covariance: covariance of a head twist in head axes about `pivot` (omega [rad], v [mm]) and of d [mm], shape
+        covariance: covariance of head twist (in head axes about `pivot`; omega [rad], v [mm]) and of d [mm], shape
             (F, 9, 9).
-        rig_covariance: covariance of d that follows from the rig's own error [mm^2], shape (F, 3, 3).
+        rig_covariance: covariance of d that the error of the rig causes [mm^2], shape (F, 3, 3).
         pivot: reference point of the head twist, upper scan frame [mm], shape (3,).
         state: `SolveState`, shape (F,).
         found: arches whose outlines were used, (upper, lower), shape (F, 2).
-        use: masks that were used, or cameras if there are no masks, shape (F, 2, C).
+        use: which masks were used, or which cameras if there are no masks, shape (F, 2, C).
         uncovered: fraction of each mask not covered by the scan, shape (F, 2, C); NaN without a mask.
         residual_px, matched_px: standard deviation of outline residuals, and length of matched contour, shape (F, 2).
         margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).
-        valid: the rig allows the pose: inside its bound, or within the tolerance of measured poses, shape (F,).
-        verdict: the rig's verdict on the pose, in words, length F.
-        camera_names: length C.
+        valid: whether the rig allows the pose (inside the bound or within the tolerance of measured poses), shape (F,).
+        verdict: the rig's verdict on each pose as text, length F.
+        camera_names: names of the cameras, length C.
         notes: estimates for the whole take.
     """
 
@@ -87,7 +87,7 @@ class Performance:
 
     @property
     def sigma_d(self) -> Array:
-        """The standard deviations of d [mm], including the rig's own error, shape (F, 3)."""
+        """Standard deviations of d [mm], including the error of the rig, shape (F, 3)."""
         return np.sqrt(np.einsum("fii->fi", self.covariance)[:, 6:] + np.einsum("fii->fi", self.rig_covariance))
 
 
@@ -108,14 +108,14 @@ def write_performance(path: str | os.PathLike[str], performance: Performance, fp
 
 @dataclass(frozen=True, eq=False)
 class SolvedJaw:
-    """The jaw of a performance, stored in `tracks.npz`.
+    """Jaw of a performance, stored in `tracks.npz`.
 
     Attributes:
         d: jaw parameters [mm], shape (F, 3).
-        sigma_mm: their standard deviations [mm], shape (F, 3).
+        sigma_mm: standard deviations of d [mm], shape (F, 3).
         margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).
         state: `SolveState`, shape (F,).
-        valid: the rig allows the pose: inside its bound, or within the tolerance of measured poses, shape (F,).
+        valid: whether the rig allows the pose (inside the bound or within the tolerance of measured poses), shape (F,).
     """
 
     d: Array

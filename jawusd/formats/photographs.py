@@ -1,4 +1,4 @@
-"""The occlusion estimated from photographs: photos.json, format jawusd-photos/1."""
+"""Occlusion estimated from photographs: photos.json, format jawusd-photos/1."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ class AlignedPhoto:
 
     name: str
     size_px: tuple[int, int]
-    mirrored: bool  # taken in a mirror: poses refer to the horizontally flipped image
+    mirrored: bool  # whether it was taken in a mirror; poses then refer to the horizontally flipped image
     focal_px: float
-    distortion: float  # OpenCV's k1
+    distortion: float  # radial distortion, OpenCV's k1
     middle_px: Array  # principal point, shape (2,)
-    T_cam_upper: Array  # upper scan to camera, shape (4, 4)
+    T_cam_upper: Array  # transform from upper scan to camera, shape (4, 4)
     outline_rms_px: float  # rms distance of drawn points from the outlines, in px of an image 1440 px wide
     outline_median_px: float
-    free_rms_px: float  # outline_rms_px without gum lines
+    free_rms_px: float  # outline_rms_px without the points on gum lines
     # mean squared distance of the worse arch in position and direction, relative to 0.5 mm; each square is capped at 1
     misfit: float
     other_hand: float  # ratio of the misfits with the opposite and with the chosen handedness, at the initial pose [-]
-    T_upper_lower_alone: Array  # the bite estimated from this photograph alone, shape (4, 4)
-    alone_off_mm: float  # distance between that and the common bite at the lower incisor
+    T_upper_lower_alone: Array  # bite estimated from this photograph alone, shape (4, 4)
+    alone_off_mm: float  # distance between own_bite and the common bite at the lower incisor
 
     def as_json(self) -> dict[str, object]:
-        """Return the fields for JSON."""
+        """Return the fields as plain data for JSON."""
         u, v = self.middle_px.tolist()
         return {
             "name": self.name,
@@ -56,16 +56,16 @@ class AlignedPhoto:
 
 @dataclass(frozen=True, eq=False)
 class AlignedPhotos:
-    """Photographs and their common bite."""
+    """Photographs and the bite estimated from all of them."""
 
-    T_upper_lower: Array  # lower scan to upper scan with the teeth together, shape (4, 4)
-    gum_mm: Array  # offset of drawn gum lines from those of the scans, towards the gum; upper, lower; shape (2,)
-    depth_mm: float  # penetration depth of the crowns
+    T_upper_lower: Array  # transform from lower to upper scan with the teeth together, shape (4, 4)
+    gum_mm: Array  # offset of drawn gum lines from the scans' towards the gum, upper and lower, shape (2,)
+    depth_mm: float  # penetration depth of the crowns in the common bite
     photos: tuple[AlignedPhoto, ...]
     findings: tuple[Finding, ...]
 
     def as_json(self) -> dict[str, object]:
-        """Return the content of the file."""
+        """Return the content of photos.json as plain data."""
         return {
             "format": FORMAT,
             "units": "mm",

@@ -1,10 +1,10 @@
-"""Poses and parameters as tables: CSV of any locale (see `jawusd.base.tables`) with a header, or JSON.
+"""Poses and jaw parameters as tables: CSV of any locale (see `jawusd.base.tables`) with a header, or JSON.
 
 Poses:      frame, m00, m01, ... m33   (row-major T_skull_mandible [mm])
         or  frame, tx, ty, tz, qw, qx, qy, qz   (scalar-first quaternion)
 Parameters: frame, d1, d2, d3   [mm]
 
-The joint table contains the transform of the mandible joint per ARKit shape, for rigs that sum joint deltas:
+The joint table contains the transform of the mandible joint for each ARKit shape, for rigs that sum joint deltas:
 
     shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,qz,clamped_mm
     JawOpen,0.5,...
@@ -35,10 +35,10 @@ MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 PARAMETER_COLUMNS = ("d1", "d2", "d3")
 _MAX_BYTES = 1 << 30
-# Maximum rigidity defect of a matrix, which accepts matrices written with 5 decimals.
+# Maximum rigidity defect of a matrix; matrices written with 5 decimals stay below it.
 _RIGID_TOLERANCE = 1e-3
 _ZERO_QUATERNION = 1e-6
-_SHOWN = 60  # maximum length of a line in messages [characters]
+_SHOWN = 60  # maximum length of a quoted line in messages [characters]
 _JOINT_COLUMNS = "shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,qz,clamped_mm"
 
 
@@ -68,7 +68,7 @@ def _is_number(text: str) -> bool:
 
 
 def _header_hint(table: TextTable) -> str:
-    """Return what to change in a table without the columns of parameters or poses."""
+    """Return a hint for a table that has no columns of parameters or poses."""
     lower = {name.lower() for name in table.header}
     if {"frame", *PARAMETER_COLUMNS} <= lower:
         return "Write the column names in lower case."
@@ -138,7 +138,7 @@ def read_poses(
             from 0 if there is no frame column.
 
     Raises:
-        FormatError: columns missing, a value that is not a finite number, or a matrix that is not rigid.
+        FormatError: a column is missing, a value is not a finite number, or a matrix is not rigid.
     """
     return _poses_of(_read_table(Path(path)), columns)
 
@@ -147,7 +147,7 @@ def read_poses_or_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.i
     """Read frame numbers (F,), and parameters d [mm] (F, 3) or T_skull_mandible (F, 4, 4), from CSV or JSON.
 
     Raises:
-        FormatError: columns missing, a value that is not a finite number, or a matrix that is not rigid.
+        FormatError: a column is missing, a value is not a finite number, or a matrix is not rigid.
     """
     table = _read_table(Path(path))
     if PARAMETER_COLUMNS[0] in table.header:
@@ -211,7 +211,7 @@ def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Ar
     """Read frame numbers (F,) and parameters d [mm] (F, 3) from CSV or JSON.
 
     Raises:
-        FormatError: columns missing, or a value that is not a finite number.
+        FormatError: a column is missing, or a value is not a finite number.
     """
     return _parameters_of(_read_table(Path(path)))
 
@@ -245,7 +245,7 @@ def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d:
 def write_table(
     path: str | os.PathLike[str], header: tuple[str, ...], frames: NDArray[np.int64], values: Array
 ) -> None:
-    """Write frames (F,) and values (F, len(header) - 1) as CSV, atomically; the header's first column is the frame.
+    """Write frames (F,) and values (F, len(header) - 1) as CSV, atomically; the first column is the frame.
 
     Raises:
         OutputError: the file cannot be written.
@@ -258,14 +258,14 @@ def write_table(
 
 @dataclass(frozen=True, eq=False)
 class JointDelta:
-    """The joint transform of one ARKit shape."""
+    """Joint transform of one ARKit shape."""
 
     shape: str  # ARKit's name for the blend shape
-    weight: float  # weight of the shape, 0 .. 1
-    d: Array  # parameters of the pose [mm], shape (3,)
-    translation_mm: Array  # translation of the joint, skull axes, shape (3,)
-    rotation: Array  # rotation of the joint, skull axes, shape (3, 3)
-    clamped_mm: float  # distance by which d was clamped to the bound
+    weight: float  # weight of the blend shape, 0 to 1
+    d: Array  # jaw parameters of the pose [mm], shape (3,)
+    translation_mm: Array  # translation of the joint in skull axes, shape (3,)
+    rotation: Array  # rotation of the joint in skull axes, shape (3, 3)
+    clamped_mm: float  # distance by which the jaw parameters were clamped to the bound
 
 
 def save_joint_table(path: str | os.PathLike[str], rows: Iterable[JointDelta]) -> None:
@@ -286,7 +286,7 @@ def save_joint_table(path: str | os.PathLike[str], rows: Iterable[JointDelta]) -
 def fixed_angles(R: Array) -> Array:
     """Return the angles [rad] about the fixed axes x, then y, then z, shape (3,), of R = Rz Ry Rx (3, 3).
 
-    J. J. Craig, "Introduction to Robotics", eq. 2.66, for rotations about y below 90 degrees.
+    The formula is eq. 2.66 of J. J. Craig, "Introduction to Robotics", for rotations about y below 90 degrees.
     """
     about_y = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
     return np.array([np.arctan2(R[2, 1], R[2, 2]), about_y, np.arctan2(R[1, 0], R[0, 0])])

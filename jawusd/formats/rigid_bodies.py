@@ -1,4 +1,4 @@
-"""Rigid bodies with markers.
+"""Read rigid bodies with markers.
 
 A body is given by a marker description file of Northern Digital (`.rig`), by the numbers of its markers in the table,
 or by their names.
@@ -22,11 +22,11 @@ _RIG_COUNT = "number of markers"
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A rigid body: its markers and, if known, their positions on it.
+    """Rigid body: its markers and, if known, their positions on the body.
 
     Attributes:
-        markers: numbers in the table, counted from 1, or names.
-        points: positions in the body's frame, shape (N, 3), in the unit of its file, or None.
+        markers: numbers of the markers in the table, counted from 1, or names.
+        points: positions in the body's coordinate frame, in the unit of the file, shape (N, 3); None if unknown.
     """
 
     markers: tuple[int | str, ...]
@@ -37,7 +37,7 @@ def read_body(description: str | os.PathLike[str]) -> RigidBody:
     """Read a rigid body: a marker description file (.rig), or the numbers or names of its markers (`5,6,7,8`).
 
     Raises:
-        FormatError: neither of them, fewer than three markers, or a marker named twice.
+        FormatError: the text is neither of these, names fewer than three markers, or names a marker twice.
     """
     text = os.fspath(description)
     numbers = [piece.strip() for piece in text.split(",")]
@@ -49,7 +49,7 @@ def read_body(description: str | os.PathLike[str]) -> RigidBody:
 
 
 def _read_rig(path: Path) -> RigidBody:
-    """Read Northern Digital's marker description: a count, then `number x y z views` per marker."""
+    """Read Northern Digital's marker description: a count, then `number x y z views` for each marker."""
     lines = read_text(path, _MAX_BYTES, "latin-1").splitlines()
     counts = [line.partition(";")[0].strip() for line in lines if _RIG_COUNT in line.lower()]
     if len(counts) != 1 or not counts[0].isdigit():

@@ -1,9 +1,9 @@
-"""Labels of crown, gum and base of a teeth scan: npz, format jawusd-scan-labels/1, beside the scan.
+"""Labels of crown, gum and base of a teeth scan, in an npz file beside the scan, format jawusd-scan-labels/1.
 
     labels (V,) uint8    0 gum, 1 crown, 2 crown at a border of interest, 3 base plate; in the order of the scan file
     meta                 JSON: scan_sha256 of the scan's vertices, source, weak_share
 
-The hash ties labels to one version of the scan; they are rejected for any other.
+The hash identifies the version of the scan for which labels were made; they are rejected for any other version.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ LabelSource = Literal["automatic", "reviewed"]
 
 @dataclass(frozen=True, eq=False)
 class ScanLabels:
-    """Labels of one scan."""
+    """Crown, gum and base labels of one scan."""
 
-    labels: NDArray[np.uint8]  # GUM, TOOTH, BOUNDARY or BASE of `formats.mesh` per vertex of the scan file, shape (V,)
-    source: LabelSource  # "automatic": from the shape; "reviewed": accepted by a user
-    weak_share: float = 0.0  # fraction of the crown-gum border with weak geometric evidence, 0 .. 1
+    labels: NDArray[np.uint8]  # label of `formats.mesh` for each vertex of the scan file, shape (V,)
+    source: LabelSource  # "automatic" if derived from the shape, "reviewed" if accepted by a user
+    weak_share: float = 0.0  # fraction of the crown-gum border with weak geometric evidence, 0 to 1
 
 
 def labels_path(scan: Path, folder: Path | None = None) -> Path:
-    """Return the label file of a scan: beside it, or in a folder of labels."""
+    """Return the path of the labels of a scan: beside the scan, or in a folder of labels."""
     return (scan.parent if folder is None else folder) / f"{scan.stem}{SUFFIX}"
 
 
@@ -52,7 +52,7 @@ def save_scan_labels(path: str | os.PathLike[str], labels: ScanLabels, mesh: Mes
     """Write the labels of a scan.
 
     Raises:
-        ValueError: their number differs from that of the vertices.
+        ValueError: the number of labels differs from the number of vertices.
         OutputError: the file cannot be written.
     """
     if labels.labels.shape != mesh.vertices.shape[:1]:
@@ -73,8 +73,8 @@ def load_scan_labels(path: str | os.PathLike[str], mesh: Mesh) -> ScanLabels:
     """Read the labels of a scan.
 
     Raises:
-        FormatError: not such a file, or made for another version of the scan.
-        VersionError: written by a newer version.
+        FormatError: the file does not contain labels, or they were made for another version of the scan.
+        VersionError: the file was written by a newer version.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
     labels = take(arrays, "labels", (None,), path)

@@ -1,4 +1,4 @@
-"""Read TOML and JSON, and check their values, with errors that name the file."""
+"""Read TOML and JSON and check their values; errors name the file."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from jawusd.formats.capture_keys import table_model
 Model = TypeVar("Model", bound=BaseModel)
 
 _MOST_TOML_BYTES = 4 << 20
-_SHOWN = 80  # maximum length of a line in messages [characters]
-# Maximum number of parts of a dotted key: tomllib takes quadratic time, hours for a key of 200 kB.
+_SHOWN = 80  # maximum length of a quoted line in messages [characters]
+# Maximum number of parts of a dotted key; tomllib needs quadratic time, which is hours for a key of 200 kB.
 _MOST_DOTS = 64
 _NAME = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_NAME}[ \t]*+\.[ \t]*+){{{_MOST_DOTS}}}", re.ASCII)
@@ -35,7 +35,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
     """Return the content of a TOML file.
 
     Raises:
-        FormatError: missing, too large, not text or not TOML.
+        FormatError: the file is missing, too large, not text or not TOML.
     """
     path = Path(path)
     text = read_text(path, _MOST_TOML_BYTES)
@@ -43,7 +43,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
         raise FormatError(f"has a dotted key of more than {_MOST_DOTS} parts.", path=path)
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # also raised for numbers of more than 4300 digits
+    except (ValueError, RecursionError) as error:  # raised also for numbers of more than 4300 digits
         said, hint = _not_toml(text, str(error))
         raise FormatError(f"is not valid TOML: {said}.", path=path, hint=hint) from error
 
@@ -65,7 +65,7 @@ def parse_json(text: str, path: Path) -> object:
     """Parse a JSON text read from a file.
 
     Raises:
-        FormatError: it is not JSON.
+        FormatError: the text is not JSON.
     """
     try:
         return json.loads(text)
@@ -79,7 +79,7 @@ def parse_json(text: str, path: Path) -> object:
             hint = "Remove the comma before it, or add the missing entry."
         said = f"line {error.lineno}, {line[:_SHOWN]}: {error.msg}" if line else f"line {error.lineno}: {error.msg}"
         raise FormatError(f"is not JSON: {said}.", path=path, hint=hint) from error
-    except (ValueError, RecursionError) as error:  # numbers of more than 4300 digits, or deep nesting
+    except (ValueError, RecursionError) as error:  # raised for numbers of more than 4300 digits, and for deep nesting
         raise FormatError(f"is not JSON ({error}).", path=path) from error
 
 
@@ -87,7 +87,7 @@ def parse_model(text: str, path: Path, model: type[Model], hint: str | None = No
     """Parse a JSON text read from a file into a pydantic model; field descriptions are used in messages.
 
     Raises:
-        FormatError: it is not JSON, or a value is missing or wrong.
+        FormatError: the text is not JSON, or a value is missing or wrong.
     """
     data = parse_json(text, path)
     try:
@@ -127,7 +127,7 @@ def of_kind(found: object, kind: type[T], name: str, path: str | os.PathLike[str
     """Return a named value of a JSON file, validated against a type.
 
     Raises:
-        FormatError: it has another type.
+        FormatError: the value has another type.
     """
     try:
         return TypeAdapter(kind).validate_python(found)

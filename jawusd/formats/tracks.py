@@ -1,4 +1,4 @@
-"""The tracked poses of both arches: `tracks.npz`, format jawusd-tracks/1."""
+"""Tracked poses of both arches: `tracks.npz`, format jawusd-tracks/1."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from jawusd.formats.performance import SolvedJaw, take_solved
 from jawusd.geometry import LANDMARKS, rigidity_defect
 
 FAMILY, VERSION = "jawusd-tracks", 1
-_APART_S = 0.5  # minimum time between chosen frames; adjacent frames have the same problem
+_APART_S = 0.5  # minimum time between chosen frames, since adjacent frames have the same problems
 
 
 class TrackStatus(IntEnum):
@@ -45,13 +45,13 @@ _WHOLE = ("frames", "status", "prior_aided", "masks_used", "lost_reason")
 class LostReason(IntEnum):
     """Values of `Tracks.lost_reason`: the check that failed when an arch was lost, and the checked quantity."""
 
-    NONE = 0  # not lost, or not recorded
-    FEW_MASKS = 1  # number of masks used
-    LITTLE_CONTOUR = 2  # matched contour [px]
-    ROUGH_FIT = 3  # standard deviation of the residuals [px]
-    LOW_SCORE = 4  # matched contour over its recent median, if residuals are also above their recent median [-]
+    NONE = 0  # the arch was not lost, or the reason was not recorded
+    FEW_MASKS = 1  # number of masks that were used
+    LITTLE_CONTOUR = 2  # length of matched contour [px]
+    ROUGH_FIT = 3  # Standard deviation of the residuals [px].
+    LOW_SCORE = 4  # Ratio of matched contour to its recent median, checked if residuals exceed their recent median [-].
     UNCOVERED_MASK = 5  # largest fraction of a mask not covered by the scan [-]
-    UNCERTAIN = 6  # standard deviation of the crowns' position [mm]
+    UNCERTAIN = 6  # standard deviation of the position of the crowns [mm]
 
     def __str__(self) -> str:
         return self.name.lower().replace("_", " ")
@@ -74,7 +74,7 @@ _EXPLANATIONS = {
 
 @dataclass(eq=False)
 class Tracks:
-    """Tracked poses of a take; NaN where an arch was not tracked.
+    """Tracked poses over a take; NaN where an arch was not tracked.
 
     Poses without prefix are final. `raw_` poses are from the first pass, without smoothing or kinematic prior; models
     are fitted to them and evaluated on them.
@@ -84,11 +84,11 @@ class Tracks:
         T_world_upper, T_world_lower, T_upper_lower: final poses, shape (F, 4, 4); the last is T_skull_mandible.
         raw_T_world_upper, raw_T_world_lower, raw_T_upper_lower: first-pass poses, shape (F, 4, 4).
         status: `TrackStatus` of (upper, lower), shape (F, 2).
-        prior_aided: the frame was recovered with a kinematic prior, shape (F,). If the metadata has `prior_spread_mm`,
+        prior_aided: whether a frame was recovered with a kinematic prior, (F,). If the metadata has `prior_spread_mm`,
             all final poses used a prior, as in tracking by colour.
         coverage_error: fraction of mask pixels not covered by the projected scan (E_SP of paper eq. 8 over segmented
             pixels), shape (F, 2, C); NaN without a mask.
-        masks_used: masks used for the raw poses, shape (F, 2, C); others are missing or outliers.
+        masks_used: which masks were used for the raw poses, shape (F, 2, C); the others are missing or outliers.
         covariance_upper, covariance_lower: covariance of the left twist xi [rad, mm] with T_true = exp(xi) T, world
             frame, about the world origin, shape (F, 6, 6).
         covariance_relative: covariance of T_upper_lower, defined likewise in the skull frame, shape (F, 6, 6).
@@ -99,8 +99,8 @@ class Tracks:
             files, like the next two.
         lost_value, lost_limit: the measured value and its limit, in the unit of the reason, shape (F, 2); NaN without
             a reason.
-        camera_names: the cameras, length C.
-        solved: jaw parameters and state per frame of a solved performance; otherwise None.
+        camera_names: names of the cameras, length C.
+        solved: jaw parameters and state of each frame of a solved performance; otherwise None.
     """
 
     frames: NDArray[np.int64]
@@ -143,7 +143,7 @@ class Tracks:
         return row if row < len(self.frames) and self.frames[row] == frame else None
 
     def explain_loss(self, index: int, arch: int) -> str:
-        """Return why an arch (0 upper, 1 lower) was lost at a frame index."""
+        """Return the reason why an arch (0 upper, 1 lower) was lost at a frame index."""
         reason = LostReason(int(self.lost_reason[index, arch]))
         return reason.explain(self.lost_value[index, arch], self.lost_limit[index, arch])
 
@@ -202,12 +202,12 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
     """Read tracks of format jawusd-tracks/1 and check them.
 
     Raises:
-        FormatError: not a tracks file, wrong shapes, or poses that are not rigid.
-        VersionError: written by a newer version.
-        UnitsError: other units or twist order.
+        FormatError: the file is not a tracks file, arrays have wrong shapes, or poses are not rigid.
+        VersionError: the file was written by a newer version.
+        UnitsError: the file uses other units or another twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
-    limit = meta.pop("margin_limit_mm", None)  # older files store the minimum allowed margin, a negative value
+    limit = meta.pop("margin_limit_mm", None)  # older files contain the minimum allowed margin, a negative value
     if isinstance(limit, float):
         meta["tolerance_mm"] = -limit
     check_notes(meta, TracksMeta, path)
@@ -215,13 +215,13 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
         raise FormatError('"meta" has no list "camera_names".', path=path)
     count = len(take(arrays, "frames", (None,), path))
-    if "masks_used" not in arrays and "coverage_error" in arrays:  # other trackers may omit it
+    if "masks_used" not in arrays and "coverage_error" in arrays:  # optional, since other trackers may omit the array
         arrays["masks_used"] = np.isfinite(arrays["coverage_error"])
     values = {
         # Lost frames are NaN, so only integer arrays must be finite.
         name: take(arrays, name, shape, path, finite=name in _WHOLE)
         for name, shape in _shapes(count, len(names)).items()
-        if not name.startswith("lost_") or "lost_reason" in arrays  # older files lack all three arrays
+        if not name.startswith("lost_") or "lost_reason" in arrays  # older files contain none of these three arrays
     }
     if not np.isin(values.get("lost_reason", 0), list(LostReason)).all():
         raise FormatError('"lost_reason" has an unknown reason.', path=path)
@@ -248,12 +248,12 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
 
 
 def used_coverage(tracks: Tracks) -> Array:
-    """Return the uncovered fraction of each mask, NaN where it is missing or unused, shape (F, 2, C)."""
+    """Return the uncovered fraction of each mask, shape (F, 2, C); NaN where a mask is missing or unused."""
     return np.where(tracks.masks_used, tracks.coverage_error, np.nan)
 
 
 def uncovered_percent(tracks: Tracks) -> Array:
-    """Return the uncovered mask area per frame and arch [%], mean over the masks used, shape (F, 2); NaN if none."""
+    """Return the uncovered mask area [%] per frame and arch, mean over the used masks, (F, 2); NaN if none."""
     value = used_coverage(tracks)
     known = np.isfinite(value)
     total = np.where(known, value, 0.0).sum(axis=2)
@@ -269,7 +269,7 @@ def worst_frames(
         badness: shape (F,); frames with NaN are never chosen.
         frames: frame numbers, shape (F,).
         most: maximum number of frames.
-        taken: indices of already chosen frames; the same distance from them is kept.
+        taken: indices of frames that were already chosen; returned frames are as far from these as from each other.
     """
     apart = max(round(_APART_S * fps), 1)
     found: list[int] = []

@@ -209,7 +209,7 @@ def test_a_failed_writer_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_missing_empty_and_foreign_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match=r"gone\.mp4: no such video"):
+    with pytest.raises(CaptureError, match=r"gone\.mp4: there is no such video"):
         Video(tmp_path / "gone.mp4")
     empty, text, sound = tmp_path / "empty.mp4", tmp_path / "text.mp4", tmp_path / "sound.wav"
     empty.touch()
