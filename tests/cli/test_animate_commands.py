@@ -1,4 +1,4 @@
-"""`jawusd animate` of keys and tables, run as a program."""
+"""`jawusd animate` of keys and tables."""
 
 import json
 import subprocess

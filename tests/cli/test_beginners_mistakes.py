@@ -3,12 +3,9 @@
 Each gives one message without a traceback, with the wrong argument and a remedy.
 """
 
-import subprocess
-import sys
-
 import pytest
 from capture_texts import HEAD, TABLES, write_media
-from package_copy import ROOT
+from run_jawusd import program
 
 CAPTURE = f'{HEAD}calibration = "cal.toml"\n{TABLES}'
 
@@ -75,16 +72,9 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("name", "words", "told"), MISTAKES, ids=[name for name, _, _ in MISTAKES])
-def test_a_mistake_is_one_message(place, name, words, told):
-    done = subprocess.run(
-        [sys.executable, "-m", "jawusd", *words],
-        cwd=place,
-        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1", "HOME": str(place)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+def test_a_mistake_is_one_message(place, monkeypatch, name, words, told):
+    monkeypatch.chdir(place)
+    done = program(*words)
     said = done.stderr + done.stdout
     assert done.returncode not in (0, 70) and "Traceback" not in said, said
     assert all(word in " ".join(said.split()) for word in told), said

@@ -1,4 +1,4 @@
-"""The commands on a finished rig, run as programs: output, JSON and exit codes."""
+"""The commands on a finished rig: output, JSON and exit codes."""
 
 import json
 import shutil
@@ -12,7 +12,7 @@ from example_rig import example_motion
 from example_tracks import make_tracks
 from package_copy import ROOT
 from pxr import Usd
-from run_jawusd import face_csv, run
+from run_jawusd import face_csv, program, run
 
 import jawusd
 from jawusd.cli.rig_commands import _info_lines
@@ -153,8 +153,7 @@ def test_names_that_no_file_can_have_are_one_line(command, out, actor, tmp_path)
     (tmp_path / "circle").symlink_to("circle")
     given = {"publish": [actor.parent], "build": [ROOT / "examples" / "capture"]}
     given = given.get(command, [actor, actor.parent / "anim_capture.usdc"])
-    line = [sys.executable, "-m", "jawusd", command, *map(str, given), "-o", str(tmp_path / out)]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+    done = program(command, *given, "-o", tmp_path / out)
     assert "Traceback" not in done.stderr
     if command != "encode" or "\n" not in out:  # a table may be in any folder
         assert done.returncode >= 2 and "jawusd: " in done.stderr

@@ -1,13 +1,12 @@
 """Overlays of a small capture: the decoded videos must be tinted where OpenCV projects the scans."""
 
-import subprocess
-import sys
 
 import av
 import cv2
 import numpy as np
 import pytest
 import trimesh
+from run_jawusd import program
 
 from jawusd.base.errors import CalibrationError, CaptureError, OutputError
 from jawusd.cameras.calibration import save_calibration
@@ -162,22 +161,15 @@ def test_what_cannot_be_drawn_is_refused(capture, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def run(*arguments):
-    command = [sys.executable, "-m", "jawusd", *map(str, arguments)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert "Traceback" not in result.stderr
-    return result
-
-
 def test_the_command_guards_its_options_and_outputs(capture, tmp_path):
-    result = run("track", capture, "-o", tmp_path / "t.npz", "--backend", "gl")
+    result = program("track", capture, "-o", tmp_path / "t.npz", "--backend", "gl")
     assert result.returncode == 2 and "--solver paper" in result.stderr
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "right.mp4").write_text("precious")
-    result = run("track", capture, "-o", tmp_path / "t.npz", "--overlay", tmp_path / "out")
+    result = program("track", capture, "-o", tmp_path / "t.npz", "--overlay", tmp_path / "out")
     assert result.returncode == OutputError.exit_code and "right.mp4" in result.stderr and "--force" in result.stderr
     assert (tmp_path / "out" / "right.mp4").read_text() == "precious"
-    result = run("track", capture, "-o", tmp_path / "t.npz", "--solver", "guess")
+    result = program("track", capture, "-o", tmp_path / "t.npz", "--solver", "guess")
     assert result.returncode == 2 and "contour" in result.stderr
 
 

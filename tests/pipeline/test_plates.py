@@ -1,12 +1,11 @@
 """Undistorted plates: a world point appears where a pinhole camera projects it, in the plate of the right frame."""
 
 import shutil
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
+from run_jawusd import program
 
 from jawusd.cameras.calibration import save_calibration
 from jawusd.geometry import Camera, make_transform
@@ -79,8 +78,7 @@ def test_plates_show_what_a_pinhole_camera_sees(capture, tmp_path):
 
 def test_the_command_needs_a_built_rig(capture, tmp_path):
     shutil.copytree(capture, tmp_path / "copy")
-    command = [sys.executable, "-m", "jawusd", "plates", str(tmp_path / "copy"), str(tmp_path / "no_rig")]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = program("plates", tmp_path / "copy", tmp_path / "no_rig")
     assert done.returncode == 3 and "tracks.npz" in done.stderr
 
 

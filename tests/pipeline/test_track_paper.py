@@ -1,14 +1,13 @@
 """`jawusd track --solver paper` on two rendered frames, run as a program."""
 
 import json
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
 from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks, vertex_error_mm
+from run_jawusd import program
 
 from jawusd.cameras.calibration import save_calibration
 from jawusd.cli.text_build import track_lines
@@ -65,9 +64,7 @@ def capture(tmp_path):
 
 
 def test_the_command_tracks_with_the_papers_method(capture, tmp_path):
-    command = [sys.executable, "-m", "jawusd", "track", str(capture), "-o", str(tmp_path / "t.npz")]
-    command += ["--solver", "paper", "--jobs", "1"]
-    result = subprocess.run([*command, "--json"], capture_output=True, text=True, timeout=120, check=False)
+    result = program("track", capture, "-o", tmp_path / "t.npz", "--solver", "paper", "--jobs", "1", "--json")
     assert result.returncode == 0, result.stderr
     summary = json.loads(result.stdout)
     assert summary["tracked"] == 2 and summary["lost"] == [] and set(summary["sigma_mm"].values()) == {None}
