@@ -4,8 +4,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 import threading
 
 import cv2
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from package_copy import ROOT
+from run_jawusd import program
 
 from jawusd.base.errors import CaptureError
 from jawusd.capture.mask_checks import swapped_cameras
@@ -71,6 +70,11 @@ def exchanged(folder, a, b):
 
 def found(folder, **options):
     return check_capture(folder, **options)
+
+
+def checking(monkeypatch, *names):
+    """Leave out all checks but some: together they take seconds."""
+    monkeypatch.setattr(checks, "_CHECKS", tuple(check for check in checks._CHECKS if check.what in names))
 
 
 def test_nothing_is_said_of_the_example():
@@ -237,7 +241,7 @@ def test_masks_numbered_for_another_camera_are_exchanged():
 
 
 def test_a_full_disk_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(checks, "_CHECKS", tuple(c for c in checks._CHECKS if c.what == "the disk"))
+    checking(monkeypatch, "the disk")
     for free, severity in ((25e6, "warning"), (5e6, "error")):
         monkeypatch.setattr(checks.shutil, "disk_usage", lambda place: type("Usage", (), {"free": free}))  # noqa: B023
         (only,) = check_capture(EXAMPLE, tmp_path / "not" / "there")
@@ -265,8 +269,8 @@ def test_every_wrong_key_is_listed(capture):
     assert any("fsp" in line for line in lines) and any("colums" in line for line in lines)
 
 
-@pytest.mark.slow
 def test_missing_packages_are_named(monkeypatch):
+    checking(monkeypatch, "the packages")
     monkeypatch.setattr(checks, "find_spec", lambda name: None if name in ("torch", "jinja2") else True)
     lines = [f.line() for f in found(EXAMPLE)]
     assert any("torch" in line and "jawusd[build]" in line for line in lines)
@@ -293,13 +297,12 @@ def test_build_refuses_with_all_errors_before_any_work(capture, tmp_path):
     assert not (tmp_path / "out" / "build.json").exists()
 
 
-@pytest.mark.slow
-def test_the_program_prints_findings_and_leaves_with_5(capture):
+def test_the_program_prints_findings_and_leaves_with_5(capture, monkeypatch):
+    checking(monkeypatch, "the scans")
     scan_in_metres(capture)
-    command = [sys.executable, "-m", "jawusd", "check", str(capture)]
-    plain = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    plain = program("check", capture)
     assert plain.returncode == 5 and "metres" in plain.stdout and "Traceback" not in plain.stderr
-    as_json = subprocess.run([*command, "--json"], capture_output=True, text=True, timeout=300, check=False)
+    as_json = program("check", capture, "--json")
     summary = json.loads(as_json.stdout)
     assert as_json.returncode == 5 and summary["errors"] == 1
     assert Finding.from_json(summary["findings"][0]).severity == "error"
