@@ -10,16 +10,24 @@ from report_data import experiments, report_data, solve_data, write_document
 
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.report import Origin, ReplayPart
+from jawusd.report import document as report_document
 from jawusd.report.solve_page import write_solve_page
 
 chromium = pytest.fixture(headless_chromium, scope="module")
 
 
-@pytest.fixture(params=["light", "dark"])
-def opened(request, chromium, tmp_path):
-    """Open the report of an example; errors and requests are checked afterwards."""
-    data, path = report_data(lost=(20, 21)), tmp_path / "report.html"
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Return the report of an example, and its data."""
+    data, path = report_data(lost=(20, 21)), tmp_path_factory.mktemp("report") / "report.html"
     write_document(path, data)
+    return path, data
+
+
+@pytest.fixture(params=["light", "dark"])
+def opened(request, chromium, written):
+    """Open the report of an example; errors and requests are checked afterwards."""
+    path, data = written
     page, trouble, requests = open_page(chromium, 1200, 900, color_scheme=request.param), [], []
     page.on("console", lambda message: trouble.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: trouble.append(str(error)))
@@ -59,7 +67,8 @@ def ball(name, kind, radius, place=(0.0, 0.0, 0.0)):
 @pytest.mark.parametrize(("bone_mm", "seen"), [(10.8, "tooth"), (13.0, "bone")])
 def test_bone_that_nearly_coincides_with_teeth_stays_behind_them(chromium, tmp_path, bone_mm, seen):
     parts = (ball("mandible", "bone", bone_mm), ball("lower_teeth", "tooth", 10.0))
-    write_document(tmp_path / "report.html", report_data(parts=parts))
+    data = report_data(parts=parts)
+    report_document.write_document(tmp_path / "report.html", data, figures={})
     page = open_page(chromium, 1200, 900)
     page.goto((tmp_path / "report.html").as_uri())
     drawn = picture(page)
@@ -69,15 +78,21 @@ def test_bone_that_nearly_coincides_with_teeth_stays_behind_them(chromium, tmp_p
     assert blue / red == pytest.approx(colour, abs=0.02)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1440, 390])
-def test_no_width_scrolls_the_page_sideways(chromium, tmp_path, scheme, width):
-    long = "x" * 300
+@pytest.fixture(scope="module")
+def wordy(tmp_path_factory):
+    """Return a report with long names and sentences."""
+    long, path = "x" * 300, tmp_path_factory.mktemp("wordy") / "report.html"
     data = report_data(experiments=experiments(sentences=("Record slow circling with the mouth half open. " * 6,)))
     data = replace(data, actor=long, origin=Origin("today", f"jawusd build {long}", {"jawusd": "1"}), left_out=(long,))
-    write_document(tmp_path / "report.html", data)
+    write_document(path, data)
+    return path
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1440, 390])
+def test_no_width_scrolls_the_page_sideways(chromium, wordy, scheme, width):
     page = open_page(chromium, width, 844, color_scheme=scheme)
-    page.goto((tmp_path / "report.html").as_uri())
+    page.goto(wordy.as_uri())
     wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
     unfolded = page.evaluate("document.documentElement.scrollWidth")
@@ -107,12 +122,19 @@ def test_tables_are_folded_and_a_link_opens_them(chromium, tmp_path):
     page.context.close()
 
 
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory):
+    """Return the report of a performance."""
+    path = tmp_path_factory.mktemp("solved") / "take.html"
+    write_solve_page(path, solve_data())
+    return path
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1440, 390])
-def test_no_width_scrolls_the_page_of_a_performance_sideways(chromium, tmp_path, scheme, width):
-    write_solve_page(tmp_path / "take.html", solve_data())
+def test_no_width_scrolls_the_page_of_a_performance_sideways(chromium, solved, scheme, width):
     page = open_page(chromium, width, 844, color_scheme=scheme)
-    page.goto((tmp_path / "take.html").as_uri())
+    page.goto(solved.as_uri())
     wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     keep_picture(page, f"solve_{width}_{scheme}", full_page=True)
     page.context.close()

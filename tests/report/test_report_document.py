@@ -16,7 +16,6 @@ from report_data import document, experiments, report_data
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import Origin, Overlay, RigFacts
 from jawusd.formats.tracks import LostReason
-from jawusd.report import document as report_document
 from jawusd.report.document import _frame_lists, worded
 from jawusd.report.replay import replay_data
 
@@ -62,7 +61,7 @@ def page():
 @pytest.fixture
 def words_alone(monkeypatch):
     """Skip the figures, which take most of the time of a page."""
-    monkeypatch.setattr(report_document, "inline_svg", lambda *arguments: "")
+    monkeypatch.setattr("report_data.all_figures", lambda data: {})
 
 
 def test_reasons_of_losses_are_listed_with_their_frames(words_alone):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from report_data import document, experiments, report_data, solve_data
 
-from jawusd.paper.figures import condyle_figure, parameter_figure, reconstruction_figure, synthesis_figure
+from jawusd.paper.figures import condyle_figure, inline_figures, parameter_figure
+from jawusd.report import document as report_document
 from jawusd.report.solve_page import solve_page
 from jawusd.report.verdicts import GOOD, OPEN, judge
 
@@ -63,9 +64,7 @@ def test_experiments_that_found_no_poses(name):
     empty = tuple(replace(one, values_mm=np.empty(0)) if one.experiment == name else one for one in found.distances)
     for distances in (empty, tuple(one for one in found.distances if one.experiment != name)):
         few = replace(found, distances=distances)
-        for figure in (reconstruction_figure(few), synthesis_figure(few)):
-            figure.draw_without_rendering()
-        assert document(report_data(experiments=few))
+        assert report_document.document(report_data(experiments=few), inline_figures(few))
 
 
 def test_experiments_without_paths_or_captured_poses():
