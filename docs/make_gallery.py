@@ -70,14 +70,14 @@ def drawn(figure: Figure) -> Image.Image:
     return Image.open(io.BytesIO(figure_bytes(figure, "png", 200)))
 
 
-def overlay(out: Path, folder: Path) -> Path:
+def overlay(out: Path, folder: Path, frames: int = FRAMES) -> Path:
     """Draw the tracked scans over the footage, all cameras side by side."""
     capture, tracks = load_capture(CAPTURE), load_tracks(out / "tracks.npz")
     offsets, scans = sync_cameras(capture, no_progress)["offsets"], tracked_scans(capture, tracks)
     wall = open_wall(capture, offsets, tracks, scans, TILE_PX)
     path, (width, height) = folder / "overlay.mp4", (side // 2 * 2 for side in wall.size_px)
     with contextlib.closing(wall), VideoWriter(path, (width, height), capture.fps / STEP, quality_crf=27) as video:
-        for row in range(FIRST, FIRST + FRAMES, STEP):
+        for row in range(FIRST, FIRST + frames, STEP):
             picture = wall.draw(int(tracks.frames[row]), placed_scans(tracks, row, scans), fill=0.15)
             video.write(picture[:height, :width])
     return path
