@@ -332,7 +332,7 @@ def test_alembic_needs_its_plugin(tmp_path):
     if Sdf.FileFormat.FindByExtension("abc") is not None:
         pytest.skip("this OpenUSD reads Alembic")
     (tmp_path / "cameras.abc").write_bytes(b"Ogawa\xff\x00\x01")
-    with pytest.raises(RigError, match=r"cameras\.abc: is Alembic, .* usdAbc; .* Export the cameras as USD"):
+    with pytest.raises(RigError, match=r"cameras\.abc: is an Alembic file; .* usdAbc, .* Export the cameras as USD"):
         read_cameras(tmp_path / "cameras.abc", dict)
 
 

@@ -60,7 +60,7 @@ def test_pictures_that_cannot_be_used_are_named(files, tmp_path):
     assert isinstance(absent.exception, CaptureError) and "none.png" in str(absent.exception)
     cv2.imwrite(str(left), np.zeros((300, 400), np.uint8))
     black = run("photos", left, *rest)
-    assert isinstance(black.exception, TrackingError) and "left: 0 px of lines" in str(black.exception)
+    assert isinstance(black.exception, TrackingError) and "left: the drawn lines cover 0 px" in str(black.exception)
     assert not (tmp_path / "out").exists()
     assert run("photos", front).exit_code == 2
 

@@ -110,7 +110,7 @@ def test_textured_obj_with_quads_keeps_its_order(tmp_path: Path) -> None:
 def test_missing_damaged_and_foreign_files(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"gone\.ply: there is no such mesh"):
         meshio.load_mesh(tmp_path / "gone.ply")
-    with pytest.raises(CaptureError, match=r"a\.glb: meshes must be \.ply, \.stl, \.obj"):
+    with pytest.raises(CaptureError, match=r"a\.glb: is not a supported mesh file; expected \.ply, \.stl, \.obj"):
         meshio.load_mesh(tmp_path / "a.glb")
     source = arch()
     source.export(tmp_path / "cut.ply")

@@ -47,7 +47,7 @@ def test_lines_are_found_to_a_fraction_of_a_pixel():
 
 
 def test_an_empty_picture_is_refused():
-    with pytest.raises(TrackingError, match="front: 0 px of lines"):
+    with pytest.raises(TrackingError, match="front: the drawn lines cover 0 px"):
         read_lines(np.zeros((300, 400), np.uint8), "front")
 
 

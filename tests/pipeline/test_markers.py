@@ -234,7 +234,7 @@ def test_names_that_do_not_tell_the_marker_are_refused(tmp_path, markers, names,
 
 def test_a_marker_hidden_at_rest_is_named(tmp_path, markers):
     markers[0, 6] = 0.0
-    with pytest.raises(FormatError, match="all markers of the jaw: 7 is occluded"):
+    with pytest.raises(FormatError, match="all markers of the jaw; occluded: 7"):
         marker_poses(write(tmp_path, markers), {"jaw": "5,6,7,8"}, rest_frame=0)
 
 
