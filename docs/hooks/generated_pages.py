@@ -1,9 +1,10 @@
-"""Add the pages of the reference that are made from the code to every build of the site, and pictures of examples/.
+"""Add to every build of the site: the reference made from the code, the page of the example rig, pictures of examples/.
 
 mkdocs loads this file as a hook (mkdocs.yml); nothing that it makes is stored.
 """
 
 import sys
+import tempfile
 from pathlib import Path
 
 from mkdocs.structure.files import File
@@ -15,6 +16,9 @@ import reference_commands  # noqa: E402
 import reference_files  # noqa: E402
 import reference_python  # noqa: E402
 import reference_tables  # noqa: E402
+
+from jawusd.pipeline.pose_page import write_page  # noqa: E402
+from jawusd.rig.layout import EXAMPLE_RIG  # noqa: E402
 
 PICTURES = ("overlay.png", "face_solver.png")
 
@@ -31,8 +35,16 @@ def pages():
     }
 
 
+def jaw_page():
+    """Return the web page that poses the example rig."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_page(EXAMPLE_RIG, Path(folder) / "jaw.html")
+        return (Path(folder) / "jaw.html").read_text(encoding="utf-8")
+
+
 def on_files(files, config):
     """Add the generated pages and the pictures."""
+    files.append(File.generated(config, "jaw.html", content=jaw_page()))
     for place, text in pages().items():
         files.append(File.generated(config, place, content=text))
     for name in PICTURES:

@@ -43,7 +43,7 @@ EXAMPLES = {
         "jawusd skin-fit out take.npz face.csv -o skin.npz --bite 1200-1260",
         "jawusd skin-fit out take.npz markers.c3d --rigid head=HL,HR,HF --rest-frame 0",
     ),
-    "view": ("jawusd view out", "jawusd view capture --tracks out"),
+    "view": ("jawusd view out", "jawusd view capture --tracks out", "jawusd view out --page jaw.html"),
     "info": ("jawusd info out", "jawusd info out/tracks.npz --frame 120"),
     "report": ("jawusd report out", "jawusd report out --experiments"),
     "validate": ("jawusd validate out", "jawusd validate out out/anim_take.usdc"),

@@ -12,6 +12,7 @@ from jawusd.cli.options import (
     Allow,
     CaptureOption,
     ColumnsOption,
+    Force,
     GroupOption,
     InvertOption,
     Json,
@@ -138,6 +139,14 @@ def _report_found(
     emit({"file": str(path), "bytes": path.stat().st_size}, as_json, lambda: [str(path)])
 
 
+PageOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Write a web page that poses the rig without a server, and end.", metavar="FILE.html", show_default=False
+    ),
+]
+
+
 def view(
     rig: Annotated[
         Path | None,
@@ -163,13 +172,13 @@ def view(
     play: Annotated[
         bool, typer.Option("--play/--no-play", help="Begin by playing the captured take of a rig, if it has one.")
     ] = True,
+    page: PageOption = None,
+    force: Force = False,
     allow_outside: Outside = False,
     prim: Prim = None,
     allow: Allow = None,
 ) -> None:
     """View and animate a rig in the browser; or view the footage of a capture, to inspect poses and set picks."""
-    import webbrowser
-
     from jawusd.pipeline.state import changed_files
     from jawusd.pipeline.view import open_viewer
     from jawusd.pipeline.view_capture import is_capture, open_capture_viewer
@@ -181,6 +190,9 @@ def view(
         raise typer.BadParameter("--tracks needs a capture, not a rig.")
     if prim is not None and capture:
         raise typer.BadParameter("--prim needs a rig, not a capture.")
+    if page is not None:
+        _write_page(rig, page, force, prim)
+        return
     _warn_of_host(host, capture)
     for folder in (rig, tracks):
         for found in changed_files(folder) if folder is not None and folder.is_dir() else ():
@@ -191,6 +203,13 @@ def view(
             viewer = open_capture_viewer(rig, tracks, host, port, report, allow_outside=allow_outside)
     else:
         viewer = open_viewer(rig, host, port, prim, play=play)
+    _serve(viewer, browser)
+
+
+def _serve(viewer: PageServer, browser: bool) -> None:
+    """Serve a page until Ctrl+C; open it in a browser first if `browser` is true."""
+    import webbrowser
+
     try:
         say(f"{viewer.url}  (Ctrl+C stops)")
         if browser:
@@ -198,6 +217,18 @@ def view(
         viewer.wait()
     except KeyboardInterrupt:
         viewer.stop()
+
+
+def _write_page(rig: Path, page: Path, force: bool, prim: str | None) -> None:
+    """Write the web page of a rig that needs no server."""
+    from jawusd.pipeline.pose_page import write_page
+    from jawusd.pipeline.view_capture import is_capture
+
+    if is_capture(rig):
+        raise typer.BadParameter("--page needs a rig, not a capture.")
+    refuse_existing(page, force)
+    write_page(rig, page, prim)
+    say(f"{page}  ({page.stat().st_size / 1e6:.1f} MB; opens in any browser)")
 
 
 def _warn_of_host(host: str, capture: bool) -> None:

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import base64
-import math
 import os
-import re
 from collections.abc import Mapping
-from importlib import resources
 from typing import cast
 
-import jinja2
 import numpy as np
-from markupsafe import Markup, escape
+from markupsafe import Markup
 from numpy.typing import NDArray
 
-from jawusd.base.errors import shown
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import DEEP, TOUCHING
@@ -25,6 +20,7 @@ from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.figures import human_ranges, model_figure, tracking_figure
 from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
+from jawusd.report.templates import package_file, page_environment
 from jawusd.report.verdicts import MARKS, WORDS, judge, summary
 
 _LISTED = 60  # maximum number of frame ranges in a list
@@ -62,7 +58,7 @@ def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> s
             words=WORDS,
             marks=MARKS,
             style=package_file("report.css"),
-            script=package_file("replay.js"),
+            script=package_file("scene.js") + package_file("replay.js"),
             replay=replay_data(data),
             figures=draw_figures(data) if figures is None else figures,
             pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
@@ -78,36 +74,6 @@ def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> s
             bite=_bite(data),
         )
     )
-
-
-def page_environment() -> jinja2.Environment:
-    """Return the Jinja environment of the page templates; it escapes text from files."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("jawusd.report", "page"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=lambda value: shown(value) if type(value) is str else value,  # this package's HTML is of type Markup
-    )
-    environment.filters |= {"worded": worded, "figure": figure}
-    return environment
-
-
-def worded(text: str) -> Markup:
-    """Return a sentence as HTML, with text in backticks marked as code."""
-    parts = re.split(r"`([^`]*)`", shown(text))  # parts at odd indices were in backticks
-    return Markup().join(Markup("<code>{}</code>").format(p) if k % 2 else escape(p) for k, p in enumerate(parts))
-
-
-def figure(value: float) -> str:
-    """Return a length in mm with three decimals, or a dash if it is unknown."""
-    return f"{value:.3f}" if math.isfinite(value) else "\u2013"
-
-
-def package_file(name: str) -> Markup:
-    """Return a text file of this package as trusted HTML."""
-    return Markup(resources.files("jawusd.report").joinpath("page", name).read_text(encoding="utf-8"))
 
 
 def draw_figures(data: ReportData) -> dict[str, Markup]:

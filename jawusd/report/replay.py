@@ -41,12 +41,12 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
     A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]
     landmarks = transform_points(A @ rest, model.arrays["landmarks"])
     return {
-        "parts": [_packed(part) for part in data.parts],
+        "parts": [packed(part) for part in data.parts],
         "captured": _poses(motions_of_poses(tracks.T_upper_lower[rows], A, rest)),
         "fitted": _poses(motions_of_poses(fitted, A, rest)),
-        "d": _text(d.astype("<f4")),
-        "frames": _text(tracks.frames[rows].astype("<i4")),
-        "state": _text(_states(tracks)[rows]),
+        "d": encoded(d.astype("<f4")),
+        "frames": encoded(tracks.frames[rows].astype("<i4")),
+        "state": encoded(_states(tracks)[rows]),
         "states": list(STATES),
         "fps": float(data.model.notes.get("fps") or _DEFAULT_FPS) / step,
         "centre": (0.5 * (low + high)).round(2).tolist(),
@@ -71,19 +71,25 @@ def _states(tracks: Tracks) -> NDArray[np.uint8]:
 
 
 def _poses(motion: Array) -> str:
-    return _text(motion[:, :3].reshape(len(motion), 12).astype("<f4"))
+    return encoded(motion[:, :3].reshape(len(motion), 12).astype("<f4"))
 
 
-def _packed(part: ReplayPart) -> dict[str, object]:
+def packed(part: ReplayPart) -> dict[str, object]:
+    """Return a mesh for scene.js, its vertices quantised to 16 bits over the bounding box.
+
+    Raises:
+        ValueError: the mesh has more vertices than 16 bits can number.
+    """
     mesh = part.mesh
     if len(mesh.vertices) > np.iinfo(np.uint16).max:
         raise ValueError(f"a mesh of the replay has {len(mesh.vertices)} vertices; the limit is 65535")
     low = mesh.vertices.min(0)
     step = float(np.ptp(mesh.vertices, axis=0).max()) / np.iinfo(np.uint16).max or 1.0
     vertices = np.round((mesh.vertices - low) / step).astype("<u2")
-    packed = {"vertices": _text(vertices), "faces": _text(mesh.faces.astype("<u2"))}
-    return {"name": part.name, "kind": part.kind, "moves": part.moves, "low": low.tolist(), "step": step, **packed}
+    arrays = {"vertices": encoded(vertices), "faces": encoded(mesh.faces.astype("<u2"))}
+    return {"name": part.name, "kind": part.kind, "moves": part.moves, "low": low.tolist(), "step": step, **arrays}
 
 
-def _text(values: ArrayLike) -> str:
+def encoded(values: ArrayLike) -> str:
+    """Return the bytes of an array as base64 text."""
     return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")

@@ -22,9 +22,9 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.performance import STATE_WORDS, SolvedJaw, SolveState
 from jawusd.formats.report import SolveReportData
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.report.document import package_file, page_environment
 from jawusd.report.figures import larger_magnitude, legend_beside, runs, thinned
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, VERMILION, inline_svg, new_figure
+from jawusd.report.templates import package_file, page_environment
 
 #: Colours of the solve states: close to those of the outlines in the images, but legible on light and dark pages.
 STATE_INKS = {SolveState.SOLVED: GREEN, SolveState.CARRIED: ORANGE, SolveState.LOST: MAGENTA}

@@ -16,8 +16,9 @@ from report_data import document, experiments, report_data
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import Origin, Overlay, RigFacts
 from jawusd.formats.tracks import LostReason
-from jawusd.report.document import _frame_lists, worded
+from jawusd.report.document import _frame_lists
 from jawusd.report.replay import replay_data
+from jawusd.report.templates import worded
 
 SECTIONS = (
     "top", "verdicts", "take", "inputs", "tracking", "model", "bounds", "condyles", "ranges", "files", "left-out"
@@ -243,10 +244,11 @@ def test_the_replay_carries_the_poses_and_the_meshes():
     assert {packed["states"][k] for k in states[lost]} == {"lost"}
 
 
-def test_the_script_is_javascript():
+@pytest.mark.parametrize("name", ["scene", "replay", "pose"])
+def test_the_scripts_are_javascript(name):
     node = shutil.which("node")
     if node is None:
         pytest.skip("there is no node to check the script with")
-    script = ROOT / "jawusd" / "report" / "page" / "replay.js"
+    script = ROOT / "jawusd" / "report" / "page" / f"{name}.js"
     assert len(script.read_text().splitlines()) <= 300
     subprocess.run([node, "--check", script], check=True, timeout=60)

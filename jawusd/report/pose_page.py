@@ -1,0 +1,70 @@
+"""Write a web page that poses a rig without a server: meshes, sampled decoder and bound in one HTML file."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.motions import motions_of_poses
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.report import ReplayPart
+from jawusd.geometry.se3 import se3_log
+from jawusd.report.replay import encoded, packed
+from jawusd.report.templates import package_file, page_environment
+
+
+@dataclass(frozen=True, eq=False)
+class PosePage:
+    """Contents of the page."""
+
+    name: str  # name of the actor
+    rig: JawRig
+    parts: tuple[ReplayPart, ...]
+    axes: tuple[Array, Array, Array]  # grid of the sampled decoder: increasing values of d1, d2 and d3 [mm]
+    clip: Array  # parameters of the take that the page plays [mm], shape (F, 3); F = 0 without a take
+    fps: float  # frame rate of the take
+
+
+def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
+    """Write the page to an HTML file; text from the rig is escaped.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    text = (
+        page_environment()
+        .get_template("pose.html.j2")
+        .render(
+            name=page.name,
+            style=package_file("report.css"),
+            script=package_file("scene.js") + package_file("pose.js"),
+            data=pose_data(page),
+        )
+    )
+    write_text_atomic(path, text)
+
+
+def pose_data(page: PosePage) -> dict[str, object]:
+    """Return the input of pose.js, ready for JSON encoding.
+
+    The table contains, for each grid point, the twist (omega [rad], v [mm]) of the motion relative to occlusion in the
+    anatomical frame, and the margin [mm].
+    """
+    rig = page.rig
+    d = np.stack(np.meshgrid(*page.axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    twists = se3_log(motions_of_poses(rig.pose(d), rig.T_anatomical_skull, rig.T_rest))
+    vertices = np.concatenate([part.mesh.vertices for part in page.parts if part.name != "skull"])
+    low, high = vertices.min(0), vertices.max(0)
+    return {
+        "parts": [packed(part) for part in page.parts],
+        "axes": [axis.round(6).tolist() for axis in page.axes],
+        "table": encoded(np.column_stack([twists, rig.margin(d)]).astype("<f4")),
+        "clip": encoded(page.clip.astype("<f4")),
+        "fps": page.fps,
+        "centre": (0.5 * (low + high)).round(2).tolist(),
+        "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
+    }

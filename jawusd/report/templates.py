@@ -1,0 +1,42 @@
+"""Jinja templates, style sheet and scripts of the pages."""
+
+from __future__ import annotations
+
+import math
+import re
+from importlib import resources
+
+import jinja2
+from markupsafe import Markup, escape
+
+from jawusd.base.errors import shown
+
+
+def page_environment() -> jinja2.Environment:
+    """Return the Jinja environment of the page templates; it escapes text from files."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jawusd.report", "page"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: shown(value) if type(value) is str else value,  # this package's HTML is of type Markup
+    )
+    environment.filters |= {"worded": worded, "figure": figure}
+    return environment
+
+
+def worded(text: str) -> Markup:
+    """Return a sentence as HTML, with text in backticks marked as code."""
+    parts = re.split(r"`([^`]*)`", shown(text))  # parts at odd indices were in backticks
+    return Markup().join(Markup("<code>{}</code>").format(p) if k % 2 else escape(p) for k, p in enumerate(parts))
+
+
+def figure(value: float) -> str:
+    """Return a length in mm with three decimals, or a dash if it is unknown."""
+    return f"{value:.3f}" if math.isfinite(value) else "\u2013"
+
+
+def package_file(name: str) -> Markup:
+    """Return a text file of this package as trusted HTML."""
+    return Markup(resources.files("jawusd.report").joinpath("page", name).read_text(encoding="utf-8"))
