@@ -135,7 +135,7 @@ def test_a_camera_whose_masks_are_of_other_frames_is_reported(drawn, tmp_path):
             own.rename(own.with_name(f"{int(own.stem) + 100:06d}.png"))
     tracks = track(make_capture(folder, COUNT))
     (found,) = findings(tracks, "camera_not_used")
-    assert found.camera == "cam1" and found.message.startswith(f"used in 0 of {COUNT} frames: the camera has no masks")
+    assert found.camera == "cam1" and found.message.startswith(f"used in 0 of {COUNT} frames: it has no masks")
 
 
 def test_a_camera_whose_masks_never_fit_is_reported(drawn, tmp_path):
