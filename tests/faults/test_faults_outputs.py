@@ -64,12 +64,11 @@ def test_a_pipe_gets_the_whole_content_and_stays(tmp_path, suffix):
     pipe, plain = tmp_path / f"out{suffix}", tmp_path / f"plain{suffix}"
     os.mkfifo(pipe)
     reader = subprocess.Popen(["cat", str(pipe)], stdout=subprocess.PIPE)
-    for _ in range(500):
+    held = None  # the reader gets everything before the end
+    while held is None and reader.poll() is None:
         with suppress(OSError):  # until the reader has opened it
-            os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
-            break
+            held = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
         threading.Event().wait(0.01)
-    held = os.open(pipe, os.O_WRONLY)  # the reader gets everything before the end
     WRITERS[suffix](pipe)
     os.close(held)
     got, _ = reader.communicate(timeout=60)
