@@ -8,7 +8,8 @@ from reference_commands import escaped
 
 import jawusd.base.errors
 from jawusd.cli.commands import EXIT_CODES
-from jawusd.evaluator import schema as arrays
+from jawusd.evaluator.kinds import every_array
+from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES
 from jawusd.formats.capture import capture_keys
 
 SCHEMA = Path(__file__).resolve().parents[2] / "schemas" / "schema.usda"
@@ -94,9 +95,8 @@ def attribute_entry(attribute, array):
 
 def array_names():
     """Return the name of the array in model.npz by USD attribute."""
-    groups = (arrays.ARRAYS, *arrays.OPTIONAL.values())
-    named = {spec.attribute: name for group in groups for name, spec in group.items() if spec.attribute}
-    return named | dict.fromkeys(arrays.D_RANGE_ATTRIBUTES, "d_range")
+    named = {spec.attribute: name for name, spec in every_array().items() if spec.attribute}
+    return named | dict.fromkeys(D_RANGE_ATTRIBUTES, "d_range")
 
 
 def errors_page():

@@ -12,17 +12,16 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.contact import PREFIXES, check_contact
-from jawusd.evaluator.schema import ANCHORED, KINDS, OPTIONAL, arrays_of
+from jawusd.evaluator.kinds import KINDS, arrays_of, optional_of
+from jawusd.evaluator.schema import ArraySpec
 from jawusd.evaluator.speeds import check_speeds
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import rigidity_defect
 
 _RIGID_TOLERANCE = 1e-6
 
-_POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
 # maximum magnitude of values [mm, rad]: far beyond any jaw, but small enough that sums of squares do not overflow
 _LARGEST = 1e9
-_RISING = ("slice_d1", "path_limits", "glide_d2", "glide_d3", "curve1_knots", "curve2_knots", "curve3_knots")
 
 
 class HeldOut(NamedTuple):
@@ -49,7 +48,7 @@ class RigArrays:
     """The arrays and the header of a rig.
 
     Attributes:
-        arrays: Named arrays, read-only; `jawusd.evaluator.schema` lists them.
+        arrays: Named arrays, read-only; `jawusd.evaluator.kinds` lists them.
         meta: The header of the file.
     """
 
@@ -69,7 +68,7 @@ class RigArrays:
 
     @property
     def kind(self) -> str:
-        """The kind of model, "anchored" or "additive"."""
+        """The kind of model, one of `jawusd.evaluator.kinds.KINDS`."""
         return str(self.meta["kind"])
 
     @property
@@ -158,7 +157,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     """Check the arrays of a rig of the given kind, and return them as read-only float64.
 
     Args:
-        arrays: Named arrays (see `jawusd.evaluator.schema`); arrays with other names are ignored.
+        arrays: Named arrays (see `jawusd.evaluator.kinds`); arrays with other names are ignored.
         kind: "anchored" or "additive".
 
     Raises:
@@ -167,18 +166,18 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     if kind not in KINDS:
         raise EvaluatorError(f'the model is of kind "{kind}"; this version of jawusd supports {", ".join(KINDS)}.')
     lengths: dict[str, int] = {}
-    checked = {name: _checked(name, arrays, spec.shape, lengths) for name, spec in arrays_of(kind).items()}
-    for first, group in OPTIONAL.items():
-        if first in arrays and all(spec.kind in (None, kind) for spec in group.values()):
-            checked |= {name: _checked(name, arrays, spec.shape, lengths) for name, spec in group.items()}
-    _check_values(checked)
+    specs = arrays_of(kind)
+    for first, group in optional_of(kind).items():
+        specs |= group if first in arrays else {}
+    checked = {name: _checked(name, arrays, spec.shape, lengths) for name, spec in specs.items()}
+    _check_values(checked, specs)
     _check_sections(checked)
     for name in PREFIXES.values():
         if f"{name}_values" in checked:
             check_contact(checked, name)
     if "velocity_covariance" in checked:
         check_speeds(checked)
-    if kind == ANCHORED and lengths["weights"] != lengths["centres"] + 3:
+    if "spline_weights" in checked and lengths["weights"] != lengths["centres"] + 3:
         raise EvaluatorError(
             f'"spline_weights" has {lengths["weights"]} rows for {lengths["centres"]} centres; '
             f"expected {lengths['centres'] + 3}: one per centre and 3 for the linear part."
@@ -187,7 +186,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
 
 
 def flat_arrays(arrays: Mapping[str, Array]) -> dict[str, list[float]]:
-    """Return the arrays flattened in row-major order, as `jawusd.evaluator.formula` expects them."""
+    """Return the arrays flattened in row-major order, as `jawusd.evaluator.kinds` expects them."""
     return {name: value.ravel().tolist() for name, value in arrays.items()}
 
 
@@ -213,18 +212,17 @@ def _checked(
     return value
 
 
-def _check_values(arrays: dict[str, Array]) -> None:
+def _check_values(arrays: dict[str, Array], specs: Mapping[str, ArraySpec]) -> None:
     for name in ("T_anatomical_skull", "T_rest"):
         defect = float(rigidity_defect(arrays[name]))
         if defect > _RIGID_TOLERANCE:
             raise EvaluatorError(
                 f'"{name}" is not rigid: its defect is {defect:.2g}; the maximum is {_RIGID_TOLERANCE:g}.'
             )
-    for name in _POSITIVE:
-        if name in arrays and not (arrays[name] > 0).all():
+    for name, spec in specs.items():
+        if spec.values == "positive" and not (arrays[name] > 0).all():
             raise EvaluatorError(f'"{name}" is {arrays[name].tolist()}; it must be positive.')
-    for name in _RISING:
-        if name in arrays and (len(arrays[name]) < 2 or (np.diff(arrays[name]) <= 0).any()):
+        if spec.values == "rising" and (len(arrays[name]) < 2 or (np.diff(arrays[name]) <= 0).any()):
             raise EvaluatorError(f'"{name}" must contain at least two increasing values.')
     if len(arrays["landmarks"]) < 3:
         raise EvaluatorError(f'"landmarks" has {len(arrays["landmarks"])} points; at least 3 are needed.')

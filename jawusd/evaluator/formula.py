@@ -1,9 +1,9 @@
 """The jaw model's formulas, written once for every number type.
 
 Each function takes numbers with ``+ - * /`` (floats, numpy arrays, torch tensors, values of an ONNX graph) and, where
-a formula needs more, an `Operations` object for that number type. The torch layer, the ONNX exporter and the
-single-file reader are built from `MODELS` and `BoundFormula`. `jawusd.evaluator.gauge` is the only other implementation
-of the gauge, with derivatives.
+a formula needs more, an `Operations` object for that number type. `jawusd.evaluator.kinds` makes models of them. The
+torch layer, the ONNX exporter and the single-file reader are built from those and `BoundFormula`.
+`jawusd.evaluator.gauge` is the only other implementation of the gauge, with derivatives.
 
 This file imports only the standard library and modules that do the same: all of them are copied into the single-file
 reader, which runs in Python 3.9.
@@ -25,11 +25,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, Protocol, cast
+from typing import Generic, NamedTuple, cast
 
 from jawusd.evaluator.curve_formula import curve, curve_tables, flat_ended_slopes
-from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, polynomial, rows, triple
-from jawusd.evaluator.spline_formula import spline, spread_of
+from jawusd.evaluator.operations import FloatOperations, Operations, Table, polynomial, rows, triple
 from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 
 # Tolerance [mm] of the inside test: parameters on the bound may round to either side of it.
@@ -189,125 +188,6 @@ def twist_motion(omega: Triple[N], v: Triple[N], ops: Operations[N, Table]) -> R
     """Return the motion exp(omega, v) of a twist (omega [rad], v [mm])."""
     a, b, c = ops.angle_coefficients(dot(omega, omega))
     return RigidMotion(omega, turning(omega, a, b), apply_series(omega, v, b, c))
-
-
-class JawFormula(Protocol):
-    """The motion of one kind of model.
-
-    Attributes:
-        tables: Rows of floats that the formula needs; each number type stores them in its own form.
-    """
-
-    tables: dict[str, Rows]
-
-    def __init__(self, arrays: Arrays) -> None: ...
-
-    @property
-    def numbers(self) -> Numbers:
-        """The scalars the formula needs, in nested tuples."""
-
-    def motion(
-        self,
-        d: Triple[N],
-        tables: Mapping[str, Table],
-        ops: Operations[N, Table],
-        numbers: Numbers | None = None,
-    ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm].
-
-        Args:
-            d: Jaw parameters [mm].
-            tables: The formula's tables in the form of the number type.
-            ops: Operations of the number type.
-            numbers: The formula's scalars in the number type; default: its own floats.
-        """
-
-
-class AnchoredNumbers(NamedTuple):
-    """The scalars of an anchored model (see `AnchoredModel`); `linear` has 3 inputs times 3 outputs [rad].
-
-    `spread` is the result of `spread_of`.
-    """
-
-    gauge: GaugeNumbers
-    incisor: Triple[float]
-    scales: Sequence[float]
-    linear: Sequence[Sequence[float]]
-    offset: Triple[float]
-    spread: Triple[float] | None
-
-
-class AnchoredFormula:
-    """Rotation as a function of the position of the lower incisal point: ``omega = f(u), t = u + p - R(omega) p``."""
-
-    def __init__(self, arrays: Arrays) -> None:
-        path_x, path_z = rows(arrays["path_coefficients"], 5)
-        gauge = GaugeNumbers(
-            path_x=path_x,
-            path_z=path_z,
-            path_scale_mm=arrays["path_scale_mm"][0],
-            low_mm=arrays["path_limits"][0],
-            high_mm=arrays["path_limits"][1],
-            arch=arrays["glide_arch"],
-            drop=arrays["glide_drop"],
-            softness_mm=arrays["glide_softness_mm"][0],
-            fade_mm=arrays["glide_fade_mm"][0],
-        )
-        *weights, first, second, third = rows(arrays["spline_weights"], 3)
-        linear = (first, second, third)
-        self.tables = {"centres": rows(arrays["spline_centres"], 3), "weights": weights}
-        self._glide_width = 0
-        if "glide_d2" in arrays:
-            self._glide_width = len(arrays["glide_d2_factors"]) // len(arrays["glide_d2"])
-            for name, d in (("glide2", "d2"), ("glide3", "d3")):
-                knots, factors = arrays[f"glide_{d}"], rows(arrays[f"glide_{d}_factors"], self._glide_width)
-                self.tables.update(curve_tables(name, knots, factors, flat_ended_slopes(knots, factors)))
-        spread = spread_of(self.tables["centres"], weights)
-        offset = spline((0.0, 0.0, 0.0), self.tables["centres"], weights, linear, spread, FloatOperations())
-        incisor, scales = triple(arrays["incisor"]), arrays["spline_scales"]
-        self.numbers = AnchoredNumbers(gauge, incisor, scales, linear, offset, spread)
-
-    def motion(
-        self,
-        d: Triple[N],
-        tables: Mapping[str, Table],
-        ops: Operations[N, Table],
-        numbers: Numbers | None = None,
-    ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite; see `JawFormula`."""
-        gauge, incisor, scales, linear, offset, spread = cast("AnchoredNumbers", numbers or self.numbers)
-        table = glide(self._glide_width, d[1], d[2], tables, ops) if self._glide_width else None
-        u = displacement(gauge, d, ops, table)
-        q = spline_input(gauge, scales, u, ops)
-        omega = spline(q, tables["centres"], tables["weights"], linear, spread, ops)
-        return anchored_motion(triple([x - o for x, o in zip(omega, offset)]), u, incisor, ops)
-
-
-class AdditiveFormula:
-    """A sum of three curves in se(3): ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang et al. 2019, eq. 5)."""
-
-    numbers: Numbers = ()
-
-    def __init__(self, arrays: Arrays) -> None:
-        self.tables = {}
-        for name in ("curve1", "curve2", "curve3"):
-            values, slopes = (rows(arrays[f"{name}_{part}"], 6) for part in ("twists", "slopes"))
-            self.tables.update(curve_tables(name, arrays[f"{name}_knots"], values, slopes))
-
-    def motion(
-        self,
-        d: Triple[N],
-        tables: Mapping[str, Table],
-        ops: Operations[N, Table],
-        numbers: Numbers | None = None,
-    ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite (see `JawFormula`); the model has no scalars."""
-        first, second, third = (curve(f"curve{i}", x, tables, ops) for i, x in enumerate(d, start=1))
-        twist = ops.split([x + y + z for x, y, z in zip(first, second, third)], 6)
-        return twist_motion(triple(twist[:3]), triple(twist[3:]), ops)
-
-
-MODELS: dict[str, type[JawFormula]] = {"anchored": AnchoredFormula, "additive": AdditiveFormula}
 
 
 class BoundNumbers(NamedTuple):

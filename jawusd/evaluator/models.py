@@ -1,4 +1,4 @@
-"""The two forms of the jaw model, which maps parameters d [mm] to a rigid motion, with exact derivatives.
+"""The forms of the jaw model, which map parameters d [mm] to a rigid motion, with exact derivatives.
 
 All quantities are in the anatomical frame (x left, y up, z anterior, mm, origin at the upper incisal point): a model
 returns the motion ``M(d)`` away from the closed bite, ``M(0) = I``. `jawusd.evaluator.rig` maps it to the skull frame.
@@ -14,86 +14,103 @@ not depend on the chart.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.gauge import ARRAYS, Gauge, gradient_by_u, spline_input
+from jawusd.evaluator.kinds import ADDITIVE, ANCHORED
 from jawusd.evaluator.motions import (
-    SingleAdditive,
     SingleAnchored,
+    SingleCurve,
     SingleForm,
+    SingleTwist,
     anchored_motions,
     motion_matrix,
     motions_from_twists,
 )
-from jawusd.evaluator.schema import ADDITIVE, ANCHORED
 from jawusd.geometry.se3 import se3_left_jacobian, se3_left_jacobian_inverse
 from jawusd.geometry.so3 import so3_left_jacobian, so3_left_jacobian_inverse
 
 
-class JawModelForm(Protocol):
-    """The interface of a jaw model; new kinds of decoders implement it."""
+class JawModelForm(ABC):
+    """A jaw model. By default its chart is d, and everything follows from log M(d); a kind may override any of it.
+
+    Attributes:
+        incisor: The lower incisal point at rest [mm], shape (3,).
+        d_range: Box of d [mm] over which searches start, shape (3, 2).
+    """
 
     kind: ClassVar[str]
+    incisor: Array
+    d_range: Array
 
-    @property
-    def incisor(self) -> Array:
-        """The lower incisal point at rest [mm], shape (3,)."""
-        ...
-
-    @property
-    def single(self) -> SingleForm:
-        """The model for one d, in floats."""
-        ...
-
+    @abstractmethod
     def arrays(self) -> dict[str, Array]:
         """Return the arrays of the model by their names in a rig."""
-        ...
+
+    @abstractmethod
+    def log(self, d: Array) -> Array:
+        """Return the twist log M(d), shape (n, 6)."""
+
+    @abstractmethod
+    def log_jacobian(self, d: Array) -> Array:
+        """Return d log M / dd, shape (n, 6, 3)."""
+
+    def log_of_one(self, d1: float, d2: float, d3: float) -> Array:
+        """Return the twist log M(d) of one finite d [mm], shape (6,)."""
+        return self.log(np.array([[d1, d2, d3]]))[0]
+
+    @cached_property
+    def single(self) -> SingleForm:
+        """The model for one d, in floats."""
+        return SingleTwist(self.log_of_one)
+
+    @cached_property
+    def starts(self) -> StartGrid:
+        """Starting points of searches in d."""
+        return StartGrid.of(self.decode, self.incisor, self.d_range)
 
     def motion(self, d: Array) -> Array:
         """Return M(d) as transforms, shape (n, 4, 4)."""
-        ...
+        return motions_from_twists(self.log(d))
 
     def decode(self, d: Array) -> tuple[Array, Array]:
         """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
-        ...
+        M = self.motion(d)
+        return M[:, :3, :3], M[:, :3, 3]
 
     def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
         """Return rotation, translation [mm] and the spatial derivative S (n, 6, 3) of M(d)."""
-        ...
-
-    def log(self, d: Array) -> Array:
-        """Return the twist log M(d), shape (n, 6)."""
-        ...
-
-    def log_jacobian(self, d: Array) -> Array:
-        """Return d log M / dd, shape (n, 6, 3)."""
-        ...
+        twist = self.log(d)
+        M = motions_from_twists(twist)
+        return M[:, :3, :3], M[:, :3, 3], se3_left_jacobian(twist) @ self.log_jacobian(d)
 
     def chart_start(self, R: Array, t: Array) -> Array:
         """Return starting points (n, 3), in chart coordinates, of searches for motions (R, t)."""
-        ...
+        return self.starts.nearest(R @ self.incisor + t - self.incisor)
 
     def chart_motion(self, x: Array) -> tuple[Array, Array]:
         """Return rotation and translation [mm] at chart coordinates x (n, 3) [mm]."""
-        ...
+        return self.decode(x)
 
     def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
         """Return rotation, translation [mm] and the derivative S (n, 6, 3) at chart coordinates x (n, 3) [mm]."""
-        ...
+        return self.decode_derivative(x)
 
     def chart_parameters(self, x: Array) -> Array:
         """Return the d (n, 3) [mm] of chart coordinates x (n, 3) [mm]."""
-        ...
+        return x
 
 
 @dataclass(frozen=True)
-class AnchoredModel:
+class AnchoredModel(JawModelForm):
     """Rotation as a function of the position of the lower incisal point: ``omega = f(u), t = u + p - R(omega) p``.
 
     f is a polyharmonic r^3 spline with a linear tail (Duchon 1977) in the displacement u of the incisal point p,
@@ -245,7 +262,7 @@ class AnchoredModel:
 
 
 @dataclass(frozen=True)
-class AdditiveModel:
+class AdditiveModel(JawModelForm):
     """A sum of three curves in se(3): ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang et al. 2019, eq. 5).
 
     The sum is zero at d = 0: the constant that the curves have in common is included only once.
@@ -254,20 +271,17 @@ class AdditiveModel:
         curves: The three curves of twists, about the origin of the anatomical frame.
         incisor: The incisal point at rest [mm], shape (3,).
         d_range: Box of valid d [mm], shape (3, 2).
-        single: The model for one row, in floats.
-        starts: Starting points of searches, spread over the box `d_range`.
     """
 
     kind: ClassVar[str] = ADDITIVE
     curves: tuple[HermiteCurve, HermiteCurve, HermiteCurve]
     incisor: Array
     d_range: Array
-    single: SingleAdditive = field(init=False, repr=False)
-    starts: StartGrid = field(init=False, repr=False)
+
+    _singles: list[SingleCurve] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "single", SingleAdditive(self.curves))
-        object.__setattr__(self, "starts", StartGrid.of(self.decode, self.incisor, self.d_range))
+        object.__setattr__(self, "_singles", [SingleCurve(curve) for curve in self.curves])
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> AdditiveModel:
@@ -290,45 +304,19 @@ class AdditiveModel:
             own |= {f"curve{i}_{part}": values for part, values in parts.items()}
         return own
 
-    def decode(self, d: Array) -> tuple[Array, Array]:
-        """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
-        M = self.motion(d)
-        return M[:, :3, :3], M[:, :3, 3]
-
-    def motion(self, d: Array) -> Array:
-        """Return M(d) as transforms, shape (n, 4, 4)."""
-        return motions_from_twists(self.log(d))
-
-    def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
-        """Return rotation, translation [mm] and the spatial derivative S (n, 6, 3) of M(d)."""
-        twist = self.log(d)
-        M = motions_from_twists(twist)
-        return M[:, :3, :3], M[:, :3, 3], se3_left_jacobian(twist) @ self.log_jacobian(d)
-
     def log(self, d: Array) -> Array:
         """Return the twist log M(d), shape (n, 6)."""
         first, second, third = self.curves
         return first.value(d[:, 0]) + second.value(d[:, 1]) + third.value(d[:, 2])
 
+    def log_of_one(self, d1: float, d2: float, d3: float) -> Array:
+        """Return the twist log M(d) of one finite d [mm], shape (6,)."""
+        first, second, third = self._singles
+        return first(d1) + second(d2) + third(d3)
+
     def log_jacobian(self, d: Array) -> Array:
         """Return d log M / dd, shape (n, 6, 3)."""
         return np.stack([curve.slope(d[:, i]) for i, curve in enumerate(self.curves)], axis=2)
-
-    def chart_start(self, R: Array, t: Array) -> Array:
-        """Return the nearest of `starts`, shape (n, 3) [mm]; the chart is d, and curves have no closed-form inverse."""
-        return self.starts.nearest(R @ self.incisor + t - self.incisor)
-
-    def chart_motion(self, x: Array) -> tuple[Array, Array]:
-        """Return rotation and translation [mm] at chart coordinates x, which are d."""
-        return self.decode(x)
-
-    def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return rotation, translation [mm] and the derivative S (n, 6, 3) at chart coordinates x, which are d."""
-        return self.decode_derivative(x)
-
-    def chart_parameters(self, x: Array) -> Array:
-        """Return the chart coordinates x unchanged: they are d."""
-        return x
 
 
 @dataclass(frozen=True)
@@ -361,6 +349,5 @@ class StartGrid:
 
 
 FORMS: dict[str, Callable[[Mapping[str, Array]], JawModelForm]] = {
-    ANCHORED: AnchoredModel.from_arrays,
-    ADDITIVE: AdditiveModel.from_arrays,
+    model.kind: model.from_arrays for model in (AnchoredModel, AdditiveModel)
 }

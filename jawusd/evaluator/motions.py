@@ -11,6 +11,7 @@ the anchor: ``u = R p + t - p``.
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -153,21 +154,20 @@ class SingleAnchored:
         ), r
 
 
-class SingleAdditive:
-    """A `models.AdditiveModel` for one finite d; the anchor is the origin of the anatomical frame."""
+class SingleTwist:
+    """A model for one finite d, given log M(d) (6,); the anchor is the origin of the anatomical frame."""
 
     anchor: Vector = (0.0, 0.0, 0.0)
 
-    def __init__(self, curves: tuple[HermiteCurve, HermiteCurve, HermiteCurve]) -> None:
-        self._curves = [_SingleCurve(curve) for curve in curves]
+    def __init__(self, log: Callable[[float, float, float], Array]) -> None:
+        self._log = log
 
     def motion(self, d1: float, d2: float, d3: float) -> Motion:
         """Return M(d)."""
-        first, second, third = self._curves
-        return motion_of_twist(*(first(d1) + second(d2) + third(d3)).tolist())
+        return motion_of_twist(*self._log(d1, d2, d3).tolist())
 
 
-class _SingleCurve:
+class SingleCurve:
     """A `HermiteCurve` evaluated at one parameter."""
 
     def __init__(self, curve: HermiteCurve) -> None:
@@ -175,6 +175,7 @@ class _SingleCurve:
         self._coefficients = list(curve.coefficients.transpose(0, 2, 1).copy())
 
     def __call__(self, x: float) -> Array:
+        """Return the point of the curve at x."""
         interval = bisect_right(self._knots, x)
         s = x - self._knots[max(interval - 1, 0)]
         return self._coefficients[interval].dot(np.array((1.0, s, s * s, s * s * s)))

@@ -1,13 +1,11 @@
-"""The named arrays of a rig: shapes, model kinds and USD attributes.
+"""The named arrays that all rigs have: shapes and USD attributes. `jawusd.evaluator.kinds` adds those of each kind.
 
 This file imports only the standard library: it is copied into the single-file reader.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-ANCHORED, ADDITIVE = KINDS = ("anchored", "additive")
+from typing import Literal, NamedTuple
 
 
 class ArraySpec(NamedTuple):
@@ -16,38 +14,28 @@ class ArraySpec(NamedTuple):
     Attributes:
         attribute: USD attribute, with the values in row-major order; None for `d_range` (see `D_RANGE_ATTRIBUTES`).
         shape: Axis lengths; axes of the same name have the same length.
-        kind: The only model kind with this array; None for both.
         integer: Whether the values are integers in USD; in memory all arrays are float64.
+        values: Required values: "positive", or "rising" for at least two increasing ones; None for any.
     """
 
     attribute: str | None
     shape: tuple[int | str, ...] = ()
-    kind: str | None = None
     integer: bool = False
+    values: Literal["positive", "rising"] | None = None
 
 
 D_RANGE_ATTRIBUTES = ("jaw:d1:range", "jaw:d2:range", "jaw:d3:range")  # one per row of `d_range`, (low, high) [mm]
 
-
-def _curve(i: int) -> dict[str, ArraySpec]:
-    knots = f"knots{i}"
-    return {
-        f"curve{i}_knots": ArraySpec(f"jaw:model:curve{i}Knots", (knots,), ADDITIVE),
-        f"curve{i}_twists": ArraySpec(f"jaw:model:curve{i}Twists", (knots, 6), ADDITIVE),
-        f"curve{i}_slopes": ArraySpec(f"jaw:model:curve{i}Slopes", (knots, 6), ADDITIVE),
-    }
-
-
-ARRAYS: dict[str, ArraySpec] = {
+COMMON: dict[str, ArraySpec] = {
     "T_anatomical_skull": ArraySpec("jaw:model:tAnatomicalSkull", (4, 4)),
     "T_rest": ArraySpec("jaw:model:tRest", (4, 4)),
     "incisor": ArraySpec("jaw:model:incisor", (3,)),
     "d_range": ArraySpec(None, (3, 2)),
     "landmarks": ArraySpec("jaw:landmarks:positions", ("landmarks", 3)),
-    "slice_d1": ArraySpec("jaw:bounds:sliceD1", ("openings",)),
+    "slice_d1": ArraySpec("jaw:bounds:sliceD1", ("openings",), values="rising"),
     "slice_directions": ArraySpec("jaw:bounds:sliceDirections", ("directions", 2)),
     "slice_support": ArraySpec("jaw:bounds:sliceSupport", ("openings", "directions")),
-    "slice_softness_mm": ArraySpec("jaw:bounds:sliceSoftness"),
+    "slice_softness_mm": ArraySpec("jaw:bounds:sliceSoftness", values="positive"),
     "slice_margin_mm": ArraySpec("jaw:bounds:sliceMargin"),
     "polygon_d1d2": ArraySpec("jaw:bounds:polygonD1D2", ("lateral corners", 2)),
     "polygon_d1d2_counts": ArraySpec("jaw:bounds:polygonD1D2Counts", ("lateral outlines",), integer=True),
@@ -56,29 +44,8 @@ ARRAYS: dict[str, ArraySpec] = {
     "residual_limit_mm": ArraySpec("jaw:thresholds:residual"),
     "tolerance_mm": ArraySpec("jaw:thresholds:tolerance"),
     "codes": ArraySpec("jaw:model:codes", ("codes", 3)),
-    "path_coefficients": ArraySpec("jaw:model:pathCoefficients", (2, 5), ANCHORED),
-    "path_scale_mm": ArraySpec("jaw:model:pathScale", (), ANCHORED),
-    "path_limits": ArraySpec("jaw:model:pathLimits", (2,), ANCHORED),
-    "glide_arch": ArraySpec("jaw:model:glideArch", (7,), ANCHORED),
-    "glide_drop": ArraySpec("jaw:model:glideDrop", (4,), ANCHORED),
-    "glide_softness_mm": ArraySpec("jaw:model:glideSoftness", (), ANCHORED),
-    "glide_fade_mm": ArraySpec("jaw:model:glideFade", (), ANCHORED),
-    "spline_scales": ArraySpec("jaw:model:splineScales", (3,), ANCHORED),
-    "spline_centres": ArraySpec("jaw:model:splineCentres", ("centres", 3), ANCHORED),
-    "spline_weights": ArraySpec("jaw:model:splineWeights", ("weights", 3), ANCHORED),
-    **_curve(1),
-    **_curve(2),
-    **_curve(3),
 }
 
-
-#: Arrays of anchored models with a glide surface measured on scans, all present or none; see `jawusd.evaluator.curves`.
-GLIDE_ARRAYS: dict[str, ArraySpec] = {
-    "glide_d2": ArraySpec("jaw:model:glideD2", ("glide knots of d2",), ANCHORED),
-    "glide_d2_factors": ArraySpec("jaw:model:glideD2Factors", ("glide knots of d2", "glide factors"), ANCHORED),
-    "glide_d3": ArraySpec("jaw:model:glideD3", ("glide knots of d3",), ANCHORED),
-    "glide_d3_factors": ArraySpec("jaw:model:glideD3Factors", ("glide knots of d3", "glide factors"), ANCHORED),
-}
 
 #: Arrays of the clearance of the teeth, all present or none; see `jawusd.evaluator.contact`.
 CONTACT_ARRAYS: dict[str, ArraySpec] = {
@@ -117,16 +84,10 @@ HELD_OUT_ARRAYS: dict[str, ArraySpec] = {
 }
 
 
-#: Optional groups of arrays, each keyed by the name of one of its arrays.
-OPTIONAL = {
-    "glide_d2": GLIDE_ARRAYS,
+#: Optional groups of arrays of any kind of model, each keyed by the name of one of its arrays.
+COMMON_OPTIONAL = {
     "contact_values": CONTACT_ARRAYS,
     "joint_values": JOINT_ARRAYS,
     "velocity_covariance": SPEED_ARRAYS,
     "held_out_share": HELD_OUT_ARRAYS,
 }
-
-
-def arrays_of(kind: str) -> dict[str, ArraySpec]:
-    """Return the arrays that a rig of a model kind has, by name."""
-    return {name: spec for name, spec in ARRAYS.items() if spec.kind in (None, kind)}

@@ -24,7 +24,7 @@ from jawusd.evaluator.nearest import (
 )
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Reason
 from jawusd.fast.hull import signed_distance
-from jawusd.fast.motion import (
+from jawusd.fast.kinds import (
     Scratch,
     displaced,
     motion,
@@ -34,11 +34,9 @@ from jawusd.fast.motion import (
     scratch,
 )
 from jawusd.fast.packing import (
-    ANCHORED_KIND,
     FROM_CLOSED,
     GRID,
     INCISOR,
-    KIND,
     STARTS,
     TO_ANATOMICAL,
     VECTORS,
@@ -196,7 +194,7 @@ def encode(model: Array, T: Array, e: Encoding) -> float:
     p0, p1, p2 = model[INCISOR], model[INCISOR + 1], model[INCISOR + 2]
     for i in range(3):
         e.x[i] = M[i, 0] * p0 + M[i, 1] * p1 + M[i, 2] * p2 + M[i, 3] - model[INCISOR + i]
-    if model[KIND] == ANCHORED_KIND:
+    if model[STARTS] == 0:
         # a search over the displacement need not evaluate the gauge; the nearest pose does not depend on the chart
         descend(model, Problem(DISPLACEMENT, vectors, e.target), e.x, e.w, e.n)
         u = (e.x[0], e.x[1], e.x[2])
@@ -232,7 +230,8 @@ def _motion_of_pose(model: Array, T: Array, half: Array, M: Array) -> None:
 def _nearest_start(model: Array, x: Array) -> None:
     """Replace the incisal displacement x by the d of the grid point with the nearest displacement."""
     count = int(model[STARTS])
-    at = model[GRID + 3 * count :]
+    d = model[int(model[GRID]) :]
+    at = d[3 * count :]
     best, least = 0, np.inf
     for i in range(count):
         a, b, c = at[3 * i] - x[0], at[3 * i + 1] - x[1], at[3 * i + 2] - x[2]
@@ -240,7 +239,7 @@ def _nearest_start(model: Array, x: Array) -> None:
         if square < least:
             best, least = i, square
     for i in range(3):
-        x[i] = model[GRID + 3 * best + i]
+        x[i] = d[3 * best + i]
 
 
 @device

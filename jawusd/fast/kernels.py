@@ -17,8 +17,9 @@ from jawusd.evaluator.verdicts import Limits, Verdicts
 from jawusd.fast.compiling import compiled
 from jawusd.fast.encoding import encoding_scratch, judge
 from jawusd.fast.hull import hull_scratch, signed_distance, signed_distance_gradient
-from jawusd.fast.motion import logarithm, logarithm_derivative, pose, scratch
-from jawusd.fast.packing import ADJOINT, packed_bound, packed_model
+from jawusd.fast.kinds import scratch
+from jawusd.fast.motion import logarithm, logarithm_derivative, packed_model, pose
+from jawusd.fast.packing import ADJOINT, packed_bound
 from jawusd.fast.rigid import device
 
 

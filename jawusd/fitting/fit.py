@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import wraps
-from typing import Literal, ParamSpec, TypeVar, get_args
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 import scipy
@@ -38,7 +38,6 @@ Result = TypeVar("Result")
 
 #: Function that is called with the number of steps done and the total number of steps.
 Progress = Callable[[int, int], None]
-Method = Literal["anchored", "additive", "paper", "pca"]
 #: Fitter of one method; the mask (3,) selects the parameters that the data excite.
 FormFitter = Callable[[TrainingData, Mask, "FittingConfig"], FittedForm]
 
@@ -62,7 +61,7 @@ _FASTEST_MM_S2 = 3e4  # maximum plausible acceleration, three times gravity; lar
 class FittingConfig:
     """Choice of model, and settings of its fit and validation."""
 
-    method: Method = "anchored"
+    method: str = "anchored"  # a key of `FORMS`, or "paper"
     literal: bool = False  # for method "paper": whether to keep the paper's fixed grouping of components
     # number of contiguous parts of the take that are held out in turn to measure the error on unseen poses; 0 to skip
     holdout_folds: int = 5
@@ -74,8 +73,8 @@ class FittingConfig:
     seed: int = 0  # seed of the first initialisation
 
     def __post_init__(self) -> None:
-        if self.method not in get_args(Method):
-            raise ValueError(f"method must be one of {', '.join(get_args(Method))}, got {self.method!r}")
+        if self.method not in (methods := [*FORMS, "paper"]):
+            raise ValueError(f"method must be one of {', '.join(methods)}, got {self.method!r}")
         if self.holdout_folds == 1 or self.holdout_folds < 0:
             raise ValueError(f"holdout_folds must be 0 or at least 2, got {self.holdout_folds}")
         if min(self.trim_mad, self.alpha) <= 0:

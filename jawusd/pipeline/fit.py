@@ -43,8 +43,6 @@ from jawusd.pipeline.subject import Subject, registered_subject
 if TYPE_CHECKING:
     import h5py
 
-    from jawusd.fitting.fit import Method
-
 #: Frame numbers (F,) and T_skull_mandible [mm] (F, 4, 4), NaN where there is no pose.
 Poses = tuple[NDArray[np.int64], Array]
 
@@ -119,7 +117,7 @@ def fit_subject(
             landmarks=subject.landmarks,
             mandible_vertices=subject.measured_points(),
             T_rest=rest,
-            config=FittingConfig(method=cast("Method", method)),  # the name is checked by FittingConfig
+            config=FittingConfig(method=method),
             actor=subject.name,
             forms=FORMS,
             progress=partial(progress, "fit"),

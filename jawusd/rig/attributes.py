@@ -21,7 +21,8 @@ from pxr import Sdf, Usd
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FormatError, VersionError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, OPTIONAL, ArraySpec, arrays_of
+from jawusd.evaluator.kinds import arrays_of, optional_of
+from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, ArraySpec
 from jawusd.rig import _gf
 from jawusd.rig.layers import set_attribute
 from jawusd.rig.layout import FORMAT_VERSION
@@ -38,7 +39,9 @@ MAX_VALUES = 30_000_000
 
 def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> None:
     """Write the model arrays whose attribute names start with one of the prefixes."""
-    optional = {name: spec for group in OPTIONAL.values() for name, spec in group.items() if name in rig.arrays}
+    optional = {
+        name: spec for group in optional_of(rig.kind).values() for name, spec in group.items() if name in rig.arrays
+    }
     for name, spec in {**arrays_of(rig.kind), **optional}.items():
         if spec.attribute is None or not spec.attribute.startswith(prefixes):
             continue
@@ -59,7 +62,7 @@ def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, Array]:
     """
     arrays: dict[str, Array] = {}
     lengths: dict[str, int] = {}
-    for name, spec in {**arrays_of(kind), **_optional_arrays(prim)}.items():
+    for name, spec in {**arrays_of(kind), **_optional_arrays(prim, kind)}.items():
         if spec.attribute is None:
             ranges = [read_value(prim, attribute, where) for attribute in D_RANGE_ATTRIBUTES]
             arrays[name] = np.array(ranges, dtype=np.float64)
@@ -78,10 +81,10 @@ def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, Array]:
     return arrays
 
 
-def _optional_arrays(prim: Usd.Prim) -> dict[str, ArraySpec]:
+def _optional_arrays(prim: Usd.Prim, kind: str) -> dict[str, ArraySpec]:
     """Return the optional arrays that a rig prim has."""
     found: dict[str, ArraySpec] = {}
-    for first, group in OPTIONAL.items():
+    for first, group in optional_of(kind).items():
         if prim.GetAttribute(group[first].attribute or "").HasAuthoredValue():
             found |= group
     return found

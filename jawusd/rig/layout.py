@@ -1,7 +1,7 @@
 """Names of a rig in USD: prim paths, files, attributes and the codeless schema JawRigAPI.
 
 Layers are built with the prim paths below and renamed after the actor when they are written (`layers.rename_actor`).
-`jawusd.evaluator.schema` names the attributes of the model arrays.
+`jawusd.evaluator.kinds` names the attributes of the model arrays.
 
 The schema provides documentation, slider limits and type checks. Rigs are read and written without it: attributes are
 found by name, and the applied schema in the raw `apiSchemas` metadata.

@@ -16,7 +16,8 @@ from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.encoding import landmark_vectors
-from jawusd.evaluator.formula import MODELS, BoundFormula, RigidMotion
+from jawusd.evaluator.formula import BoundFormula, RigidMotion
+from jawusd.evaluator.kinds import MODELS
 from jawusd.evaluator.operations import Rows, triple
 from jawusd.geometry.rodrigues import apply_series, dot
 from jawusd.geometry.se3 import se3_adjoint, se3_inverse

@@ -5,7 +5,7 @@ needs a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is 
 evaluator of the package onnx, which is slower.
 
 The metadata of the decoder contain the whole rig as JSON, so that poses can be judged from this file alone: `arrays`,
-named as in `jawusd.evaluator.schema` (landmarks, limits, contact field, ...), and `header`.
+named as in `jawusd.evaluator.kinds` (landmarks, limits, contact field, ...), and `header`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from jawusd.base.errors import EvaluatorError, FormatError, JawusdError, RigErro
 from jawusd.base.inputs import check_input
 from jawusd.base.version import __version__
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.schema import ARRAYS, OPTIONAL
+from jawusd.evaluator.kinds import every_array
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.rig.onnx_graph import FloatType, Graph, Value, float_type
 from jawusd.rig.onnx_model import add_encoder, add_margin, add_twist, decode_motion, images
@@ -141,7 +141,7 @@ def _metadata(rig: JawRig) -> dict[str, str]:
 
 def _whole_rig(rig: JawRig) -> dict[str, str]:
     """Return the arrays and the header of a rig as JSON, read by `rig_in`."""
-    integer = {name for group in (ARRAYS, *OPTIONAL.values()) for name, spec in group.items() if spec.integer}
+    integer = {name for name, spec in every_array().items() if spec.integer}
     arrays = {name: (a.astype(int) if name in integer else a).tolist() for name, a in rig.arrays.items()}
     return {"arrays": json.dumps(arrays), "header": json.dumps(rig.meta, sort_keys=True)}
 

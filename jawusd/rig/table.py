@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.schema import ADDITIVE
+from jawusd.evaluator.kinds import ADDITIVE
 from jawusd.evaluator.table import SampledTable
 from jawusd.geometry.se3 import se3_exp, transform_points
 

@@ -1,7 +1,7 @@
-"""Both kinds of models with derivatives, in the chart coordinates x (n, 3) [mm] of the search for the nearest pose.
+"""Models with derivatives, in the chart coordinates x (n, 3) [mm] of the search for the nearest pose.
 
-As in `jawusd.evaluator.models`: for an anchored model x is the displacement u of the incisal point, for an additive one
-d itself; derivatives are spatial, S (n, 6, 3) with ``M(x + e) = exp(S e) M(x)``; twists are (omega [rad], v [mm]).
+As in `jawusd.evaluator.models`: for an anchored model x is the displacement u of the incisal point, for others d
+itself; derivatives are spatial, S (n, 6, 3) with ``M(x + e) = exp(S e) M(x)``; twists are (omega [rad], v [mm]).
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator.formula import AnchoredNumbers
 from jawusd.evaluator.gauge import (
     INVERSE_ITERATIONS,
     INVERSE_STEP_MM,
@@ -26,9 +25,9 @@ from jawusd.evaluator.gauge import (
     opening_equation,
     spline_input,
 )
-from jawusd.evaluator.models import AdditiveModel
+from jawusd.evaluator.kinds import ADDITIVE, ANCHORED, AnchoredNumbers
+from jawusd.evaluator.models import FORMS
 from jawusd.evaluator.operations import triple
-from jawusd.evaluator.schema import ADDITIVE, ANCHORED
 from jawusd.evaluator.spline_formula import spline
 from jawusd.solvers.motion import OPERATIONS, MotionModule
 from jawusd.solvers.solution import applied, attached, capturing, finished, inverse
@@ -153,15 +152,15 @@ class AnchoredMotion(MotionModule):
         return torch.stack([d1, d2, d3], dim=1)
 
 
-class AdditiveMotion(MotionModule):
-    """An additive model; x is d."""
+class DirectMotion(MotionModule):
+    """A model of any kind; x is d. A subclass may have its derivative in closed form, which takes half the time."""
 
     starts: Tensor
     displacements: Tensor
 
-    def __init__(self, arrays: Mapping[str, Array]) -> None:
-        super().__init__(ADDITIVE, arrays)
-        starts = AdditiveModel.from_arrays(arrays).starts
+    def __init__(self, kind: str, arrays: Mapping[str, Array]) -> None:
+        super().__init__(kind, arrays)
+        starts = FORMS[kind](arrays).starts
         self.register_buffer("starts", torch.tensor(starts.d))
         self.register_buffer("displacements", torch.tensor(starts.displacements))
 
@@ -172,8 +171,13 @@ class AdditiveMotion(MotionModule):
 
     def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rotation, translation [mm] and spatial derivative at d (n, 3) [mm]."""
-        values, slopes = zip(*(_curve(self, f"curve{i + 1}", x[:, i : i + 1]) for i in range(3)))
-        return _twist_derivative(sum(values), torch.stack(slopes, dim=2))
+        axes = torch.eye(3, dtype=x.dtype, device=x.device)
+        M, by_d = zip(*(torch.func.jvp(self.forward, (x,), (axis.expand_as(x),)) for axis in axes))
+        R, t, change = M[0][:, :3, :3], M[0][:, :3, 3], torch.stack(by_d, dim=3)
+        # a change of d turns by dR R^T = [s] and shifts the origin by dt - s x t
+        spin = torch.einsum("nijk,nlj->nilk", change[:, :3, :3], R)
+        s = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], dim=1)
+        return R, t, torch.cat([s, change[:, :3, 3] - _cross(s, t[:, :, None])], dim=1)
 
     def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return the chart coordinates x, which are d, and the identity as their derivative."""
@@ -184,9 +188,20 @@ class AdditiveMotion(MotionModule):
         return x
 
 
-def chart_of(kind: str, arrays: Mapping[str, Array]) -> AnchoredMotion | AdditiveMotion:
+class AdditiveMotion(DirectMotion):
+    """An additive model; x is d."""
+
+    def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return rotation, translation [mm] and spatial derivative at d (n, 3) [mm]."""
+        values, slopes = zip(*(_curve(self, f"curve{i + 1}", x[:, i : i + 1]) for i in range(3)))
+        return _twist_derivative(sum(values), torch.stack(slopes, dim=2))
+
+
+def chart_of(kind: str, arrays: Mapping[str, Array]) -> AnchoredMotion | DirectMotion:
     """Return the model, of the given kind, in its chart."""
-    return AnchoredMotion(arrays) if kind == ANCHORED else AdditiveMotion(arrays)
+    if kind == ANCHORED:
+        return AnchoredMotion(arrays)
+    return AdditiveMotion(kind, arrays) if kind == ADDITIVE else DirectMotion(kind, arrays)
 
 
 def _columns(slopes: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.arrays import flat_arrays
-from jawusd.evaluator.formula import MODELS, Numbers, RigidMotion, anchored_motion
+from jawusd.evaluator.formula import Numbers, RigidMotion, anchored_motion
+from jawusd.evaluator.kinds import MODELS
 from jawusd.evaluator.operations import Rows, polynomial, triple
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, Triple, angle_quotients, angle_series
 from jawusd.solvers.precision import check_precision, full_precision

@@ -8,8 +8,8 @@ from example_model import example_arrays
 from scipy.spatial.transform import Rotation
 
 from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.kinds import KINDS, arrays_of
 from jawusd.evaluator.models import FORMS, AnchoredModel
-from jawusd.evaluator.schema import KINDS, arrays_of
 from jawusd.geometry.se3 import se3_exp
 
 # inside, on a knot of the curves, past both ends of the path, at rest

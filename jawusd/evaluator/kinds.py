@@ -1,0 +1,203 @@
+"""The kinds of jaw models: the arrays and the formula of each.
+
+`MODELS` is the one list of kinds: files, checks, ONNX graphs, the torch layer and the single-file reader follow it.
+This file imports only the standard library and modules that do the same: it is copied into the single-file reader.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, NamedTuple, Protocol, cast
+
+from jawusd.evaluator.curve_formula import curve, curve_tables, flat_ended_slopes
+from jawusd.evaluator.formula import (
+    Arrays,
+    GaugeNumbers,
+    Numbers,
+    RigidMotion,
+    anchored_motion,
+    displacement,
+    glide,
+    spline_input,
+    twist_motion,
+)
+from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, rows, triple
+from jawusd.evaluator.schema import COMMON, COMMON_OPTIONAL, ArraySpec
+from jawusd.evaluator.spline_formula import spline, spread_of
+from jawusd.geometry.rodrigues import N, Triple
+
+ANCHORED, ADDITIVE = "anchored", "additive"
+
+
+class JawFormula(Protocol):
+    """The motion of one kind of model.
+
+    Attributes:
+        arrays: The arrays that a rig of this kind has besides `schema.COMMON`, by name.
+        optional: Its optional groups of arrays besides `schema.COMMON_OPTIONAL`.
+        tables: The rows of floats the formula needs; each number type stores them in its own form.
+    """
+
+    arrays: ClassVar[dict[str, ArraySpec]]
+    optional: ClassVar[dict[str, dict[str, ArraySpec]]]
+    tables: dict[str, Rows]
+
+    def __init__(self, arrays: Arrays) -> None: ...
+
+    @property
+    def numbers(self) -> Numbers:
+        """The scalars the formula needs, in nested tuples."""
+
+    def motion(
+        self,
+        d: Triple[N],
+        tables: Mapping[str, Table],
+        ops: Operations[N, Table],
+        numbers: Numbers | None = None,
+    ) -> RigidMotion[N]:
+        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm].
+
+        Args:
+            d: Jaw parameters [mm].
+            tables: The formula's tables in the form of the number type.
+            ops: Operations of the number type.
+            numbers: The formula's scalars in the number type; default: its own floats.
+        """
+
+
+class AnchoredNumbers(NamedTuple):
+    """The scalars of an anchored model (see `AnchoredModel`); `linear` has 3 inputs times 3 outputs [rad].
+
+    `spread` is as from `spread_of`.
+    """
+
+    gauge: GaugeNumbers
+    incisor: Triple[float]
+    scales: Sequence[float]
+    linear: Sequence[Sequence[float]]
+    offset: Triple[float]
+    spread: Triple[float] | None
+
+
+#: A glide surface measured on scans, all or none; see `jawusd.evaluator.curves`.
+GLIDE_ARRAYS: dict[str, ArraySpec] = {
+    "glide_d2": ArraySpec("jaw:model:glideD2", ("glide knots of d2",), values="rising"),
+    "glide_d2_factors": ArraySpec("jaw:model:glideD2Factors", ("glide knots of d2", "glide factors")),
+    "glide_d3": ArraySpec("jaw:model:glideD3", ("glide knots of d3",), values="rising"),
+    "glide_d3_factors": ArraySpec("jaw:model:glideD3Factors", ("glide knots of d3", "glide factors")),
+}
+
+
+class AnchoredFormula:
+    """Rotation as a function of the position of the lower incisal point: ``omega = f(u), t = u + p - R(omega) p``."""
+
+    arrays: ClassVar[dict[str, ArraySpec]] = {
+        "path_coefficients": ArraySpec("jaw:model:pathCoefficients", (2, 5)),
+        "path_scale_mm": ArraySpec("jaw:model:pathScale", values="positive"),
+        "path_limits": ArraySpec("jaw:model:pathLimits", (2,), values="rising"),
+        "glide_arch": ArraySpec("jaw:model:glideArch", (7,)),
+        "glide_drop": ArraySpec("jaw:model:glideDrop", (4,)),
+        "glide_softness_mm": ArraySpec("jaw:model:glideSoftness", values="positive"),
+        "glide_fade_mm": ArraySpec("jaw:model:glideFade", values="positive"),
+        "spline_scales": ArraySpec("jaw:model:splineScales", (3,), values="positive"),
+        "spline_centres": ArraySpec("jaw:model:splineCentres", ("centres", 3)),
+        "spline_weights": ArraySpec("jaw:model:splineWeights", ("weights", 3)),
+    }
+    optional: ClassVar[dict[str, dict[str, ArraySpec]]] = {"glide_d2": GLIDE_ARRAYS}
+
+    def __init__(self, arrays: Arrays) -> None:
+        path_x, path_z = rows(arrays["path_coefficients"], 5)
+        gauge = GaugeNumbers(
+            path_x=path_x,
+            path_z=path_z,
+            path_scale_mm=arrays["path_scale_mm"][0],
+            low_mm=arrays["path_limits"][0],
+            high_mm=arrays["path_limits"][1],
+            arch=arrays["glide_arch"],
+            drop=arrays["glide_drop"],
+            softness_mm=arrays["glide_softness_mm"][0],
+            fade_mm=arrays["glide_fade_mm"][0],
+        )
+        *weights, first, second, third = rows(arrays["spline_weights"], 3)
+        linear = (first, second, third)
+        self.tables = {"centres": rows(arrays["spline_centres"], 3), "weights": weights}
+        self._glide_width = 0
+        if "glide_d2" in arrays:
+            self._glide_width = len(arrays["glide_d2_factors"]) // len(arrays["glide_d2"])
+            for name, d in (("glide2", "d2"), ("glide3", "d3")):
+                knots, factors = arrays[f"glide_{d}"], rows(arrays[f"glide_{d}_factors"], self._glide_width)
+                self.tables.update(curve_tables(name, knots, factors, flat_ended_slopes(knots, factors)))
+        spread = spread_of(self.tables["centres"], weights)
+        offset = spline((0.0, 0.0, 0.0), self.tables["centres"], weights, linear, spread, FloatOperations())
+        incisor, scales = triple(arrays["incisor"]), arrays["spline_scales"]
+        self.numbers = AnchoredNumbers(gauge, incisor, scales, linear, offset, spread)
+
+    def motion(
+        self,
+        d: Triple[N],
+        tables: Mapping[str, Table],
+        ops: Operations[N, Table],
+        numbers: Numbers | None = None,
+    ) -> RigidMotion[N]:
+        """Return the motion away from the closed bite; see `JawFormula`."""
+        gauge, incisor, scales, linear, offset, spread = cast("AnchoredNumbers", numbers or self.numbers)
+        table = glide(self._glide_width, d[1], d[2], tables, ops) if self._glide_width else None
+        u = displacement(gauge, d, ops, table)
+        q = spline_input(gauge, scales, u, ops)
+        omega = spline(q, tables["centres"], tables["weights"], linear, spread, ops)
+        return anchored_motion(triple([x - o for x, o in zip(omega, offset)]), u, incisor, ops)
+
+
+def _curve(i: int) -> dict[str, ArraySpec]:
+    knots = f"knots{i}"
+    return {
+        f"curve{i}_knots": ArraySpec(f"jaw:model:curve{i}Knots", (knots,), values="rising"),
+        f"curve{i}_twists": ArraySpec(f"jaw:model:curve{i}Twists", (knots, 6)),
+        f"curve{i}_slopes": ArraySpec(f"jaw:model:curve{i}Slopes", (knots, 6)),
+    }
+
+
+class AdditiveFormula:
+    """A sum of three curves in se(3): ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang et al. 2019, eq. 5)."""
+
+    arrays: ClassVar[dict[str, ArraySpec]] = {**_curve(1), **_curve(2), **_curve(3)}
+    optional: ClassVar[dict[str, dict[str, ArraySpec]]] = {}
+    numbers: Numbers = ()
+
+    def __init__(self, arrays: Arrays) -> None:
+        self.tables = {}
+        for name in ("curve1", "curve2", "curve3"):
+            values, slopes = (rows(arrays[f"{name}_{part}"], 6) for part in ("twists", "slopes"))
+            self.tables.update(curve_tables(name, arrays[f"{name}_knots"], values, slopes))
+
+    def motion(
+        self,
+        d: Triple[N],
+        tables: Mapping[str, Table],
+        ops: Operations[N, Table],
+        numbers: Numbers | None = None,
+    ) -> RigidMotion[N]:
+        """Return the motion away from the closed bite (see `JawFormula`); the model has no scalars."""
+        first, second, third = (curve(f"curve{i}", x, tables, ops) for i, x in enumerate(d, start=1))
+        twist = ops.split([x + y + z for x, y, z in zip(first, second, third)], 6)
+        return twist_motion(triple(twist[:3]), triple(twist[3:]), ops)
+
+
+MODELS: dict[str, type[JawFormula]] = {ANCHORED: AnchoredFormula, ADDITIVE: AdditiveFormula}
+KINDS = tuple(MODELS)
+
+
+def arrays_of(kind: str) -> dict[str, ArraySpec]:
+    """Return the arrays that a rig of a model kind has, by name."""
+    return {**COMMON, **MODELS[kind].arrays}
+
+
+def optional_of(kind: str) -> dict[str, dict[str, ArraySpec]]:
+    """Return the optional groups of arrays of a model kind, each keyed by the name of one of its arrays."""
+    return {**MODELS[kind].optional, **COMMON_OPTIONAL}
+
+
+def every_array() -> dict[str, ArraySpec]:
+    """Return the arrays of all kinds, also the optional ones, by name."""
+    groups = [group for kind in KINDS for group in (arrays_of(kind), *optional_of(kind).values())]
+    return {name: spec for group in groups for name, spec in group.items()}
